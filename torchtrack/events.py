@@ -1,0 +1,180 @@
+"""Events: the flat ragged batch, its checks, and the windows a stream is cut into.
+
+Conventions, stated once: times are integer microseconds (int64) at every boundary; windows are half open on the left,
+``t_start_us < t <= t_end_us``, so an event at a window's end belongs to it; polarity is ``True`` where it got brighter.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from torchtrack.errors import EventDataError
+
+
+@dataclass(frozen=True)
+class EventBatch:
+    """Events of one or more streams in flat ragged form, sorted by time within each stream.
+
+    Args:
+        x, y: sensor pixels, int32.
+        t_us: times in microseconds, int64.
+        polarity: bool, ``True`` where the pixel got brighter.
+        stream_index: which stream each event belongs to, int64, not decreasing.
+    """
+
+    x: Int[Tensor, "e"]
+    y: Int[Tensor, "e"]
+    t_us: Int[Tensor, "e"]
+    polarity: Bool[Tensor, "e"]
+    stream_index: Int[Tensor, "e"]
+
+    @classmethod
+    def from_numpy(cls, x: np.ndarray, y: np.ndarray, t_us: np.ndarray, polarity: np.ndarray, stream: int = 0) -> "EventBatch":
+        """A batch of one stream from arrays of any integer type; polarity counts as positive where it is > 0."""
+        lengths = {len(x), len(y), len(t_us), len(polarity)}
+        if len(lengths) != 1:
+            raise EventDataError(f"x, y, t and polarity must have one length, got {len(x)}, {len(y)}, {len(t_us)} and {len(polarity)}.")
+        return cls(
+            torch.from_numpy(np.ascontiguousarray(x, dtype=np.int32)),
+            torch.from_numpy(np.ascontiguousarray(y, dtype=np.int32)),
+            torch.from_numpy(np.ascontiguousarray(t_us, dtype=np.int64)),
+            torch.from_numpy(np.ascontiguousarray(np.asarray(polarity) > 0)),
+            torch.full((len(x),), stream, dtype=torch.int64),
+        )
+
+    @classmethod
+    def empty(cls) -> "EventBatch":
+        """A batch without events."""
+        none = np.zeros(0, dtype=np.int64)
+        return cls.from_numpy(none, none, none, none)
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+    def __getitem__(self, index: slice | Tensor) -> "EventBatch":
+        return EventBatch(self.x[index], self.y[index], self.t_us[index], self.polarity[index], self.stream_index[index])
+
+    def to(self, device: torch.device | str) -> "EventBatch":
+        """The same events on another device."""
+        return EventBatch(*(field.to(device) for field in (self.x, self.y, self.t_us, self.polarity, self.stream_index)))
+
+    def of_stream(self, stream: int) -> "EventBatch":
+        """The same events, all said to be of one stream."""
+        return replace(self, stream_index=torch.full_like(self.stream_index, stream))
+
+    def slice_time(self, t_start_us: int, t_end_us: int) -> "EventBatch":
+        """Events with ``t_start_us < t <= t_end_us``, of a batch of one stream."""
+        bounds = torch.tensor([t_start_us, t_end_us], dtype=torch.int64, device=self.t_us.device)
+        first, last = torch.searchsorted(self.t_us, bounds, right=True).tolist()
+        return self[first:last]
+
+
+def concatenate(batches: Iterable[EventBatch]) -> EventBatch:
+    """Batches one after the other; the caller keeps the order by stream, then time."""
+    batches = list(batches)
+    if not batches:
+        return EventBatch.empty()
+    return EventBatch(*(torch.cat([getattr(b, name) for b in batches]) for name in ("x", "y", "t_us", "polarity", "stream_index")))
+
+
+def check_events(events: EventBatch, width: int, height: int, source: str = "events", last_t_us: int | None = None) -> None:
+    """Raise :class:`EventDataError` unless the events of one stream are sorted by time and inside the sensor.
+
+    ``last_t_us`` is the time of the event before the first one, where there is one.
+    """
+    if len(events) == 0:
+        return
+    steps = torch.diff(events.t_us)
+    if last_t_us is not None and int(events.t_us[0]) < last_t_us:
+        raise EventDataError(f"{source}: time goes back from {last_t_us} to {int(events.t_us[0])} µs. Sort the events by time.")
+    if bool((steps < 0).any()):
+        at = int(torch.nonzero(steps < 0)[0])
+        before, after = events.t_us[at : at + 2].tolist()
+        raise EventDataError(f"{source}: time goes back from {before} to {after} µs at event {at + 1}. Sort the events by time.")
+    outside = (events.x < 0) | (events.x >= width) | (events.y < 0) | (events.y >= height)
+    if bool(outside.any()):
+        at = int(torch.nonzero(outside)[0])
+        raise EventDataError(
+            f"{source}: event {at} is at ({int(events.x[at])}, {int(events.y[at])}), outside the sensor of {width}x{height} pixels "
+            f"({int(outside.sum())} such events). Check the sensor size, or whether x and y are swapped."
+        )
+
+
+@dataclass(frozen=True)
+class EventWindow:
+    """Events with ``t_start_us < t <= t_end_us``."""
+
+    events: EventBatch
+    t_start_us: int
+    t_end_us: int
+
+
+def windows_by_time(chunks: Iterable[EventBatch], duration_us: int, t_start_us: int | None = None) -> Iterator[EventWindow]:
+    """Cut a stream into windows of equal duration, in constant memory; windows without events are yielded too.
+
+    Args:
+        chunks: the events of one stream in time order, cut anywhere.
+        duration_us: length of a window.
+        t_start_us: where the first window starts; just before the first event when not given.
+    """
+    if duration_us < 1:
+        raise EventDataError(f"a window must last at least 1 µs, got {duration_us}.")
+    pending = EventBatch.empty()
+    for chunk in chunks:
+        if len(chunk) == 0:
+            continue
+        if t_start_us is None:
+            t_start_us = int(chunk.t_us[0]) - 1
+        pending = concatenate([pending, chunk]) if len(pending) else chunk
+        # A window is complete only once an event after its end has been seen.
+        newest_us = int(pending.t_us[-1])
+        ends = range(t_start_us + duration_us, newest_us, duration_us)
+        cuts = torch.searchsorted(pending.t_us, torch.tensor([t_start_us, *ends], dtype=torch.int64), right=True).tolist()
+        for end_us, first, last in zip(ends, cuts, cuts[1:], strict=False):
+            yield EventWindow(pending[first:last], end_us - duration_us, end_us)
+        t_start_us += duration_us * len(ends)
+        pending = pending[cuts[-1] :]
+    if len(pending) and t_start_us is not None:
+        yield EventWindow(pending, t_start_us, t_start_us + duration_us)
+
+
+def windows_by_count(
+    chunks: Iterable[EventBatch], count: int, max_age_us: int | None = None, t_start_us: int | None = None
+) -> Iterator[EventWindow]:
+    """Cut a stream into windows of ``count`` events, closed early once ``max_age_us`` have passed.
+
+    Events that share the time of a window's last event stay together with it, so windows may hold a few more.
+    ``t_start_us`` is where the first window starts; just before the first event when not given.
+    """
+    if count < 1 or (max_age_us is not None and max_age_us < 1):
+        raise EventDataError(f"a window needs a positive count and maximum age, got {count} and {max_age_us}.")
+    pending = EventBatch.empty()
+    for chunk in chunks:
+        if len(chunk) == 0:
+            continue
+        pending = concatenate([pending, chunk]) if len(pending) else chunk
+        if t_start_us is None:
+            t_start_us = int(pending.t_us[0]) - 1
+        while (end_us := _count_window_end(pending, count, max_age_us, t_start_us)) is not None:
+            cut = int(torch.searchsorted(pending.t_us, end_us, right=True))
+            yield EventWindow(pending[:cut], t_start_us, end_us)
+            pending, t_start_us = pending[cut:], end_us
+    if len(pending) and t_start_us is not None:
+        yield EventWindow(pending, t_start_us, int(pending.t_us[-1]))
+
+
+def _count_window_end(pending: EventBatch, count: int, max_age_us: int | None, t_start_us: int) -> int | None:
+    """End of the first complete window of ``pending``, or None while an event after its end has not been seen."""
+    if len(pending) == 0:
+        return None
+    ends = []
+    if len(pending) > count:
+        ends.append(int(pending.t_us[count - 1]))
+    if max_age_us is not None:
+        ends.append(t_start_us + max_age_us)
+    end_us = min(ends, default=None)
+    return end_us if end_us is not None and int(pending.t_us[-1]) > end_us else None

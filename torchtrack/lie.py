@@ -1,0 +1,184 @@
+"""Rotations SO(3) and rigid motions SE(3) as matrices, batched and differentiable.
+
+Conventions, stated once:
+
+- ``T_cam_obj [..., 4, 4]`` maps points of the object frame to the camera frame, in metres;
+  inner names cancel: ``T_cam_obj = T_cam_world @ T_world_obj``.
+- A twist is ``[rotation φ, translation ρ]`` (rad, m), the order of the paper's Eq. 13.
+- Perturbations act on the left: ``T <- exp(ξ^) T``.
+
+Every function has finite values and gradients at the identity and near a half turn: both branches of each ``where``
+see a safe denominator. Formulas: Barfoot, *State Estimation for Robotics*, ch. 7.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.errors import PoseError
+
+# Below this squared angle the Taylor series are exact to float64 rounding (next terms are O(θ⁶)).
+_SMALL_ANGLE_SQ = 1e-4
+
+
+def hat(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Skew-symmetric matrix of a vector: ``hat(a) @ b == cross(a, b)``."""
+    x, y, z = phi.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+
+
+def _exp_coefficients(angle_sq: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """``sin θ / θ``, ``(1 - cos θ) / θ²`` and ``(θ - sin θ) / θ³``."""
+    small = angle_sq < _SMALL_ANGLE_SQ
+    safe_sq = torch.where(small, torch.ones_like(angle_sq), angle_sq)
+    angle = safe_sq.sqrt()
+    sin, half_sin = angle.sin(), (0.5 * angle).sin()
+    a = torch.where(small, 1 - angle_sq / 6 * (1 - angle_sq / 20), sin / angle)
+    b = torch.where(small, 0.5 - angle_sq / 24 * (1 - angle_sq / 30), 2 * half_sin.square() / safe_sq)
+    c = torch.where(small, 1 / 6 - angle_sq / 120 * (1 - angle_sq / 42), (angle - sin) / (safe_sq * angle))
+    return a, b, c
+
+
+def so3_exp(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation matrix of a rotation vector (rad), by Rodrigues' formula."""
+    a, b, _ = _exp_coefficients(phi.square().sum(-1))
+    skew = hat(phi)
+    eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
+    return eye + a[..., None, None] * skew + b[..., None, None] * (skew @ skew)
+
+
+def quaternion_from_rotation(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
+    """Unit quaternion ``[x, y, z, w]`` with ``w >= 0`` of a rotation matrix.
+
+    Shepperd's method: of the four algebraically equal forms, take the one with the largest divisor.
+    """
+    m = [[rotation[..., i, j] for j in range(3)] for i in range(3)]
+    xx, yy, zz = m[0][0], m[1][1], m[2][2]
+    x_w, y_w, z_w = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
+    x_y, x_z, y_z = m[1][0] + m[0][1], m[0][2] + m[2][0], m[2][1] + m[1][2]
+    forms = torch.stack(
+        [
+            torch.stack([1 + xx - yy - zz, x_y, x_z, x_w], -1),
+            torch.stack([x_y, 1 - xx + yy - zz, y_z, y_w], -1),
+            torch.stack([x_z, y_z, 1 - xx - yy + zz, z_w], -1),
+            torch.stack([x_w, y_w, z_w, 1 + xx + yy + zz], -1),
+        ],
+        -2,
+    )
+    best = torch.stack([xx - yy - zz, yy - xx - zz, zz - xx - yy, xx + yy + zz], -1).argmax(-1)
+    quaternion = forms.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
+    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
+    return torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+
+
+def rotation_from_quaternion(quaternion: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation matrix of a quaternion ``[x, y, z, w]``, which is normalised first."""
+    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
+    skew = hat(quaternion[..., :3])
+    eye = torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)
+    return eye + 2 * (quaternion[..., 3, None, None] * skew + skew @ skew)
+
+
+def so3_log(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Rotation vector (rad, length at most π) of a rotation matrix."""
+    quaternion = quaternion_from_rotation(rotation)
+    vector, w = quaternion[..., :3], quaternion[..., 3]
+    sin_sq = vector.square().sum(-1)
+    small = sin_sq < _SMALL_ANGLE_SQ / 4
+    sin = torch.where(small, torch.ones_like(sin_sq), sin_sq).sqrt()
+    # atan(x)/x with x = |v|/w: 1 - x²/3 + x⁴/5 is exact to rounding below the threshold.
+    ratio_sq = sin_sq / torch.where(small, w, torch.ones_like(w)).square()
+    series = 2 / torch.where(small, w, torch.ones_like(w)) * (1 - ratio_sq / 3 + ratio_sq.square() / 5 - ratio_sq**3 / 7)
+    factor = torch.where(small, series, 2 * torch.atan2(sin, w) / sin)
+    return factor[..., None] * vector
+
+
+def _assemble(rotation: Tensor, translation: Tensor) -> Tensor:
+    """``[R t; 0 1]``."""
+    top = torch.cat([rotation, translation[..., None]], -1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1
+    return torch.cat([top, bottom], -2)
+
+
+def se3_exp(xi: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 4 4"]:
+    """Rigid motion of a twist ``[φ, ρ]`` (the paper's Eq. 13)."""
+    phi, rho = xi[..., :3], xi[..., 3:]
+    a, b, c = _exp_coefficients(phi.square().sum(-1))
+    skew = hat(phi)
+    skew_sq = skew @ skew
+    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
+    rotation = eye + a[..., None, None] * skew + b[..., None, None] * skew_sq
+    left_jacobian = eye + b[..., None, None] * skew + c[..., None, None] * skew_sq
+    return _assemble(rotation, (left_jacobian @ rho[..., None]).squeeze(-1))
+
+
+def se3_log(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6"]:
+    """Twist ``[φ, ρ]`` of a rigid motion, with rotation of at most π."""
+    phi = so3_log(T[..., :3, :3])
+    angle_sq = phi.square().sum(-1)
+    small = angle_sq < _SMALL_ANGLE_SQ
+    safe_sq = torch.where(small, torch.ones_like(angle_sq), angle_sq)
+    a, b, _ = _exp_coefficients(safe_sq)
+    d = torch.where(small, 1 / 12 + angle_sq / 720 * (1 + angle_sq / 42), (1 - 0.5 * a / b) / safe_sq)
+    skew = hat(phi)
+    eye = torch.eye(3, dtype=T.dtype, device=T.device)
+    inverse_jacobian = eye - 0.5 * skew + d[..., None, None] * (skew @ skew)
+    return torch.cat([phi, (inverse_jacobian @ T[..., :3, 3:]).squeeze(-1)], -1)
+
+
+def se3_inverse(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Inverse of a rigid motion, by transposition."""
+    rotation_t = T[..., :3, :3].transpose(-1, -2)
+    return _assemble(rotation_t, -(rotation_t @ T[..., :3, 3:]).squeeze(-1))
+
+
+def se3_adjoint(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6 6"]:
+    """Adjoint: ``T exp(ξ^) T⁻¹ = exp((Ad_T ξ)^)``, for twists ``[φ, ρ]``."""
+    rotation = T[..., :3, :3]
+    top = torch.cat([rotation, torch.zeros_like(rotation)], -1)
+    bottom = torch.cat([hat(T[..., :3, 3]) @ rotation, rotation], -1)
+    return torch.cat([top, bottom], -2)
+
+
+def transform_points(T_a_b: Float[Tensor, "*b 4 4"], points_b: Float[Tensor, "*b n 3"]) -> Float[Tensor, "*b n 3"]:
+    """Points of frame b, seen in frame a."""
+    return points_b @ T_a_b[..., :3, :3].transpose(-1, -2) + T_a_b[..., None, :3, 3]
+
+
+def se3_interpolate(
+    T_start: Float[Tensor, "*b 4 4"], T_end: Float[Tensor, "*b 4 4"], fraction: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b 4 4"]:
+    """Constant-twist interpolation on SE(3): ``T_start`` at fraction 0, ``T_end`` at fraction 1."""
+    xi = se3_log(T_end @ se3_inverse(T_start))
+    return se3_exp(fraction[..., None] * xi) @ T_start
+
+
+def rotation_angle_deg(rotation_a: Float[Tensor, "*b 3 3"], rotation_b: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+    """Angle between two rotations in degrees: the paper's δR.
+
+    The paper writes it as an arc cosine of the trace, which loses half the digits near zero; the logarithm does not.
+    """
+    return torch.rad2deg(so3_log(rotation_a.transpose(-1, -2) @ rotation_b).norm(dim=-1))
+
+
+def check_pose(T: Tensor, name: str = "T_cam_obj", tolerance: float = 1e-3) -> None:
+    """Raise :class:`PoseError` unless ``T [..., 4, 4]`` holds finite rigid motions."""
+    if T.shape[-2:] != (4, 4):
+        raise PoseError(f"{name}: expected matrices of shape [..., 4, 4], got {list(T.shape)}.")
+    if not bool(torch.isfinite(T).all()):
+        raise PoseError(f"{name}: contains NaN or infinite entries. Check the file or the computation that made it.")
+    rotation = T[..., :3, :3].double()
+    eye = torch.eye(3, dtype=torch.float64, device=T.device)
+    deviation = float((rotation @ rotation.transpose(-1, -2) - eye).abs().amax()) if T.numel() else 0.0
+    if deviation > tolerance:
+        raise PoseError(
+            f"{name}: the upper left 3x3 block is not a rotation (R Rᵀ differs from the identity by {deviation:.3g}, "
+            f"at most {tolerance:g} is allowed). Remove any scale, or check whether rows and columns are swapped."
+        )
+    if bool((torch.linalg.det(rotation) < 0).any()):
+        raise PoseError(f"{name}: the upper left 3x3 block is a reflection (determinant -1). Check the axis conventions: x right, y down, z forward.")
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=T.device)
+    if T.numel() and float((T[..., 3, :].double() - bottom).abs().amax()) > tolerance:
+        raise PoseError(f"{name}: the last row must be [0, 0, 0, 1]. Check whether the matrix is stored transposed.")
