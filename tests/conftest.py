@@ -1,0 +1,44 @@
+"""Fixtures that every test may use. Shapes and types of the whole package are checked while tests run."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from jaxtyping import install_import_hook
+
+# Must come before the first import of torchtrack: it wraps the package's functions as they are loaded.
+install_import_hook("torchtrack", "beartype.beartype")
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread():
+    """One thread per worker: several on busy cores are slower, and sums would differ between runs."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder of the shared data (``$TORCHTRACK_DATA``, else ``../shared/data``); tests are skipped where it is absent."""
+    path = Path(os.environ.get("TORCHTRACK_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not path.is_dir():
+        pytest.skip(f"no data at {path}; set TORCHTRACK_DATA to the folder that holds sequences/ and recordings/")
+    return path
+
+
+def _devices() -> list[str]:
+    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+@pytest.fixture(params=_devices())
+def device(request) -> torch.device:
+    """Every device of this machine."""
+    return torch.device(request.param)
+
+
+@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+def dtype(request) -> torch.dtype:
+    """Both floating types that the tracker runs in."""
+    return request.param

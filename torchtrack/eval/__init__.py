@@ -1,0 +1,1 @@
+"""Evaluation: errors against ground truth, tables of them, and running many sequences."""
