@@ -34,15 +34,19 @@ class EventBatch:
 
     @classmethod
     def from_numpy(cls, x: np.ndarray, y: np.ndarray, t_us: np.ndarray, polarity: np.ndarray, stream: int = 0) -> "EventBatch":
-        """A batch of one stream from arrays of any integer type; polarity counts as positive where it is > 0."""
+        """A batch of one stream from arrays of any integer type; polarity counts as positive where it is > 0.
+
+        Raises:
+            EventDataError: if lengths differ, an array is not of integers, or a number does not fit.
+        """
         lengths = {len(x), len(y), len(t_us), len(polarity)}
         if len(lengths) != 1:
             raise EventDataError(f"x, y, t and polarity must have one length, got {len(x)}, {len(y)}, {len(t_us)} and {len(polarity)}.")
         return cls(
-            torch.from_numpy(np.ascontiguousarray(x, dtype=np.int32)),
-            torch.from_numpy(np.ascontiguousarray(y, dtype=np.int32)),
-            torch.from_numpy(np.ascontiguousarray(t_us, dtype=np.int64)),
-            torch.from_numpy(np.ascontiguousarray(np.asarray(polarity) > 0)),
+            _integer_tensor(x, np.int32, "x"),
+            _integer_tensor(y, np.int32, "y"),
+            _integer_tensor(t_us, np.int64, "t"),
+            torch.from_numpy(np.asarray(polarity) > 0),
             torch.full((len(x),), stream, dtype=torch.int64),
         )
 
@@ -73,6 +77,18 @@ class EventBatch:
         return self[first:last]
 
 
+def _integer_tensor(values: np.ndarray, dtype: type[np.signedinteger], name: str) -> Tensor:
+    """A tensor of ``dtype`` with exactly these values."""
+    values = np.asarray(values)
+    if values.size and values.dtype.kind not in "iu":
+        raise EventDataError(f"{name} must be integers, got {values.dtype}. Times are in microseconds; multiply seconds by 1e6 and round.")
+    limits = np.iinfo(dtype)
+    if not np.can_cast(values.dtype, dtype) and values.size and (values.min() < limits.min or values.max() > limits.max):
+        raise EventDataError(f"{name} must lie within {limits.min}…{limits.max}, got {values.min()}…{values.max()}. Check the file.")
+    # torch wants memory that it may write to; arrays over a file's bytes are read-only.
+    return torch.from_numpy(np.require(values, dtype=dtype, requirements=("C", "W")))
+
+
 def concatenate(batches: Iterable[EventBatch]) -> EventBatch:
     """Batches one after the other; the caller keeps the order by stream, then time."""
     batches = list(batches)
@@ -81,25 +97,28 @@ def concatenate(batches: Iterable[EventBatch]) -> EventBatch:
     return EventBatch(*(torch.cat([getattr(b, name) for b in batches]) for name in ("x", "y", "t_us", "polarity", "stream_index")))
 
 
-def check_events(events: EventBatch, width: int, height: int, source: str = "events", last_t_us: int | None = None) -> None:
+def check_events(events: EventBatch, width: int, height: int, source: str = "events", last_t_us: int | None = None, first_index: int = 0) -> None:
     """Raise :class:`EventDataError` unless the events of one stream are sorted by time and inside the sensor.
 
-    ``last_t_us`` is the time of the event before the first one, where there is one.
+    ``last_t_us`` is the time of the event before the first one, where there is one; ``first_index`` is the number of
+    the first one in its stream, for the message.
     """
     if len(events) == 0:
         return
     steps = torch.diff(events.t_us)
     if last_t_us is not None and int(events.t_us[0]) < last_t_us:
-        raise EventDataError(f"{source}: time goes back from {last_t_us} to {int(events.t_us[0])} µs. Sort the events by time.")
+        raise EventDataError(
+            f"{source}: time goes back from {last_t_us} to {int(events.t_us[0])} µs at event {first_index}. Sort the events by time."
+        )
     if bool((steps < 0).any()):
         at = int(torch.nonzero(steps < 0)[0])
         before, after = events.t_us[at : at + 2].tolist()
-        raise EventDataError(f"{source}: time goes back from {before} to {after} µs at event {at + 1}. Sort the events by time.")
+        raise EventDataError(f"{source}: time goes back from {before} to {after} µs at event {first_index + at + 1}. Sort the events by time.")
     outside = (events.x < 0) | (events.x >= width) | (events.y < 0) | (events.y >= height)
     if bool(outside.any()):
         at = int(torch.nonzero(outside)[0])
         raise EventDataError(
-            f"{source}: event {at} is at ({int(events.x[at])}, {int(events.y[at])}), outside the sensor of {width}x{height} pixels "
+            f"{source}: event {first_index + at} is at ({int(events.x[at])}, {int(events.y[at])}), outside the sensor of {width}x{height} pixels "
             f"({int(outside.sum())} such events). Check the sensor size, or whether x and y are swapped."
         )
 
@@ -142,9 +161,7 @@ def windows_by_time(chunks: Iterable[EventBatch], duration_us: int, t_start_us: 
         yield EventWindow(pending, t_start_us, t_start_us + duration_us)
 
 
-def windows_by_count(
-    chunks: Iterable[EventBatch], count: int, max_age_us: int | None = None, t_start_us: int | None = None
-) -> Iterator[EventWindow]:
+def windows_by_count(chunks: Iterable[EventBatch], count: int, max_age_us: int | None = None, t_start_us: int | None = None) -> Iterator[EventWindow]:
     """Cut a stream into windows of ``count`` events, closed early once ``max_age_us`` have passed.
 
     Events that share the time of a window's last event stay together with it, so windows may hold a few more.

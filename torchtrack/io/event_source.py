@@ -1,0 +1,64 @@
+"""What every reader of events gives: one stream, in time order, checked, in constant memory."""
+
+from collections.abc import Iterable, Iterator
+from typing import Protocol, runtime_checkable
+
+from torchtrack.errors import EventDataError
+from torchtrack.events import EventBatch, check_events
+
+DEFAULT_CHUNK_EVENTS = 500_000
+
+
+@runtime_checkable
+class EventSource(Protocol):
+    """A stream of events of one sensor.
+
+    :meth:`chunks` may be called again and starts from the beginning each time. A stream without events yields nothing:
+    whoever needs events says so.
+    """
+
+    @property
+    def width(self) -> int:
+        """Sensor width in pixels."""
+        ...
+
+    @property
+    def height(self) -> int:
+        """Sensor height in pixels."""
+        ...
+
+    def chunks(self, max_events: int = DEFAULT_CHUNK_EVENTS) -> Iterator[EventBatch]:
+        """The events in time order, in batches of 1 to ``max_events`` events, in constant memory.
+
+        Raises:
+            EventDataError: if events are malformed, go back in time (also from one batch to the next) or lie outside
+                the sensor.
+        """
+        ...
+
+
+def checked(batches: Iterable[EventBatch], width: int, height: int, source: str, max_events: int) -> Iterator[EventBatch]:
+    """Cut batches to at most ``max_events`` and check them, each against the one before it too; empty ones are dropped.
+
+    ``source`` names the stream in error messages.
+    """
+    last_t_us, count = None, 0
+    for batch in batches:
+        if len(batch) == 0:
+            continue
+        check_events(batch, width, height, source, last_t_us, first_index=count)
+        last_t_us, count = int(batch.t_us[-1]), count + len(batch)
+        for start in range(0, len(batch), max_events):
+            yield batch[start : start + max_events]
+
+
+def check_max_events(max_events: int) -> None:
+    """Raise :class:`EventDataError` unless a chunk may hold at least one event."""
+    if max_events < 1:
+        raise EventDataError(f"max_events must be at least 1, got {max_events}.")
+
+
+def check_sensor_size(width: int, height: int, source: str) -> None:
+    """Raise :class:`EventDataError` unless the sensor has at least one pixel."""
+    if width < 1 or height < 1:
+        raise EventDataError(f"{source}: the sensor size must be positive, got {width}x{height}.")

@@ -1,0 +1,190 @@
+"""Events in ``.npz`` files, streamed: members ``t`` (µs), ``x``, ``y``, ``p``, compressed or stored.
+
+``numpy.load`` would read whole arrays; here the members are read through :mod:`zipfile`, chunk by chunk, so that memory
+does not grow with the file. Pickled objects are never loaded.
+"""
+
+import os
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
+from torchtrack.events import EventBatch
+from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size, checked
+
+ZIP_MAGIC = b"PK\x03\x04"
+_EVENT_KEYS = ("t", "x", "y", "p")
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
+_HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+@contextmanager
+def _damage_reported(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except _DAMAGED as error:
+        raise EventDataError(f"'{path}' is truncated or damaged ({error}). Copy or make it again.") from error
+
+
+def open_archive(path: str | os.PathLike[str]) -> zipfile.ZipFile:
+    """Open an ``.npz`` file for reading; the caller closes it.
+
+    Raises:
+        MissingFileError: if there is no such file.
+        UnknownFormatError: if it is not an ``.npz`` file.
+        EventDataError: if it is one, but truncated or damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingFileError(f"file '{path}' does not exist.")
+    with path.open("rb") as stream:
+        magic = stream.read(len(ZIP_MAGIC))
+    if magic != ZIP_MAGIC:
+        raise UnknownFormatError(f"'{path}' is not an .npz file (a zip archive of numpy arrays): it starts with {magic!r}.")
+    with _damage_reported(path):
+        return zipfile.ZipFile(path)
+
+
+def keys_of(archive: zipfile.ZipFile) -> set[str]:
+    """Names of the arrays of an archive."""
+    return {name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")}
+
+
+@dataclass
+class _Member:
+    """One array of an archive, positioned at its data."""
+
+    stream: IO[bytes]
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    fortran_order: bool
+    path: Path
+
+    def read(self, count: int) -> np.ndarray:
+        """The next ``count`` elements, flat."""
+        with _damage_reported(self.path):
+            data = self.stream.read(count * self.dtype.itemsize)
+        if len(data) != count * self.dtype.itemsize:
+            raise EventDataError(f"'{self.path}' is truncated or damaged: an array ends early. Copy or make it again.")
+        return np.frombuffer(data, self.dtype)
+
+    def finish(self) -> None:
+        """Read past the end, which makes :mod:`zipfile` compare the checksum."""
+        with _damage_reported(self.path):
+            self.stream.read(1)
+
+
+def _open_member(archive: zipfile.ZipFile, key: str, path: Path) -> _Member:
+    """Open an array and check its header against the size of its data, before anything of that size is allocated."""
+    if key not in keys_of(archive):
+        raise EventDataError(f"'{path}' has no array '{key}'; it holds: {', '.join(sorted(keys_of(archive))) or 'none'}.")
+    with _damage_reported(path):
+        stream = archive.open(f"{key}.npy")
+    try:
+        with _damage_reported(path):
+            version = np.lib.format.read_magic(stream)
+            shape, fortran_order, dtype = _HEADER_READERS[version](stream)
+    except (ValueError, KeyError) as error:
+        stream.close()
+        raise EventDataError(f"'{path}': the array '{key}' has no readable numpy header ({error}).") from error
+    if dtype.hasobject:
+        stream.close()
+        raise EventDataError(f"'{path}': the array '{key}' holds Python objects, which are not loaded. Save it as plain numbers.")
+    data_bytes = archive.getinfo(f"{key}.npy").file_size - stream.tell()
+    if data_bytes != int(np.prod(shape, dtype=object)) * dtype.itemsize:
+        stream.close()
+        raise EventDataError(f"'{path}': the array '{key}' should have shape {shape} of {dtype}, but holds {data_bytes} bytes. Make it again.")
+    return _Member(stream, dtype, shape, fortran_order, path)
+
+
+def read_array(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray:
+    """A whole (small) array of an archive.
+
+    Raises:
+        EventDataError: if it is not there, damaged, or holds objects; ``path`` is for the message.
+    """
+    member = _open_member(archive, key, path)
+    with member.stream:
+        flat = member.read(int(np.prod(member.shape)))
+        member.finish()
+    return flat.reshape(member.shape, order="F" if member.fortran_order else "C")
+
+
+@dataclass(frozen=True)
+class NpzEvents:
+    """Events of an ``.npz`` file: integer arrays ``t`` (µs), ``x``, ``y`` and polarity ``p`` of one length.
+
+    Args:
+        path: the file.
+        width, height: sensor size in pixels; taken from the arrays ``width`` and ``height`` where the file has them.
+
+    Raises:
+        MissingFileError, UnknownFormatError: if there is no such file, or it is not an ``.npz`` file.
+        EventDataError: if an array is missing or of the wrong kind, the file is damaged, or the sensor size is unknown
+            or differs from the one in the file.
+    """
+
+    path: Path
+    width: int = 0
+    height: int = 0
+    count: int = field(init=False, default=0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))
+        with open_archive(self.path) as archive:
+            if not keys_of(archive):
+                raise UnknownFormatError(f"'{self.path}' is a zip archive, but holds no numpy arrays (.npy).")
+            for name in ("width", "height"):
+                object.__setattr__(self, name, _sensor_length(archive, name, getattr(self, name), self.path))
+            members = [_open_member(archive, key, self.path) for key in _EVENT_KEYS]
+        for member, key in zip(members, _EVENT_KEYS, strict=True):
+            _check_event_member(member, key, members[0].shape)
+        check_sensor_size(self.width, self.height, str(self.path))
+        object.__setattr__(self, "count", members[0].shape[0])
+
+    def chunks(self, max_events: int = DEFAULT_CHUNK_EVENTS) -> Iterator[EventBatch]:
+        """The events in time order; see :class:`torchtrack.io.event_source.EventSource`."""
+        check_max_events(max_events)
+        return checked(self._read(max_events), self.width, self.height, str(self.path), max_events)
+
+    def _read(self, max_events: int) -> Iterator[EventBatch]:
+        with ExitStack() as stack:
+            archive = stack.enter_context(open_archive(self.path))
+            members = [_open_member(archive, key, self.path) for key in _EVENT_KEYS]
+            for member in members:
+                stack.enter_context(member.stream)
+            for start in range(0, self.count, max_events):
+                size = min(max_events, self.count - start)
+                t_us, x, y, polarity = (member.read(size) for member in members)
+                yield EventBatch.from_numpy(x, y, t_us, polarity)
+            for member in members:
+                member.finish()
+
+
+def _sensor_length(archive: zipfile.ZipFile, name: str, given: int, path: Path) -> int:
+    """Width or height, from the file or as given; 0 stands for not given."""
+    if name not in keys_of(archive):
+        if not given:
+            raise EventDataError(f"'{path}' does not say the sensor's {name}. Give width and height in pixels.")
+        return given
+    stored = read_array(archive, name, path)
+    if stored.size != 1 or stored.dtype.kind not in "iu":
+        raise EventDataError(f"'{path}': '{name}' must be one integer, got shape {stored.shape} of {stored.dtype}.")
+    if given and given != stored.item():
+        raise EventDataError(f"'{path}' says that the sensor's {name} is {stored.item()}, but {given} was given. Leave it out, or correct it.")
+    return int(stored.item())
+
+
+def _check_event_member(member: _Member, key: str, shape: tuple[int, ...]) -> None:
+    if len(member.shape) != 1 or member.shape != shape:
+        raise EventDataError(f"'{member.path}': t, x, y and p must be flat and of one length, but '{key}' has shape {member.shape} and t {shape}.")
+    if member.dtype.kind not in ("iub" if key == "p" else "iu"):
+        unit = "microseconds" if key == "t" else "numbers"
+        raise EventDataError(f"'{member.path}': '{key}' must be integer {unit}, got {member.dtype}. Convert and save it again.")
