@@ -195,3 +195,36 @@ def _count_window_end(pending: EventBatch, count: int, max_age_us: int | None, t
         ends.append(t_start_us + max_age_us)
     end_us = min(ends, default=None)
     return end_us if end_us is not None and int(pending.t_us[-1]) > end_us else None
+
+
+@dataclass(frozen=True)
+class PaddedEvents:
+    """The events of one window, a row per stream, padded.
+
+    Args:
+        x, y: sensor pixels; 0 for padding.
+        age_us: time from the event to the window's end (µs).
+        polarity: whether it got brighter.
+        mask: which entries are events.
+    """
+
+    x: Int[Tensor, "s e"]
+    y: Int[Tensor, "s e"]
+    age_us: Int[Tensor, "s e"]
+    polarity: Bool[Tensor, "s e"]
+    mask: Bool[Tensor, "s e"]
+
+
+def pad_streams(events: EventBatch, streams: int, t_end_us: Int[Tensor, "s"]) -> PaddedEvents:
+    """Ragged events as one padded row per stream, with ages at ``t_end_us``."""
+    bounds = torch.searchsorted(events.stream_index, torch.arange(streams + 1, device=events.stream_index.device))
+    counts = torch.diff(bounds)
+    column = torch.arange(max(int(counts.max()), 1), device=bounds.device)
+    mask = column < counts[:, None]
+    index = torch.where(mask, bounds[:-1, None] + column, 0)
+    if len(events) == 0:
+        nothing = torch.zeros_like(index)
+        return PaddedEvents(nothing, nothing, nothing, mask, mask)
+    age_us = torch.where(mask, t_end_us[:, None] - events.t_us[index], 0)
+    x, y = (torch.where(mask, field[index], 0).long() for field in (events.x, events.y))
+    return PaddedEvents(x, y, age_us, events.polarity[index] & mask, mask)

@@ -79,10 +79,9 @@ def _from_numbers(numbers: list[float], width: int | None, height: int | None) -
         raise CalibrationError(f"expected 'fx fy cx cy' and 0, 4, 5 or 8 distortion coefficients, got {len(numbers)} numbers.")
     if width is None or height is None:
         raise CalibrationError("this form does not say the sensor size. Give width and height in pixels (DAVIS240C: 240 and 180).")
-    distortion = tuple(numbers[4:])
-    if not any(distortion):
-        return Camera(*numbers[:4], width, height)
-    return Camera(*numbers[:4], width, height, "plumb_bob", distortion)
+    fx, fy, cx, cy, *distortion = numbers
+    model: DistortionModel = "plumb_bob" if any(distortion) else "none"
+    return Camera(fx, fy, cx, cy, width, height, model, tuple(distortion) if any(distortion) else ())
 
 
 def _from_yaml(text: str, width: int | None, height: int | None) -> Camera:

@@ -21,7 +21,7 @@ from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, c
 
 ZIP_MAGIC = b"PK\x03\x04"
 _EVENT_KEYS = ("t", "x", "y", "p")
-_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError)
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError)
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -114,7 +114,8 @@ def read_array(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray:
     with member.stream:
         flat = member.read(int(np.prod(member.shape)))
         member.finish()
-    return flat.reshape(member.shape, order="F" if member.fortran_order else "C")
+    native = flat.astype(member.dtype.newbyteorder("="))
+    return native.reshape(member.shape, order="F" if member.fortran_order else "C")
 
 
 @dataclass(frozen=True)

@@ -73,28 +73,32 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
         PoseError: if the ground truth is not rigid, or its times do not increase.
     """
     path = Path(path)
+    events = NpzEvents(path)
     with open_archive(path) as archive:
-        camera = _read_camera(archive, path)
+        camera = _read_camera(archive, events, path)
         labels, mesh_files = _read_names(archive, "labels", path), _read_names(archive, "mesh_files", path)
         if len(labels) != len(mesh_files) or not labels:
             raise EventDataError(f"'{path}': labels and mesh_files must name one or more objects each, got {len(labels)} and {len(mesh_files)}.")
         ground_truth = _read_ground_truth(archive, labels, path)
         meta = _read_meta(archive, path)
     objects = tuple(_sequence_object(path, *row) for row in zip(labels, mesh_files, ground_truth, strict=True))
-    return Sequence(path.stem, NpzEvents(path), camera, objects, meta)
+    return Sequence(path.stem, events, camera, objects, meta)
 
 
-def _read_camera(archive: zipfile.ZipFile, path: Path) -> Camera:
-    size = [read_array(archive, name, path) for name in ("width", "height")]
-    if any(value.size != 1 for value in size):
-        raise CalibrationError(f"'{path}': width and height must be one number each, got shapes {[value.shape for value in size]}.")
-    width, height = (int(value.item()) for value in size)
+def _read_numbers(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray:
+    numbers = read_array(archive, key, path)
+    if numbers.dtype.kind not in "iuf":
+        raise EventDataError(f"'{path}': '{key}' must hold numbers, got {numbers.dtype}.")
+    return numbers
+
+
+def _read_camera(archive: zipfile.ZipFile, events: NpzEvents, path: Path) -> Camera:
     model, distortion = "none", ()
     if "distortion_model" in keys_of(archive):
         model = str(read_array(archive, "distortion_model", path))
-        distortion = tuple(read_array(archive, "distortion", path).tolist())
+        distortion = tuple(_read_numbers(archive, "distortion", path).ravel().tolist())
     try:
-        return Camera.from_matrix(read_array(archive, "K", path), width, height, model, distortion)  # type: ignore[arg-type]
+        return Camera.from_matrix(_read_numbers(archive, "K", path), events.width, events.height, model, distortion)  # type: ignore[arg-type]
     except CalibrationError as error:
         raise CalibrationError(f"'{path}': {error}") from error
 
@@ -109,9 +113,9 @@ def _read_names(archive: zipfile.ZipFile, key: str, path: Path) -> list[str]:
 def _read_ground_truth(archive: zipfile.ZipFile, labels: list[str], path: Path) -> list[Trajectory | None]:
     if "poses" not in keys_of(archive):
         return [None] * len(labels)
-    poses, t_us = read_array(archive, "poses", path), read_array(archive, "pose_t", path)
+    poses, t_us = _read_numbers(archive, "poses", path), _read_numbers(archive, "pose_t", path)
     stacked = poses[None] if poses.ndim == 3 else poses
-    if stacked.shape != (len(labels), len(t_us), 4, 4):
+    if t_us.ndim != 1 or stacked.shape != (len(labels), len(t_us), 4, 4):
         raise EventDataError(
             f"'{path}': poses must be [P, 4, 4] for one object or [{len(labels)}, P, 4, 4] for its {len(labels)} labels, "
             f"with pose_t [P]; got {poses.shape} and {t_us.shape}."
@@ -180,7 +184,7 @@ def write_sequence(
     _check_objects(path, labels, len(meshes), len(trajectories), len(textured))
     check_events(EventBatch.from_numpy(x, y, t_us, polarity), camera.width, camera.height, str(path))
     mesh_files = [f"{path.stem}_{label}.ply" for label in labels]
-    arrays = {
+    arrays: dict[str, Any] = {
         "t": np.asarray(t_us, np.int64),
         "x": np.asarray(x, np.uint16),
         "y": np.asarray(y, np.uint16),
@@ -199,9 +203,9 @@ def write_sequence(
         written = Path(folder)
         for mesh, mesh_file in zip(meshes, mesh_files, strict=True):
             _geometry(mesh).export(written / mesh_file)
-        for label, mesh in zip(labels, textured, strict=True):
-            if mesh is not None:
-                mesh.export(written / f"{path.stem}_{label}_textured.glb")
+        for label, model in zip(labels, textured, strict=True):
+            if model is not None:
+                model.export(written / f"{path.stem}_{label}_textured.glb")
         with (written / path.name).open("wb") as stream:
             np.savez(stream, **arrays)
         # The file that names the others comes last: whoever sees it finds them.
@@ -232,8 +236,8 @@ def _pose_arrays(trajectories: ListOf[Trajectory]) -> dict[str, np.ndarray]:
     t_us = trajectories[0].t_us
     if any(not torch.equal(trajectory.t_us, t_us) for trajectory in trajectories):
         raise PoseError("the trajectories of a sequence must share their times. Resample them with Trajectory.at().")
-    poses = np.stack([trajectory.T_cam_obj.numpy() for trajectory in trajectories])
-    return {"poses": poses[0] if len(poses) == 1 else poses, "pose_t": t_us.numpy()}
+    poses = np.stack([trajectory.T_cam_obj.cpu().numpy() for trajectory in trajectories])
+    return {"poses": poses[0] if len(poses) == 1 else poses, "pose_t": t_us.cpu().numpy()}
 
 
 def _geometry(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -48,7 +48,9 @@ class Trajectory:
         return len(self.t_us)
 
     def at(self, t_us: Int[Tensor, "q"]) -> Float[Tensor, "q 4 4"]:
-        """Poses at the times ``t_us`` (µs), moving with constant twist between neighbours and at rest beyond the ends."""
+        """Poses at the integer times ``t_us`` (µs), moving with constant twist between neighbours, at rest beyond the ends."""
+        if t_us.dtype.is_floating_point:
+            raise PoseError(f"times to interpolate at must be integer microseconds, got {t_us.dtype}.")
         t_us = t_us.to(self.t_us)
         if len(self) == 1:
             return self.T_cam_obj.expand(len(t_us), 4, 4).clone()
