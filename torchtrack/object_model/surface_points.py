@@ -1,0 +1,82 @@
+"""Points on the edges of a texture or of colours, and how they are spread evenly."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+# Neighbours whose tangents differ by more than 60 degrees, or whose dark sides are opposite, lie on different edges.
+_SAME_EDGE_COSINE = 0.5
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points on edges of brightness; the brighter side of each lies along ``cross(normal, tangent)``.
+
+    Attributes:
+        points: ``[n, 3]`` metres.
+        tangents: ``[n, 3]`` unit, along the edge.
+        normals: ``[n, 3]`` unit, outwards.
+        length_m: length of all the edges together.
+    """
+
+    points: np.ndarray
+    tangents: np.ndarray
+    normals: np.ndarray
+    length_m: float
+
+
+def oriented_points(points: np.ndarray, tangents: np.ndarray, normals: np.ndarray, to_brighter: np.ndarray, length_m: float) -> SurfacePoints:
+    """Points whose tangents (of any length and sign) are made unit, and turned so that the brighter side is to their left."""
+    wrong = (np.cross(normals, tangents) * to_brighter).sum(1) < 0
+    tangents = np.where(wrong[:, None], -tangents, tangents)
+    return SurfacePoints(points, tangents / np.linalg.norm(tangents, axis=1, keepdims=True), normals, length_m)
+
+
+def points_along(segments: np.ndarray, normals: np.ndarray, to_brighter: np.ndarray, spacing_m: float) -> SurfacePoints:
+    """Points on segments ``[n, 2, 3]``, at most ``spacing_m`` apart and at least one on each."""
+    start, along = segments[:, 0], segments[:, 1] - segments[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    count = np.ceil(length / spacing_m).astype(np.int64).clip(min=1)
+    of = np.repeat(np.arange(len(segments)), count)
+    fraction = (np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[of]
+    return oriented_points(start[of] + fraction[:, None] * along[of], along[of], normals[of], to_brighter[of], float(length.sum()))
+
+
+def join_points(sets: Sequence[SurfacePoints]) -> SurfacePoints:
+    """All points of several sets; of none, no points."""
+    empty = np.zeros((0, 3))
+    points, tangents, normals = ([empty, *(getattr(s, field) for s in sets)] for field in ("points", "tangents", "normals"))
+    return SurfacePoints(np.concatenate(points), np.concatenate(tangents), np.concatenate(normals), sum(s.length_m for s in sets))
+
+
+def thin_out(dense: SurfacePoints, spacing_m: float, max_points: int) -> SurfacePoints:
+    """Points of the same edge kept ``spacing_m`` apart, or further where more than ``max_points`` would be left.
+
+    Points are taken in their order, each removing those of its edge that are too near.
+    """
+    if len(dense.points) == 0 or max_points == 0:
+        return _pick(dense, np.zeros(0, dtype=np.int64))
+    kept = _keep_apart(dense, max(spacing_m, dense.length_m / max_points))
+    if len(kept) > max_points:
+        kept = kept[np.linspace(0, len(kept) - 1, max_points).round().astype(np.int64)]
+    return _pick(dense, kept)
+
+
+def _pick(dense: SurfacePoints, kept: np.ndarray) -> SurfacePoints:
+    return SurfacePoints(dense.points[kept], dense.tangents[kept], dense.normals[kept], dense.length_m)
+
+
+def _keep_apart(dense: SurfacePoints, spacing_m: float) -> np.ndarray:
+    """Indices of points no two of which, on the same edge, are nearer than ``spacing_m``."""
+    pairs = cKDTree(dense.points).query_pairs(spacing_m, output_type="ndarray")
+    alike = (dense.tangents[pairs[:, 0]] * dense.tangents[pairs[:, 1]]).sum(1) > _SAME_EDGE_COSINE
+    pairs = pairs[alike & ((dense.normals[pairs[:, 0]] * dense.normals[pairs[:, 1]]).sum(1) > _SAME_EDGE_COSINE)]
+    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
+    first = np.searchsorted(pairs[:, 0], np.arange(len(dense.points) + 1)).tolist()
+    later, alive = pairs[:, 1], np.ones(len(dense.points), dtype=bool)
+    for point in range(len(dense.points)):
+        if alive[point]:
+            alive[later[first[point] : first[point + 1]]] = False
+    return np.flatnonzero(alive)
