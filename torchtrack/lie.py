@@ -182,3 +182,21 @@ def check_pose(T: Tensor, name: str = "T_cam_obj", tolerance: float = 1e-3) -> N
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=T.device)
     if T.numel() and float((T[..., 3, :].double() - bottom).abs().amax()) > tolerance:
         raise PoseError(f"{name}: the last row must be [0, 0, 0, 1]. Check whether the matrix is stored transposed.")
+
+
+def retract_about(T: Float[Tensor, "*b 4 4"], delta: Float[Tensor, "*b 6"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
+    """Rotate by ``φ`` about the object's centre, and move the centre by ``ρ``, both in the camera's axes.
+
+    A chart of SE(3) that is better conditioned than the left perturbation for an object far from the camera.
+    """
+    rotation = so3_exp(delta[..., :3]) @ T[..., :3, :3]
+    offset_before = (T[..., :3, :3] @ centre_obj[..., None]).squeeze(-1)
+    offset_after = (rotation @ centre_obj[..., None]).squeeze(-1)
+    return _assemble(rotation, T[..., :3, 3] + offset_before - offset_after + delta[..., 3:])
+
+
+def difference_about(T_from: Float[Tensor, "*b 4 4"], T_to: Float[Tensor, "*b 4 4"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6"]:
+    """The ``delta`` with ``retract_about(T_from, delta, centre_obj) == T_to``."""
+    phi = so3_log(T_to[..., :3, :3] @ T_from[..., :3, :3].transpose(-1, -2))
+    moved = (T_to - T_from)[..., :3, :]
+    return torch.cat([phi, (moved[..., :3] @ centre_obj[..., None]).squeeze(-1) + moved[..., 3]], -1)

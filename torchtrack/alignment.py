@@ -1,0 +1,145 @@
+"""One window's alignment: rounds of matching and solving with ever tighter gates."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.contours import Contours, reproject, take_points
+from torchtrack.lie import transform_points
+from torchtrack.matching import (
+    ContourIndex,
+    Matches,
+    Observations,
+    both_coordinates,
+    index_contours,
+    match_along_flow,
+    match_nearest,
+    object_plane_velocity,
+    pixel_velocity,
+)
+from torchtrack.pose_solver import Linearisation, PoseProblem, solve_pose
+
+# The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).
+_INDEX_MARGIN_PX = 2
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Where the rounds begin, and what holds them there.
+
+    Args:
+        T_prior: predicted pose.
+        prior_information: information of the prediction in the solver's chart.
+        velocity: rotation and velocity of the centre (rad/s, m/s).
+        centre_obj: centre of each object (m).
+        intrinsics: ``[fx, fy, cx, cy]`` of each object's camera.
+        image_size: (height, width) of the image.
+    """
+
+    T_prior: Float[Tensor, "b 4 4"]
+    prior_information: Float[Tensor, "b 6 6"]
+    velocity: Float[Tensor, "b 6"]
+    centre_obj: Float[Tensor, "b 3"]
+    intrinsics: Float[Tensor, "b 4"]
+    image_size: tuple[int, int]
+
+    def centre_cam(self, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 3"]:
+        """Centre of each object in the camera's frame (m)."""
+        return transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0]
+
+    def plane_velocity(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
+        """Image velocity of pixels at the depth of the object's centre (px/s)."""
+        return object_plane_velocity(pixels, self.velocity, self.centre_cam(self.T_prior), self.intrinsics)
+
+    def contour_velocity(self, contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b m 2"]:
+        """Image velocity of contour points (px/s)."""
+        return pixel_velocity(contours.points_cam, self.velocity, self.centre_cam(T_cam_obj), self.intrinsics)
+
+
+@dataclass(frozen=True)
+class AlignmentResult:
+    """The pose after the last round, and what it stands on."""
+
+    solution: Linearisation
+    contours: Contours
+    matches: Matches
+
+
+def index_radius_px(config: TrackerConfig) -> int:
+    """How far from a contour observations are looked for (px)."""
+    return int(max(config.matching.gates_px)) + _INDEX_MARGIN_PX
+
+
+def align(
+    start: Alignment,
+    contours: Contours,
+    index: ContourIndex,
+    observations: Observations,
+    extract: Callable[[Float[Tensor, "b 4 4"]], Contours],
+    config: TrackerConfig,
+) -> AlignmentResult:
+    """Match and solve, one round per gate.
+
+    Args:
+        contours: visible contours at ``start.T_prior``, and ``index`` of them.
+        extract: makes contours at a pose anew, in the rounds that ``config.contours.refresh_rounds`` names.
+    """
+    T_cam_obj = start.T_prior
+    seed = torch.full_like(observations.age_s, -1, dtype=torch.int64)
+    compensate = 1.0 if config.matching.motion_compensation else 0.0
+    seed_velocity = compensate * start.plane_velocity(observations.pixels)
+    for number, gate_px in enumerate(config.matching.gates_px):
+        if number and number in config.contours.refresh_rounds:
+            contours = extract(T_cam_obj)
+            index = index_contours(contours, start.image_size, index_radius_px(config))
+            seed = torch.full_like(seed, -1)
+        velocity = compensate * start.contour_velocity(contours, T_cam_obj)
+        matches = _match(observations, contours, index, seed, seed_velocity, velocity, gate_px, config)
+        solution = solve_pose(_problem(start, matches, contours, gate_px, config), T_cam_obj, config.solver)
+        T_cam_obj = solution.T_cam_obj
+        contours = reproject(contours, T_cam_obj, start.intrinsics)
+        if not config.matching.along_flow:
+            seed = torch.where(matches.mask, matches.contour, seed)
+            seed_velocity = torch.where(matches.mask[..., None], take_points(velocity, matches.contour), seed_velocity)
+    return AlignmentResult(solution, contours, matches)
+
+
+def _match(
+    observations: Observations,
+    contours: Contours,
+    index: ContourIndex,
+    seed: Int[Tensor, "b n"],
+    seed_velocity: Float[Tensor, "b n 2"],
+    contour_velocity: Float[Tensor, "b m 2"],
+    gate_px: float,
+    config: TrackerConfig,
+) -> Matches:
+    """Matches of one round; none for an object with too few of them."""
+    if config.matching.along_flow:
+        matches = match_along_flow(observations, contours, contour_velocity, gate_px, config.matching)
+    else:
+        matches = match_nearest(observations, contours, index, seed, seed_velocity, contour_velocity, gate_px)
+    enough = matches.mask.sum(-1, keepdim=True) >= config.quality.min_observations
+    matches = replace(matches, mask=matches.mask & enough)
+    return both_coordinates(matches) if config.matching.residual == "point" else matches
+
+
+def _problem(start: Alignment, matches: Matches, contours: Contours, gate_px: float, config: TrackerConfig) -> PoseProblem:
+    """The least squares problem of one round; objects without a match stay where they are."""
+    idle = ~matches.mask.any(-1)
+    information = torch.where(idle[:, None, None], torch.zeros_like(start.prior_information), start.prior_information)
+    return PoseProblem(
+        points_obj=take_points(contours.points_obj, matches.contour),
+        targets=matches.targets,
+        directions=matches.directions,
+        weights=matches.mask.to(matches.targets.dtype),
+        intrinsics=start.intrinsics,
+        centre_obj=start.centre_obj,
+        scale_px=torch.full_like(start.centre_obj[:, 0], gate_px),
+        T_prior=start.T_prior,
+        prior_information=information,
+    )

@@ -1,0 +1,125 @@
+"""Settings of the tracker, stage by stage in data-flow order; every addition to the paper is a switch of its own."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Settings(BaseModel):
+    """Frozen, and a name that is not known is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class WindowConfig(_Settings):
+    """How the stream is cut into windows, one pose each."""
+
+    mode: Literal["time", "count"] = Field("time", description="Windows of equal duration, or of an equal number of events.")
+    duration_us: int = Field(5_000, ge=100, le=1_000_000, description="Length of a window in mode 'time' (µs).")
+    count: int = Field(5_000, ge=10, description="Events of a window in mode 'count'.")
+    max_age_us: int = Field(20_000, ge=100, description="In mode 'count', a window is closed after this long (µs) with fewer events.")
+
+
+class SurfaceConfig(_Settings):
+    """The time surface (Eq. 5) and its guided filter."""
+
+    tau_s: float = Field(0.03, gt=0, le=10, description="Decay constant τ (s).")
+    margin_px: int = Field(16, ge=12, le=128, description="Border around an object's contours that its region includes (px).")
+    filter_size_px: int = Field(5, ge=3, le=31, description="Side of the guided filter's window (px, odd).")
+    filter_eps: float = Field(0.01, gt=0, description="Regularisation of the guided filter, in squared intensity.")
+    filter_subsample: int = Field(1, ge=1, le=4, description="Subsampling of the guided filter's coefficients.")
+
+
+class CornerConfig(_Settings):
+    """Harris corners of the filtered surface."""
+
+    max_corners: int = Field(64, ge=0, le=2000, description="Corners per object; 0 switches corners off.")
+    cell_px: int = Field(8, ge=3, le=64, description="At most one corner in a cell of this side (px): corners are spread evenly.")
+    relative_threshold: float = Field(1e-3, ge=0, le=1, description="Least Harris response, as a share of the region's largest.")
+    snap: bool = Field(True, description="Move each corner to the newest event of its 3x3 neighbourhood.")
+    fresh_only: bool = Field(True, description="Drop corners whose neighbourhood has no event within the window.")
+
+
+class FlowConfig(_Settings):
+    """Event flow of each corner (Eq. 6-11)."""
+
+    radius_px: int = Field(6, ge=1, le=20, description="Events within this distance of the corner take part (px).")
+    span_s: float = Field(0.02, gt=0, le=1, description="Events up to this old take part (s).")
+    iterations: int = Field(5, ge=1, le=50, description="Reweightings.")
+    tuning: float = Field(4.685, gt=0, description="b of the bisquare weight (Eq. 8), in units of the residual's scale.")
+    min_events: int = Field(8, ge=3, description="Fewer events give no flow.")
+
+
+class ContourConfig(_Settings):
+    """Visible 3D contours of the object at a pose."""
+
+    source: Literal["mesh", "splat"] = Field("mesh", description="Exact contours of the mesh, or the boundary of its splatted point cloud (the paper).")
+    occluding: bool = Field(True, description="Edges between a front and a back face.")
+    creases: bool = Field(True, description="Sharp edges of the mesh.")
+    texture: bool = Field(True, description="Edges of the texture.")
+    segments: bool = Field(True, description="Segments of a polyline model.")
+    max_edge_points: int = Field(800, ge=16, le=10_000, description="Points sampled on occluding contours, creases and segments.")
+    max_texture_points: int = Field(4000, ge=0, le=20_000, description="Points of texture edges.")
+    remove_hidden: bool = Field(True, description="Remove contours behind a surface of any object of the stream.")
+    depth_cell_px: int = Field(4, ge=1, le=16, description="Cell of the depth buffer (px).")
+    depth_margin: float = Field(0.06, ge=0, le=1, description="A contour is hidden by what is nearer by this share of the object's diameter.")
+    splat_radius_px: int = Field(3, ge=1, le=16, description="Closing radius of the splatted point cloud (px).")
+    refresh_rounds: tuple[int, ...] = Field((0,), description="Rounds of matching before which contours are extracted anew.")
+
+
+class MatchingConfig(_Settings):
+    """Association of corners and events with contours."""
+
+    along_flow: bool = Field(False, description="Corners search along their flow (the paper), instead of the nearest contour.")
+    residual: Literal["normal", "flow", "point"] = Field(
+        "normal", description="Distance normal to the contour, along the corner's flow, or to the matched point in both coordinates."
+    )
+    gates_px: tuple[float, ...] = Field((5, 3, 2, 1.5, 1.5), min_length=1, description="One round of matching and solving per gate (px).")
+    flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
+    motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
+    max_events: int = Field(3000, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
+
+
+class SolverConfig(_Settings):
+    """Levenberg-Marquardt on SE(3) (Eq. 12-17)."""
+
+    iterations: int = Field(2, ge=1, le=100, description="Iterations in each round.")
+    loss: Literal["tukey", "huber", "none"] = Field("tukey", description="Robust loss, with the round's gate as its scale.")
+    damping: float = Field(1e-6, ge=0, description="Initial damping, as a share of the Hessian's diagonal.")
+    prior: bool = Field(True, description="Hold the pose near the predicted one.")
+    prior_rotation_rad: float = Field(0.006, gt=0, description="Standard deviation of the prediction's rotation (rad), per 1 px of residual noise.")
+    prior_translation_m: float = Field(0.003, gt=0, description="Standard deviation of the prediction's translation (m), per 1 px of residual noise.")
+
+
+class MotionConfig(_Settings):
+    """Prediction of the next pose."""
+
+    model: Literal["constant_velocity", "hold"] = Field("constant_velocity", description="Carry the velocity on, or start from the last pose.")
+    velocity_gain: float = Field(0.6, gt=0, le=1, description="Share of a new window in the velocity.")
+    without_events: Literal["predict", "hold"] = Field("hold", description="What the pose does in a window with too few events.")
+
+
+class QualityConfig(_Settings):
+    """When a pose is trusted."""
+
+    min_observations: int = Field(30, ge=6, description="Fewer matched observations: the pose is not updated.")
+    min_visible_share: float = Field(0.2, ge=0, le=1, description="A smaller share of the contour inside the image: out of view.")
+    uncertain_below: float = Field(0.5, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is uncertain.")
+    lost_below: float = Field(0.2, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is lost.")
+    min_speed_px_s: float = Field(30.0, ge=0, description="Contours moving slower than this across themselves need not fire (px/s).")
+    max_step_rotation_rad: float = Field(0.5, gt=0, description="A larger rotation against the prediction within one window has diverged (rad).")
+    max_step_translation: float = Field(0.5, gt=0, description="A larger move against the prediction within one window has diverged (diameters).")
+
+
+class TrackerConfig(_Settings):
+    """All settings of the tracker."""
+
+    window: WindowConfig = WindowConfig()
+    surface: SurfaceConfig = SurfaceConfig()
+    corners: CornerConfig = CornerConfig()
+    flow: FlowConfig = FlowConfig()
+    contours: ContourConfig = ContourConfig()
+    matching: MatchingConfig = MatchingConfig()
+    solver: SolverConfig = SolverConfig()
+    motion: MotionConfig = MotionConfig()
+    quality: QualityConfig = QualityConfig()

@@ -1,0 +1,241 @@
+"""From an object's pose to its visible 3D contours: points with image positions and normals.
+
+Occluding edges (between a front and a back face), creases, texture edges and polyline segments, sampled evenly in the
+image. Objects that share a model are handled as one batch.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torchtrack.camera import MIN_DEPTH_M, project
+from torchtrack.config.tracker import ContourConfig
+from torchtrack.lie import transform_points
+from torchtrack.object_model import ObjectModel
+
+# Active edges beyond this many are thinned evenly before they are projected.
+_MAX_ACTIVE_EDGES = 8192
+# Texture seen at a grazing angle (cosine below this) is foreshortened beyond use.
+_MIN_TEXTURE_COSINE = 0.15
+
+
+class ContourKind(IntEnum):
+    """What a contour point comes from."""
+
+    OCCLUDING = 0
+    CREASE = 1
+    TEXTURE = 2
+    SEGMENT = 3
+    SPLAT = 4
+
+
+@dataclass(frozen=True)
+class Contours:
+    """Contour points of each object at a pose, padded.
+
+    Args:
+        points_obj: the points in the object's frame (m).
+        tangents_obj: unit directions of the contour there, in the object's frame.
+        kind: :class:`ContourKind` of each point.
+        mask: which entries are visible contour points.
+        points_cam: the points in the camera's frame (m).
+        pixels: ideal pixels.
+        normals: unit normals of the projected contour.
+    """
+
+    points_obj: Float[Tensor, "b m 3"]
+    tangents_obj: Float[Tensor, "b m 3"]
+    kind: Int[Tensor, "b m"]
+    mask: Bool[Tensor, "b m"]
+    points_cam: Float[Tensor, "b m 3"]
+    pixels: Float[Tensor, "b m 2"]
+    normals: Float[Tensor, "b m 2"]
+
+
+class ContourModel(nn.Module):
+    """The constant tensors of one :class:`ObjectModel` that contours are made from, as buffers."""
+
+    edge_start: Tensor
+    edge_end: Tensor
+    face_normals: Tensor
+    face_offsets: Tensor
+    is_crease: Tensor
+    is_segment: Tensor
+    texture_points: Tensor
+    texture_tangents: Tensor
+    texture_normals: Tensor
+    surface_points: Tensor
+
+    def __init__(self, model: ObjectModel, config: ContourConfig) -> None:
+        """Take what ``config`` switches on from ``model``."""
+        super().__init__()
+        segments = model.segments if config.segments else model.segments[:0]
+        points = torch.cat([model.edge_points, segments])
+        self.register_buffer("edge_start", points[:, 0].clone())
+        self.register_buffer("edge_end", points[:, 1].clone())
+        normals = torch.cat([model.edge_normals, torch.zeros_like(segments)])
+        self.register_buffer("face_normals", normals)
+        self.register_buffer("face_offsets", (normals * points[:, :1]).sum(-1))
+        is_segment = torch.zeros(len(points), dtype=torch.bool)
+        is_segment[len(model.edge_points) :] = True
+        self.register_buffer("is_segment", is_segment)
+        self.register_buffer("is_crease", torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)]) & config.creases)
+        texture_count = min(len(model.texture_points), config.max_texture_points) if config.texture else 0
+        spread = torch.linspace(0, max(len(model.texture_points) - 1, 0), texture_count).long()
+        for name in ("texture_points", "texture_tangents", "texture_normals"):
+            self.register_buffer(name, getattr(model, name)[spread].clone())
+        self.register_buffer("surface_points", model.surface_points.clone())
+
+    def active_edges(self, camera_obj: Float[Tensor, "b 3"], occluding: bool) -> tuple[Bool[Tensor, "b e"], Bool[Tensor, "b e"]]:
+        """Which edges are contours for a camera at ``camera_obj`` (object frame), and which of these occlude."""
+        facing = torch.einsum("esk,bk->bes", self.face_normals, camera_obj) > self.face_offsets
+        front, back = facing.unbind(-1)
+        occludes = front != back
+        crease = self.is_crease & (front | back)
+        return (occludes & occluding) | crease | self.is_segment, occludes
+
+
+def group_by_model(models: Sequence[ObjectModel], config: ContourConfig) -> tuple[nn.ModuleList, list[int]]:
+    """One :class:`ContourModel` per distinct object model, and the index of each object's."""
+    distinct: list[ObjectModel] = []
+    index = []
+    for model in models:
+        known = next((i for i, other in enumerate(distinct) if other is model), None)
+        if known is None:
+            distinct.append(model)
+            known = len(distinct) - 1
+        index.append(known)
+    return nn.ModuleList(ContourModel(model, config) for model in distinct), index
+
+
+def select_ranked(mask: Bool[Tensor, "b n"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
+    """Indices of ``count`` true entries of each row, spread evenly over them, and which of these exist.
+
+    Deterministic, of static shape, and independent of the other rows.
+    """
+    cumulative = mask.cumsum(-1)
+    total = cumulative[:, -1:].to(torch.float64)
+    step = torch.arange(count, device=mask.device, dtype=torch.float64)
+    rank = (step * (total / count).clamp(min=1)).floor().long() + 1
+    index = torch.searchsorted(cumulative, rank)
+    return index.clamp(max=mask.shape[1] - 1), rank <= cumulative[:, -1:]
+
+
+def take_points(values: Float[Tensor, "b n k"], index: Int[Tensor, "b m"]) -> Float[Tensor, "b m k"]:
+    """``values[b, index[b, m]]``."""
+    return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+
+def _edge_points(
+    model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points (object frame), tangents, kinds and mask on the active edges, spread evenly in the image."""
+    rotation, translation = T_cam_obj[:, :3, :3], T_cam_obj[:, :3, 3]
+    camera_obj = -(rotation.transpose(1, 2) @ translation[..., None]).squeeze(-1)
+    active, occludes = model.active_edges(camera_obj, config.occluding)
+    chosen, exists = select_ranked(active, min(_MAX_ACTIVE_EDGES, active.shape[1]))
+    start, end = model.edge_start[chosen], model.edge_end[chosen]
+    ends_cam = transform_points(T_cam_obj, torch.cat([start, end], 1))
+    start_px, end_px = project(ends_cam, intrinsics).chunk(2, 1)
+    start_z, end_z = ends_cam[..., 2].chunk(2, 1)
+    length = torch.where(exists & (start_z > MIN_DEPTH_M) & (end_z > MIN_DEPTH_M), (end_px - start_px).norm(dim=-1), start_z.new_zeros(()))
+    cumulative = length.cumsum(-1)
+    count = config.max_edge_points
+    target = (torch.arange(count, device=length.device, dtype=length.dtype) + 0.5) / count * cumulative[:, -1:]
+    edge = torch.searchsorted(cumulative, target).clamp(max=length.shape[1] - 1)
+    along = 1 - (cumulative.gather(1, edge) - target) / length.gather(1, edge).clamp(min=1e-9)
+    # Even steps in the image are not even along the edge: undo the perspective.
+    z0, z1 = start_z.gather(1, edge), end_z.gather(1, edge)
+    along = (along * z0 / (z1 + along * (z0 - z1)).clamp(min=MIN_DEPTH_M)).clamp(0, 1)
+    edge_start, edge_vector = take_points(start, edge), take_points(end - start, edge)
+    points = edge_start + along[..., None] * edge_vector
+    tangents = torch.nn.functional.normalize(edge_vector, dim=-1)
+    original = chosen.gather(1, edge)
+    kind = torch.where(occludes.gather(1, original), int(ContourKind.OCCLUDING), int(ContourKind.CREASE))
+    kind = torch.where(model.is_segment[original], int(ContourKind.SEGMENT), kind)
+    return points, tangents, kind, (cumulative[:, -1:] > 0).expand(-1, count)
+
+
+def _texture_mask(model: ContourModel, T_cam_obj: Tensor) -> Tensor:
+    """Texture points on faces that look at the camera."""
+    points = transform_points(T_cam_obj, model.texture_points.expand(len(T_cam_obj), -1, -1))
+    normals = model.texture_normals @ T_cam_obj[:, :3, :3].transpose(1, 2)
+    return (normals * points).sum(-1) < -_MIN_TEXTURE_COSINE * points.norm(dim=-1)
+
+
+def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, texture_count: int) -> tuple[Tensor, ...]:
+    """Points, tangents, kinds and mask of objects that share a model, before hidden parts are removed."""
+    batch, own = len(T_cam_obj), len(model.texture_points)
+    if len(model.edge_start):
+        points, tangents, kind, mask = _edge_points(model, T_cam_obj, intrinsics, config)
+    else:
+        points = T_cam_obj.new_zeros(batch, config.max_edge_points, 3)
+        tangents, kind = points, torch.zeros(points.shape[:2], dtype=torch.int64, device=points.device)
+        mask = torch.zeros_like(kind, dtype=torch.bool)
+    padding = texture_count - own
+    pad_points = T_cam_obj.new_zeros(batch, padding, 3)
+    texture = torch.cat([model.texture_points.expand(batch, -1, -1), pad_points], 1)
+    texture_tangents = torch.cat([model.texture_tangents.expand(batch, -1, -1), pad_points], 1)
+    texture_mask = torch.nn.functional.pad(_texture_mask(model, T_cam_obj), (0, padding))
+    texture_kind = torch.full((batch, texture_count), int(ContourKind.TEXTURE), device=kind.device)
+    return (
+        torch.cat([points, texture], 1),
+        torch.cat([tangents, texture_tangents], 1),
+        torch.cat([kind, texture_kind], 1),
+        torch.cat([mask, texture_mask], 1),
+    )
+
+
+def image_normals(
+    points_cam: Float[Tensor, "b m 3"], tangents_cam: Float[Tensor, "b m 3"], intrinsics: Float[Tensor, "b 4"]
+) -> tuple[Float[Tensor, "b m 2"], Bool[Tensor, "b m"]]:
+    """Unit normals of projected tangents, and where they exist (not along the line of sight)."""
+    depth = points_cam[..., 2:].clamp(min=MIN_DEPTH_M)
+    along = (tangents_cam[..., :2] - points_cam[..., :2] / depth * tangents_cam[..., 2:]) / depth * intrinsics[:, None, :2]
+    length = along.norm(dim=-1, keepdim=True)
+    normals = torch.stack([-along[..., 1], along[..., 0]], -1) / length.clamp(min=1e-9)
+    return normals, length[..., 0] > 1e-6
+
+
+def reproject(contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
+    """The same contour points seen from another pose."""
+    points_cam = transform_points(T_cam_obj, contours.points_obj)
+    tangents_cam = contours.tangents_obj @ T_cam_obj[:, :3, :3].transpose(1, 2)
+    normals, _ = image_normals(points_cam, tangents_cam, intrinsics)
+    return replace(contours, points_cam=points_cam, pixels=project(points_cam, intrinsics), normals=normals)
+
+
+def mesh_contours(
+    models: nn.ModuleList, members: Sequence[Int[Tensor, "g"]], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"], config: ContourConfig
+) -> Contours:
+    """Contours of each object at its pose, hidden parts included.
+
+    Args:
+        models: the distinct models.
+        members: for each model, the objects that have it.
+    """
+    texture_count = max(len(model.texture_points) for model in models)
+    parts = [_model_contours(model, T_cam_obj[i], intrinsics[i], config, texture_count) for model, i in zip(models, members, strict=True)]
+    order = torch.cat(list(members)).argsort()
+    points, tangents, kind, mask = (torch.cat(column)[order] for column in zip(*parts, strict=True))
+    return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics)
+
+
+def assemble(
+    points_obj: Float[Tensor, "b m 3"],
+    tangents_obj: Float[Tensor, "b m 3"],
+    kind: Int[Tensor, "b m"],
+    mask: Bool[Tensor, "b m"],
+    T_cam_obj: Float[Tensor, "b 4 4"],
+    intrinsics: Float[Tensor, "b 4"],
+) -> Contours:
+    """Contours from points in the object's frame; those behind the camera or without a normal are masked."""
+    points_cam = transform_points(T_cam_obj, points_obj)
+    tangents_cam = tangents_obj @ T_cam_obj[:, :3, :3].transpose(1, 2)
+    normals, has_normal = image_normals(points_cam, tangents_cam, intrinsics)
+    mask = mask & has_normal & (points_cam[..., 2] > MIN_DEPTH_M)
+    return Contours(points_obj, tangents_obj, kind, mask, points_cam, project(points_cam, intrinsics), normals)

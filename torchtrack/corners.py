@@ -1,0 +1,147 @@
+"""From the time surface to corners: guided filter, Harris response, even selection, newest event.
+
+The filter and the response are kornia's; region borders wide enough for their support keep every object's corners
+independent of the other objects of the batch.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from kornia.feature import harris_response
+from kornia.filters import guided_blur
+from torch import Tensor
+
+from torchtrack.config.tracker import CornerConfig, SurfaceConfig
+from torchtrack.time_surface import Regions
+
+# Guided filter, Sobel and Harris window reach this far into a region from its border (px).
+_FILTER_REACH_PX = 10
+# Large temporaries page-fault on the CPU: regions are filtered this many at a time.
+_CHUNK = 8
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Corners on the sensor, padded.
+
+    Args:
+        sensor_pixels: integer sensor pixels (u, v).
+        pixels: the same in ideal pixels.
+        age_s: time from the newest event at the corner to the window's end (s).
+        mask: which entries are corners.
+        flow: velocity (px/s); zero where there is none.
+        has_flow: where the flow was estimated.
+    """
+
+    sensor_pixels: Int[Tensor, "b n 2"]
+    pixels: Float[Tensor, "b n 2"]
+    age_s: Float[Tensor, "b n"]
+    mask: Bool[Tensor, "b n"]
+    flow: Float[Tensor, "b n 2"]
+    has_flow: Bool[Tensor, "b n"]
+
+
+def filter_surface(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> Float[Tensor, "b h w"]:
+    """Edge-preserving smoothing: the guided filter with the surface as its own guide (kornia)."""
+    image = surface[:, None]
+    filtered = guided_blur(image, image, config.filter_size_px, config.filter_eps, subsample=config.filter_subsample)
+    return filtered[:, 0]
+
+
+def corner_response(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> Float[Tensor, "b h w"]:
+    """Harris response of the filtered surface, a few regions at a time."""
+    parts = [harris_response(filter_surface(part, config)[:, None])[:, 0] for part in surface.split(_CHUNK)]
+    return torch.cat(parts)
+
+
+def select_corners(response: Float[Tensor, "b h w"], regions: Regions, config: CornerConfig) -> tuple[Int[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
+    """The strongest local maxima, at most one per cell: pixels within the region, and which of them are corners."""
+    batch, height, width = response.shape
+    cell = config.cell_px
+    rows, columns = height // cell, width // cell
+    own = _own_area(response, regions)
+    cells = own[:, : rows * cell, : columns * cell].reshape(batch, rows, cell, columns, cell).permute(0, 1, 3, 2, 4).flatten(3).flatten(1, 2)
+    score, within = cells.max(-1)
+    count = min(config.max_corners, score.shape[1])
+    best, chosen = score.topk(count)
+    offset = within.gather(1, chosen)
+    v = torch.div(chosen, columns, rounding_mode="floor") * cell + torch.div(offset, cell, rounding_mode="floor")
+    u = chosen % columns * cell + offset % cell
+    strong = best > config.relative_threshold * best[:, :1]
+    return torch.stack([u, v], -1), strong & (best > 0) & _is_local_maximum(own, u, v, best)
+
+
+def _own_area(response: Tensor, regions: Regions) -> Tensor:
+    """The response, zero where it depends on what lies outside the object's own region."""
+    height, width = response.shape[-2:]
+    v = torch.arange(height, device=response.device)[:, None]
+    u = torch.arange(width, device=response.device)
+    reach = _FILTER_REACH_PX
+    last_u, last_v = (regions.extent - reach).unbind(-1)
+    own = (u >= reach) & (v >= reach) & (u < last_u[:, None, None]) & (v < last_v[:, None, None])
+    return torch.where(own, response, response.new_zeros(()))
+
+
+def _is_local_maximum(response: Tensor, u: Tensor, v: Tensor, value: Tensor) -> Tensor:
+    """Whether ``value`` at (u, v) is the largest of its 5x5 neighbourhood."""
+    height, width = response.shape[-2:]
+    step = torch.arange(-2, 3, device=u.device)
+    rows = (v[..., None, None] + step[:, None]).clamp(0, height - 1)
+    columns = (u[..., None, None] + step).clamp(0, width - 1)
+    neighbours = response.flatten(1).gather(1, (rows * width + columns).flatten(1)).view(*u.shape, 25)
+    return value >= neighbours.amax(-1)
+
+
+def snap_to_newest(
+    sensor_pixels: Int[Tensor, "b n 2"], last_event_us: Int[Tensor, "s h w"], stream_index: Int[Tensor, "b"], radius_px: int
+) -> tuple[Int[Tensor, "b n 2"], Int[Tensor, "b n"]]:
+    """Move each pixel to the newest event within ``radius_px``; returns the pixels and their event times (µs).
+
+    A corner of the surface often sits on the stale tail of an edge's trail; the newest event beside it is the edge.
+    """
+    _, height, width = last_event_us.shape
+    step = torch.arange(-radius_px, radius_px + 1, device=sensor_pixels.device)
+    u = (sensor_pixels[..., 0, None, None] + step).clamp(0, width - 1)
+    v = (sensor_pixels[..., 1, None, None] + step[:, None]).clamp(0, height - 1)
+    u, v = (grid.expand(*sensor_pixels.shape[:2], len(step), len(step)).flatten(2) for grid in (u, v))
+    newest_us, best = last_event_us[stream_index[:, None, None], v, u].max(-1, keepdim=True)
+    return torch.stack([u.gather(-1, best), v.gather(-1, best)], -1).squeeze(-2), newest_us.squeeze(-1)
+
+
+def detect_corners(
+    surface: Float[Tensor, "b h w"],
+    regions: Regions,
+    last_event_us: Int[Tensor, "s h w"],
+    t_us: Int[Tensor, "s"],
+    window_s: Float[Tensor, "s"],
+    ideal_pixels: Float[Tensor, "s h w 2"],
+    surface_config: SurfaceConfig,
+    config: CornerConfig,
+) -> Corners:
+    """Corners of each object's region: filtered surface, Harris, even selection, snapped to the newest event.
+
+    Args:
+        window_s: length of the window of each stream; older corners are dropped with ``fresh_only``.
+        ideal_pixels: undistortion table of each stream.
+    """
+    response = corner_response(surface, surface_config)
+    local, mask = select_corners(response, regions, config)
+    _, height, width = last_event_us.shape
+    sensor = local + regions.origin[:, None]
+    limit = torch.tensor([width - 1, height - 1], device=sensor.device)
+    mask = mask & ((sensor >= 0) & (sensor <= limit)).all(-1)
+    sensor, newest_us = snap_to_newest(torch.minimum(sensor.clamp(min=0), limit), last_event_us, regions.stream_index, 1 if config.snap else 0)
+    stream = regions.stream_index[:, None]
+    age_s = ((t_us[stream] - newest_us).clamp(0, 10**9) * 1e-6).to(surface.dtype)
+    if config.fresh_only:
+        mask = mask & (age_s < window_s[stream])
+    pixels = ideal_pixels[stream, sensor[..., 1], sensor[..., 0]].to(surface.dtype)
+    return Corners(sensor, pixels, age_s, mask, torch.zeros_like(pixels), torch.zeros_like(mask))
+
+
+def no_corners(like: Float[Tensor, "b m 2"]) -> Corners:
+    """Corners of nothing, for objects of the same number, type and device as ``like``."""
+    none = like.new_zeros(len(like), 0, 2)
+    mask = torch.zeros(len(like), 0, dtype=torch.bool, device=like.device)
+    return Corners(none.long(), none, none[..., 0], mask, none, mask)

@@ -1,0 +1,198 @@
+"""Association of corners and events with contours, with gates, and moved to the window's end.
+
+Many observations look their nearest contour point up in an index: an image of the region in which every pixel holds the
+nearest contour point. It is made once per extraction; when the pose moves by a few pixels, the observation is moved
+back instead. Corners may search along their flow, as the paper does.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack.camera import MIN_DEPTH_M
+from torchtrack.config.tracker import MatchingConfig
+from torchtrack.contours import Contours, select_ranked, take_points
+
+# Squared distances are compared in these fractions of a pixel².
+_DISTANCE_STEPS = 16
+# An edge this parallel to the flow (|n·f| below) is not crossed by it.
+_MIN_CROSSING = 0.3
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What was seen, padded: corners and events.
+
+    Args:
+        pixels: ideal pixels at the time of the event.
+        age_s: time from the event to the window's end (s).
+        mask: which entries exist.
+        flow: velocity (px/s); zero where there is none.
+        has_flow: where the flow is known.
+    """
+
+    pixels: Float[Tensor, "b n 2"]
+    age_s: Float[Tensor, "b n"]
+    mask: Bool[Tensor, "b n"]
+    flow: Float[Tensor, "b n 2"]
+    has_flow: Bool[Tensor, "b n"]
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Contour point of each observation.
+
+    Args:
+        contour: index of the contour point; 0 where there is none.
+        mask: which observations are matched.
+        targets: ideal pixels of the observations, moved to the window's end.
+        directions: unit directions along which the distance counts.
+    """
+
+    contour: Int[Tensor, "b n"]
+    mask: Bool[Tensor, "b n"]
+    targets: Float[Tensor, "b n 2"]
+    directions: Float[Tensor, "b n 2"]
+
+
+@dataclass(frozen=True)
+class ContourIndex:
+    """The nearest contour point of every pixel of a region, within a radius.
+
+    Args:
+        origin: ideal pixel (u, v) of the region's first entry.
+        size: (height, width) of the region.
+        nearest: contour index per pixel, -1 where none is near.
+        pixels: where the contour points were when the index was made.
+    """
+
+    origin: Int[Tensor, "b 2"]
+    size: tuple[int, int]
+    nearest: Int[Tensor, "b p"]
+    pixels: Float[Tensor, "b m 2"]
+
+    def look_up(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
+        """Nearest contour point of each pixel, -1 where none is near."""
+        height, width = self.size
+        local = pixels.round() - self.origin[:, None]
+        u, v = local.unbind(-1)
+        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        cell = torch.where(inside, v * width + u, 0).long()
+        return torch.where(inside, self.nearest.gather(1, cell), -1)
+
+
+def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: int) -> ContourIndex:
+    """Index the visible contour points by pixel; those far outside the image (height, width) are left out."""
+    batch, count, _ = contours.pixels.shape
+    device = contours.pixels.device
+    limit = torch.tensor([image_size[1] - 1, image_size[0] - 1], device=device)
+    inside = contours.mask & ((contours.pixels > -radius_px) & (contours.pixels < limit + radius_px)).all(-1)
+    centre = torch.where(inside[..., None], contours.pixels, 0).round().long()
+    low = torch.where(inside[..., None], centre, 2**31).amin(1).clamp(max=2**30) - radius_px
+    span = (torch.where(inside[..., None], centre - low[:, None], 0).amax((0, 1)) + radius_px + 1).tolist()
+    width, height = span
+    step = torch.arange(-radius_px, radius_px + 1, device=device)
+    disc = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1).flatten(0, 1)
+    disc = disc[disc.square().sum(-1) <= radius_px**2]
+    to_centre = centre.to(contours.pixels.dtype) - contours.pixels
+    distance_sq = (to_centre[:, :, None] + disc.to(to_centre.dtype)).square().sum(-1)
+    key = (distance_sq * _DISTANCE_STEPS).long() * count + torch.arange(count, device=device)[:, None]
+    local = (centre - low[:, None])[:, :, None] + disc
+    # Masked points write to a spare last entry.
+    cell = torch.where(inside[..., None], local[..., 1] * width + local[..., 0], height * width)
+    nothing = torch.iinfo(torch.int64).max
+    keys = torch.full((batch, height * width + 1), nothing, device=device)
+    keys = keys.scatter_reduce(1, cell.flatten(1), key.flatten(1), "amin")[:, :-1]
+    return ContourIndex(low, (height, width), torch.where(keys == nothing, -1, keys % count), contours.pixels)
+
+
+def pixel_velocity(
+    points_cam: Float[Tensor, "b m 3"], velocity: Float[Tensor, "b 6"], centre_cam: Float[Tensor, "b 3"], intrinsics: Float[Tensor, "b 4"]
+) -> Float[Tensor, "b m 2"]:
+    """Image velocity (px/s) of points that turn about ``centre_cam`` and move with it: ``velocity`` is [rad/s, m/s]."""
+    rotating = torch.linalg.cross(velocity[:, None, :3].expand_as(points_cam), points_cam - centre_cam[:, None], dim=-1)
+    moving = rotating + velocity[:, None, 3:]
+    inverse_depth = points_cam[..., 2:].clamp(min=MIN_DEPTH_M).reciprocal()
+    return (moving[..., :2] - points_cam[..., :2] * inverse_depth * moving[..., 2:]) * inverse_depth * intrinsics[:, None, :2]
+
+
+def object_plane_velocity(
+    pixels: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b 6"], centre_cam: Float[Tensor, "b 3"], intrinsics: Float[Tensor, "b 4"]
+) -> Float[Tensor, "b n 2"]:
+    """Image velocity (px/s) that a pixel would have at the depth of the object's centre."""
+    depth = centre_cam[:, None, 2:].expand(-1, pixels.shape[1], -1)
+    rays = (pixels - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]
+    return pixel_velocity(torch.cat([rays * depth, depth], -1), velocity, centre_cam, intrinsics)
+
+
+def select_events(
+    pixels: Float[Tensor, "b e 2"], age_s: Float[Tensor, "b e"], mask: Bool[Tensor, "b e"], index: ContourIndex, plane_velocity: Float[Tensor, "b e 2"], count: int
+) -> Observations:
+    """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time."""
+    near = mask & (index.look_up(pixels + plane_velocity * age_s[..., None]) >= 0)
+    chosen, exists = select_ranked(near, count)
+    flow = torch.zeros(*chosen.shape, 2, dtype=pixels.dtype, device=pixels.device)
+    return Observations(take_points(pixels, chosen), age_s.gather(1, chosen), exists, flow, torch.zeros_like(exists))
+
+
+def join(first: Observations, second: Observations) -> Observations:
+    """Observations of both, for each object."""
+    return Observations(*(torch.cat([getattr(first, name), getattr(second, name)], 1) for name in vars(first)))
+
+
+def match_nearest(
+    observations: Observations,
+    contours: Contours,
+    index: ContourIndex,
+    seed: Int[Tensor, "b n"],
+    seed_velocity: Float[Tensor, "b n 2"],
+    contour_velocity: Float[Tensor, "b m 2"],
+    gate_px: float,
+) -> Matches:
+    """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
+
+    Args:
+        contours: at the current pose; ``index`` may be of an earlier one.
+        seed: contour point believed so far, -1 where unknown: tells how far the contour moved since it was indexed.
+        seed_velocity: velocity of each observation believed so far (px/s).
+        contour_velocity: velocity of each contour point (px/s); zero to switch motion compensation off.
+    """
+    known = seed.clamp(min=0)
+    moved = take_points(contours.pixels, known) - take_points(index.pixels, known)
+    moved = torch.where((seed >= 0)[..., None], moved, torch.zeros_like(moved))
+    found = index.look_up(observations.pixels + seed_velocity * observations.age_s[..., None] - moved)
+    contour = found.clamp(min=0)
+    targets = observations.pixels + take_points(contour_velocity, contour) * observations.age_s[..., None]
+    offset = take_points(contours.pixels, contour) - targets
+    mask = observations.mask & (found >= 0) & contours.mask.gather(1, contour) & (offset.norm(dim=-1) < gate_px)
+    return Matches(contour, mask, targets, take_points(contours.normals, contour))
+
+
+def match_along_flow(observations: Observations, contours: Contours, contour_velocity: Float[Tensor, "b m 2"], gate_px: float, config: MatchingConfig) -> Matches:
+    """Match each corner with the contour point nearest to it along the line of its flow, either way (the paper's 3.3).
+
+    The paper moves corners along the flow "to locate the edge points"; seen from a pose that is a window old the edge
+    lies behind, from a predicted one on either side, so both ways are searched. Contours that the flow hardly crosses
+    are no match.
+    """
+    speed = observations.flow.norm(dim=-1, keepdim=True)
+    heading = observations.flow / speed.clamp(min=1e-6)
+    offsets = contours.pixels[:, None] - observations.pixels[:, :, None]
+    along = (offsets * heading[:, :, None]).sum(-1)
+    across = offsets[..., 1] * heading[..., None, 0] - offsets[..., 0] * heading[..., None, 1]
+    crossing = (contours.normals[:, None] * heading[:, :, None]).sum(-1).abs()
+    allowed = contours.mask[:, None] & (across.abs() < config.flow_tolerance_px) & (along.abs() < gate_px) & (crossing > _MIN_CROSSING)
+    distance, contour = torch.where(allowed, along.square() + across.square(), torch.inf).min(-1)
+    targets = observations.pixels + take_points(contour_velocity, contour) * observations.age_s[..., None]
+    directions = heading if config.residual == "flow" else take_points(contours.normals, contour)
+    return Matches(contour, observations.mask & observations.has_flow & torch.isfinite(distance), targets, directions)
+
+
+def both_coordinates(matches: Matches) -> Matches:
+    """The same matches with the distance in u and in v, as two observations each."""
+    axes = torch.eye(2, dtype=matches.targets.dtype, device=matches.targets.device)
+    directions = torch.cat([axes[axis].expand_as(matches.targets) for axis in range(2)], 1)
+    contour, mask = (torch.cat([value, value], 1) for value in (matches.contour, matches.mask))
+    return Matches(contour, mask, torch.cat([matches.targets, matches.targets], 1), directions)

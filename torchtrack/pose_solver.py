@@ -1,0 +1,146 @@
+"""From matches to the pose: batched Levenberg-Marquardt on SE(3) (Eq. 12-17). The one solver loop of the package.
+
+The unknown of each object is a rotation about its centre and a move of its centre, in the camera's axes
+(:func:`torchtrack.lie.retract_about`). The step is ``Δξ = -(JᵀWJ + Λ + λD)⁻¹ (JᵀWr + Λδ)``: the minus signs of the
+paper's Eq. 16 and 17 cancel, which cannot be meant.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchtrack.camera import project, projection_gradient
+from torchtrack.config.tracker import SolverConfig
+from torchtrack.lie import difference_about, retract_about, transform_points
+
+# Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
+_DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
+
+
+@dataclass(frozen=True)
+class PoseProblem:
+    """Observations and prior of each object.
+
+    Args:
+        points_obj: matched contour points in the object's frame (m).
+        targets: ideal pixels where they were observed.
+        directions: unit directions along which the distance counts.
+        weights: weight of each observation; 0 for padding.
+        intrinsics: ``[fx, fy, cx, cy]``.
+        centre_obj: centre of rotation in the object's frame (m).
+        scale_px: scale of the robust loss, per object.
+        T_prior: pose the prior draws to.
+        prior_information: information of the prior in the solver's chart; zero for no prior.
+    """
+
+    points_obj: Float[Tensor, "b n 3"]
+    targets: Float[Tensor, "b n 2"]
+    directions: Float[Tensor, "b n 2"]
+    weights: Float[Tensor, "b n"]
+    intrinsics: Float[Tensor, "b 4"]
+    centre_obj: Float[Tensor, "b 3"]
+    scale_px: Float[Tensor, "b"]
+    T_prior: Float[Tensor, "b 4 4"]
+    prior_information: Float[Tensor, "b 6 6"]
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """The problem at a pose: cost, gradient and Gauss-Newton Hessian in the solver's chart, residuals and weights."""
+
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    cost: Float[Tensor, "b"]
+    gradient: Float[Tensor, "b 6"]
+    hessian: Float[Tensor, "b 6 6"]
+    residuals: Float[Tensor, "b n"]
+    robust_weights: Float[Tensor, "b n"]
+
+
+def robust_loss(residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss: str) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
+    """Loss ``ρ(r)`` and weight ``ρ'(r) / r``; both equal least squares (``r²/2``, 1) near zero.
+
+    ``loss`` is ``"tukey"`` (zero weight beyond ``scale``), ``"huber"`` or ``"none"``.
+    """
+    if loss == "none":
+        return 0.5 * residuals.square(), torch.ones_like(residuals)
+    c = scale[:, None]
+    if loss == "huber":
+        size = residuals.abs().clamp(min=1e-12)
+        weight = (c / size).clamp(max=1)
+        return torch.where(size <= c, 0.5 * residuals.square(), c * (size - 0.5 * c)), weight
+    inside = (1 - (residuals / c).square()).clamp(min=0)
+    return c.square() / 6 * (1 - inside**3), inside.square()
+
+
+def pose_jacobian(
+    points_cam: Float[Tensor, "b n 3"], directions: Float[Tensor, "b n 2"], intrinsics: Float[Tensor, "b 4"], centre_cam: Float[Tensor, "b 3"]
+) -> Float[Tensor, "b n 6"]:
+    """Rows ``[(P - c) × g, g]`` with ``g = dπᵀ n``: the paper's Eq. 15 as one vector product."""
+    gradient = projection_gradient(points_cam, directions, intrinsics)
+    return torch.cat([torch.linalg.cross(points_cam - centre_cam[:, None], gradient, dim=-1), gradient], -1)
+
+
+def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
+    """Cost, gradient and Gauss-Newton Hessian of ``problem`` at a pose."""
+    points_cam = transform_points(T_cam_obj, problem.points_obj)
+    residuals = ((project(points_cam, problem.intrinsics) - problem.targets) * problem.directions).sum(-1)
+    centre_cam = transform_points(T_cam_obj, problem.centre_obj[:, None])[:, 0]
+    jacobian = pose_jacobian(points_cam, problem.directions, problem.intrinsics, centre_cam)
+    value, robust = robust_loss(residuals, problem.scale_px, loss)
+    weights = robust * problem.weights
+    weighted = jacobian * weights[..., None]
+    from_prior = difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
+    pull = (problem.prior_information @ from_prior[..., None]).squeeze(-1)
+    gradient = (weighted.transpose(1, 2) @ residuals[..., None]).squeeze(-1) + pull
+    hessian = weighted.transpose(1, 2) @ jacobian + problem.prior_information
+    cost = (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1)
+    return Linearisation(T_cam_obj, cost, gradient, hessian, residuals, weights)
+
+
+def solve_positive(matrix: Float[Tensor, "b 6 6"], right: Float[Tensor, "b 6 k"]) -> tuple[Float[Tensor, "b 6 k"], Bool[Tensor, "b"]]:
+    """Solve with symmetric positive definite matrices; where one is not, zero and False.
+
+    The matrix is made sane before it is factorised: masking afterwards would leave gradients that are not finite.
+    """
+    eye = torch.eye(6, dtype=matrix.dtype, device=matrix.device)
+    sane = (torch.isfinite(matrix).all(-1) & (matrix.diagonal(dim1=-2, dim2=-1) > 0)).all(-1) & torch.isfinite(right).flatten(1).all(-1)
+    matrix = torch.where(sane[:, None, None], matrix, eye)
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    good = sane & (info == 0)
+    factor = torch.where(good[:, None, None], factor, eye)
+    return torch.cholesky_solve(torch.where(good[:, None, None], right, 0), factor), good
+
+
+def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
+    """The Levenberg-Marquardt step, damped along the Hessian's diagonal."""
+    diagonal = at.hessian.diagonal(dim1=-2, dim2=-1)
+    # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is.
+    damped = at.hessian + torch.diag_embed(diagonal * damping[:, None] + 1e-9 * diagonal.amax(-1, keepdim=True) + 1e-12)
+    return solve_positive(damped, -at.gradient[..., None])[0].squeeze(-1)
+
+
+def _choose(better: Tensor, candidate: Linearisation, current: Linearisation) -> Linearisation:
+    """The candidate where it is better, the current one elsewhere."""
+    fields = {}
+    for name, value in vars(candidate).items():
+        condition = better.view(-1, *([1] * (value.dim() - 1)))
+        fields[name] = torch.where(condition, value, getattr(current, name))
+    return Linearisation(**fields)
+
+
+def solve_pose(problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig) -> Linearisation:
+    """Minimise each object's cost from ``T_start``: Levenberg-Marquardt with a damping of its own per object.
+
+    A step that does not lower an object's cost is undone and its damping raised; its neighbours are not affected.
+    """
+    current = linearise(problem, T_start, config.loss)
+    damping = torch.full_like(current.cost, config.damping)
+    for _ in range(config.iterations):
+        T_next = retract_about(current.T_cam_obj, _damped_step(current, damping), problem.centre_obj)
+        candidate = linearise(problem, T_next, config.loss)
+        better = candidate.cost <= current.cost
+        current = _choose(better, candidate, current)
+        damping = torch.where(better, damping * _DAMPING_DECAY, damping.clamp(min=_DAMPING_START) * _DAMPING_GROWTH)
+    return current

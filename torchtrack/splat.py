@@ -1,0 +1,73 @@
+"""The paper's contours: the boundary of the projected point cloud, carried back to 3D (its Section 3.2)."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int
+from kornia.filters import gaussian_blur2d, spatial_gradient
+from torch import Tensor, nn
+from torch.nn.functional import max_pool2d, normalize
+
+from torchtrack.camera import MIN_DEPTH_M, project
+from torchtrack.config.tracker import ContourConfig
+from torchtrack.contours import ContourKind, Contours, assemble, select_ranked, take_points
+from torchtrack.lie import transform_points
+
+
+def _close(occupied: Float[Tensor, "b h w"], radius: int) -> Float[Tensor, "b h w"]:
+    """Morphological closing with a square of side ``2 radius + 1``."""
+    side = 2 * radius + 1
+    dilated = max_pool2d(occupied[:, None], side, 1, radius)
+    return -max_pool2d(-dilated, side, 1, radius)[:, 0]
+
+
+def _silhouette(pixels: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """Closed mask of the splatted pixels, and the flat cell of each pixel in it."""
+    border = radius + 3
+    low = torch.where(valid[..., None], pixels, torch.inf).amin(1, keepdim=True).floor() - border
+    local = torch.where(valid[..., None], pixels - low, 0).round().long()
+    width, height = (local.amax((0, 1)) + border + 1).tolist()
+    cell = local[..., 1] * width + local[..., 0]
+    occupied = torch.zeros(len(pixels), height * width, dtype=pixels.dtype, device=pixels.device).scatter(1, cell, valid.to(pixels.dtype))
+    return _close(occupied.view(-1, height, width), radius), cell
+
+
+def boundary_points(
+    pixels: Float[Tensor, "b n 2"], valid: Bool[Tensor, "b n"], radius: int
+) -> tuple[Bool[Tensor, "b n"], Float[Tensor, "b n 2"]]:
+    """Which projected points lie on the boundary of the closed point cloud, and the boundary's normal at each."""
+    mask, cell = _silhouette(pixels, valid, radius)
+    eroded = -max_pool2d(-mask[:, None], 3, 1, 1)[:, 0]
+    near_boundary = max_pool2d((mask - eroded)[:, None], 3, 1, 1)[:, 0]
+    gradient = spatial_gradient(gaussian_blur2d(mask[:, None], (9, 9), (2.0, 2.0)))[:, 0]
+    on_boundary = (near_boundary.flatten(1).gather(1, cell) > 0) & valid
+    normals = torch.stack([gradient[:, axis].flatten(1).gather(1, cell) for axis in range(2)], -1)
+    return on_boundary, normalize(normals, dim=-1)
+
+
+def splat_contours(
+    models: nn.ModuleList, members: Sequence[Int[Tensor, "g"]], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"], config: ContourConfig
+) -> Contours:
+    """Boundary points of each object's splatted surface samples.
+
+    Args:
+        models: the distinct models.
+        members: for each model, the objects that have it.
+    """
+    parts = [_model_boundary(model.surface_points, T_cam_obj[i], intrinsics[i], config) for model, i in zip(models, members, strict=True)]
+    order = torch.cat(list(members)).argsort()
+    points, tangents, mask = (torch.cat(column)[order] for column in zip(*parts, strict=True))
+    kind = torch.full(mask.shape, int(ContourKind.SPLAT), device=mask.device)
+    return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics)
+
+
+def _model_boundary(surface_points: Tensor, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Boundary points, tangents (both object frame) and mask of the objects of one model."""
+    points = surface_points.expand(len(T_cam_obj), -1, -1)
+    points_cam = transform_points(T_cam_obj, points)
+    on_boundary, normals = boundary_points(project(points_cam, intrinsics), points_cam[..., 2] > MIN_DEPTH_M, config.splat_radius_px)
+    index, mask = select_ranked(on_boundary, config.max_edge_points)
+    normals = take_points(normals, index)
+    # A tangent parallel to the image plane: only its projection matters.
+    tangents_cam = torch.stack([normals[..., 1], -normals[..., 0], torch.zeros_like(normals[..., 0])], -1)
+    return take_points(points, index), normalize(tangents_cam @ T_cam_obj[:, :3, :3], dim=-1), mask

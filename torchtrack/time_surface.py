@@ -1,0 +1,84 @@
+"""From events to the time surface: the newest event time of every pixel, decayed exponentially (Eq. 5).
+
+One map of newest times per stream is kept over the whole sensor; surfaces are only computed for a region per object.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack.events import EventBatch
+
+# Time of a pixel that never fired: far in the past, and its age still fits int64 microseconds.
+NEVER_US = -(2**62)
+# Ages are clamped to this many decay constants: exp(-16) is zero to 1e-7, and exp of large negative numbers is slow.
+_MAX_DECAYS = 16.0
+
+
+def empty_last_event(streams: int, height: int, width: int, device: torch.device | str | None = None) -> Int[Tensor, "s h w"]:
+    """The map of newest event times (µs) before any event."""
+    return torch.full((streams, height, width), NEVER_US, dtype=torch.int64, device=device)
+
+
+def update_last_event(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -> Int[Tensor, "s h w"]:
+    """The map of newest event times (µs) after ``events``; the input is left as it was.
+
+    A maximum, not an assignment: with repeated indices the order of assignment is not defined.
+    """
+    _, height, width = last_event_us.shape
+    pixel = (events.stream_index * height + events.y) * width + events.x
+    updated = last_event_us.flatten().scatter_reduce(0, pixel, events.t_us, "amax")
+    return updated.view_as(last_event_us)
+
+
+@dataclass(frozen=True)
+class Regions:
+    """One rectangle of the sensor per object, all of one size; each object owns the first ``extent`` of its own.
+
+    Args:
+        origin: sensor pixel (u, v) of the upper left corner; may lie outside the sensor.
+        extent: width and height that the object itself needs (px).
+        size: (height, width) common to all.
+        stream_index: the stream of each object.
+    """
+
+    origin: Int[Tensor, "b 2"]
+    extent: Int[Tensor, "b 2"]
+    size: tuple[int, int]
+    stream_index: Int[Tensor, "b"]
+
+
+def object_regions(
+    pixels: Float[Tensor, "b m 2"], mask: Bool[Tensor, "b m"], stream_index: Int[Tensor, "b"], sensor_size: tuple[int, int], margin_px: int
+) -> Regions:
+    """Rectangles around the contours ``pixels`` (sensor px) with a margin, clipped to the sensor of (height, width).
+
+    Objects without a contour in the image get the smallest rectangle, at the origin.
+    """
+    limit = torch.tensor([sensor_size[1] - 1, sensor_size[0] - 1], device=pixels.device)
+    inside = (mask & ((pixels >= 0) & (pixels <= limit)).all(-1))[..., None]
+    low = torch.where(inside, pixels, torch.inf).amin(1)
+    high = torch.where(inside, pixels, -torch.inf).amax(1)
+    empty = ~inside.any(1)
+    low = torch.where(empty, torch.zeros_like(low), low).floor().long() - margin_px
+    high = torch.where(empty, torch.zeros_like(high), high).ceil().long() + margin_px
+    # Origins on a grid of 4 px keep a subsampled filter's phase independent of the other objects' regions.
+    low = torch.div(low, 4, rounding_mode="floor") * 4
+    extent = high - low + 1
+    width, height = (-(-extent.amax(0) // 32) * 32).tolist()
+    return Regions(low, extent, (height, width), stream_index)
+
+
+def time_surface(last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], regions: Regions, tau_s: float, dtype: torch.dtype) -> Float[Tensor, "b rh rw"]:
+    """Exponentially decayed surface (Eq. 5) of each object's region at ``t_us``; zero outside the sensor."""
+    _, height, width = last_event_us.shape
+    rows = regions.origin[:, 1, None] + torch.arange(regions.size[0], device=t_us.device)
+    columns = regions.origin[:, 0, None] + torch.arange(regions.size[1], device=t_us.device)
+    inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
+    stream = regions.stream_index[:, None, None]
+    newest_us = last_event_us[stream, rows.clamp(0, height - 1)[:, :, None], columns.clamp(0, width - 1)[:, None, :]]
+    max_age_us = int(_MAX_DECAYS * tau_s * 1e6)
+    age_us = (t_us[stream] - newest_us).clamp(0, max_age_us).to(dtype)
+    return torch.where(inside & (age_us < max_age_us), torch.exp(age_us * (-1e-6 / tau_s)), age_us.new_zeros(()))

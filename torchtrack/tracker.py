@@ -1,0 +1,278 @@
+"""The tracker: events in, poses out (Algorithm 1 of the paper, for many objects and streams at once).
+
+The only state is an immutable :class:`TrackerState`; ``step`` is pure: the same state and events give the same result.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from torchtrack import lie, quality
+from torchtrack.alignment import Alignment, AlignmentResult, align, index_radius_px
+from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, undistortion_table
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.contours import Contours, group_by_model, mesh_contours
+from torchtrack.corners import Corners, detect_corners, no_corners
+from torchtrack.errors import PoseError
+from torchtrack.events import EventBatch, pad_streams
+from torchtrack.flow import estimate_flow
+from torchtrack.matching import ContourIndex, Observations, index_contours, join, select_events
+from torchtrack.object_model import ObjectModel
+from torchtrack.splat import splat_contours
+from torchtrack.time_surface import empty_last_event, object_regions, time_surface, update_last_event
+from torchtrack.visibility import remove_hidden
+
+# Contours this far outside the image still find their place on a distorted sensor (px).
+_BORDER_PX = 64
+
+
+@dataclass(frozen=True)
+class TrackerState:
+    """Everything the tracker remembers between windows.
+
+    Args:
+        T_cam_obj: pose of each object at its stream's ``t_us`` (float64).
+        velocity: rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s).
+        t_us: end of the last window of each stream (µs).
+        last_event_us: time of the newest event of every sensor pixel (µs).
+    """
+
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    velocity: Float[Tensor, "b 6"]
+    t_us: Int[Tensor, "s"]
+    last_event_us: Int[Tensor, "s h w"]
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one window gave.
+
+    Args:
+        t_us: end of the window of each stream (µs).
+        T_cam_obj: pose of each object at that time (float64).
+        covariance: of the left perturbation ``[φ, ρ]`` of the pose (rad, m).
+        status: :class:`torchtrack.quality.Status` of each object.
+        quality: share of the moving contour that events explain.
+        contours: visible contours at the pose.
+        corners: corners and their flow.
+        observation_count: matched observations of each object.
+    """
+
+    t_us: Int[Tensor, "s"]
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    covariance: Float[Tensor, "b 6 6"]
+    status: Int[Tensor, "b"]
+    quality: Float[Tensor, "b"]
+    contours: Contours
+    corners: Corners
+    observation_count: Int[Tensor, "b"]
+
+
+class Tracker(nn.Module):
+    """Tracks known rigid objects in one or more event streams.
+
+    Args:
+        objects: models of the objects; the same model object may appear many times.
+        camera: one camera, or one per stream.
+        config: settings; the ``default`` preset when not given.
+        stream_index: the stream each object is seen in; the first for all when not given.
+        dtype: precision of the pipeline; poses are kept in float64.
+    """
+
+    intrinsics: Tensor
+    ideal_pixels: Tensor
+    sensor_pixels: Tensor
+    stream_index: Tensor
+    centre_obj: Tensor
+    diameter_m: Tensor
+
+    def __init__(
+        self,
+        objects: Sequence[ObjectModel],
+        camera: Camera | Sequence[Camera],
+        config: TrackerConfig | None = None,
+        stream_index: Sequence[int] | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        super().__init__()
+        cameras = [camera] if isinstance(camera, Camera) else list(camera)
+        self.config = config or TrackerConfig()
+        self.object_names = tuple(model.name for model in objects)
+        streams = list(stream_index) if stream_index is not None else [0] * len(objects)
+        _check_setup(objects, cameras, streams)
+        self.image_size = (max(c.height for c in cameras), max(c.width for c in cameras))
+        self.models, model_index = group_by_model(objects, self.config.contours)
+        for number in range(len(self.models)):
+            members = torch.tensor([i for i, m in enumerate(model_index) if m == number])
+            self.register_buffer(f"members_{number}", members)
+        self.register_buffer("stream_index", torch.tensor(streams))
+        self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
+        self.register_buffer("ideal_pixels", _stack_tables([undistortion_table(c) for c in cameras]))
+        self.register_buffer("sensor_pixels", _stack_tables([distortion_table(c, _BORDER_PX) for c in cameras]))
+        self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
+        self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
+        self.to(dtype)
+
+    @property
+    def members(self) -> list[Tensor]:
+        """For each distinct model, the objects that have it."""
+        return [self.get_buffer(f"members_{number}") for number in range(len(self.models))]
+
+    @property
+    def streams(self) -> int:
+        """Number of event streams."""
+        return len(self.ideal_pixels)
+
+    def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
+        """The state before the first window, from each object's pose at ``t_us``.
+
+        Raises:
+            PoseError: if a pose is not a rigid motion, or an object is behind the camera.
+        """
+        T_cam_obj = torch.as_tensor(T_cam_obj, dtype=torch.float64, device=self.intrinsics.device)
+        lie.check_pose(T_cam_obj)
+        if T_cam_obj.shape != (len(self.centre_obj), 4, 4):
+            raise PoseError(f"expected one initial pose per object, shape {[len(self.centre_obj), 4, 4]}, got {list(T_cam_obj.shape)}.")
+        depth = lie.transform_points(T_cam_obj, self.centre_obj.double()[:, None])[:, 0, 2]
+        for name, z in zip(self.object_names, depth.tolist(), strict=True):
+            if z < MIN_DEPTH_M:
+                raise PoseError(f"object '{name}' is behind the camera (depth {z:.3f} m): the z axis must point from the camera to the scene.")
+        times = torch.as_tensor(t_us, dtype=torch.int64, device=T_cam_obj.device).expand(self.streams).clone()
+        velocity = torch.zeros(len(T_cam_obj), 6, dtype=self.intrinsics.dtype, device=T_cam_obj.device)
+        return TrackerState(T_cam_obj.clone(), velocity, times, empty_last_event(self.streams, *self.image_size, device=T_cam_obj.device))
+
+    def forward(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
+        """The same as :meth:`step`."""
+        return self.step(state, events, t_end_us)
+
+    def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
+        """Advance every object by one window of events.
+
+        Args:
+            state: from :meth:`init` or the last step.
+            events: of all streams, after ``state.t_us`` and up to ``t_end_us``.
+            t_end_us: end of the window; the newest event of each stream when not given.
+        """
+        t_us = self._window_end(state, events, t_end_us)
+        window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
+        last_event_us = update_last_event(state.last_event_us, events)
+        start = self._predict(state, window_s)
+        contours = self._extract(start.T_prior)
+        corners = self._corners(contours, last_event_us, t_us, window_s)
+        index = index_contours(contours, self.image_size, index_radius_px(self.config))
+        observations = self._observe(start, index, events, corners, t_us)
+        aligned = align(start, contours, index, observations, self._extract, self.config)
+        return self._conclude(state, start, aligned, corners, last_event_us, t_us, window_s)
+
+    def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
+        """End of the window of each stream (µs)."""
+        if t_end_us is None:
+            return state.t_us.scatter_reduce(0, events.stream_index, events.t_us, "amax")
+        return torch.as_tensor(t_end_us, dtype=torch.int64, device=state.t_us.device).expand(self.streams).clone()
+
+    def _predict(self, state: TrackerState, window_s: Tensor) -> Alignment:
+        """Predicted pose, and how strongly it holds."""
+        velocity = state.velocity
+        if self.config.motion.model == "hold":
+            velocity = torch.zeros_like(velocity)
+        T_start = state.T_cam_obj.to(velocity.dtype)
+        T_prior = lie.retract_about(T_start, velocity * window_s[self.stream_index, None], self.centre_obj)
+        solver = self.config.solver
+        sigma = velocity.new_tensor([solver.prior_rotation_rad] * 3 + [solver.prior_translation_m] * 3)
+        information = torch.diag(sigma.pow(-2) if solver.prior else torch.zeros_like(sigma)).expand(len(velocity), 6, 6)
+        return Alignment(T_prior, information, velocity, self.centre_obj, self.intrinsics, self.image_size)
+
+    def _extract(self, T_cam_obj: Tensor) -> Contours:
+        """Visible contours at a pose."""
+        config = self.config.contours
+        if config.source == "splat":
+            return splat_contours(self.models, self.members, T_cam_obj, self.intrinsics, config)
+        contours = mesh_contours(self.models, self.members, T_cam_obj, self.intrinsics, config)
+        if not config.remove_hidden:
+            return contours
+        shape = (self.streams, *self.image_size)
+        return remove_hidden(
+            contours, self.models, self.members, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, shape, config
+        )
+
+    def _corners(self, contours: Contours, last_event_us: Tensor, t_us: Tensor, window_s: Tensor) -> Corners:
+        """Corners of each object's region and their flow."""
+        config = self.config
+        if config.corners.max_corners == 0:
+            return no_corners(contours.pixels)
+        height, width = self.sensor_pixels.shape[1:3]
+        # Clamped before the conversion: a far-off pixel does not fit an integer.
+        limit = self.intrinsics.new_tensor([width - 1, height - 1])
+        u, v = torch.minimum((contours.pixels + _BORDER_PX).clamp(min=0), limit).round().long().unbind(-1)
+        sensor = self.sensor_pixels[self.stream_index[:, None], v, u]
+        regions = object_regions(sensor, contours.mask, self.stream_index, self.image_size, config.surface.margin_px)
+        surface = time_surface(last_event_us, t_us, regions, config.surface.tau_s, self.intrinsics.dtype)
+        corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config.surface, config.corners)
+        return estimate_flow(corners, last_event_us, self.stream_index, self.ideal_pixels, config.flow)
+
+    def _observe(self, start: Alignment, index: ContourIndex, events: EventBatch, corners: Corners, t_us: Tensor) -> Observations:
+        """Corners and recent events near each object's contours."""
+        seen = Observations(corners.pixels, corners.age_s, corners.mask, corners.flow, corners.has_flow)
+        count = self.config.matching.max_events
+        if count == 0:
+            return seen
+        window = pad_streams(events, self.streams, t_us)
+        stream = torch.arange(self.streams, device=t_us.device)[:, None]
+        pixels = self.ideal_pixels[stream, window.y, window.x][self.stream_index]
+        age_s = window.age_us[self.stream_index].to(pixels.dtype) * 1e-6
+        recent = select_events(pixels, age_s, window.mask[self.stream_index], index, start.plane_velocity(pixels), count)
+        return join(seen, recent)
+
+    def _conclude(
+        self, state: TrackerState, start: Alignment, aligned: AlignmentResult, corners: Corners, last_event_us: Tensor, t_us: Tensor, window_s: Tensor
+    ) -> tuple[TrackerState, StepResult]:
+        """Judge every object, hold those that failed, and make the next state."""
+        config, solution, contours = self.config, aligned.solution, aligned.contours
+        velocity = start.contour_velocity(contours, solution.T_cam_obj)
+        share = quality.explained_share(contours, aligned.matches, velocity, self.image_size, config.quality.min_speed_px_s)
+        count = aligned.matches.mask.sum(-1)
+        step = lie.difference_about(start.T_prior, solution.T_cam_obj, self.centre_obj)
+        status = quality.judge(share, count, quality.visible_share(contours, self.image_size), step, self.diameter_m, config.quality)
+        failed = status >= int(quality.Status.TOO_FEW_EVENTS)
+        T_held = state.T_cam_obj if config.motion.without_events == "hold" else start.T_prior.double()
+        T_cam_obj = torch.where(failed[:, None, None], T_held, _orthonormal(solution.T_cam_obj.double()))
+        next_velocity = self._next_velocity(state, T_cam_obj, failed, window_s)
+        centre_cam = start.centre_cam(T_cam_obj.to(velocity.dtype))
+        result = StepResult(t_us, T_cam_obj, quality.pose_covariance(solution, centre_cam), status, share, contours, corners, count)
+        return TrackerState(T_cam_obj, next_velocity, t_us, last_event_us), result
+
+    def _next_velocity(self, state: TrackerState, T_cam_obj: Tensor, failed: Tensor, window_s: Tensor) -> Tensor:
+        """Velocity after a window: a running mean of what the poses moved; zero where the pose is held."""
+        dtype = state.velocity.dtype
+        duration_s = window_s[self.stream_index, None].clamp(min=1e-6)
+        moved = lie.difference_about(state.T_cam_obj, T_cam_obj, self.centre_obj.double()).to(dtype) / duration_s
+        gain = self.config.motion.velocity_gain
+        mixed = gain * moved + (1 - gain) * state.velocity
+        if self.config.motion.without_events == "predict":
+            return torch.where(failed[:, None], state.velocity, mixed)
+        return torch.where(failed[:, None], torch.zeros_like(mixed), mixed)
+
+
+def _orthonormal(T: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:
+    """The pose with its rotation made exact again: rounding adds up over thousands of steps."""
+    rotation = lie.rotation_from_quaternion(lie.quaternion_from_rotation(T[:, :3, :3]))
+    return torch.cat([torch.cat([rotation, T[:, :3, 3:]], -1), T[:, 3:]], 1)
+
+
+def _stack_tables(tables: list[Tensor]) -> Tensor:
+    """Tables of cameras of different sizes as one tensor; pixels outside a smaller sensor are never looked up."""
+    height, width = max(t.shape[0] for t in tables), max(t.shape[1] for t in tables)
+    return torch.stack([nn.functional.pad(t, (0, 0, 0, width - t.shape[1], 0, height - t.shape[0])) for t in tables])
+
+
+def _check_setup(objects: Sequence[ObjectModel], cameras: list[Camera], streams: list[int]) -> None:
+    """Raise ``ValueError`` unless objects, cameras and streams fit together."""
+    if not objects:
+        raise ValueError("a tracker needs at least one object.")
+    if len(streams) != len(objects):
+        raise ValueError(f"stream_index needs one entry per object: got {len(streams)} for {len(objects)} objects.")
+    if not all(0 <= s < len(cameras) for s in streams):
+        raise ValueError(f"stream_index must be within the {len(cameras)} cameras given (one per stream), got {streams}.")
