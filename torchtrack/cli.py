@@ -1,0 +1,156 @@
+"""The command line: parse → config → call.
+
+Options of a command are typed with tyro. Any setting can be given by its dotted key, as in
+``--tracker.window.duration-us 3000``, on top of the config file; ``torchtrack settings`` lists them.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from tyro.conf import Positional, arg, subcommand
+
+from torchtrack.config.load import typed
+from torchtrack.config.settings import CommandLineText
+from torchtrack.errors import ConfigError, TorchtrackError
+
+EXIT_FAILED, EXIT_WRONG_SETTINGS, EXIT_INTERRUPTED = 1, 2, 130
+
+_Output = Annotated[str | None, arg(aliases=["-o"], metavar="DIR")]
+_SETTINGS_HINT = "Any setting can be given by its dotted key, e.g. --tracker.window.duration-us 3000; `torchtrack settings {}` lists them."
+
+
+@dataclass(frozen=True)
+class Track:
+    """Track the objects of one recording or sequence; write poses, overlay and summary."""
+
+    config: Positional[Annotated[str, arg(metavar="CONFIG|SOURCE")]]
+    """A YAML config file, or directly a sequence (.npz)."""
+    output: _Output = None
+    """Folder for the results."""
+    preset: str | None = None
+    """Tracker settings to start from: default or paper."""
+    models: Literal["textured", "geometry"] | None = None
+    """Use a sequence's textured models where it has them, or geometry alone."""
+    start_us: int | None = None
+    """Time of the initial pose, in stream time (µs)."""
+    end_us: int | None = None
+    """Tracking ends here, in stream time (µs)."""
+    device: str | None = None
+    """Where the tracker runs: cpu, cuda or cuda:N."""
+    threads: int | None = None
+    """Threads of the tracker on the CPU."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        from torchtrack.commands import track
+
+        return track(self.config, _given(self, ("config", "quiet")) | overrides, quiet=self.quiet)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Track sequences with known ground truth under one or more methods and compare the errors."""
+
+    paths: Positional[tuple[str, ...]] = ()
+    """Sequences (.npz), or folders of them."""
+    output: _Output = None
+    """Folder for metrics.json and errors.csv."""
+    methods: str | None = None
+    """Comma-separated: labels of methods in the config file, or names of presets."""
+    config: str | None = None
+    """A YAML config file with paths and methods."""
+    models: Literal["textured", "geometry"] | None = None
+    """Use a sequence's textured models where it has them, or geometry alone."""
+    jobs: Annotated[int | None, arg(aliases=["-j"])] = None
+    """Processes, of one thread each."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        from torchtrack.commands import evaluate
+
+        chosen = self.methods.split(",") if self.methods else None
+        given = _given(self, ("config", "methods", "quiet", "paths"))
+        if self.paths:
+            given["paths"] = [CommandLineText(path) for path in self.paths]
+        return evaluate(self.config, given, overrides, chosen, quiet=self.quiet)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """List every setting of a command: its key, type, default, bounds and meaning."""
+
+    command: Positional[Literal["track", "evaluate"]] = "track"
+    """The command."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        from torchtrack.commands import list_settings
+
+        return list_settings(self.command)
+
+
+_Command = (
+    Annotated[Track, subcommand("track", description=f"{Track.__doc__} {_SETTINGS_HINT.format('track')}")]
+    | Annotated[Evaluate, subcommand("evaluate", description=f"{Evaluate.__doc__} {_SETTINGS_HINT.format('evaluate')}")]
+    | Annotated[Settings, subcommand("settings")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0, 1 (failed), 2 (wrong settings) or 130 (interrupted)."""
+    try:
+        options, overrides = split_overrides(sys.argv[1:] if arguments is None else arguments)
+        command = tyro.cli(_Command, prog="torchtrack", description="6DoF object pose tracking with an event camera.", args=options)  # type: ignore[call-overload]
+        code: int = command.run(overrides)
+    except ConfigError as error:
+        return _report(error, EXIT_WRONG_SETTINGS)
+    except TorchtrackError as error:
+        return _report(error, EXIT_FAILED)
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    return code
+
+
+def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    """Options of the command, and settings given by dotted key as ``--a.b VALUE`` or ``--a.b=VALUE``; dashes in keys count as underscores.
+
+    Raises:
+        ConfigError: if a setting has no value.
+    """
+    options: list[str] = []
+    overrides: dict[str, Any] = {}
+    rest = iter(arguments)
+    for argument in rest:
+        name, has_value, value = argument.removeprefix("--").partition("=")
+        if not argument.startswith("--") or "." not in name:
+            options.append(argument)
+            continue
+        if not has_value:
+            following = next(rest, None)
+            if following is None or following.startswith("--"):
+                raise ConfigError(f"command line: --{name} needs a value, as in --{name} VALUE.")
+            value = following
+        overrides[name.replace("-", "_")] = typed(value)
+    return options, overrides
+
+
+def _given(command: Any, without: tuple[str, ...]) -> dict[str, Any]:
+    """The options of a command that were given and are settings, ready to be laid over a config file."""
+    values = {name: value for name, value in vars(command).items() if name not in without and value is not None}
+    return {name: CommandLineText(value) if isinstance(value, str) else value for name, value in values.items()}
+
+
+def _report(error: Exception, code: int) -> int:
+    """Tell one error on stderr, without a traceback."""
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console.print("error:", style="bold red", end=" ")
+    console.print(str(error), markup=False)
+    return code

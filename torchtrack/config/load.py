@@ -1,0 +1,92 @@
+"""From a YAML file and the command line to settings, with every mistake told at once.
+
+What counts, from weakest to strongest: defaults, preset, file, command line.
+"""
+
+from collections.abc import Hashable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import ValidationError
+
+from torchtrack.config.explain import explained
+from torchtrack.config.merge import merged, nested
+from torchtrack.config.settings import CommandLineText, Settings
+from torchtrack.errors import ConfigError, MissingFileError
+
+S = TypeVar("S", bound=Settings)
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """YAML where a key that is given twice is an error, not a silent replacement."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if isinstance(key, Hashable) and key in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"the key '{key}' is given twice", key_node.start_mark)
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping that a YAML file holds; an empty file is an empty mapping.
+
+    Raises:
+        MissingFileError: if the file is not there.
+        ConfigError: if it is not YAML, holds something other than a mapping, or a key twice.
+    """
+    if not path.is_file():
+        raise MissingFileError(f"no config file at {path}. Check the path; examples are in the folder configs/.")
+    try:
+        # The loader is a SafeLoader: it builds plain values only.
+        values = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    if values is not None and not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected settings as 'name: value' lines, got a {type(values).__name__}.")
+    return values or {}
+
+
+def typed(text: str) -> Any:
+    """A value typed on the command line, read as YAML: ``3`` is a number, ``[1, 2]`` a list, ``null`` nothing."""
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        value = text
+    return _from_command_line(value)
+
+
+def _from_command_line(value: Any) -> Any:
+    """Mark every text, so that paths among them are taken from the working folder."""
+    if isinstance(value, str):
+        return CommandLineText(value)
+    if isinstance(value, list):
+        return [_from_command_line(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _from_command_line(item) for key, item in value.items()}
+    return value
+
+
+def load(settings: type[S], path: Path | None = None, overrides: Mapping[str, Any] | None = None) -> S:
+    """Settings from a YAML file, with ``overrides`` (dotted key to value) laid over them.
+
+    Relative paths in the file are relative to its folder; see :class:`CommandLineText` for those in overrides.
+
+    Raises:
+        MissingFileError: if the file is not there.
+        ConfigError: with all mistakes of file and overrides at once.
+    """
+    overrides = overrides or {}
+    values = merged(read_yaml(path) if path else {}, nested(overrides))
+    try:
+        return settings.model_validate(values, context={"folder": path.resolve().parent if path else None})
+    except ValidationError as error:
+        raise ConfigError(explained(error, settings, str(path) if path else None, overrides.keys())) from error
+
+
+def as_yaml(settings: Settings) -> str:
+    """Settings as YAML that :func:`load` reads back to the same."""
+    return yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=120)

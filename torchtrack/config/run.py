@@ -1,0 +1,127 @@
+"""Settings of one run: what is tracked, where from, how, and where the results go."""
+
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from pydantic import Field, model_validator
+
+from torchtrack.camera import DistortionModel
+from torchtrack.config.merge import merged
+from torchtrack.config.presets import PresetName, preset
+from torchtrack.config.settings import ConfigPath, Settings
+from torchtrack.config.tracker import TrackerConfig
+
+Models = Literal["textured", "geometry"]
+Row = tuple[float, float, float, float]
+
+
+class PoseConfig(Settings):
+    """An initial pose ``T_cam_obj``, in one of three ways."""
+
+    matrix: tuple[Row, Row, Row, Row] | None = Field(None, description="The 4x4 matrix, row by row.")
+    translation_m: tuple[float, float, float] | None = Field(None, description="Position of the object's origin in the camera frame (m).")
+    quaternion_xyzw: Row = Field((0, 0, 0, 1), description="Rotation beside translation_m, as a quaternion x, y, z, w.")
+    trajectory: ConfigPath | None = Field(None, description="A TUM file; the pose is taken at the start time.")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "PoseConfig":
+        ways = [name for name in ("matrix", "translation_m", "trajectory") if getattr(self, name) is not None]
+        if len(ways) != 1:
+            raise ValueError(f"give exactly one of matrix, translation_m (with quaternion_xyzw) or trajectory; got {' and '.join(ways) or 'none'}")
+        return self
+
+
+class ObjectConfig(Settings):
+    """One object: its model and where it is at first."""
+
+    label: str = Field(min_length=1, pattern=r"^[\w.-]+$", description="Name of the object in outputs; for a sequence, one of its labels.")
+    mesh: ConfigPath | None = Field(None, description="PLY, OBJ, STL, GLB or OFF file; by default the sequence's own.")
+    polylines: ConfigPath | None = Field(None, description="File of 3D polylines, instead of a mesh.")
+    unit: Literal["m", "cm", "mm", "inch"] = Field("m", description="Unit of the model's coordinates.")
+    initial_pose: PoseConfig | None = Field(None, description="Pose at the start; by default the sequence's ground truth.")
+
+    @model_validator(mode="after")
+    def _one_model(self) -> "ObjectConfig":
+        if self.mesh is not None and self.polylines is not None:
+            raise ValueError("give mesh or polylines, not both")
+        return self
+
+
+class CameraConfig(Settings):
+    """Intrinsics, from a calibration file or inline; a sequence brings its own."""
+
+    calibration: ConfigPath | None = Field(None, description="Calibration file, for example the text 'fx fy cx cy k1 k2 p1 p2 k3'.")
+    fx: float | None = Field(None, gt=0, description="Focal length (px).")
+    fy: float | None = Field(None, gt=0, description="Focal length (px).")
+    cx: float | None = Field(None, description="Principal point (px).")
+    cy: float | None = Field(None, description="Principal point (px).")
+    width: int | None = Field(None, ge=1, le=8192, description="Sensor width (px), where the calibration does not say it.")
+    height: int | None = Field(None, ge=1, le=8192, description="Sensor height (px), where the calibration does not say it.")
+    distortion_model: DistortionModel = Field("none", description="Lens model, as in OpenCV.")
+    distortion: tuple[float, ...] = Field((), description="Its coefficients.")
+
+    @model_validator(mode="after")
+    def _complete(self) -> "CameraConfig":
+        missing = [name for name in ("fx", "fy", "cx", "cy", "width", "height") if getattr(self, name) is None]
+        if self.calibration is None and missing:
+            raise ValueError(f"give a calibration file, or fx, fy, cx, cy, width and height; {', '.join(missing)} missing")
+        if self.calibration is not None and not {"fx", "fy", "cx", "cy"} <= set(missing):
+            raise ValueError("give a calibration file or fx, fy, cx and cy, not both")
+        return self
+
+
+class OverlayConfig(Settings):
+    """The video of what was tracked."""
+
+    enabled: bool = Field(True, description="Write overlay.mp4 and stills.")
+    frames_per_second: float = Field(30.0, gt=0, le=240, description="Frames per second of the video.")
+    slow_motion: float = Field(4.0, ge=0.01, le=1000, description="How many times slower than life the video plays.")
+    stills: int = Field(4, ge=0, le=100, description="PNG stills, taken evenly over the video.")
+
+
+class TrackingConfig(Settings):
+    """How objects are tracked: preset, tracker, arithmetic."""
+
+    preset: PresetName = Field("default", description="Tracker settings to start from.")
+    tracker: TrackerConfig = Field(TrackerConfig(), description="Tracker settings that differ from the preset.")
+    device: str = Field("cpu", pattern=r"^(cpu|cuda(:\d+)?)$", description="Where the tracker runs: cpu, cuda or cuda:N.")
+    dtype: Literal["float32", "float64"] = Field("float32", description="Floating type of the tracker.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _start_from_preset(cls, values: Any) -> Any:
+        """Lay the given tracker settings over those of the preset."""
+        tracker = values.get("tracker", {}) if isinstance(values, dict) else None
+        if not isinstance(tracker, dict):
+            return values
+        name = values.get("preset", "default")
+        # An unknown preset is reported by its own field.
+        base = preset(name).model_dump() if name in get_args(PresetName) else {}
+        return {**values, "tracker": merged(base, tracker)}
+
+
+class RunConfig(TrackingConfig):
+    """Settings of ``torchtrack track``."""
+
+    source: ConfigPath = Field(description="Event file or simulated sequence (.npz).")
+    objects: tuple[ObjectConfig, ...] = Field((), description="Objects to track; none given: all objects of the sequence.")
+    camera: CameraConfig | None = Field(None, description="The camera; a sequence brings its own.")
+    start_us: int | None = Field(None, description="Time of the initial pose, in stream time (µs); by default the start of the stream.")
+    end_us: int | None = Field(None, description="Tracking ends here, in stream time (µs); by default with the stream.")
+    models: Models = Field("textured", description="Use a sequence's textured models where it has them, or geometry alone.")
+    threads: int = Field(1, ge=1, le=256, description="Threads of the tracker on the CPU.")
+    output: ConfigPath = Field(
+        default_factory=lambda: Path.cwd() / "outputs" / "track", description="Folder for the results; by default in the working folder."
+    )
+    overlay: OverlayConfig = OverlayConfig()
+    alignment: bool = Field(False, description="Measure how far events lie from the contours, at the tracked and at the initial pose.")
+    reference_angular_velocity: ConfigPath | None = Field(None, description="Text file of three numbers (rad/s) put beside the recovered rotation.")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "RunConfig":
+        labels = [obj.label for obj in self.objects]
+        if duplicates := {label for label in labels if labels.count(label) > 1}:
+            raise ValueError(f"objects: labels must differ; {', '.join(sorted(duplicates))} given more than once")
+        if self.start_us is not None and self.end_us is not None and self.end_us <= self.start_us:
+            raise ValueError(f"end_us must be after start_us; got {self.end_us} and {self.start_us}")
+        return self

@@ -1,0 +1,38 @@
+"""The base of all settings, and paths that know what they are relative to."""
+
+import os
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict
+
+
+class Settings(BaseModel):
+    """Frozen, and a name that is not known is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CommandLineText(str):
+    """Text typed on the command line: a path in it is relative to the working folder, not to the config file's."""
+
+    __slots__ = ()
+
+
+def _absolute(value: Any, info: Any) -> Any:
+    """An absolute path: ``~`` and ``$VARIABLES`` expanded, relative to ``context["folder"]``, else to the working folder.
+
+    ``info`` is pydantic's ValidationInfo, a protocol that cannot be checked at run time.
+    """
+    if not isinstance(value, str | Path):
+        return value
+    expanded = os.path.expandvars(Path(value).expanduser())
+    if missing := re.findall(r"\$\{?(\w+)", expanded):
+        raise ValueError(f"the environment variable {missing[0]} is not set")
+    folder = (info.context or {}).get("folder")
+    base = Path.cwd() if folder is None or isinstance(value, CommandLineText) else folder
+    return Path(os.path.normpath(base / expanded))
+
+
+ConfigPath = Annotated[Path, BeforeValidator(_absolute)]

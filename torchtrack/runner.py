@@ -1,0 +1,108 @@
+"""One run: source → tracker → sinks."""
+
+import json
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchtrack.config.load import as_yaml
+from torchtrack.config.run import RunConfig, TrackingConfig
+from torchtrack.errors import ConfigError
+from torchtrack.interrupt import Interrupt
+from torchtrack.session import Session, open_session
+from torchtrack.sinks import Sink
+from torchtrack.sinks.folder import output_folder
+from torchtrack.sinks.poses import PoseFiles
+from torchtrack.sinks.record import Record
+from torchtrack.sinks.summary import RunSummary, summarise_run
+from torchtrack.stepping import Step, cut_windows, steps, track
+from torchtrack.tracker import Tracker
+
+__all__ = ["build_tracker", "run", "session_steps", "track"]
+
+OUTPUT_FILES = ("trajectory_*.tum", "poses.csv", "config.yaml", "summary.json", "overlay*.mp4", "overlay*.png")
+
+
+def build_tracker(session: Session, config: TrackingConfig) -> Tracker:
+    """The tracker of a session's objects, on the configured device.
+
+    Raises:
+        ConfigError: if the device is not there.
+    """
+    if config.device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError(f"device: '{config.device}' was asked for, but PyTorch sees no CUDA device. Use cpu, or a CUDA build of torch.")
+    tracker = Tracker(list(session.models), session.camera, config.tracker, dtype=getattr(torch, config.dtype))
+    return tracker.to(config.device)
+
+
+def session_steps(session: Session, tracker: Tracker, config: TrackingConfig) -> Iterator[Step]:
+    """Track a session from its initial poses on, one step per window."""
+    state = tracker.init(session.T_cam_obj.to(config.device), session.start_us)
+    return steps(cut_windows(session.chunks(), config.tracker.window, session.start_us), tracker, state)
+
+
+def run(config: RunConfig, sinks: Sequence[Sink] = ()) -> RunSummary:
+    """Track a source and write trajectories, poses, overlay, settings and summary into the output folder.
+
+    Ctrl-C ends the run after the window at hand; the outputs are complete up to there. On an error nothing is written.
+
+    Args:
+        config: what to do.
+        sinks: further sinks, such as a progress bar.
+
+    Raises:
+        TorchtrackError: of the kind that fits, if anything that the run needs is missing or wrong.
+    """
+    session = open_session(config)
+    tracker = build_tracker(session, config)
+    record = Record(session.ground_truth)
+    begun = time.perf_counter()
+    with threads(config.threads), output_folder(config.output, OUTPUT_FILES) as folder, Interrupt() as interrupt:
+        with ExitStack() as stack:
+            own = [record, PoseFiles(folder, session.labels, record), *_optional_sinks(folder, session, config)]
+            every = [stack.enter_context(closing(sink)) for sink in (*own, *sinks)]
+            for step in session_steps(session, tracker, config):
+                for sink in every:
+                    sink.add(step)
+                if interrupt.requested:
+                    break
+        summary = summarise_run(
+            session.name,
+            session.labels,
+            record,
+            wall_s=time.perf_counter() - begun,
+            device=config.device,
+            interrupted=interrupt.requested,
+            more=_further_facts(session, config, own),
+        )
+        (folder / "config.yaml").write_text(as_yaml(config), encoding="utf-8")
+        write_json(folder / "summary.json", summary.as_json())
+    return summary
+
+
+def _optional_sinks(folder: Path, session: Session, config: RunConfig) -> list[Sink]:
+    return []
+
+
+def _further_facts(session: Session, config: RunConfig, sinks: Sequence[Sink]) -> dict[str, dict[str, Any]]:
+    return {}
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write plain values as JSON for people to read."""
+    path.write_text(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Let PyTorch use ``count`` threads within the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,161 @@
+"""What a run tracks: events, camera, object models, the initial poses, and the truth where it is known."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.camera import Camera
+from torchtrack.config.run import CameraConfig, ObjectConfig, PoseConfig, RunConfig
+from torchtrack.errors import ConfigError, EventDataError
+from torchtrack.events import EventBatch
+from torchtrack.io import EventSource, SequenceObject, Trajectory, open_events, read_calibration, read_sequence, read_tum
+from torchtrack.io.npz import ZIP_MAGIC
+from torchtrack.lie import check_pose, rotation_from_quaternion
+from torchtrack.object_model import ObjectModel
+from torchtrack.stepping import clipped
+
+
+@dataclass(frozen=True)
+class Session:
+    """One stream, its camera, and the objects to track in it.
+
+    Args:
+        name: what the source is called.
+        events: the stream.
+        camera: its camera.
+        labels, models, ground_truth: one per object; the truth is None where it is not known.
+        T_cam_obj: ``[B, 4, 4]`` float64, the initial poses.
+        start_us: time of the initial poses.
+        end_us: where tracking ends, or None for the end of the stream.
+    """
+
+    name: str
+    events: EventSource
+    camera: Camera
+    labels: tuple[str, ...]
+    models: tuple[ObjectModel, ...]
+    ground_truth: tuple[Trajectory | None, ...]
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    start_us: int
+    end_us: int | None
+
+    def chunks(self) -> Iterator[EventBatch]:
+        """The events after the start and up to the end."""
+        return clipped(self.events.chunks(), self.start_us, self.end_us)
+
+
+def open_session(config: RunConfig) -> Session:
+    """Open everything that a run needs.
+
+    Raises:
+        TorchtrackError: of the kind that fits, if a file, model, camera or pose is missing or wrong.
+        EventDataError: if the stream has no events in the time asked for.
+    """
+    name, events, camera, of_sequence = _open_source(config)
+    chosen = config.objects or tuple(ObjectConfig(label=label) for label in of_sequence)
+    if not chosen:
+        raise ConfigError(f"objects: '{config.source}' brings no objects of its own. List those to track, each with a mesh and an initial_pose.")
+    known = tuple(_matching(obj, of_sequence, config.source) for obj in chosen)
+    truth = tuple(obj.ground_truth if obj else None for obj in known)
+    start_us = _start(config, events, truth)
+    poses = [_initial_pose(*pair, start_us) for pair in zip(chosen, truth, strict=True)]
+    return Session(
+        name=name,
+        events=events,
+        camera=camera,
+        labels=tuple(obj.label for obj in chosen),
+        models=tuple(_load_model(obj, found, config) for obj, found in zip(chosen, known, strict=True)),
+        ground_truth=truth,
+        T_cam_obj=torch.stack(poses),
+        start_us=start_us,
+        end_us=config.end_us,
+    )
+
+
+def _open_source(config: RunConfig) -> tuple[str, EventSource, Camera, dict[str, SequenceObject]]:
+    """Name, events and camera of the source, and the objects it knows by label."""
+    if _is_sequence(config.source):
+        sequence = read_sequence(config.source)
+        camera = _camera(config.camera) if config.camera else sequence.camera
+        return sequence.name, sequence.events, camera, {obj.label: obj for obj in sequence.objects}
+    if config.camera is None:
+        # Opened first, so that a file that is not there or is not one of events is told as such.
+        open_events(config.source)
+        raise ConfigError(f"camera: '{config.source}' holds events alone. Give a calibration file, or fx, fy, cx, cy, width and height.")
+    camera = _camera(config.camera)
+    return config.source.stem, open_events(config.source, camera.width, camera.height), camera, {}
+
+
+def _is_sequence(path: Path) -> bool:
+    """Whether a file is an archive of arrays that holds a camera too."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        if not stream.read(4).startswith(ZIP_MAGIC):
+            return False
+    with np.load(path) as archive:
+        return "K" in archive.files
+
+
+def _camera(config: CameraConfig) -> Camera:
+    if config.calibration is not None:
+        return read_calibration(config.calibration, config.width, config.height)
+    return Camera(**config.model_dump(exclude={"calibration"}))
+
+
+def _matching(obj: ObjectConfig, of_sequence: dict[str, SequenceObject], source: Path) -> SequenceObject | None:
+    """The object of the sequence that a configured one names, or None where it brings its own model."""
+    found = of_sequence.get(obj.label)
+    if found is None and obj.mesh is None and obj.polylines is None:
+        known = f"its objects are {', '.join(of_sequence)}" if of_sequence else "it brings none of its own"
+        raise ConfigError(f"objects: '{obj.label}' has no model, and '{source}' knows no such object ({known}). Give mesh or polylines.")
+    return found
+
+
+def _load_model(obj: ObjectConfig, found: SequenceObject | None, config: RunConfig) -> ObjectModel:
+    if obj.polylines is not None:
+        return ObjectModel.from_polylines(obj.polylines, name=obj.label, unit=obj.unit)
+    if obj.mesh is not None:
+        return ObjectModel.from_file(obj.mesh, name=obj.label, unit=obj.unit)
+    if found is None:
+        raise ConfigError(f"objects: '{obj.label}' has no model.")
+    return ObjectModel.from_file(found.model_path(config.models), name=obj.label)
+
+
+def _start(config: RunConfig, events: EventSource, truth: tuple[Trajectory | None, ...]) -> int:
+    """Time of the initial poses: as configured, else the first moment that has events and, where there is truth, truth."""
+    span = f"after {config.start_us} µs " if config.start_us is not None else ""
+    span += f"up to {config.end_us} µs " if config.end_us is not None else ""
+    before = config.start_us if config.start_us is not None else -(2**62)
+    first = next(clipped(events.chunks(), before, config.end_us), None)
+    if first is None:
+        raise EventDataError(f"'{config.source}' has no events {span}to track with. Check the file, and start_us and end_us.")
+    if config.start_us is not None:
+        return config.start_us
+    return max([int(first.t_us[0]) - 1, *(int(trajectory.t_us[0]) for trajectory in truth if trajectory is not None)])
+
+
+def _initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) -> Float[Tensor, "4 4"]:
+    if obj.initial_pose is not None:
+        T = _configured_pose(obj.initial_pose, start_us)
+        check_pose(T, f"initial_pose of '{obj.label}'")
+        return T
+    if truth is None:
+        raise ConfigError(f"objects: '{obj.label}' needs an initial_pose, as the source has no ground truth for it.")
+    return truth.at(torch.tensor([start_us]))[0]
+
+
+def _configured_pose(pose: PoseConfig, start_us: int) -> Float[Tensor, "4 4"]:
+    if pose.trajectory is not None:
+        return read_tum(pose.trajectory).at(torch.tensor([start_us]))[0]
+    if pose.matrix is not None:
+        return torch.tensor(pose.matrix, dtype=torch.float64)
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3] = rotation_from_quaternion(torch.tensor(pose.quaternion_xyzw, dtype=torch.float64))
+    T[:3, 3] = torch.tensor(pose.translation_m, dtype=torch.float64)
+    return T

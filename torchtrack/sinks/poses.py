@@ -1,0 +1,53 @@
+"""Poses as text while a run goes on: one TUM trajectory per object, and one table of everything."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchtrack.io.seconds import format_seconds
+from torchtrack.lie import quaternion_from_rotation
+from torchtrack.quality import Status
+from torchtrack.sinks.record import Record
+from torchtrack.stepping import Step
+
+COLUMNS = (
+    *("t_us", "label", "tx", "ty", "tz", "qx", "qy", "qz", "qw"),
+    *("status", "quality", "observations", "rotation_error_deg", "translation_error_cm"),
+)
+
+
+class PoseFiles:
+    """Writes ``trajectory_LABEL.tum`` and ``poses.csv`` into a folder, row by row.
+
+    Errors are left empty where there is no truth.
+    """
+
+    def __init__(self, folder: Path, labels: Sequence[str], record: Record) -> None:
+        """``record`` has taken a step before this sink does: the errors come from there."""
+        self._labels, self._record = labels, record
+        # Open until close(): a run of any length must not keep its poses in memory.
+        self._tum = [(folder / f"trajectory_{label}.tum").open("w", encoding="utf-8") for label in labels]
+        self._table = (folder / "poses.csv").open("w", encoding="utf-8", newline="")
+        self._rows = csv.writer(self._table)
+        self._rows.writerow(COLUMNS)
+        for file in self._tum:
+            file.write("# t tx ty tz qx qy qz qw (seconds, metres)\n")
+
+    def add(self, step: Step) -> None:
+        """Write one row per object."""
+        result = step.result
+        t_us = int(result.t_us[0])
+        T = result.T_cam_obj.cpu()
+        quaternions = quaternion_from_rotation(T[:, :3, :3]).tolist()
+        judged = zip(result.status.tolist(), result.quality.tolist(), result.observation_count.tolist(), strict=True)
+        columns = zip(self._labels, T[:, :3, 3].tolist(), quaternions, judged, strict=True)
+        for index, (label, translation, quaternion, (status, quality, count)) in enumerate(columns):
+            pose = [f"{value:.12g}" for value in (*translation, *quaternion)]
+            self._tum[index].write(f"{format_seconds(t_us)} {' '.join(pose)}\n")
+            errors = [f"{value:.6g}" for value in self._record.newest_errors(index)]
+            self._rows.writerow([t_us, label, *pose, Status(status).name, f"{quality:.4g}", count, *(errors or ("", ""))])
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in (*self._tum, self._table):
+            file.close()

@@ -1,0 +1,99 @@
+"""What is remembered of a run: a few numbers per window, for its summary."""
+
+from array import array
+from collections import Counter
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchtrack.eval.metrics import PoseErrors, pose_errors
+from torchtrack.io import Trajectory
+from torchtrack.lie import so3_log
+from torchtrack.stepping import Step
+
+
+class ObjectRecord:
+    """Status counts, qualities, the rotation so far, and the errors of one object."""
+
+    def __init__(self, truth: Trajectory | None) -> None:
+        """``truth`` is None where it is not known."""
+        self.truth = truth
+        self.statuses: Counter[int] = Counter()
+        self.quality_sum = 0.0
+        # Sum of the rotations between windows (rad, camera axes): full turns count.
+        self.turned = torch.zeros(3, dtype=torch.float64)
+        self._last_rotation: Tensor | None = None
+        self._t_us, self._rotation_deg, self._translation_cm = array("q"), array("d"), array("d")
+        self._newest: tuple[float, ...] = ()
+
+    def add(self, t_us: Tensor, T_cam_obj: Tensor, status: int, quality: float) -> None:
+        """Take one window: time ``[1]``, pose ``[4, 4]``."""
+        self.statuses[status] += 1
+        self.quality_sum += quality
+        rotation = T_cam_obj[:3, :3]
+        if self._last_rotation is not None:
+            self.turned = self.turned + so3_log(rotation @ self._last_rotation.T)
+        self._last_rotation = rotation
+        self._newest = ()
+        if self.truth is not None:
+            self._add_errors(pose_errors(t_us, T_cam_obj[None], self.truth))
+
+    def _add_errors(self, errors: PoseErrors) -> None:
+        for t_us, rotation, translation in zip(errors.t_us.tolist(), errors.rotation_deg.tolist(), errors.translation_cm.tolist(), strict=True):
+            self._t_us.append(t_us)
+            self._rotation_deg.append(rotation)
+            self._translation_cm.append(translation)
+            self._newest = (rotation, translation)
+
+    @property
+    def newest_errors(self) -> tuple[float, ...]:
+        """δR (°) and δT (cm) of the newest window; empty where there is no truth for it."""
+        return self._newest
+
+    @property
+    def errors(self) -> PoseErrors | None:
+        """The errors of all windows; None where the truth is not known."""
+        if self.truth is None:
+            return None
+        return PoseErrors(
+            torch.tensor(self._t_us, dtype=torch.int64),
+            torch.tensor(self._rotation_deg, dtype=torch.float64),
+            torch.tensor(self._translation_cm, dtype=torch.float64),
+        )
+
+
+class Record:
+    """The sink that everything in a summary comes from."""
+
+    def __init__(self, truth: Sequence[Trajectory | None]) -> None:
+        """``truth`` has one entry per object."""
+        self.objects = [ObjectRecord(of_object) for of_object in truth]
+        self.step_seconds = array("d")
+        self.event_count = 0
+        self.first_us: int | None = None
+        self.last_us = 0
+
+    def add(self, step: Step) -> None:
+        """Take one step."""
+        result = step.result
+        self.step_seconds.append(step.seconds)
+        self.event_count += len(step.window.events)
+        self.last_us = step.window.t_end_us
+        if self.first_us is None:
+            self.first_us = step.window.t_start_us
+        t_us, T = result.t_us[:1].cpu(), result.T_cam_obj.cpu()
+        for index, (status, quality) in enumerate(zip(result.status.tolist(), result.quality.tolist(), strict=True)):
+            self.objects[index].add(t_us, T[index], status, quality)
+
+    def newest_errors(self, index: int) -> tuple[float, ...]:
+        """δR (°) and δT (cm) of an object in the newest window; empty where there is no truth for it."""
+        return self.objects[index].newest_errors
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    @property
+    def duration_s(self) -> float:
+        """Stream time that was tracked."""
+        return 1e-6 * (self.last_us - self.first_us) if self.first_us is not None else 0.0

@@ -1,0 +1,129 @@
+"""The summary of a run: what ran on what, how fast, how well."""
+
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+import torch
+
+import torchtrack
+from torchtrack.eval.metrics import Metrics, summarise
+from torchtrack.quality import Status
+from torchtrack.sinks.record import ObjectRecord, Record
+
+
+@dataclass(frozen=True)
+class ObjectSummary:
+    """How one object fared.
+
+    Args:
+        status: windows by status.
+        mean_quality: mean over all windows, 0 to 1.
+        angular_velocity_rad_s: mean over the run, camera axes.
+        errors: against ground truth; None where it is not known.
+        more: what other sinks have to say, by name.
+    """
+
+    status: dict[str, int]
+    mean_quality: float
+    angular_velocity_rad_s: tuple[float, ...]
+    errors: Metrics | None
+    more: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """One run.
+
+    Args:
+        source: name of what was tracked.
+        interrupted: whether it was stopped before the stream's end.
+        device, threads: where the tracker ran.
+        versions: of torchtrack and what it stands on.
+        windows, events: how many.
+        duration_s: stream time tracked.
+        event_rate_per_s: events by stream time.
+        wall_s: time that it took, with reading and writing.
+        real_time_factor: stream time by wall time.
+        step_median_ms, step_p95_ms: time of one tracker step.
+        objects: by label.
+    """
+
+    source: str
+    interrupted: bool
+    device: str
+    threads: int
+    versions: dict[str, str]
+    windows: int
+    events: int
+    duration_s: float
+    event_rate_per_s: float
+    wall_s: float
+    real_time_factor: float
+    step_median_ms: float
+    step_p95_ms: float
+    objects: dict[str, ObjectSummary]
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; numbers that are not finite become None, as JSON has none."""
+        return finite(asdict(self))
+
+
+def summarise_run(
+    source: str, labels: Sequence[str], record: Record, *, wall_s: float, device: str, interrupted: bool, more: Mapping[str, Mapping[str, Any]]
+) -> RunSummary:
+    """The summary of what ``record`` has seen; ``more`` has further facts by label and name."""
+    step_ms = 1e3 * np.frombuffer(record.step_seconds)
+    by_label = zip(labels, record.objects, strict=True)
+    return RunSummary(
+        source=source,
+        interrupted=interrupted,
+        device=device_name(device),
+        threads=torch.get_num_threads(),
+        versions=versions(),
+        windows=len(step_ms),
+        events=record.event_count,
+        duration_s=record.duration_s,
+        event_rate_per_s=record.event_count / record.duration_s,
+        wall_s=wall_s,
+        real_time_factor=record.duration_s / wall_s,
+        step_median_ms=float(np.median(step_ms)),
+        step_p95_ms=float(np.percentile(step_ms, 95)),
+        objects={
+            label: _summarise_object(of, record.duration_s, dict(more.get(label, {}))) for label, of in zip(labels, record.objects, strict=True)
+        },
+    )
+
+
+def _summarise_object(record: ObjectRecord, duration_s: float, more: dict[str, Any]) -> ObjectSummary:
+    windows = sum(record.statuses.values())
+    return ObjectSummary(
+        status={Status(status).name: count for status, count in sorted(record.statuses.items())},
+        mean_quality=record.quality_sum / windows,
+        angular_velocity_rad_s=tuple((record.turned / duration_s).tolist()),
+        errors=summarise(record.errors) if record.errors is not None else None,
+        more=more,
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of torchtrack and of what decides its results."""
+    return {"torchtrack": torchtrack.__version__, "python": platform.python_version(), "torch": str(torch.__version__), "kornia": version("kornia")}
+
+
+def device_name(device: str) -> str:
+    """``cpu``, or the name of the graphics card."""
+    return torch.cuda.get_device_name(device) if device.startswith("cuda") else device
+
+
+def finite(value: Any) -> Any:
+    """The same nested value with None in place of numbers that are not finite."""
+    if isinstance(value, dict):
+        return {key: finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,80 @@
+"""The loop itself: a stream cut into windows, one tracker step each, in constant memory."""
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import torch
+
+from torchtrack.config.tracker import WindowConfig
+from torchtrack.errors import EventDataError
+from torchtrack.events import EventBatch, EventWindow, windows_by_count, windows_by_time
+from torchtrack.io import EventSource
+from torchtrack.tracker import StepResult, Tracker, TrackerState
+
+
+@dataclass(frozen=True)
+class Step:
+    """One window, what the tracker made of it, and how long that took (s)."""
+
+    window: EventWindow
+    state: TrackerState
+    result: StepResult
+    seconds: float
+
+
+def cut_windows(chunks: Iterable[EventBatch], config: WindowConfig, t_start_us: int) -> Iterator[EventWindow]:
+    """The windows of a stream, by time or by count as configured."""
+    if config.mode == "time":
+        return windows_by_time(chunks, config.duration_us, t_start_us)
+    return windows_by_count(chunks, config.count, config.max_age_us, t_start_us)
+
+
+def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState) -> Iterator[Step]:
+    """One step per window; nothing is recorded for gradients."""
+    device = state.T_cam_obj.device
+    for window in windows:
+        begun = time.perf_counter()
+        with torch.inference_mode():
+            state, result = tracker.step(state, window.events.to(device), window.t_end_us)
+            if device.type == "cuda":
+                # Work on the GPU is queued: without waiting, the time measured is that of queueing.
+                torch.cuda.synchronize(device)
+        yield Step(window, state, result, time.perf_counter() - begun)
+
+
+def track(
+    source: EventSource | Iterable[EventBatch], tracker: Tracker, state: TrackerState, window: WindowConfig | None = None
+) -> Iterator[StepResult]:
+    """Track one stream from ``state`` on, one result per window, in constant memory.
+
+    Args:
+        source: a source of events, or batches of them in time order; events up to the state's time are passed over.
+        tracker: the tracker, of one stream.
+        state: where it starts, from :meth:`Tracker.init`.
+        window: how to cut the stream; as the tracker is configured when not given.
+
+    Raises:
+        EventDataError: if the stream has no events after the state's time, or they are malformed.
+    """
+    start_us = int(state.t_us[0])
+    chunks = source.chunks() if isinstance(source, EventSource) else source
+    seen = False
+    for step in steps(cut_windows(clipped(chunks, start_us), window or tracker.config.window, start_us), tracker, state):
+        seen = True
+        yield step.result
+    if not seen:
+        raise EventDataError(f"the stream has no events after {start_us} µs, where tracking starts. Check the start time and the file.")
+
+
+def clipped(chunks: Iterable[EventBatch], start_us: int, end_us: int | None = None) -> Iterator[EventBatch]:
+    """Events with ``start_us < t <= end_us`` of a stream, reading no further than needed."""
+    for chunk in chunks:
+        if len(chunk) == 0:
+            continue
+        newest_us = int(chunk.t_us[-1])
+        inside = chunk.slice_time(start_us, newest_us if end_us is None else end_us)
+        if len(inside):
+            yield inside
+        if end_us is not None and newest_us > end_us:
+            return
