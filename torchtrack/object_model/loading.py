@@ -5,12 +5,13 @@ import re
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import trimesh
 
 from torchtrack.errors import MissingFileError, ModelError, TorchtrackWarning, UnknownFormatError
-from torchtrack.object_model.settings import METRES_PER_UNIT, Unit
+from torchtrack.object_model.settings import METRES_PER_UNIT
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 _SMALLEST_M, _LARGEST_M = 0.005, 5.0
@@ -57,33 +58,30 @@ def load_parts(path: str | Path) -> list[trimesh.Trimesh]:
 
 
 def mesh_parts(mesh: "trimesh.Trimesh | trimesh.Scene | Iterable[trimesh.Trimesh]") -> list[trimesh.Trimesh]:
-    """Copies of the meshes that have faces, each where it belongs."""
-    if isinstance(mesh, trimesh.Trimesh):
-        mesh = [mesh]
-    elif isinstance(mesh, trimesh.Scene):
-        mesh = mesh.dump()
-    return [part.copy() for part in mesh if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    """Copies of the meshes that have faces, each where it belongs, without vertices that no face uses."""
+    pieces: Iterable[Any] = [mesh] if isinstance(mesh, trimesh.Trimesh) else mesh.dump() if isinstance(mesh, trimesh.Scene) else mesh
+    parts = [piece.copy() for piece in pieces if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
+    for part in parts:
+        part.remove_unreferenced_vertices()
+    return parts
 
 
-def to_metres(points: np.ndarray, unit: Unit, name: str) -> np.ndarray:
-    """Points ``[n, 3]`` in metres, after the checks that every model must pass.
+def checked_scale(points: np.ndarray, unit: str, name: str) -> float:
+    """Metres per ``unit``, once points ``[n, 3]`` in that unit have passed the checks that every model must pass.
 
     Raises:
         ModelError: if a coordinate is not finite, the unit is unknown, or the diameter is outside 5 mm to 5 m.
     """
     if unit not in METRES_PER_UNIT:
         raise ModelError(f"unknown unit '{unit}' for '{name}': use one of {', '.join(METRES_PER_UNIT)}.")
-    if len(points) == 0:
-        raise ModelError(f"'{name}' is empty: it has no vertices. Export it again.")
     bad = ~np.isfinite(points).all(1)
     if bad.any():
-        raise ModelError(f"{bad.sum()} of {len(points)} vertices of '{name}' are not finite (NaN or infinite). Repair the mesh and export it again.")
-    points = np.asarray(points, dtype=np.float64)
+        raise ModelError(f"{bad.sum()} of {len(points)} vertices of '{name}' are not finite (NaN or infinite). Repair the model and export it again.")
     _check_diameter(float(np.linalg.norm(np.ptp(points, axis=0))), unit, name)
-    return points * METRES_PER_UNIT[unit]
+    return METRES_PER_UNIT[unit]
 
 
-def _check_diameter(diameter: float, unit: Unit, name: str) -> None:
+def _check_diameter(diameter: float, unit: str, name: str) -> None:
     """Refuse a size that no tracked object has, and say which unit would make it plausible."""
     metres = diameter * METRES_PER_UNIT[unit]
     if _SMALLEST_M <= metres <= _LARGEST_M:
@@ -95,9 +93,7 @@ def _check_diameter(diameter: float, unit: Unit, name: str) -> None:
 
 def join_parts(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     """One mesh of all parts, faces in their order, for drawing and export."""
-    if len(parts) == 1:
-        return parts[0]
-    return trimesh.util.concatenate(parts)
+    return parts[0] if len(parts) == 1 else cast(trimesh.Trimesh, trimesh.util.concatenate(parts))
 
 
 def _warn_missing_textures(path: Path) -> None:

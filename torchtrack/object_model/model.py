@@ -13,13 +13,13 @@ from torch import Tensor
 
 from torchtrack.errors import ModelError
 from torchtrack.object_model.colour_edges import colour_edges
-from torchtrack.object_model.loading import MESH_SUFFIXES, check_file, join_parts, load_parts, mesh_parts, to_metres
-from torchtrack.object_model.mesh_edges import EdgeTable, MeshEdges, contour_edges
+from torchtrack.object_model.loading import MESH_SUFFIXES, check_file, checked_scale, join_parts, load_parts, mesh_parts
+from torchtrack.object_model.mesh_edges import NO_EDGES, EdgeTable, MeshEdges, contour_edges
 from torchtrack.object_model.polylines import POLYLINE_SUFFIXES, as_polylines, has_obj_lines, read_polylines, segments_of
-from torchtrack.object_model.sampling import sample_surface
-from torchtrack.object_model.settings import METRES_PER_UNIT, ModelSettings, Unit
+from torchtrack.object_model.sampling import NO_SAMPLES, sample_surface
+from torchtrack.object_model.settings import ModelSettings, Unit
 from torchtrack.object_model.surface import Surface, surface_from_parts
-from torchtrack.object_model.surface_points import SurfacePoints, join_points, thin_out
+from torchtrack.object_model.surface_points import NO_POINTS, SurfacePoints, join_points, thin_out
 from torchtrack.object_model.texture_edges import texture_edges
 from torchtrack.object_model.winding import turn_outwards
 
@@ -99,12 +99,18 @@ class ObjectModel:
         parts = mesh_parts(mesh)
         if not parts:
             raise ModelError(f"'{name}' has no triangles: the tracker needs a surface. Give a triangle mesh, or lines with from_polylines.")
-        to_metres(np.concatenate([part.vertices for part in parts]), unit, name)
+        scale = checked_scale(np.concatenate([part.vertices for part in parts]), unit, name)
         for part in parts:
-            part.apply_scale(METRES_PER_UNIT[unit])
+            part.apply_scale(scale)
         surface, table, outwards = turn_outwards(surface_from_parts(parts), name)
-        edges = contour_edges(surface, table, settings.crease_angle_deg, drop_concave=outwards)
-        return cls._assemble(name, surface, edges, _print_edges(surface, table, settings), settings, _drawable(parts, surface))
+        return cls._assemble(
+            name,
+            surface.vertices[np.unique(surface.faces)],
+            edges=contour_edges(surface, table, settings.crease_angle_deg, drop_concave=outwards),
+            printed=_print_edges(surface, table, settings),
+            samples=sample_surface(surface, settings.surface_point_count),
+            mesh=_drawable(parts, surface),
+        )
 
     @classmethod
     def from_polylines(
@@ -124,38 +130,33 @@ class ObjectModel:
         Raises:
             MissingFileError, UnknownFormatError, ModelError: as :meth:`from_file`.
         """
+        stated: str | None = None
         if isinstance(source, str | Path):
             polylines, stated = read_polylines(source)
-            unit, name = stated or unit, name or Path(source).stem
+            name = name or Path(source).stem
         else:
             polylines = as_polylines(source)
         name = name or "polylines"
         segments = segments_of(polylines)
         if len(segments) == 0:
             raise ModelError(f"'{name}' has no line segments. Give at least one polyline of two different points.")
-        points = to_metres(segments.reshape(-1, 3), unit, name)
-        low, high = points.min(0), points.max(0)
-        return cls(
-            name=name,
-            centre=_tensor((low + high) / 2),
-            diameter_m=float(np.linalg.norm(high - low)),
-            edge_points=torch.zeros(0, 2, 3),
-            edge_normals=torch.zeros(0, 2, 3),
-            edge_is_crease=torch.zeros(0, dtype=torch.bool),
-            texture_points=torch.zeros(0, 3),
-            texture_tangents=torch.zeros(0, 3),
-            texture_normals=torch.zeros(0, 3),
-            segments=_tensor(points.reshape(-1, 2, 3)),
-            surface_points=torch.zeros(0, 3),
-            surface_normals=torch.zeros(0, 3),
-            mesh=None,
-        )
+        points = segments.reshape(-1, 3) * checked_scale(segments.reshape(-1, 3), stated or unit, name)
+        return cls._assemble(name, points, segments=points.reshape(-1, 2, 3))
 
     @classmethod
-    def _assemble(cls, name: str, surface: Surface, edges: MeshEdges, printed: SurfacePoints, settings: ModelSettings, mesh: trimesh.Trimesh) -> Self:
-        used = surface.vertices[np.unique(surface.faces)]
-        low, high = used.min(0), used.max(0)
-        points, normals = sample_surface(surface, settings.surface_point_count)
+    def _assemble(
+        cls,
+        name: str,
+        extent: np.ndarray,
+        *,
+        edges: MeshEdges = NO_EDGES,
+        printed: SurfacePoints = NO_POINTS,
+        segments: np.ndarray = NO_EDGES.points,
+        samples: tuple[np.ndarray, np.ndarray] = NO_SAMPLES,
+        mesh: trimesh.Trimesh | None = None,
+    ) -> Self:
+        """The model with the given parts, whose bounding box is that of ``extent [n, 3]``."""
+        low, high = extent.min(0), extent.max(0)
         return cls(
             name=name,
             centre=_tensor((low + high) / 2),
@@ -166,9 +167,9 @@ class ObjectModel:
             texture_points=_tensor(printed.points),
             texture_tangents=_tensor(printed.tangents),
             texture_normals=_tensor(printed.normals),
-            segments=torch.zeros(0, 2, 3),
-            surface_points=_tensor(points),
-            surface_normals=_tensor(normals),
+            segments=_tensor(segments),
+            surface_points=_tensor(samples[0]),
+            surface_normals=_tensor(samples[1]),
             mesh=mesh,
         )
 

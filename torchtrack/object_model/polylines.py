@@ -15,14 +15,13 @@ import numpy as np
 
 from torchtrack.errors import ModelError
 from torchtrack.object_model.loading import check_file
-from torchtrack.object_model.settings import Unit
 
 POLYLINE_SUFFIXES = (".json", ".obj")
 
 Polylines = list[np.ndarray]
 
 
-def read_polylines(path: str | Path) -> tuple[Polylines, Unit | None]:
+def read_polylines(path: str | Path) -> tuple[Polylines, str | None]:
     """The polylines ``[n, 3]`` of a file, and the unit that it states, if it does.
 
     Raises:
@@ -34,7 +33,7 @@ def read_polylines(path: str | Path) -> tuple[Polylines, Unit | None]:
         if path.suffix.lower() == ".obj":
             return _obj_lines(path.read_text(encoding="latin-1")), None
         content = json.loads(path.read_text(encoding="utf-8"))
-        return as_polylines(content["polylines"]), content.get("unit")
+        return as_polylines(content["polylines"]), str(content["unit"]) if "unit" in content else None
     except ModelError as error:
         raise ModelError(f"'{path}': {error}") from error
     except (ValueError, KeyError, IndexError, TypeError) as error:

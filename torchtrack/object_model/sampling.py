@@ -4,9 +4,11 @@ import numpy as np
 
 from torchtrack.object_model.surface import Surface
 
+NO_SAMPLES = np.zeros((0, 3)), np.zeros((0, 3))
+
 
 def sample_surface(surface: Surface, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """``count`` points and normals ``[N, 3]``, uniform over the area, the same every time.
+    """``count`` points and their unit normals, each ``[N, 3]``: uniform over the area, the same every time.
 
     Areas are stratified: each sample has an equal share of the area to itself, which is more even than independent draws.
     """

@@ -17,6 +17,6 @@ class ModelSettings(BaseModel):
     crease_angle_deg: float = Field(25.0, gt=0, lt=180, description="Mesh edges bent by more than this are always drawn (degrees).")
     max_texture_points: int = Field(4000, ge=0, description="At most this many points on texture edges; 0 for none.")
     texture_contrast: float = Field(
-        0.4, gt=0, le=5, description="Smallest step of log luminance that counts as an edge of the texture or of the colours."
+        0.5, gt=0, le=5, description="Smallest step of log luminance that counts as an edge of the texture or of the colours."
     )
     surface_point_count: int = Field(10_000, ge=100, description="Samples of the surface.")

@@ -7,6 +7,7 @@ texture is stored per corner of a face.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -122,17 +123,18 @@ class _Look:
 
 def _look(mesh: trimesh.Trimesh) -> _Look:
     """Texture or colours of a mesh, per corner."""
+    visual: Any = mesh.visual  # one of several classes, told apart by their kind
     uv = np.full((len(mesh.faces), 3, 2), np.nan)
     luminance = np.full((len(mesh.faces), 3), np.nan)
     image = texture_image(mesh)
     if image is not None:
-        return _Look(log_luminance(np.asarray(image.convert("RGB"))), np.asarray(mesh.visual.uv, dtype=np.float64)[mesh.faces], luminance)
-    if mesh.visual.kind == "vertex":
-        luminance = log_luminance(mesh.visual.vertex_colors[:, :3])[mesh.faces]
-    elif mesh.visual.kind == "face":
-        luminance = np.repeat(log_luminance(mesh.visual.face_colors[:, :3])[:, None], 3, 1)
-    elif mesh.visual.kind == "texture":
-        luminance = np.full_like(luminance, log_luminance(np.asarray(mesh.visual.material.main_color)[:3]))
+        return _Look(log_luminance(np.asarray(image.convert("RGB"))), np.asarray(visual.uv, dtype=np.float64)[mesh.faces], luminance)
+    if visual.kind == "vertex":
+        luminance = log_luminance(visual.vertex_colors[:, :3])[mesh.faces]
+    elif visual.kind == "face":
+        luminance = np.repeat(log_luminance(visual.face_colors[:, :3])[:, None], 3, 1)
+    elif visual.kind == "texture":
+        luminance = np.full_like(luminance, log_luminance(np.asarray(visual.material.main_color)[:3]))
     return _Look(None, uv, luminance)
 
 
@@ -141,7 +143,7 @@ def texture_image(mesh: trimesh.Trimesh) -> Image.Image | None:
     uv = getattr(mesh.visual, "uv", None)
     if uv is None or len(uv) != len(mesh.vertices):
         return None
-    material = mesh.visual.material
+    material = getattr(mesh.visual, "material", None)
     for attribute in ("baseColorTexture", "image"):
         image = getattr(material, attribute, None)
         if image is not None:
@@ -163,7 +165,7 @@ def log_luminance(colours: np.ndarray) -> np.ndarray:
 def _weld(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distinct positions ``[V, 3]`` and the index of each given vertex among them."""
     low = vertices.min(0)
-    step = max(np.linalg.norm(np.ptp(vertices, axis=0)), 1e-300) * _WELD_FRACTION
+    step = max(float(np.linalg.norm(np.ptp(vertices, axis=0))), 1e-300) * _WELD_FRACTION
     # Copies differ by rounding at most; the odd offset keeps grid lines away from the lowest vertex and its round multiples.
     cell = np.floor((vertices - low) / step + 0.377).astype(np.int64)
     key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]

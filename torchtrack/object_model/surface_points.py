@@ -27,6 +27,9 @@ class SurfacePoints:
     length_m: float
 
 
+NO_POINTS = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), 0.0)
+
+
 def oriented_points(points: np.ndarray, tangents: np.ndarray, normals: np.ndarray, to_brighter: np.ndarray, length_m: float) -> SurfacePoints:
     """Points whose tangents (of any length and sign) are made unit, and turned so that the brighter side is to their left."""
     wrong = (np.cross(normals, tangents) * to_brighter).sum(1) < 0
@@ -46,9 +49,9 @@ def points_along(segments: np.ndarray, normals: np.ndarray, to_brighter: np.ndar
 
 def join_points(sets: Sequence[SurfacePoints]) -> SurfacePoints:
     """All points of several sets; of none, no points."""
-    empty = np.zeros((0, 3))
-    points, tangents, normals = ([empty, *(getattr(s, field) for s in sets)] for field in ("points", "tangents", "normals"))
-    return SurfacePoints(np.concatenate(points), np.concatenate(tangents), np.concatenate(normals), sum(s.length_m for s in sets))
+    sets = [NO_POINTS, *sets]
+    points, tangents, normals = (np.concatenate([getattr(s, field) for s in sets]) for field in ("points", "tangents", "normals"))
+    return SurfacePoints(points, tangents, normals, sum(s.length_m for s in sets))
 
 
 def thin_out(dense: SurfacePoints, spacing_m: float, max_points: int) -> SurfacePoints:

@@ -13,7 +13,7 @@ import numpy as np
 from torchtrack.object_model.image_edges import ImageEdges, image_edges
 from torchtrack.object_model.mesh_edges import EdgeTable, corners_at_ends
 from torchtrack.object_model.surface import Surface
-from torchtrack.object_model.surface_points import SurfacePoints, join_points, oriented_points
+from torchtrack.object_model.surface_points import NO_POINTS, SurfacePoints, join_points, oriented_points
 
 # Finer detail than this fraction of the diameter is blurred away: no event camera that sees the whole object resolves it.
 _BLUR_FRACTION = 0.002
@@ -46,7 +46,7 @@ def _edges_of_texture(surface: Surface, number: int, borders: np.ndarray, contra
     placement = _place(surface, number, borders, image.shape)
     texel_m = _texel_size(surface, placement)
     if texel_m is None:
-        return join_points([])
+        return NO_POINTS
     image, placement, texel_m = _at_working_scale(image, placement, texel_m, surface.diameter)
     blur_px = max(1.0, _BLUR_FRACTION * surface.diameter / texel_m)
     edges = image_edges(image, blur_px, contrast)
@@ -128,7 +128,6 @@ def _inside_islands(edges: ImageEdges, placement: _Placement, shape: tuple[int, 
         cv2.fillConvexPoly(mask, triangle, 1, shift=_SUBPIXEL_BITS)
     sides = np.stack([fixed, np.roll(fixed, -1, 1)], 2)[placement.border]
     cv2.polylines(mask, list(sides), False, 0, shift=_SUBPIXEL_BITS)
-    # The image's own border is none: where a texture fills it, edges run up to it.
     distance = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     u, v = edges.pixels.round().astype(np.int64).clip(0, [shape[1] - 1, shape[0] - 1]).T
     kept = distance[v, u] > margin_px
