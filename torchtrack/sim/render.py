@@ -1,0 +1,229 @@
+"""Renderer of known rigid objects: meshes at poses in, luminance, depth and object indices out (extra ``sim``).
+
+::
+
+    objects = [RenderObject.from_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))]
+    renderer = Renderer(objects, Camera(600, 600, 319.5, 239.5, 640, 480), plain_background(640, 480, 0.2))
+    frame = renderer.render(T_cam_obj)        # [objects, 4, 4] -> frame.luminance [480, 640], linear in light
+
+Conventions of :mod:`torchtrack.camera`: pixel ``i`` gathers the light between ``i - 0.5`` and ``i + 0.5``. Luminance is
+linear in light: 1 is a white surface that faces the light. Lens distortion is not drawn: images are ideal.
+
+Samples lie in a canonical multi-jittered arrangement (Chiu, Shirley & Wang 1994; Kensler 2013): ``n x n`` samples fall into
+``n²`` different columns and rows, so an edge along the pixel grid moves in steps of ``1/n²`` pixel. On a regular grid it would
+move in steps of ``1/n``, and the events of a slow upright edge would come in bursts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+
+from torchtrack.camera import Camera
+from torchtrack.errors import CalibrationError, MissingExtraError, ModelError
+from torchtrack.sim.surface import RenderObject, Scene, merge_objects
+
+# The blur's weights beyond this many standard deviations are below 1e-4.
+_BLUR_REACH = 4.0
+
+
+class RenderConfig(BaseModel):
+    """How a scene is lit and sampled."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    supersampling: int = Field(4, ge=1, le=8, description="Samples per pixel along each axis.")
+    lens_blur_px: float = Field(0.5, ge=0, le=5, description="Standard deviation of the lens blur, pixels.")
+    near_m: float = Field(0.01, gt=0, description="Surfaces nearer than this are not drawn, m.")
+    light_direction: tuple[float, float, float] = Field((-0.4, -0.7, -0.6), description="Direction towards the light, camera frame.")
+    ambient: float = Field(0.35, ge=0, le=1, description="Share of light that comes from everywhere.")
+    diffuse: float = Field(0.65, ge=0, le=1, description="Share of light that comes from the light's direction.")
+
+
+@dataclass(frozen=True)
+class Region:
+    """A rectangle of pixels, ends excluded."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the rectangle in an image ``[H, W]``."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    def overlaps(self, other: "Region") -> bool:
+        """Whether the two share a pixel."""
+        return self.top < other.bottom and other.top < self.bottom and self.left < other.right and other.left < self.right
+
+    def union(self, other: "Region") -> "Region":
+        """The smallest rectangle around both."""
+        return Region(min(self.top, other.top), max(self.bottom, other.bottom), min(self.left, other.left), max(self.right, other.right))
+
+
+def merge_regions(regions: Sequence[Region]) -> tuple[Region, ...]:
+    """Rectangles that overlap, joined until none do."""
+    merged: list[Region] = []
+    for region in regions:
+        while overlapping := [other for other in merged if other.overlaps(region)]:
+            for other in overlapping:
+                merged.remove(other)
+                region = region.union(other)
+        merged.append(region)
+    return tuple(merged)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rendered image.
+
+    Args:
+        luminance: linear in light, 1 is white.
+        depth: z of the surface at the pixel's centre, m; infinite on the background.
+        object_index: which object holds most of the pixel; -1 on the background.
+        regions: rectangles outside of which there is background alone.
+    """
+
+    luminance: Float[ndarray, "h w"]
+    depth: Float[ndarray, "h w"]
+    object_index: Int[ndarray, "h w"]
+    regions: tuple[Region, ...]
+
+
+def plain_background(width: int, height: int, luminance: float) -> Float[ndarray, "h w"]:
+    """An even background."""
+    return np.full((height, width), luminance, dtype=np.float32)
+
+
+class Renderer:
+    """Draws a fixed set of objects before a fixed background.
+
+    Args:
+        objects: what to draw.
+        camera: pinhole camera without distortion.
+        background: luminance ``[H, W]``, linear, finite and not negative.
+        config: light and sampling.
+
+    Raises:
+        MissingExtraError: if numba is not installed.
+        CalibrationError: if the camera has distortion, or the background's size is not the sensor's.
+        ModelError: if there is no object.
+    """
+
+    def __init__(
+        self, objects: Sequence[RenderObject], camera: Camera, background: Float[ndarray, "h w"], config: RenderConfig | None = None
+    ) -> None:
+        self._kernels = _load_kernels()
+        self.camera, self.config = camera, config or RenderConfig()
+        _check_inputs(objects, camera, background)
+        self._scene: Scene = merge_objects(objects)
+        self._sharp_background = np.ascontiguousarray(background, dtype=np.float32)
+        self._background = self._blur(self._sharp_background)
+        self._offsets = sample_offsets(self.config.supersampling)
+        self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, self.config.near_m])
+        light = np.array(self.config.light_direction)
+        self._lighting = self._kernels.Lighting(
+            self.config.ambient, self.config.diffuse, (light / max(np.linalg.norm(light), 1e-12)).astype(np.float32)
+        )
+
+    def render(self, T_cam_obj: Float[ndarray, "o 4 4"] | Float[Tensor, "o 4 4"]) -> Frame:
+        """One image of all objects at their poses; parts behind the camera or outside the image are left out."""
+        corners, normals = self._scene.at_poses(np.asarray(T_cam_obj, dtype=np.float64))
+        boxes = [self._box(corners[faces]) for faces in self._scene.object_faces]
+        regions = merge_regions([box for box in boxes if box is not None])
+        luminance = self._background.copy()
+        depth = np.full(luminance.shape, np.inf, dtype=np.float32)
+        object_index = np.full(luminance.shape, -1, dtype=np.int16)
+        for region in regions:
+            inside = [faces for faces, box in zip(self._scene.object_faces, boxes, strict=True) if box is not None and box.overlaps(region)]
+            ranges = np.array([[faces.start, faces.stop] for faces in inside])
+            self._render_region(region, ranges, corners, normals, luminance, depth, object_index)
+        return Frame(luminance, depth, object_index, regions)
+
+    def _render_region(
+        self, region: Region, ranges: ndarray, corners: ndarray, normals: ndarray, luminance: ndarray, depth: ndarray, object_index: ndarray
+    ) -> None:
+        """Draw the faces of ``ranges`` (first, end) into one rectangle of the full images."""
+        sharp = self._sharp_background[region.slices].copy()
+        samples = (len(self._offsets), *sharp.shape)
+        inverse_depth, face_index = np.empty(samples, np.float32), np.empty(samples, np.int32)
+        planes = np.zeros((len(corners), 3, 3))
+        origin = np.array([region.left, region.top], dtype=np.float64)
+        self._kernels.draw(corners, ranges, self._intrinsics, origin, self._offsets, planes, inverse_depth, face_index)
+        surface = self._kernels.Surface(normals=normals, **self._scene.look)
+        self._kernels.shade(
+            face_index, inverse_depth, planes, self._offsets, surface, self._lighting, self._intrinsics, origin,
+            sharp, depth[region.slices], object_index[region.slices],
+        )  # fmt: skip
+        luminance[region.slices] = self._blurred_region(sharp, region)
+
+    @property
+    def _blur_radius(self) -> int:
+        return int(np.ceil(_BLUR_REACH * self.config.lens_blur_px))
+
+    def _blur(self, image: Float[ndarray, "h w"]) -> Float[ndarray, "h w"]:
+        size, sigma = 2 * self._blur_radius + 1, self.config.lens_blur_px
+        return cv2.GaussianBlur(image, (size, size), sigma, borderType=cv2.BORDER_REPLICATE) if sigma > 0 else image
+
+    def _blurred_region(self, sharp: Float[ndarray, "h w"], region: Region) -> Float[ndarray, "h w"]:
+        """The rectangle as it looks in the blurred whole: near its inner borders there is background alone."""
+        blurred, radius = self._blur(sharp), self._blur_radius
+        result = self._background[region.slices].copy()
+        top, left = (0 if start == 0 else radius for start in (region.top, region.left))
+        bottom = sharp.shape[0] - (0 if region.bottom == self.camera.height else radius)
+        right = sharp.shape[1] - (0 if region.right == self.camera.width else radius)
+        result[top:bottom, left:right] = blurred[top:bottom, left:right]
+        return result
+
+    def _box(self, corners: Float[ndarray, "f 3 3"]) -> Region | None:
+        """Pixels that an object can touch, blur included; the whole image where it reaches through the camera plane."""
+        width, height = self.camera.width, self.camera.height
+        depth = corners[..., 2]
+        if not (depth > self.config.near_m).any():
+            return None
+        if (depth < self.config.near_m).any():
+            return Region(0, height, 0, width)
+        fx, fy, cx, cy = self._intrinsics[:4]
+        u, v = corners[..., 0] / depth * fx + cx, corners[..., 1] / depth * fy + cy
+        # The pixel that a point falls into, then the blur of its light, then what that blur sees.
+        margin = 2 * self._blur_radius + 1
+        top, left = np.clip(np.floor([v.min(), u.min()]) - margin, 0, [height, width]).astype(int).tolist()
+        bottom, right = np.clip(np.ceil([v.max(), u.max()]) + margin + 1, 0, [height, width]).astype(int).tolist()
+        return Region(top, bottom, left, right) if top < bottom and left < right else None
+
+
+def sample_offsets(n: int) -> Float[ndarray, "s 2"]:
+    """Offsets (u, v) of ``n x n`` samples from the centre of a pixel, pixels: no two share a column or a row."""
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    u, v = (i + (j + 0.5) / n) / n - 0.5, (j + (i + 0.5) / n) / n - 0.5
+    return np.stack([u.ravel(), v.ravel()], 1)
+
+
+def _check_inputs(objects: Sequence[RenderObject], camera: Camera, background: ndarray) -> None:
+    if not objects:
+        raise ModelError("a renderer needs at least one object, got none.")
+    if camera.distortion_model != "none":
+        raise CalibrationError(f"the renderer draws ideal pinhole images, got a camera with '{camera.distortion_model}' distortion. Leave it out.")
+    if background.shape != (camera.height, camera.width):
+        raise CalibrationError(
+            f"the background must have the sensor's size {camera.width}x{camera.height}, got {background.shape[1]}x{background.shape[0]}."
+        )
+    if not np.isfinite(background).all() or (background < 0).any():
+        raise CalibrationError("the background's luminance must be finite and not negative.")
+
+
+def _load_kernels() -> ModuleType:
+    """The compiled kernels; numba takes a second to import, so only those who render pay for it."""
+    try:
+        from torchtrack.sim import rasterizer
+    except ImportError as error:
+        raise MissingExtraError("numba", "sim", "Rendering simulated scenes") from error
+    return rasterizer

@@ -1,0 +1,168 @@
+"""Surfaces for the renderer: triangles with normals, texture coordinates and reflectances.
+
+Reflectance is linear in light. Images and colours of a mesh are sRGB, as glTF 2.0 has it, and are taken to linear light
+and to one grey channel (Rec. 709 luma weights).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from torchtrack.errors import ModelError
+
+_LUMA = np.array([0.2126, 0.7152, 0.0722])
+DEFAULT_CREASE_DEG = 30.0
+
+
+def srgb_to_linear(value: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
+    """Linear light of sRGB values in 0..1 (IEC 61966-2-1)."""
+    value = np.asarray(value, dtype=np.float64)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(value: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
+    """Values in 0..1 as sRGB, of linear light, for showing a luminance image."""
+    value = np.clip(np.asarray(value, dtype=np.float64), 0, 1)
+    return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
+
+
+def grey_reflectance(rgb: ndarray) -> Float[ndarray, "..."]:
+    """Linear grey of 8-bit sRGB colours ``[..., 3 or 4]``; transparency is ignored."""
+    return srgb_to_linear(np.asarray(rgb)[..., :3] / 255.0) @ _LUMA
+
+
+@dataclass(frozen=True)
+class RenderObject:
+    """Triangles of one object, in its own frame.
+
+    Args:
+        corners: m.
+        normals: unit normals at the corners.
+        uv: texture coordinates of the corners, v counted downwards from the top of the image.
+        albedo: reflectance of the corners; it multiplies the texture.
+        texture: reflectances ``[h, w]``; one texel where there is no texture.
+        gloss: strength of the highlight.
+    """
+
+    corners: Float[ndarray, "f 3 3"]
+    normals: Float[ndarray, "f 3 3"]
+    uv: Float[ndarray, "f 3 2"]
+    albedo: Float[ndarray, "f 3"]
+    texture: Float[ndarray, "h w"]
+    gloss: float = 0.1
+
+    @classmethod
+    def from_mesh(
+        cls, mesh: trimesh.Trimesh, reflectance: float = 0.6, gloss: float = 0.1, crease_angle_deg: float = DEFAULT_CREASE_DEG
+    ) -> "RenderObject":
+        """Prepare a mesh: its texture or colours where it has any, else an even ``reflectance``.
+
+        Normals are smoothed over edges that bend by less than ``crease_angle_deg``: curved meshes look smooth and angular
+        ones keep flat faces.
+
+        Raises:
+            ModelError: if the mesh is empty or not finite.
+        """
+        if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+            raise ModelError(f"cannot draw a mesh of {len(mesh.faces)} faces; it needs faces, and vertices that are finite.")
+        faces = np.asarray(mesh.faces)
+        corners = np.asarray(mesh.vertices, dtype=np.float64)[faces]
+        uv, albedo, texture = np.zeros((*faces.shape, 2)), np.full(faces.shape, reflectance), np.ones((1, 1))
+        if (image := _texture_image(mesh)) is not None:
+            uv = np.asarray(mesh.visual.uv, dtype=np.float64)[faces] * [1, -1] + [0, 1]
+            albedo, texture = np.ones(faces.shape), grey_reflectance(image)
+        elif isinstance(mesh.visual, trimesh.visual.ColorVisuals) and mesh.visual.defined:
+            albedo = grey_reflectance(np.asarray(mesh.visual.vertex_colors))[faces]
+        return cls(corners, corner_normals(corners, crease_angle_deg), uv, albedo, texture, gloss)
+
+
+def _texture_image(mesh: trimesh.Trimesh) -> ndarray | None:
+    """The texture ``[h, w, 3]`` of a mesh, or None."""
+    if not isinstance(mesh.visual, trimesh.visual.TextureVisuals) or mesh.visual.uv is None:
+        return None
+    material = mesh.visual.material
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    return None if image is None else np.asarray(image.convert("RGB"))
+
+
+def corner_normals(corners: Float[ndarray, "f 3 3"], crease_angle_deg: float) -> Float[ndarray, "f 3 3"]:
+    """Unit normal of each corner: area-weighted mean over the faces around its vertex that bend less than the crease angle."""
+    area_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    unit = area_normals / np.maximum(np.linalg.norm(area_normals, axis=1, keepdims=True), 1e-30)
+    # Texture seams double a vertex: corners belong together where their positions agree.
+    scale = max(float(np.ptp(corners, axis=(0, 1)).max()), 1e-12)
+    _, vertex = np.unique(np.round(corners.reshape(-1, 3) / scale, 7), axis=0, return_inverse=True)
+    corner, neighbour = _corner_pairs(vertex.ravel())
+    keep = (unit[corner // 3] * unit[neighbour // 3]).sum(1) > np.cos(np.radians(crease_angle_deg)) - 1e-9
+    normals = np.zeros((3 * len(corners), 3))
+    np.add.at(normals, corner[keep], area_normals[neighbour[keep] // 3])
+    norm = np.linalg.norm(normals, axis=1, keepdims=True)
+    fallback = np.repeat(unit, 3, axis=0)
+    return np.where(norm > 1e-30, normals / np.maximum(norm, 1e-30), fallback).reshape(-1, 3, 3)
+
+
+def _corner_pairs(vertex: Int[ndarray, "c"]) -> tuple[Int[ndarray, "p"], Int[ndarray, "p"]]:
+    """All pairs of corners, each with itself too, that share a vertex."""
+    order = np.argsort(vertex, kind="stable")
+    counts = np.bincount(vertex)
+    starts = np.cumsum(counts) - counts
+    per_corner = counts[vertex[order]]
+    first = np.repeat(order, per_corner)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(per_corner) - per_corner, per_corner)
+    return first, order[np.repeat(starts[vertex[order]], per_corner) + step]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All objects of a scene as one list of triangles.
+
+    Args:
+        corners, normals: of every face, in the frame of its object.
+        object_faces: which faces belong to each object.
+        look: the other fields of :class:`torchtrack.sim.rasterizer.Surface`.
+    """
+
+    corners: Float[ndarray, "f 3 3"]
+    normals: Float[ndarray, "f 3 3"]
+    object_faces: tuple[slice, ...]
+    look: dict[str, Any]
+
+    def at_poses(self, T_cam_obj: Float[ndarray, "o 4 4"]) -> tuple[Float[ndarray, "f 3 3"], Float[ndarray, "f 3 3"]]:
+        """Corners and normals in the camera frame; normals are turned so that both sides of a face are lit."""
+        corners, normals = np.empty_like(self.corners), np.empty_like(self.normals)
+        for faces, T in zip(self.object_faces, T_cam_obj, strict=True):
+            corners[faces] = self.corners[faces] @ T[:3, :3].T + T[:3, 3]
+            normals[faces] = self.normals[faces] @ T[:3, :3].T
+        area_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals *= np.where((area_normals * corners[:, 0]).sum(1) > 0, -1.0, 1.0)[:, None, None]
+        return corners, normals.astype(np.float32)
+
+
+def merge_objects(objects: Sequence[RenderObject]) -> Scene:
+    """One list of triangles, with all textures in one array of texels."""
+    counts = [len(item.corners) for item in objects]
+    ends = np.cumsum(counts)
+    sizes = [item.texture.size for item in objects]
+    starts = np.cumsum(sizes) - sizes
+    textures = [(start, item.texture.shape[1], item.texture.shape[0]) for start, item in zip(starts, objects, strict=True)]
+    normals = np.concatenate([item.normals for item in objects])
+    look = {
+        "uv": np.concatenate([item.uv for item in objects]).astype(np.float32),
+        "albedo": np.concatenate([item.albedo for item in objects]).astype(np.float32),
+        "is_flat": _is_flat(normals),
+        "texture": np.repeat(np.array(textures, dtype=np.int64), counts, axis=0),
+        "texels": np.concatenate([item.texture.ravel() for item in objects]).astype(np.float32),
+        "face_object": np.repeat(np.arange(len(objects)), counts),
+        "gloss": np.repeat(np.array([item.gloss for item in objects], dtype=np.float32), counts),
+    }
+    slices = tuple(slice(int(end - count), int(end)) for end, count in zip(ends, counts, strict=True))
+    return Scene(np.concatenate([item.corners for item in objects]), normals, slices, look)
+
+
+def _is_flat(normals: Float[ndarray, "f 3 3"]) -> Bool[ndarray, "f"]:
+    return np.abs(normals - normals[:, :1]).max(axis=(1, 2)) < 1e-6
