@@ -1,3 +1,81 @@
-"""Optical-flow guided 6DoF object pose tracking with an event camera."""
+"""Optical-flow guided 6DoF object pose tracking with an event camera: batched over objects and streams, on PyTorch and kornia.
+
+The pipeline, one file per stage, in data-flow order::
+
+    events         a window of events                         torchtrack.events
+    time surface   decayed image of last event times          torchtrack.time_surface
+    corners        guided filter, Harris, snapped to events   torchtrack.corners
+    flow           robust event flow of each corner           torchtrack.flow
+    contours       visible 3D contours at the predicted pose  torchtrack.contours
+    matching       corners and events to contours             torchtrack.matching
+    pose solver    Levenberg-Marquardt on SE(3)               torchtrack.pose_solver
+    quality        status, covariance, explained contour      torchtrack.quality
+    tracker        all of it: state and window in, pose out   torchtrack.tracker
+    runner         a whole recording: source, tracker, sinks  torchtrack.runner
+
+In use::
+
+    sequence = torchtrack.read_sequence("lbracket_normal.npz")
+    objects = [torchtrack.ObjectModel.from_file(obj.model_path()) for obj in sequence.objects]
+    tracker = torchtrack.Tracker(objects, sequence.camera, torchtrack.preset("default"))
+    first = torch.stack([obj.ground_truth.T_cam_obj[0] for obj in sequence.objects])
+    state = tracker.init(first, t_us=0)
+    for result in torchtrack.track(sequence.events, tracker, state):
+        print(result.t_us, result.T_cam_obj, result.status)
+
+Public names are loaded when they are first used, so importing the package is quick and changes no setting of PyTorch.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from torchtrack import errors as errors
+    from torchtrack.camera import Camera as Camera
+    from torchtrack.config.presets import preset as preset
+    from torchtrack.config.tracker import TrackerConfig as TrackerConfig
+    from torchtrack.events import EventBatch as EventBatch
+    from torchtrack.io import Trajectory as Trajectory
+    from torchtrack.io import open_events as open_events
+    from torchtrack.io import read_sequence as read_sequence
+    from torchtrack.object_model import ObjectModel as ObjectModel
+    from torchtrack.quality import Status as Status
+    from torchtrack.runner import track as track
+    from torchtrack.tracker import StepResult as StepResult
+    from torchtrack.tracker import Tracker as Tracker
+    from torchtrack.tracker import TrackerState as TrackerState
+
+_HOME = {
+    "Camera": "camera",
+    "EventBatch": "events",
+    "ObjectModel": "object_model",
+    "Status": "quality",
+    "StepResult": "tracker",
+    "Tracker": "tracker",
+    "TrackerConfig": "config.tracker",
+    "TrackerState": "tracker",
+    "Trajectory": "io",
+    "open_events": "io",
+    "preset": "config.presets",
+    "read_sequence": "io",
+    "track": "runner",
+}
+
+__all__ = [*_HOME, "__version__", "errors"]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name on first use."""
+    if name == "errors":
+        return import_module("torchtrack.errors")
+    if name not in _HOME:
+        raise AttributeError(f"module 'torchtrack' has no attribute '{name}'")
+    value = getattr(import_module(f"torchtrack.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

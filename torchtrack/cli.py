@@ -19,7 +19,16 @@ from torchtrack.errors import ConfigError, TorchtrackError
 
 EXIT_FAILED, EXIT_WRONG_SETTINGS, EXIT_INTERRUPTED = 1, 2, 130
 
-_Output = Annotated[str | None, arg(aliases=["-o"], metavar="DIR")]
+
+def _option(metavar: str, *aliases: str) -> Any:
+    """An option that may be left out: the config file decides then, and the defaults last."""
+    return arg(metavar=metavar, aliases=aliases, help_behavior_hint="")
+
+
+_Output = Annotated[str | None, _option("DIR", "-o")]
+_Preset = Annotated[str | None, _option("NAME")]
+_Models = Annotated[Literal["textured", "geometry"] | None, _option("textured|geometry")]
+_Number = Annotated[int | None, _option("N")]
 _SETTINGS_HINT = "Any setting can be given by its dotted key, e.g. --tracker.window.duration-us 3000; `torchtrack settings {}` lists them."
 
 
@@ -31,17 +40,17 @@ class Track:
     """A YAML config file, or directly a sequence (.npz)."""
     output: _Output = None
     """Folder for the results."""
-    preset: str | None = None
+    preset: _Preset = None
     """Tracker settings to start from: default or paper."""
-    models: Literal["textured", "geometry"] | None = None
+    models: _Models = None
     """Use a sequence's textured models where it has them, or geometry alone."""
-    start_us: int | None = None
+    start_us: _Number = None
     """Time of the initial pose, in stream time (µs)."""
-    end_us: int | None = None
+    end_us: _Number = None
     """Tracking ends here, in stream time (µs)."""
-    device: str | None = None
+    device: Annotated[str | None, _option("NAME")] = None
     """Where the tracker runs: cpu, cuda or cuda:N."""
-    threads: int | None = None
+    threads: _Number = None
     """Threads of the tracker on the CPU."""
     quiet: bool = False
     """No progress bar."""
@@ -57,17 +66,17 @@ class Track:
 class Evaluate:
     """Track sequences with known ground truth under one or more methods and compare the errors."""
 
-    paths: Positional[tuple[str, ...]] = ()
+    paths: Positional[Annotated[tuple[str, ...], arg(metavar="[PATH ...]", help_behavior_hint="")]] = ()
     """Sequences (.npz), or folders of them."""
     output: _Output = None
     """Folder for metrics.json and errors.csv."""
-    methods: str | None = None
+    methods: Annotated[str | None, _option("A,B,...")] = None
     """Comma-separated: labels of methods in the config file, or names of presets."""
-    config: str | None = None
+    config: Annotated[str | None, _option("FILE")] = None
     """A YAML config file with paths and methods."""
-    models: Literal["textured", "geometry"] | None = None
+    models: _Models = None
     """Use a sequence's textured models where it has them, or geometry alone."""
-    jobs: Annotated[int | None, arg(aliases=["-j"])] = None
+    jobs: Annotated[int | None, _option("N", "-j")] = None
     """Processes, of one thread each."""
     quiet: bool = False
     """No progress bar."""
@@ -108,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 1 (failed), 2 (wrong settings) or 130 (interrupted)."""
     try:
         options, overrides = split_overrides(sys.argv[1:] if arguments is None else arguments)
-        command = tyro.cli(_Command, prog="torchtrack", description="6DoF object pose tracking with an event camera.", args=options)  # type: ignore[call-overload]
+        command = tyro.cli(_Command, prog="torchtrack", description="6DoF object pose tracking with an event camera.", args=options)
         code: int = command.run(overrides)
     except ConfigError as error:
         return _report(error, EXIT_WRONG_SETTINGS)

@@ -12,33 +12,42 @@ from torchtrack.config.describe import described
 from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.config.load import load, read_yaml
 from torchtrack.config.run import RunConfig
-from torchtrack.config.settings import CommandLineText
+from torchtrack.config.settings import CommandLineText, Settings
 from torchtrack.eval.evaluate import evaluate as evaluate_all
 from torchtrack.eval.evaluate import find_sequences
-from torchtrack.eval.tables import results_table, run_table
+from torchtrack.eval.tables import results_table, run_headline, run_table
 from torchtrack.runner import run
 from torchtrack.sinks.progress import ProgressBar
 
 EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
+# Tables need this much where the output is no terminal, which says how wide it is.
+_FILE_WIDTH = 160
+
+
+def output_console() -> Console:
+    """Standard output, as wide as the terminal, or as tables need in a file or a pipe."""
+    console = Console(highlight=False, soft_wrap=True)
+    return console if console.is_terminal else Console(highlight=False, soft_wrap=True, width=_FILE_WIDTH)
 
 
 def track(config_or_source: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
     """Track one source, show the summary; returns the exit code."""
-    console = Console()
+    console = output_console()
     if Path(config_or_source).suffix.lower() in (".yaml", ".yml"):
         config = load(RunConfig, Path(config_or_source), overrides)
     else:
         config = load(RunConfig, None, {"source": CommandLineText(config_or_source), **overrides})
     progress = [] if quiet else [ProgressBar(Console(stderr=True), config.source.name)]
     summary = run(config, progress)
+    console.print(run_headline(summary))
     console.print(run_table(summary))
-    console.print(f"Results are in {config.output}", highlight=False, soft_wrap=True)
+    console.print(f"Results are in {config.output}")
     return EXIT_INTERRUPTED if summary.interrupted else 0
 
 
 def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mapping[str, Any], chosen: Sequence[str] | None, *, quiet: bool) -> int:
     """Evaluate sequences, show the table; returns the exit code, which is not 0 where a sequence failed."""
-    console = Console()
+    console = output_console()
     path = Path(config_file) if config_file else None
     config = load(EvaluateConfig, path, _method_overrides(path, overrides, chosen) | dict(given))
     if chosen is not None:
@@ -47,7 +56,7 @@ def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mappi
         bar = progress.add_task("sequences", total=len(find_sequences(config.paths)) * len(config.methods))
         evaluation = evaluate_all(config, lambda job: progress.advance(bar))
     console.print(results_table(evaluation.results))
-    console.print(f"Results are in {config.output}", highlight=False, soft_wrap=True)
+    console.print(f"Results are in {config.output}")
     for failure in evaluation.failures:
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {failure.sequence} ({failure.method}): {failure.reason}", markup=False)
     return EXIT_FAILED if evaluation.failures else 0
@@ -66,11 +75,9 @@ def _method_overrides(config_file: Path | None, overrides: Mapping[str, Any], ch
 
 def list_settings(command: str) -> int:
     """Show every setting of a command; returns the exit code."""
-    table = Table(title=f"Settings of torchtrack {command}", header_style="bold")
-    table.add_column("setting", no_wrap=True)
-    for name in ("type", "default", "meaning"):
-        table.add_column(name, overflow="fold")
-    for row in described({"track": RunConfig, "evaluate": EvaluateConfig}[command]):
+    table = Table("setting", "type", "default", "meaning", header_style="bold", box=None)
+    settings: dict[str, type[Settings]] = {"track": RunConfig, "evaluate": EvaluateConfig}
+    for row in described(settings[command]):
         table.add_row(*row)
-    Console().print(table)
+    output_console().print(table)
     return 0

@@ -63,7 +63,7 @@ def run(config: RunConfig, sinks: Sequence[Sink] = ()) -> RunSummary:
     begun = time.perf_counter()
     with threads(config.threads), output_folder(config.output, OUTPUT_FILES) as folder, Interrupt() as interrupt:
         with ExitStack() as stack:
-            own = [record, PoseFiles(folder, session.labels, record), *_optional_sinks(folder, session, config)]
+            own: list[Sink] = [record, PoseFiles(folder, session.labels, record), *_optional_sinks(folder, session, config)]
             every = [stack.enter_context(closing(sink)) for sink in (*own, *sinks)]
             for step in session_steps(session, tracker, config):
                 for sink in every:

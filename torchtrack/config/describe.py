@@ -1,12 +1,17 @@
 """Every setting, for people to look up."""
 
 from collections.abc import Iterator
-from typing import Any, get_args, get_origin
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from torchtrack.config.explain import model_in
+
+_SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+_PLAIN_NAMES: dict[Any, str] = {NoneType: "null", str: "text", Path: "path"}
 
 
 def described(settings: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
@@ -21,19 +26,22 @@ def described(settings: type[BaseModel], prefix: str = "") -> Iterator[tuple[str
 
 
 def _type_name(annotation: Any) -> str:
-    if annotation is type(None):
-        return "null"
-    if get_args(annotation) and get_origin(annotation) is not tuple:
-        return " | ".join(value if isinstance(value, str) else _type_name(value) for value in get_args(annotation))
-    if get_origin(annotation) is tuple:
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _type_name(inner[0])
+    if origin is Literal:
+        return " | ".join(inner)
+    if origin in (Union, UnionType):
+        return " | ".join(_type_name(one) for one in inner)
+    if origin is tuple:
         return "list"
-    return {"str": "text", "PosixPath": "path", "WindowsPath": "path", "Path": "path"}.get(annotation.__name__, annotation.__name__)
+    return _PLAIN_NAMES.get(annotation, getattr(annotation, "__name__", str(annotation)))
 
 
 def _default(field: FieldInfo) -> str:
     if field.is_required():
         return "needed"
-    default = field.get_default(call_default_factory=not field.default_factory_takes_validated_data)
+    default = field.get_default(call_default_factory=True, validated_data={})
     if default is None:
         return "-"
     return str(list(default)) if isinstance(default, tuple) else str(default).lower() if isinstance(default, bool) else str(default)
@@ -42,6 +50,3 @@ def _default(field: FieldInfo) -> str:
 def _meaning(field: FieldInfo) -> str:
     bounds = [f"{sign} {getattr(limit, name)}" for limit in field.metadata for name, sign in _SIGNS.items() if getattr(limit, name, None) is not None]
     return (field.description or "") + (f" [{', '.join(bounds)}]" if bounds else "")
-
-
-_SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}

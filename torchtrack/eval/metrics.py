@@ -38,6 +38,10 @@ def pose_errors(t_us: Int[Tensor, "p"], T_cam_obj: Float[Tensor, "p 4 4"], truth
     )
 
 
+_NAN = float("nan")
+_NOTHING = (_NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN)
+
+
 @dataclass(frozen=True)
 class Metrics:
     """Errors of one object over a whole sequence; all NaN where no window has a truth."""
@@ -60,8 +64,16 @@ def summarise(errors: PoseErrors, lost_rotation_deg: float = 10.0, lost_translat
     """Mean, median and maximum over all windows, and the share of them whose rotation or translation is off by more than the limits."""
     rotation, translation = errors.rotation_deg.numpy(), errors.translation_cm.numpy()
     if len(rotation) == 0:
-        return Metrics(0, *[float("nan")] * 7)
+        return Metrics(0, *_NOTHING)
     # A pose that is not finite is as lost as can be, and must not pass a comparison.
     lost = ~((rotation <= lost_rotation_deg) & (translation <= lost_translation_cm))
-    values = [function(of) for function in (np.mean, np.median, np.max) for of in (rotation, translation)]
-    return Metrics(len(rotation), *map(float, values), float(lost.mean()))
+    return Metrics(
+        windows=len(rotation),
+        mean_rotation_deg=float(rotation.mean()),
+        mean_translation_cm=float(translation.mean()),
+        median_rotation_deg=float(np.median(rotation)),
+        median_translation_cm=float(np.median(translation)),
+        max_rotation_deg=float(rotation.max()),
+        max_translation_cm=float(translation.max()),
+        lost_fraction=float(lost.mean()),
+    )

@@ -93,9 +93,7 @@ def summarise_run(
         real_time_factor=record.duration_s / wall_s,
         step_median_ms=float(np.median(step_ms)),
         step_p95_ms=float(np.percentile(step_ms, 95)),
-        objects={
-            label: _summarise_object(of, record.duration_s, dict(more.get(label, {}))) for label, of in zip(labels, record.objects, strict=True)
-        },
+        objects={label: _summarise_object(of, record.duration_s, dict(more.get(label, {}))) for label, of in by_label},
     )
 
 
