@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 import torch
@@ -61,7 +60,7 @@ class ObjectModel:
     mesh: trimesh.Trimesh | None
 
     @classmethod
-    def from_file(cls, path: str | Path, *, name: str | None = None, unit: Unit = "m", settings: ModelSettings | None = None) -> Self:
+    def from_file(cls, path: str | Path, *, name: str | None = None, unit: Unit = "m", settings: ModelSettings | None = None) -> "ObjectModel":
         """A model from a PLY, OBJ, STL, GLB, glTF or OFF mesh, or from polylines (JSON, or OBJ with lines and no faces).
 
         Args:
@@ -87,7 +86,7 @@ class ObjectModel:
         name: str = "object",
         unit: Unit = "m",
         settings: ModelSettings | None = None,
-    ) -> Self:
+    ) -> "ObjectModel":
         """A model from a mesh, a scene, or meshes that make up one object; they are not changed.
 
         Warns (:class:`~torchtrack.errors.TorchtrackWarning`) when faces point inwards and are flipped.
@@ -119,7 +118,7 @@ class ObjectModel:
         *,
         name: str | None = None,
         unit: Unit = "m",
-    ) -> Self:
+    ) -> "ObjectModel":
         """A model of line segments alone: a printed pattern, a book's page.
 
         Args:
@@ -154,7 +153,7 @@ class ObjectModel:
         segments: np.ndarray = NO_EDGES.points,
         samples: tuple[np.ndarray, np.ndarray] = NO_SAMPLES,
         mesh: trimesh.Trimesh | None = None,
-    ) -> Self:
+    ) -> "ObjectModel":
         """The model with the given parts, whose bounding box is that of ``extent [n, 3]``."""
         low, high = extent.min(0), extent.max(0)
         return cls(
