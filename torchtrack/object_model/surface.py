@@ -134,7 +134,7 @@ def _look(mesh: trimesh.Trimesh) -> _Look:
     elif visual.kind == "face":
         luminance = np.repeat(log_luminance(visual.face_colors[:, :3])[:, None], 3, 1)
     elif visual.kind == "texture":
-        luminance = np.full_like(luminance, log_luminance(np.asarray(visual.material.main_color)[:3]))
+        luminance = np.full_like(luminance, log_luminance(np.asarray(visual.material.main_color)[None, :3]))
     return _Look(None, uv, luminance)
 
 

@@ -34,7 +34,7 @@ def turn_outwards(surface: Surface, name: str) -> tuple[Surface, EdgeTable, bool
         table = edge_table(surface)
     cones = _cone_volumes(surface, np.zeros(len(surface.faces), dtype=np.int64))
     closed = bool(table.paired.all())
-    certain = bool(table.consistent.all()) and (closed or cones.sum() > _OUTWARD_SHARE * np.abs(cones).sum())
+    certain = bool(table.consistent.all() and (closed or cones.sum() > _OUTWARD_SHARE * np.abs(cones).sum()))
     return surface, table, certain
 
 
