@@ -24,7 +24,10 @@ _COEFFICIENTS = {"none": (0,), "plumb_bob": (4, 5, 8), "fisheye": (4,)}
 
 # Points nearer than this to the camera plane have no useful projection; callers mask them.
 MIN_DEPTH_M = 1e-3
-_REFINEMENT_STEPS = 20
+
+# OpenCV's own stopping rule leaves 0.1 px at the corners of a wide lens.
+_UNTIL_EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+_LARGEST_MISMATCH_PX = 0.01
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,8 @@ class Camera:
     cy: float
     width: int
     height: int
-    distortion_model: DistortionModel = "none"
+    # Any text, because it may come from a file: an unknown one is reported as every other mistake is.
+    distortion_model: str = "none"
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -66,9 +70,7 @@ class Camera:
             )
 
     @classmethod
-    def from_matrix(
-        cls, K: np.ndarray, width: int, height: int, distortion_model: DistortionModel = "none", distortion: tuple[float, ...] = ()
-    ) -> "Camera":
+    def from_matrix(cls, K: np.ndarray, width: int, height: int, distortion_model: str = "none", distortion: tuple[float, ...] = ()) -> "Camera":
         """A camera from its 3x3 matrix ``K``."""
         K = np.asarray(K, dtype=np.float64)
         if K.shape != (3, 3):
@@ -127,24 +129,26 @@ def undistort(pixels: np.ndarray, camera: Camera) -> np.ndarray:
     pixels = np.asarray(pixels, dtype=np.float64)
     if camera.distortion_model == "none" or len(pixels) == 0:
         return pixels
-    module = cv2.fisheye if camera.distortion_model == "fisheye" else cv2
     coefficients, matrix = np.array(camera.distortion), camera.matrix
-    ideal = module.undistortPoints(pixels[:, None], matrix, coefficients, R=np.eye(3), P=matrix)[:, 0]
-    # OpenCV stops early (by 0.1 px at the corners of a wide lens); a few fixed-point steps on its own model make it exact.
-    for _ in range(_REFINEMENT_STEPS):
-        ideal = ideal + (pixels - distort(ideal, camera))
-    return ideal
+    if camera.distortion_model == "fisheye":
+        return cv2.fisheye.undistortPoints(pixels[:, None], matrix, coefficients, R=np.eye(3), P=matrix)[:, 0]
+    return cv2.undistortImagePoints(pixels[:, None], matrix, coefficients, None, _UNTIL_EXACT)[:, 0]
 
 
 def undistortion_table(camera: Camera) -> Float[Tensor, "h w 2"]:
-    """Ideal pixel (u, v) of the centre of every sensor pixel, float32."""
+    """Ideal pixel (u, v) of the centre of every sensor pixel, float32.
+
+    Raises:
+        CalibrationError: if some pixel has no ideal pixel: the coefficients are wrong, or the lens sees 180° or more.
+    """
     v, u = np.mgrid[: camera.height, : camera.width]
-    ideal = undistort(np.stack([u.ravel(), v.ravel()], 1), camera)
+    sensor = np.stack([u.ravel(), v.ravel()], 1)
+    ideal = undistort(sensor, camera)
+    # Written so that NaN fails too.
+    failed = ~(np.abs(distort(ideal, camera) - sensor).max(1) < _LARGEST_MISMATCH_PX)
+    if failed.any():
+        raise CalibrationError(
+            f"the {camera.distortion_model} distortion {camera.distortion} cannot be undone at {failed.sum()} of {len(sensor)} pixels, "
+            f"first at {tuple(sensor[failed][0].tolist())}. Check the order and number of its coefficients, or use another distortion model."
+        )
     return torch.from_numpy(ideal.reshape(camera.height, camera.width, 2).astype(np.float32))
-
-
-def distortion_table(camera: Camera, border_px: int) -> Float[Tensor, "h w 2"]:
-    """Sensor pixel (u, v) of every ideal pixel, float32, for the image and a border of ``border_px`` around it."""
-    v, u = np.mgrid[-border_px : camera.height + border_px, -border_px : camera.width + border_px]
-    sensor = distort(np.stack([u.ravel(), v.ravel()], 1), camera)
-    return torch.from_numpy(sensor.reshape(*u.shape, 2).astype(np.float32))

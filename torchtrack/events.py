@@ -165,7 +165,8 @@ def windows_by_count(chunks: Iterable[EventBatch], count: int, max_age_us: int |
     """Cut a stream into windows of ``count`` events, closed early once ``max_age_us`` have passed.
 
     Events that share the time of a window's last event stay together with it, so windows may hold a few more.
-    ``t_start_us`` is where the first window starts; just before the first event when not given.
+    ``t_start_us`` is where the first window starts; just before the first event when not given. Windows in which
+    ``max_age_us`` passed without an event are yielded too.
     """
     if count < 1 or (max_age_us is not None and max_age_us < 1):
         raise EventDataError(f"a window needs a positive count and maximum age, got {count} and {max_age_us}.")
@@ -173,9 +174,11 @@ def windows_by_count(chunks: Iterable[EventBatch], count: int, max_age_us: int |
     for chunk in chunks:
         if len(chunk) == 0:
             continue
-        pending = concatenate([pending, chunk]) if len(pending) else chunk
         if t_start_us is None:
-            t_start_us = int(pending.t_us[0]) - 1
+            t_start_us = int(chunk.t_us[0]) - 1
+        pending = concatenate([pending, chunk]) if len(pending) else chunk
+        # Only what is after the start counts; later on, nothing else is left.
+        pending = pending[int(torch.searchsorted(pending.t_us, t_start_us, right=True)) :]
         while (end_us := _count_window_end(pending, count, max_age_us, t_start_us)) is not None:
             cut = int(torch.searchsorted(pending.t_us, end_us, right=True))
             yield EventWindow(pending[:cut], t_start_us, end_us)

@@ -21,7 +21,8 @@ from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, c
 
 ZIP_MAGIC = b"PK\x03\x04"
 _EVENT_KEYS = ("t", "x", "y", "p")
-_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError)
+# What zipfile is known to raise over damaged bytes.
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, UnicodeDecodeError, OSError)
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 

@@ -93,12 +93,12 @@ def _read_numbers(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray:
 
 
 def _read_camera(archive: zipfile.ZipFile, events: NpzEvents, path: Path) -> Camera:
-    model, distortion = "none", ()
+    model, distortion = "none", tuple[float, ...]()
     if "distortion_model" in keys_of(archive):
         model = str(read_array(archive, "distortion_model", path))
         distortion = tuple(_read_numbers(archive, "distortion", path).ravel().tolist())
     try:
-        return Camera.from_matrix(_read_numbers(archive, "K", path), events.width, events.height, model, distortion)  # type: ignore[arg-type]
+        return Camera.from_matrix(_read_numbers(archive, "K", path), events.width, events.height, model, distortion)
     except CalibrationError as error:
         raise CalibrationError(f"'{path}': {error}") from error
 

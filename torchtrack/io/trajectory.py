@@ -29,8 +29,9 @@ class Trajectory:
         PoseError: if shapes disagree, there is no pose, times do not increase, or a matrix is not a rigid motion.
     """
 
-    t_us: Int[Tensor, "p"]
-    T_cam_obj: Float[Tensor, "p 4 4"]
+    # Shapes and types are checked below: what a file holds must fail as a PoseError.
+    t_us: Tensor
+    T_cam_obj: Tensor
 
     def __post_init__(self) -> None:
         if self.t_us.dtype.is_floating_point:

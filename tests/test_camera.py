@@ -1,0 +1,170 @@
+"""Projection and distortion against OpenCV, and calibrations that make no sense."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from tests.helpers import generator
+from torchtrack.camera import MIN_DEPTH_M, Camera, distort, project, projection_gradient, undistort, undistortion_table
+from torchtrack.errors import CalibrationError
+
+PINHOLE = Camera(612.3, 610.9, 318.2, 241.7, 640, 480)
+LENSES = {
+    "none": PINHOLE,
+    "plumb_bob_4": Camera(400.0, 402.0, 318.0, 241.0, 640, 480, "plumb_bob", (-0.25, 0.08, 0.001, -0.0008)),
+    "plumb_bob_5": Camera(199.092, 198.829, 132.192, 110.713, 240, 180, "plumb_bob", (-0.368436, 0.150947, -0.000296, -0.000759, 0.0)),
+    "plumb_bob_5_k3": Camera(335.4, 335.4, 129.9, 99.2, 240, 180, "plumb_bob", (-0.1386, 0.0934, -0.0003, 0.0002, -0.02)),
+    "plumb_bob_8": Camera(500.0, 500.0, 320.0, 240.0, 640, 480, "plumb_bob", (0.1, -0.05, 0.0005, -0.0004, 0.01, 0.2, -0.03, 0.005)),
+    "fisheye": Camera(300.0, 301.0, 322.0, 238.0, 640, 480, "fisheye", (-0.02, 0.004, -0.002, 0.0003)),
+}
+
+
+def points_in_front(*batch: int, count: int = 20, dtype=torch.float64) -> torch.Tensor:
+    points = torch.randn((*batch, count, 3), generator=generator(), dtype=dtype) * 0.2
+    points[..., 2] = points[..., 2].abs() + 0.3
+    return points
+
+
+def pixels_of(camera: Camera) -> np.ndarray:
+    """A grid over the sensor, its corners among it."""
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 25), np.linspace(0, camera.height - 1, 19))
+    return np.stack([u.ravel(), v.ravel()], 1)
+
+
+# ---- projection
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_projection_agrees_with_opencv(batch, dtype):
+    points = points_in_front(*batch, dtype=dtype)
+    pixels = project(points, PINHOLE.intrinsics(dtype).expand(*batch, 4))
+    expected, _ = cv2.projectPoints(points.double().reshape(-1, 1, 3).numpy(), np.zeros(3), np.zeros(3), PINHOLE.matrix, None)
+    assert pixels.shape == (*batch, 20, 2)
+    np.testing.assert_allclose(pixels.double().reshape(-1, 2), expected[:, 0], atol=1e-3 if dtype == torch.float32 else 1e-10)
+
+
+def test_the_principal_point_is_where_the_axis_meets_the_sensor():
+    pixel = project(torch.tensor([[0.0, 0.0, 1.0]]), PINHOLE.intrinsics())
+    assert torch.equal(pixel, PINHOLE.intrinsics()[None, 2:])
+
+
+@pytest.mark.parametrize("depth", [0.0, -1e-9, -1.0, MIN_DEPTH_M])
+def test_points_behind_the_camera_are_finite_with_finite_gradients(depth, dtype):
+    points = torch.tensor([[0.1, -0.2, depth]], dtype=dtype, requires_grad=True)
+    pixels = project(points, PINHOLE.intrinsics(dtype))
+    pixels.sum().backward()
+    assert bool(torch.isfinite(pixels).all())
+    assert bool(torch.isfinite(points.grad).all())
+
+
+def test_projection_gradient_is_the_derivative():
+    points = points_in_front(2).requires_grad_()
+    normals = torch.nn.functional.normalize(torch.randn(2, 20, 2, generator=generator(1), dtype=torch.float64), dim=-1)
+    intrinsics = PINHOLE.intrinsics(torch.float64).expand(2, 4)
+    (project(points, intrinsics) * normals).sum().backward()
+    torch.testing.assert_close(projection_gradient(points.detach(), normals, intrinsics), points.grad)
+
+
+def test_projection_is_differentiable_in_points_and_calibration():
+    points = points_in_front(count=4).requires_grad_()
+    intrinsics = PINHOLE.intrinsics(torch.float64).requires_grad_()
+    assert gradcheck(project, (points, intrinsics), atol=1e-3)
+
+
+# ---- distortion
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_undistortion_undoes_distortion(camera):
+    sensor = pixels_of(camera)
+    ideal = undistort(sensor, camera)
+    np.testing.assert_allclose(distort(ideal, camera), sensor, atol=1e-4)
+    np.testing.assert_allclose(undistort(distort(ideal, camera), camera), ideal, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", [name for name in LENSES if name.startswith("plumb_bob")])
+def test_plumb_bob_agrees_with_opencv(name):
+    camera, points = LENSES[name], points_in_front()
+    expected, _ = cv2.projectPoints(points.numpy()[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion))
+    ideal = project(points, camera.intrinsics(torch.float64)).numpy()
+    np.testing.assert_allclose(distort(ideal, camera), expected[:, 0], atol=1e-8)
+
+
+def test_fisheye_follows_its_formula():
+    camera, points = LENSES["fisheye"], points_in_front().numpy()
+    radius = np.hypot(points[:, 0], points[:, 1])
+    theta = np.arctan2(radius, points[:, 2])
+    k1, k2, k3, k4 = camera.distortion
+    theta_d = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8)
+    expected = theta_d[:, None] * points[:, :2] / radius[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    ideal = project(torch.from_numpy(points), camera.intrinsics(torch.float64)).numpy()
+    np.testing.assert_allclose(distort(ideal, camera), expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_the_table_holds_the_ideal_pixel_of_every_sensor_pixel(camera):
+    table = undistortion_table(camera)
+    assert table.shape == (camera.height, camera.width, 2)
+    assert table.dtype == torch.float32
+    for u, v in [(0, 0), (camera.width - 1, 0), (17, 101), (camera.width - 1, camera.height - 1)]:
+        np.testing.assert_allclose(table[v, u], undistort(np.array([[u, v]]), camera)[0], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera(300.0, 300.0, 320.0, 240.0, 640, 480, "plumb_bob", (-0.5, 0.0, 0.0, 0.0)),
+        Camera(200.0, 200.0, 320.0, 240.0, 640, 480, "plumb_bob", (-1.0, 0.3, 0.0, 0.0)),
+        Camera(150.0, 150.0, 320.0, 240.0, 640, 480, "fisheye", (0.0, 0.0, 0.0, 0.0)),
+    ],
+    ids=["folds", "folds_more", "more_than_180_degrees"],
+)
+def test_a_distortion_that_cannot_be_undone_is_refused(camera):
+    with pytest.raises(CalibrationError, match=r"cannot be undone at \d+ of 307200 pixels, first at"):
+        undistortion_table(camera)
+
+
+def test_no_distortion_changes_nothing():
+    table = undistortion_table(PINHOLE)
+    assert table[100, 200].tolist() == [200.0, 100.0]
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_no_pixels_are_no_trouble(camera):
+    assert distort(np.zeros((0, 2)), camera).shape == (0, 2)
+    assert undistort(np.zeros((0, 2)), camera).shape == (0, 2)
+
+
+# ---- the camera itself
+
+
+def test_matrix_round_trip():
+    assert Camera.from_matrix(PINHOLE.matrix, 640, 480) == PINHOLE
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": float("nan")}, "finite"),
+        ({"distortion_model": "plumb_bob", "distortion": (float("inf"), 0.0, 0.0, 0.0)}, "finite"),
+        ({"fx": 0.0}, "focal lengths must be positive"),
+        ({"fy": -600.0}, "focal lengths must be positive"),
+        ({"width": 0}, "sensor size"),
+        ({"height": -1}, "sensor size"),
+        ({"distortion_model": "tangential"}, "use one of none, plumb_bob, fisheye"),
+        ({"distortion_model": "plumb_bob", "distortion": (0.1, 0.2)}, "takes 4 or 5 or 8 coefficients, got 2"),
+        ({"distortion_model": "fisheye", "distortion": (0.1,) * 5}, "takes 4 coefficients, got 5"),
+        ({"distortion": (0.1,) * 4}, "takes 0 coefficients, got 4"),
+    ],
+)
+def test_calibrations_that_make_no_sense(change, message):
+    values = {"fx": 600.0, "fy": 600.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480, **change}
+    with pytest.raises(CalibrationError, match=message):
+        Camera(**values)
+
+
+def test_a_camera_matrix_must_be_3x3():
+    with pytest.raises(CalibrationError, match="3x3"):
+        Camera.from_matrix(np.eye(4), 640, 480)

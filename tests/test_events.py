@@ -1,0 +1,228 @@
+"""Events: batches, checks, and the windows a stream is cut into."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.helpers import random_events
+from torchtrack.errors import EventDataError
+from torchtrack.events import EventBatch, EventWindow, check_events, concatenate, windows_by_count, windows_by_time
+
+
+def batch_at(times) -> EventBatch:
+    """Events at these times; x counts them, so that each can be told from the others."""
+    number = np.arange(len(times))
+    return EventBatch.from_numpy(number, number % 7, np.asarray(times, dtype=np.int64), number % 2)
+
+
+def chunks_of(events: EventBatch, cuts) -> list[EventBatch]:
+    borders = [0, *sorted(cut % (len(events) + 1) for cut in cuts), len(events)]
+    return [events[a:b] for a, b in itertools.pairwise(borders)]
+
+
+def described(windows: list[EventWindow]) -> list[tuple]:
+    return [(w.t_start_us, w.t_end_us, w.events.x.tolist()) for w in windows]
+
+
+times = st.lists(st.integers(0, 400), max_size=60).map(sorted)
+cut_places = st.lists(st.integers(0, 1000), max_size=5)
+start_times = st.one_of(st.none(), st.integers(-50, 450))
+
+
+# ---- EventBatch
+
+
+@pytest.mark.parametrize("integer", [np.uint8, np.uint16, np.int32, np.int64, np.uint64, ">i4"])
+def test_from_numpy_takes_any_integer_type(integer):
+    x = np.array([1, 2, 3], dtype=integer)
+    events = EventBatch.from_numpy(x, x, x, np.array([-1, 0, 1]), stream=4)
+    assert events.x.dtype == events.y.dtype == torch.int32
+    assert events.t_us.dtype == events.stream_index.dtype == torch.int64
+    assert events.t_us.tolist() == [1, 2, 3]
+    assert events.polarity.tolist() == [False, False, True]
+    assert events.stream_index.tolist() == [4, 4, 4]
+
+
+def test_from_numpy_takes_read_only_arrays():
+    x = np.frombuffer(np.arange(3, dtype=np.int32).tobytes(), np.int32)
+    assert EventBatch.from_numpy(x, x, x, x).x.tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("x", "t_us", "message"),
+    [
+        ([1, 2], [1], "one length"),
+        ([0.5], [1], "x must be integers"),
+        ([1], [0.25], "t must be integers"),
+        ([2**31], [1], "x must lie within"),
+        ([1], np.array([2**63], dtype=np.uint64), "t must lie within"),
+    ],
+)
+def test_from_numpy_refuses_what_does_not_fit(x, t_us, message):
+    x = np.asarray(x)
+    with pytest.raises(EventDataError, match=message):
+        EventBatch.from_numpy(x, np.zeros(len(x), dtype=int), np.asarray(t_us), np.zeros(len(x)))
+
+
+def test_empty_batch():
+    assert len(EventBatch.empty()) == 0
+    assert len(concatenate([])) == 0
+    check_events(EventBatch.empty(), 1, 1)
+
+
+def test_indexing_and_concatenation_undo_each_other():
+    events = random_events(50)
+    joined = concatenate([events[:20], events[20:20], events[20:]])
+    for name in ("x", "y", "t_us", "polarity", "stream_index"):
+        assert torch.equal(getattr(joined, name), getattr(events, name))
+    assert torch.equal(events[events.polarity].t_us, events.t_us[events.polarity])
+
+
+def test_of_stream_changes_the_stream_alone():
+    events = random_events(10)
+    moved = events.of_stream(3)
+    assert moved.stream_index.tolist() == [3] * 10
+    assert events.stream_index.tolist() == [0] * 10
+    assert torch.equal(moved.x, events.x)
+
+
+def test_to_moves_every_field(device):
+    events = random_events(10).to(device)
+    assert {getattr(events, name).device.type for name in ("x", "y", "t_us", "polarity", "stream_index")} == {device.type}
+
+
+@given(times, st.integers(-10, 410), st.integers(-10, 410))
+def test_slice_time_is_half_open(t_us, start, end):
+    inside = batch_at(t_us).slice_time(start, end)
+    assert inside.t_us.tolist() == [t for t in t_us if start < t <= end]
+
+
+# ---- check_events
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "t_us", "message"),
+    [
+        ([1, 1, 1], [1, 1, 1], [5, 7, 6], r"recording: time goes back from 7 to 6 µs at event 2\."),
+        ([1, 64, 1], [1, 1, 1], [5, 6, 7], r"event 1 is at \(64, 1\), outside the sensor of 64x48"),
+        ([1, 1, 1], [1, 1, 48], [5, 6, 7], r"event 2 is at \(1, 48\)"),
+        ([-1, 1, 1], [1, -1, 1], [5, 6, 7], r"event 0 is at \(-1, 1\).*\(2 such events\)"),
+    ],
+)
+def test_check_events_names_the_event(x, y, t_us, message):
+    events = EventBatch.from_numpy(np.array(x), np.array(y), np.array(t_us), np.zeros(3))
+    with pytest.raises(EventDataError, match=message):
+        check_events(events, 64, 48, "recording")
+
+
+def test_check_events_compares_with_the_event_before_and_counts_on():
+    events = batch_at([10, 11])
+    check_events(events, 64, 48, last_t_us=10)
+    with pytest.raises(EventDataError, match="from 12 to 10 µs at event 100"):
+        check_events(events, 64, 48, last_t_us=12, first_index=100)
+
+
+def test_events_at_one_time_are_sorted():
+    check_events(batch_at([3, 3, 3]), 64, 48)
+
+
+# ---- windows by time
+
+
+@given(times, cut_places, st.integers(1, 90), start_times)
+def test_windows_by_time_hold_every_event_once(t_us, cuts, duration, start):
+    events = batch_at(t_us)
+    windows = list(windows_by_time(chunks_of(events, cuts), duration, start))
+    first_start = start if start is not None else (t_us[0] - 1 if t_us else 0)
+    held = [x for window in windows for x in window.events.x.tolist()]
+    assert held == [i for i, t in enumerate(t_us) if t > first_start]
+    for index, window in enumerate(windows):
+        assert window.t_start_us == first_start + index * duration
+        assert window.t_end_us == window.t_start_us + duration
+        assert all(window.t_start_us < t <= window.t_end_us for t in window.events.t_us.tolist())
+    if windows:
+        assert len(windows[-1].events) > 0
+
+
+@given(times, cut_places, st.integers(1, 90), start_times)
+def test_windows_by_time_do_not_depend_on_how_the_stream_is_cut(t_us, cuts, duration, start):
+    events = batch_at(t_us)
+    assert described(list(windows_by_time(chunks_of(events, cuts), duration, start))) == described(list(windows_by_time([events], duration, start)))
+
+
+def test_windows_without_events_are_yielded():
+    windows = list(windows_by_time([batch_at([1, 2, 41])], 10, 0))
+    assert [(w.t_end_us, len(w.events)) for w in windows] == [(10, 2), (20, 0), (30, 0), (40, 0), (50, 1)]
+
+
+def test_an_event_at_the_border_belongs_to_the_window_that_ends_there():
+    windows = list(windows_by_time([batch_at([10, 11])], 10, 0))
+    assert [w.events.t_us.tolist() for w in windows] == [[10], [11]]
+
+
+def test_windows_are_made_as_the_stream_comes():
+    """A window is there as soon as an event after its end is, and nothing is read ahead."""
+    read = []
+
+    def stream():
+        for t_us in range(5, 1000, 10):
+            read.append(t_us)
+            yield batch_at([t_us])
+
+    windows = windows_by_time(stream(), 20, 0)
+    assert next(windows).t_end_us == 20
+    assert read == [5, 15, 25]
+    assert next(windows).t_end_us == 40
+    assert read == [5, 15, 25, 35, 45]
+
+
+# ---- windows by count
+
+
+def expected_count_windows(t_us: list[int], count: int, max_age_us: int | None, start: int) -> list[tuple[int, int, list[int]]]:
+    """The definition, event by event."""
+    numbered = [(t, i) for i, t in enumerate(t_us) if t > start]
+    windows = []
+    while numbered:
+        by_count = numbered[count - 1][0] if len(numbered) >= count else numbered[-1][0]
+        end = by_count if max_age_us is None else min(by_count, start + max_age_us)
+        windows.append((start, end, [i for t, i in numbered if t <= end]))
+        numbered = [(t, i) for t, i in numbered if t > end]
+        start = end
+    return windows
+
+
+@settings(max_examples=200)
+@given(times, cut_places, st.integers(1, 20), st.one_of(st.none(), st.integers(1, 60)), start_times)
+def test_windows_by_count_follow_their_definition(t_us, cuts, count, max_age_us, start):
+    events = batch_at(t_us)
+    windows = list(windows_by_count(chunks_of(events, cuts), count, max_age_us, start))
+    first_start = start if start is not None else (t_us[0] - 1 if t_us else 0)
+    assert described(windows) == expected_count_windows(t_us, count, max_age_us, first_start)
+
+
+def test_events_of_one_time_stay_together():
+    windows = list(windows_by_count([batch_at([1, 2, 2, 2, 3])], 2))
+    assert [w.events.t_us.tolist() for w in windows] == [[1, 2, 2, 2], [3]]
+
+
+def test_maximum_age_closes_windows_early():
+    windows = list(windows_by_count([batch_at([1, 2, 50, 51, 52])], 3, max_age_us=20, t_start_us=0))
+    assert [(w.t_end_us, w.events.t_us.tolist()) for w in windows] == [(20, [1, 2]), (40, []), (52, [50, 51, 52])]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: windows_by_time([], 0),
+        lambda: windows_by_count([], 0),
+        lambda: windows_by_count([], 5, max_age_us=0),
+    ],
+)
+def test_windows_of_no_extent_are_refused(make):
+    with pytest.raises(EventDataError, match="window"):
+        list(make())
