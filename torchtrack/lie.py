@@ -28,6 +28,11 @@ def hat(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
+def vee(skew: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """The vector of a skew-symmetric matrix: the inverse of :func:`hat`."""
+    return torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
+
+
 def _exp_coefficients(angle_sq: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """``sin θ / θ``, ``(1 - cos θ) / θ²`` and ``(θ - sin θ) / θ³``."""
     small = angle_sq < _SMALL_ANGLE_SQ

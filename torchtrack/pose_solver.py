@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchtrack.camera import project, projection_gradient
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.lie import difference_about, retract_about, transform_points
+from torchtrack.lie import retract_about, transform_points, vee
 
 # Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
 _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
@@ -82,6 +82,13 @@ def pose_jacobian(
     return torch.cat([torch.linalg.cross(points_cam - centre_cam[:, None], gradient, dim=-1), gradient], -1)
 
 
+def _offset_from_prior(problem: PoseProblem, T_cam_obj: Tensor, centre_cam: Tensor) -> Tensor:
+    """Rotation ``sin θ · axis`` and move of the centre from the prior's pose: cheap, smooth, and exact to second order."""
+    relative = T_cam_obj[:, :3, :3] @ problem.T_prior[:, :3, :3].transpose(1, 2)
+    turned = 0.5 * vee(relative - relative.transpose(1, 2))
+    return torch.cat([turned, centre_cam - transform_points(problem.T_prior, problem.centre_obj[:, None])[:, 0]], -1)
+
+
 def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
     """Cost, gradient and Gauss-Newton Hessian of ``problem`` at a pose."""
     points_cam = transform_points(T_cam_obj, problem.points_obj)
@@ -91,7 +98,7 @@ def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str
     value, robust = robust_loss(residuals, problem.scale_px, loss)
     weights = robust * problem.weights
     weighted = jacobian * weights[..., None]
-    from_prior = difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
+    from_prior = _offset_from_prior(problem, T_cam_obj, centre_cam)
     pull = (problem.prior_information @ from_prior[..., None]).squeeze(-1)
     gradient = (weighted.transpose(1, 2) @ residuals[..., None]).squeeze(-1) + pull
     hessian = weighted.transpose(1, 2) @ jacobian + problem.prior_information
