@@ -29,9 +29,10 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor
 
+from torchtrack.config.settings import Settings
 from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch
 
@@ -43,10 +44,8 @@ _BRIGHT_NOISE_SHARE = 0.25
 NEVER_US = -(2**62)
 
 
-class EventCameraConfig(BaseModel):
+class EventCameraConfig(Settings):
     """Physical parameters of an event camera; the defaults are those of a good sensor in good light."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     threshold_on: float = Field(0.2, gt=0, le=2, description="Mean ON contrast threshold, log units (0.2: 22 % brighter).")
     threshold_off: float = Field(0.2, gt=0, le=2, description="Mean OFF contrast threshold, log units.")
@@ -177,9 +176,7 @@ class EventCamera:
         last_event_us = _latest(last_event_us, noise, state.frame_us)
         reference = state.reference.clone()
         reference.view(-1)[pixels.index] = pixels.reference
-        after = EventCameraState(
-            log_level, reference, last_event_us, state.in_reset, state.start_us, t_us, generator.get_state()
-        )
+        after = EventCameraState(log_level, reference, last_event_us, state.in_reset, state.start_us, t_us, generator.get_state())
         self._memorise(after, state, noise.index)
         touched = torch.cat([pixels.index, noise.index]).unique()
         in_reset = touched[last_event_us.view(-1)[touched] + self.config.refractory_us > t_us]

@@ -3,7 +3,7 @@
 ``make_mesh(name)`` gives one of :data:`SHAPES`. Textured ones carry an atlas image with UVs (trimesh ``TextureVisuals``).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,14 +108,14 @@ def l_bracket(width_m: float = 0.14, height_m: float = 0.10, depth_m: float = 0.
     outline = outline - [width_m / 2, height_m / 2]
     count = len(outline)
     back = np.column_stack([outline, np.full(count, -depth_m / 2)])
-    vertices = np.concatenate([back, back + [0, 0, depth_m]])
+    vertices = np.concatenate([back, back + np.array([0, 0, depth_m])])
     cap = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
     side, after = np.arange(count), np.roll(np.arange(count), -1)
     walls = np.concatenate([np.column_stack([side, after, after + count]), np.column_stack([side, after + count, side + count])])
     return trimesh.Trimesh(vertices, np.concatenate([cap[:, ::-1], cap + count, walls]), process=False)
 
 
-SHAPES = {"cube": cube, "lbracket": l_bracket, "satellite": satellite, "book": book}
+SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {"cube": cube, "lbracket": l_bracket, "satellite": satellite, "book": book}
 
 
 def make_mesh(name: str, scale: float = 1.0) -> trimesh.Trimesh:
@@ -126,4 +126,6 @@ def make_mesh(name: str, scale: float = 1.0) -> trimesh.Trimesh:
     """
     if name not in SHAPES:
         raise ConfigError(f"unknown shape '{name}': use one of {', '.join(SHAPES)}.")
-    return SHAPES[name]().apply_scale(scale)
+    mesh = SHAPES[name]()
+    mesh.apply_scale(scale)
+    return mesh

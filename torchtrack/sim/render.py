@@ -22,10 +22,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor
 
 from torchtrack.camera import Camera
+from torchtrack.config.settings import Settings
 from torchtrack.errors import CalibrationError, MissingExtraError, ModelError
 from torchtrack.sim.surface import RenderObject, Scene, merge_objects
 
@@ -33,10 +34,8 @@ from torchtrack.sim.surface import RenderObject, Scene, merge_objects
 _BLUR_REACH = 4.0
 
 
-class RenderConfig(BaseModel):
+class RenderConfig(Settings):
     """How a scene is lit and sampled."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     supersampling: int = Field(4, ge=1, le=8, description="Samples per pixel along each axis.")
     lens_blur_px: float = Field(0.5, ge=0, le=5, description="Standard deviation of the lens blur, pixels.")

@@ -83,9 +83,10 @@ class RenderObject:
 
 def _texture_image(mesh: trimesh.Trimesh) -> ndarray | None:
     """The texture ``[h, w, 3]`` of a mesh, or None."""
-    if not isinstance(mesh.visual, trimesh.visual.TextureVisuals) or mesh.visual.uv is None:
+    visual = mesh.visual
+    if not isinstance(visual, trimesh.visual.TextureVisuals) or visual.uv is None:
         return None
-    material = mesh.visual.material
+    material = visual.material
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     return None if image is None else np.asarray(image.convert("RGB"))
 

@@ -9,8 +9,8 @@ from numpy import ndarray
 
 Image = UInt8[ndarray, "h w"]
 
-# Reflectances of print: paper about 75 %, ink about 4 %.
-PAPER, GREY, INK = 225, 140, 55
+# Reflectances of print: paper about 75 %, ink about 7 %.
+PAPER, GREY, INK = 225, 150, 75
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -37,7 +37,7 @@ def target(size: int) -> Image:
 def stripes(size: int) -> Image:
     """Diagonal stripes of growing width."""
     row, col = np.mgrid[:size, :size]
-    phase = ((row + col) / (2 * size)) ** 1.4 * 7
+    phase = ((row + col) / (2 * size)) ** 1.3 * 5
     return np.where(phase % 1 < 0.5, INK, PAPER).astype(np.uint8)
 
 

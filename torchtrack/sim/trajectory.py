@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor
 
 from torchtrack import lie
+from torchtrack.config.settings import Settings
 from torchtrack.io.trajectory import Trajectory
 
 Vector = tuple[float, float, float]
@@ -29,10 +30,8 @@ _FREQUENCY_RANGES = ((0.7, 1.0), (1.2, 1.7))
 GROUND_TRUTH_RATE_HZ = 1000
 
 
-class MotionConfig(BaseModel):
+class MotionConfig(Settings):
     """How one object moves about its mean pose."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     position_m: Vector = Field((0.0, 0.0, 0.7), description="Mean position of the object's origin in the camera frame, m.")
     rotation_deg: Vector = Field((0.0, 0.0, 0.0), description="Mean orientation as a rotation vector, degrees.")
@@ -65,9 +64,7 @@ class SinusoidMotion:
         multiple = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
         phase = 2 * math.pi * torch.rand(shape, generator=generator, dtype=torch.float64)
         amplitude = [*map(math.radians, config.rotation_amplitude_deg), *config.translation_amplitude_m]
-        return cls(
-            _mean_pose(config), torch.tensor(amplitude, dtype=torch.float64), speed * config.frequency_hz * multiple, phase
-        )
+        return cls(_mean_pose(config), torch.tensor(amplitude, dtype=torch.float64), speed * config.frequency_hz * multiple, phase)
 
     def pose(self, t_s: Float[Tensor, "q"]) -> Float[Tensor, "q 4 4"]:
         """Poses ``T_cam_obj`` at times in seconds."""
