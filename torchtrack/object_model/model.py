@@ -114,7 +114,7 @@ class ObjectModel:
     @classmethod
     def from_polylines(
         cls,
-        source: str | Path | Sequence[Sequence[Sequence[float]]] | np.ndarray,
+        source: str | Path | Sequence[Sequence[Sequence[float | int]]] | Sequence[np.ndarray] | np.ndarray,
         *,
         name: str | None = None,
         unit: Unit = "m",

@@ -8,8 +8,9 @@ Two formats, both plain text:
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ def read_polylines(path: str | Path) -> tuple[Polylines, str | None]:
         if path.suffix.lower() == ".obj":
             return _obj_lines(path.read_text(encoding="latin-1")), None
         content = json.loads(path.read_text(encoding="utf-8"))
-        return as_polylines(content["polylines"]), str(content["unit"]) if "unit" in content else None
+        return as_polylines(list(content["polylines"])), str(content["unit"]) if "unit" in content else None
     except ModelError as error:
         raise ModelError(f"'{path}': {error}") from error
     except (ValueError, KeyError, IndexError, TypeError) as error:
@@ -66,8 +67,8 @@ def _obj_lines(text: str) -> Polylines:
     return as_polylines(lines)
 
 
-def as_polylines(lines: Sequence[Sequence[Sequence[float]]] | np.ndarray) -> Polylines:
-    """Lists of points as arrays ``[n, 3]``.
+def as_polylines(lines: Iterable[Any]) -> Polylines:
+    """Lists of points, from anywhere, as arrays ``[n, 3]``.
 
     Raises:
         ModelError: if a line is not made of two or more points of three numbers.
