@@ -1,0 +1,136 @@
+import json
+import subprocess
+import sys
+
+import pytest
+from tiny_sequence import write_tiny_sequence
+
+import torchtrack
+from torchtrack.cli import main, split_overrides
+from torchtrack.errors import ConfigError
+
+
+@pytest.fixture(scope="module")
+def sequence_path(tmp_path_factory):
+    return write_tiny_sequence(tmp_path_factory.mktemp("sequence"), duration_us=20_000)
+
+
+@pytest.fixture
+def config_path(sequence_path, tmp_path):
+    path = tmp_path / "track.yaml"
+    path.write_text(f"source: {sequence_path}\noutput: results\noverlay: {{enabled: false}}\n")
+    return path
+
+
+def command(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+def test_track_writes_into_the_folder_of_the_config(config_path, capsys):
+    assert command("track", config_path, "--quiet") == 0
+    assert (config_path.parent / "results" / "summary.json").is_file()
+    output = capsys.readouterr().out
+    assert "box" in output and "TRACKING" in output and str(config_path.parent / "results") in output
+
+
+def test_options_and_dotted_settings_override_the_file(config_path, tmp_path, capsys):
+    arguments = ("--tracker.window.duration-us", 10_000, "--tracker.flow.iterations=7", "-o", tmp_path / "other", "--preset", "paper", "--quiet")
+    assert command("track", config_path, *arguments) == 0
+    stored = (tmp_path / "other" / "config.yaml").read_text()
+    assert "preset: paper" in stored and "duration_us: 10000" in stored and "iterations: 7" in stored
+    assert json.loads((tmp_path / "other" / "summary.json").read_text())["windows"] == 2
+
+
+def test_a_sequence_can_be_tracked_without_a_config(sequence_path, tmp_path, capsys):
+    assert command("track", sequence_path, "-o", tmp_path / "out", "--overlay.enabled", "false", "--end-us", 11_000) == 0
+    captured = capsys.readouterr()
+    assert "trajectory_box.tum" in {path.name for path in (tmp_path / "out").iterdir()}
+    assert "Traceback" not in captured.err
+
+
+def test_evaluate_writes_metrics_and_shows_them(sequence_path, tmp_path, capsys):
+    arguments = ("--methods", "default,paper", "--jobs", 1, "--quiet", "--tracker.window.duration-us", 10_000)
+    assert command("evaluate", sequence_path, "-o", tmp_path / "out", *arguments) == 0
+    entries = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert [(entry["method"], entry["windows"]) for entry in entries] == [("default", 1), ("paper", 1)]
+    output = capsys.readouterr().out
+    assert "tiny" in output and "paper" in output
+
+
+def test_evaluate_takes_methods_of_a_config_by_label(sequence_path, tmp_path, capsys):
+    path = tmp_path / "evaluate.yaml"
+    path.write_text(f"paths: [{sequence_path}]\njobs: 1\nmethods: {{short: {{tracker: {{window: {{duration_us: 2000}}}}}}, long: {{}}}}\n")
+    assert command("evaluate", "--config", path, "--methods", "short,default", "-o", tmp_path / "out", "--quiet") == 0
+    entries = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert [(entry["method"], entry["windows"]) for entry in entries] == [("short", 9), ("default", 3)]
+
+
+def test_evaluate_fails_when_a_sequence_does(sequence_path, tmp_path, capsys):
+    (tmp_path / "bad.npz").write_bytes(b"no archive")
+    assert command("evaluate", tmp_path / "bad.npz", sequence_path, "-o", tmp_path / "out", "--jobs", 1, "--quiet") == 1
+    captured = capsys.readouterr()
+    assert "failed: bad (default)" in captured.err
+    assert "tiny" in captured.out
+
+
+def test_wrong_settings_end_with_2_and_one_message(config_path, capsys):
+    assert command("track", config_path, "--tracker.window.duration-su", 5, "--tracker.flow.iterations", "many") == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert str(config_path) in captured.err and "2 settings are wrong" in captured.err
+    assert "tracker.window.duration_su (command line): unknown setting; perhaps you meant 'tracker.window.duration_us'" in captured.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "expected"),
+    [
+        (("track", "nowhere.yaml"), 1, "no config file at nowhere.yaml"),
+        (("track", "nowhere.npz"), 1, "nowhere.npz"),
+        (("evaluate",), 2, "nothing to evaluate"),
+        (("evaluate", "nowhere"), 1, "nowhere"),
+        (("evaluate", "nowhere", "--methods", "papre"), 2, "methods.papre.preset"),
+        (("track", "a.npz", "--tracker.window.mode"), 2, "needs a value"),
+    ],
+)
+def test_errors_are_told_without_a_traceback(arguments, code, expected, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert command(*arguments) == code
+    error = capsys.readouterr().err
+    assert expected in error
+    assert "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("arguments", "expected"), [(["--help"], "evaluate"), (["track", "--help"], "--tracker.window.duration-us")])
+def test_help(arguments, expected, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 0
+    assert expected in capsys.readouterr().out
+
+
+def test_settings_are_listed(capsys):
+    assert command("settings", "track") == 0
+    output = capsys.readouterr().out
+    assert "tracker.window.duration_us" in output and "objects[].initial_pose.matrix" in output
+
+
+def test_dotted_settings_are_told_from_options():
+    options, overrides = split_overrides(["track", "a.yaml", "--a.b-c", "-0.5", "-o", "out", "--d.e=[1, 2]", "--quiet", "x.npz"])
+    assert options == ["track", "a.yaml", "-o", "out", "--quiet", "x.npz"]
+    assert overrides == {"a.b_c": -0.5, "d.e": [1, 2]}
+    with pytest.raises(ConfigError, match="--a.b needs a value"):
+        split_overrides(["--a.b", "--quiet"])
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    code = "import sys, torchtrack; assert 'torch' not in sys.modules; print(sorted(torchtrack.__all__))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "Tracker" in result.stdout
+
+
+def test_public_names_are_all_there():
+    assert [name for name in torchtrack.__all__ if getattr(torchtrack, name, None) is None] == []
+    assert set(torchtrack.__all__) <= set(dir(torchtrack))
+    with pytest.raises(AttributeError, match="no attribute 'Trakcer'"):
+        _ = torchtrack.Trakcer

@@ -1,0 +1,129 @@
+import csv
+import json
+import math
+
+import pytest
+import torch
+from helpers import random_pose
+from tiny_sequence import write_tiny_sequence
+
+from torchtrack.config.evaluate import EvaluateConfig
+from torchtrack.errors import ConfigError, MissingFileError
+from torchtrack.eval.evaluate import evaluate, find_sequences
+from torchtrack.eval.metrics import PoseErrors, pose_errors, summarise
+from torchtrack.eval.tables import results_table
+from torchtrack.io import Trajectory
+from torchtrack.lie import se3_interpolate, so3_exp
+
+KEYS = (
+    *("sequence", "object", "method", "windows", "mean_rotation_deg", "mean_translation_cm", "median_rotation_deg"),
+    *("median_translation_cm", "max_rotation_deg", "max_translation_cm", "lost_fraction"),
+)
+
+
+def turned(T, degrees):
+    """The pose with its rotation changed by an angle, and its position by 3 cm and 4 cm."""
+    result = T.clone()
+    result[..., :3, :3] = T[..., :3, :3] @ so3_exp(torch.deg2rad(torch.tensor([0.0, degrees, 0.0], dtype=torch.float64)))
+    result[..., :3, 3] += torch.tensor([0.03, 0.0, 0.04])
+    return result
+
+
+def test_errors_of_known_poses():
+    t_us = torch.arange(5) * 1000
+    T = random_pose(5)
+    errors = pose_errors(t_us, turned(T, 2.5), Trajectory(t_us, T))
+    assert torch.allclose(errors.rotation_deg, torch.full((5,), 2.5, dtype=torch.float64))
+    assert torch.allclose(errors.translation_cm, torch.full((5,), 5.0, dtype=torch.float64))
+
+
+def test_truth_is_interpolated_at_the_time_of_the_pose():
+    start, end = random_pose(2)
+    truth = Trajectory(torch.tensor([0, 1000]), torch.stack([start, end]))
+    between = se3_interpolate(start, end, torch.tensor(0.3, dtype=torch.float64))
+    errors = pose_errors(torch.tensor([300]), between[None], truth)
+    assert errors.rotation_deg.item() == pytest.approx(0, abs=1e-6)
+    assert errors.translation_cm.item() == pytest.approx(0, abs=1e-6)
+
+
+def test_times_without_truth_are_left_out():
+    truth = Trajectory(torch.tensor([1000, 2000]), random_pose(2))
+    errors = pose_errors(torch.tensor([999, 1000, 2000, 2001]), random_pose(4), truth)
+    assert errors.t_us.tolist() == [1000, 2000]
+
+
+def errors_of(rotation, translation):
+    return PoseErrors(torch.arange(len(rotation)), torch.tensor(rotation, dtype=torch.float64), torch.tensor(translation, dtype=torch.float64))
+
+
+def test_summary_of_errors():
+    metrics = summarise(errors_of([1.0, 2.0, 12.0, 3.0], [1.0, 9.0, 8.0, 2.0]))
+    assert (metrics.windows, metrics.mean_rotation_deg, metrics.median_rotation_deg, metrics.max_rotation_deg) == (4, 4.5, 2.5, 12.0)
+    assert (metrics.mean_translation_cm, metrics.median_translation_cm, metrics.max_translation_cm) == (5.0, 5.0, 9.0)
+    # One window is off in translation alone, one in both.
+    assert metrics.lost_fraction == 0.5
+    assert summarise(errors_of([1.0, 2.0, 12.0, 3.0], [1.0, 9.0, 8.0, 2.0]), 20.0, 8.5).lost_fraction == 0.25
+
+
+def test_a_pose_that_is_not_finite_is_lost():
+    assert summarise(errors_of([1.0, float("nan")], [1.0, float("nan")])).lost_fraction == 0.5
+
+
+def test_summary_of_nothing():
+    metrics = summarise(errors_of([], []))
+    assert metrics.windows == 0
+    assert math.isnan(metrics.mean_rotation_deg)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a sequence of one object and one of two."""
+    folder = tmp_path_factory.mktemp("sequences")
+    write_tiny_sequence(folder, "one", duration_us=30_000)
+    write_tiny_sequence(folder, "two", labels=("left", "right"), duration_us=20_000)
+    return folder
+
+
+def test_evaluate_measures_every_sequence_object_and_method(folder, tmp_path):
+    methods = {"default": {}, "short": {"tracker": {"window": {"duration_us": 2500}}}}
+    done = []
+    evaluation = evaluate(EvaluateConfig(paths=(folder,), methods=methods, jobs=1, output=tmp_path / "out"), done.append)
+    entries = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert [(entry["sequence"], entry["object"], entry["method"]) for entry in entries] == [
+        *[("one", "box", "default"), ("one", "box", "short")],
+        *[("two", "left", "default"), ("two", "right", "default"), ("two", "left", "short"), ("two", "right", "short")],
+    ]
+    assert all(set(KEYS) <= set(entry) for entry in entries)
+    # Truth starts at 0, the first event comes at 500 µs, and so does the first window.
+    assert [entry["windows"] for entry in entries] == [5, 11, 3, 3, 7, 7]
+    assert all(entry["lost_fraction"] == 0 and entry["max_rotation_deg"] < 2 for entry in entries)
+    rows = list(csv.DictReader((tmp_path / "out" / "errors.csv").read_text().splitlines()))
+    assert len(rows) == sum(entry["windows"] for entry in entries)
+    assert len(done) == 4
+    assert results_table(evaluation.results).row_count == 6
+
+
+def test_a_sequence_that_fails_is_reported_and_the_rest_completes(folder, tmp_path):
+    (tmp_path / "bad.npz").write_bytes(b"no archive")
+    config = EvaluateConfig(paths=(tmp_path / "bad.npz", folder / "two.npz"), jobs=1, output=tmp_path / "out")
+    evaluation = evaluate(config)
+    assert [(failure.sequence, failure.method) for failure in evaluation.failures] == [("bad", "default")]
+    assert "bad.npz" in evaluation.failures[0].reason
+    assert [result.object for result in evaluation.results] == ["left", "right"]
+    assert len(json.loads((tmp_path / "out" / "metrics.json").read_text())) == 2
+
+
+def test_processes_give_the_same_as_one(folder, tmp_path):
+    alone = evaluate(EvaluateConfig(paths=(folder,), jobs=1, output=tmp_path / "alone"))
+    shared = evaluate(EvaluateConfig(paths=(folder,), jobs=2, output=tmp_path / "shared"))
+    assert [result.metrics for result in alone.results] == [result.metrics for result in shared.results]
+
+
+def test_finding_sequences(folder, tmp_path):
+    assert [path.name for path in find_sequences([folder, folder / "one.npz"])] == ["one.npz", "two.npz"]
+    with pytest.raises(ConfigError, match="nothing to evaluate"):
+        find_sequences([])
+    with pytest.raises(MissingFileError, match="nowhere"):
+        find_sequences([tmp_path / "nowhere"])
+    with pytest.raises(MissingFileError, match="holds no sequence"):
+        find_sequences([tmp_path])

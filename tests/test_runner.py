@@ -1,0 +1,250 @@
+import csv
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+from tiny_sequence import CAMERA, write_tiny_sequence
+
+import torchtrack
+from torchtrack.config.load import load
+from torchtrack.config.run import RunConfig
+from torchtrack.config.tracker import WindowConfig
+from torchtrack.errors import CalibrationError, ConfigError, EventDataError, MissingFileError, PoseError
+from torchtrack.events import EventBatch
+from torchtrack.io import read_sequence, read_tum
+from torchtrack.lie import rotation_angle_deg
+from torchtrack.runner import build_tracker, run
+from torchtrack.session import open_session
+from torchtrack.stepping import clipped, track
+
+
+@pytest.fixture(scope="module")
+def sequence_path(tmp_path_factory):
+    return write_tiny_sequence(tmp_path_factory.mktemp("sequence"), duration_us=40_000)
+
+
+def quick(sequence_path, output, **settings):
+    """A run without an overlay."""
+    return RunConfig(**{"source": sequence_path, "output": output, "overlay": {"enabled": False}, **settings})
+
+
+def events_of(t_us):
+    zeros = np.zeros(len(t_us), np.int64)
+    return EventBatch.from_numpy(zeros, zeros, np.array(t_us), zeros)
+
+
+def test_outputs_are_complete(sequence_path, tmp_path):
+    summary = run(quick(sequence_path, tmp_path / "out"))
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.yaml", "poses.csv", "summary.json", "trajectory_box.tum"]
+    rows = list(csv.DictReader((tmp_path / "out" / "poses.csv").read_text().splitlines()))
+    trajectory = read_tum(tmp_path / "out" / "trajectory_box.tum")
+    assert len(rows) == len(trajectory) == summary.windows == 8
+    assert [int(row["t_us"]) for row in rows] == trajectory.t_us.tolist() == [499 + 5000 * n for n in range(1, 9)]
+    stored = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert stored["events"] == len(np.load(sequence_path)["t"]) == summary.events
+    assert stored["versions"]["torchtrack"] == torchtrack.__version__
+    assert sum(stored["objects"]["box"]["status"].values()) == 8
+    assert {"step_median_ms", "step_p95_ms", "real_time_factor", "event_rate_per_s", "device"} <= set(stored)
+    # The last window ends after the last true pose, so it has no error.
+    assert stored["objects"]["box"]["errors"]["windows"] == 7
+    assert rows[-1]["rotation_error_deg"] == ""
+    assert float(rows[0]["rotation_error_deg"]) < 1
+
+
+def test_the_resolved_config_repeats_the_run(sequence_path, tmp_path):
+    config = quick(sequence_path, tmp_path / "first", tracker={"window": {"duration_us": 8000}})
+    run(config)
+    again = load(RunConfig, tmp_path / "first" / "config.yaml")
+    assert again == config
+    run(again.model_copy(update={"output": tmp_path / "second"}))
+    assert (tmp_path / "first" / "trajectory_box.tum").read_bytes() == (tmp_path / "second" / "trajectory_box.tum").read_bytes()
+
+
+def test_angular_velocity_is_recovered(sequence_path, tmp_path):
+    velocity = run(quick(sequence_path, tmp_path / "out")).objects["box"].angular_velocity_rad_s
+    assert velocity == pytest.approx((0.3, -0.2, 0.5), abs=0.4)
+
+
+def test_start_and_end_bound_the_run(sequence_path, tmp_path):
+    summary = run(quick(sequence_path, tmp_path / "out", start_us=10_000, end_us=25_000))
+    t_us = np.load(sequence_path)["t"]
+    assert summary.events == ((t_us > 10_000) & (t_us <= 25_000)).sum()
+    assert summary.windows == 3
+    assert summary.objects["box"].errors.max_rotation_deg < 1
+
+
+def test_nothing_is_written_on_an_error_and_an_earlier_run_stays(sequence_path, tmp_path):
+    run(quick(sequence_path, tmp_path / "out"))
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+
+    class Broken:
+        def add(self, step):
+            raise EventDataError("the disk of the test is full")
+
+        def close(self):
+            pass
+
+    with pytest.raises(EventDataError, match="full"):
+        run(quick(sequence_path, tmp_path / "out"), [Broken()])
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_new_run_replaces_all_files_of_an_earlier_one(sequence_path, tmp_path):
+    run(quick(sequence_path, tmp_path / "out"))
+    (tmp_path / "out" / "trajectory_gone.tum").write_text("old")
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    run(quick(sequence_path, tmp_path / "out"))
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert "trajectory_gone.tum" not in names
+    assert "notes.txt" in names
+
+
+def test_interrupt_ends_the_run_with_complete_outputs(sequence_path, tmp_path):
+    class InterruptAtThird:
+        count = 0
+
+        def add(self, step):
+            self.count += 1
+            if self.count == 3:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        def close(self):
+            pass
+
+    handler = signal.getsignal(signal.SIGINT)
+    summary = run(quick(sequence_path, tmp_path / "out"), [InterruptAtThird()])
+    assert summary.interrupted
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert len(read_tum(tmp_path / "out" / "trajectory_box.tum")) == summary.windows == 3
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["interrupted"] is True
+
+
+def test_threads_are_as_before_after_a_run(sequence_path, tmp_path):
+    before = torch.get_num_threads()
+    summary = run(quick(sequence_path, tmp_path / "out", threads=2, end_us=6000))
+    assert summary.threads == 2
+    assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("mode", ["time", "count"])
+def test_track_yields_one_result_per_window(sequence_path, mode):
+    config = RunConfig(source=sequence_path)
+    session = open_session(config)
+    tracker = build_tracker(session, config)
+    state = tracker.init(session.T_cam_obj, session.start_us)
+    results = list(track(session.events, tracker, state, WindowConfig(mode=mode, duration_us=10_000, count=400)))
+    assert len(results) == (4 if mode == "time" else -(-len(np.load(sequence_path)["t"]) // 400))
+    truth = session.ground_truth[0].at(results[-2].t_us)
+    assert rotation_angle_deg(results[-2].T_cam_obj[:, :3, :3], truth[:, :3, :3]).item() < 1
+
+
+def test_track_says_when_there_is_nothing_to_track(sequence_path):
+    config = RunConfig(source=sequence_path)
+    session = open_session(config)
+    tracker = build_tracker(session, config)
+    state = tracker.init(session.T_cam_obj, 10**9)
+    with pytest.raises(EventDataError, match="no events after 1000000000"):
+        next(track(session.events, tracker, state))
+
+
+def test_clipping_reads_no_further_than_needed():
+    def chunks():
+        yield events_of([1, 2, 3])
+        yield events_of([])
+        yield events_of([4, 5, 6])
+        raise RuntimeError("read too far")
+
+    assert [chunk.t_us.tolist() for chunk in clipped(chunks(), 2, 5)] == [[3], [4, 5]]
+
+
+def pose_settings(sequence_path):
+    T = read_sequence(sequence_path).objects[0].ground_truth.T_cam_obj[0]
+    return {"matrix": T.tolist()}
+
+
+def text_source(sequence_path, folder):
+    """The sequence's events as text, which brings neither camera nor objects."""
+    arrays = np.load(sequence_path)
+    lines = [f"{1e-6 * t:.6f} {x} {y} {p}" for t, x, y, p in zip(arrays["t"], arrays["x"], arrays["y"], arrays["p"], strict=True)]
+    path = folder / "events.txt"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def camera_settings():
+    return {name: getattr(CAMERA, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+
+
+def test_plain_events_with_camera_mesh_and_pose_give_the_same_poses(sequence_path, tmp_path):
+    run(quick(sequence_path, tmp_path / "sequence", start_us=500))
+    obj = {"label": "box", "mesh": sequence_path.with_name("tiny_box.ply"), "initial_pose": pose_settings(sequence_path)}
+    source = text_source(sequence_path, tmp_path)
+    summary = run(quick(source, tmp_path / "text", start_us=0, camera=camera_settings(), objects=[obj]))
+    assert summary.objects["box"].errors is None
+    assert summary.objects["box"].status == {"TRACKING": summary.windows}
+
+
+def test_plain_events_need_camera_objects_and_pose(sequence_path, tmp_path):
+    source, mesh = text_source(sequence_path, tmp_path), sequence_path.with_name("tiny_box.ply")
+    with pytest.raises(ConfigError, match="camera: .*holds events alone"):
+        open_session(RunConfig(source=source))
+    with pytest.raises(ConfigError, match="brings no objects"):
+        open_session(RunConfig(source=source, camera=camera_settings()))
+    with pytest.raises(ConfigError, match="'box' has no model"):
+        open_session(RunConfig(source=source, camera=camera_settings(), objects=[{"label": "box"}]))
+    with pytest.raises(ConfigError, match="'box' needs an initial_pose"):
+        open_session(RunConfig(source=source, camera=camera_settings(), objects=[{"label": "box", "mesh": mesh}]))
+
+
+def test_an_object_that_the_sequence_does_not_know(sequence_path):
+    with pytest.raises(ConfigError, match="'cup' has no model.*its objects are box"):
+        open_session(RunConfig(source=sequence_path, objects=[{"label": "cup"}]))
+
+
+@pytest.mark.parametrize(
+    ("pose", "expected"),
+    [
+        ({"matrix": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]}, "not a rotation"),
+        ({"translation_m": [0, 0, -0.5]}, "behind the camera"),
+    ],
+)
+def test_poses_that_cannot_be(sequence_path, tmp_path, pose, expected):
+    with pytest.raises(PoseError, match=expected):
+        run(quick(sequence_path, tmp_path / "out", objects=[{"label": "box", "initial_pose": pose}]))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_initial_pose_from_a_trajectory_or_a_quaternion(sequence_path, tmp_path):
+    run(quick(sequence_path, tmp_path / "out"))
+    trajectory = read_tum(tmp_path / "out" / "trajectory_box.tum")
+    pose = {"trajectory": tmp_path / "out" / "trajectory_box.tum"}
+    session = open_session(RunConfig(source=sequence_path, start_us=int(trajectory.t_us[2]), objects=[{"label": "box", "initial_pose": pose}]))
+    assert torch.allclose(session.T_cam_obj[0], trajectory.T_cam_obj[2])
+    pose = {"translation_m": [0, 0, 0.5], "quaternion_xyzw": [0, 0, 1, 0]}
+    session = open_session(RunConfig(source=sequence_path, objects=[{"label": "box", "initial_pose": pose}]))
+    assert torch.allclose(session.T_cam_obj[0, :3, :3], torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)))
+
+
+def test_a_stream_without_events_says_so(sequence_path, tmp_path):
+    with pytest.raises(EventDataError, match=r"no events after 900000 µs to track with"):
+        run(quick(sequence_path, tmp_path / "out", start_us=900_000))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_source_and_missing_device(sequence_path, tmp_path):
+    with pytest.raises(MissingFileError, match="nowhere"):
+        run(quick(tmp_path / "nowhere.npz", tmp_path / "out"))
+    if not torch.cuda.is_available():
+        with pytest.raises(ConfigError, match="no CUDA device"):
+            run(quick(sequence_path, tmp_path / "out", device="cuda"))
+
+
+def test_a_calibration_that_makes_no_sense(sequence_path, tmp_path):
+    path = tmp_path / "calib.txt"
+    path.write_text("0 0 0 0\n")
+    with pytest.raises(CalibrationError, match="focal lengths"):
+        open_session(RunConfig(source=sequence_path, camera={"calibration": path, "width": 120, "height": 90}))
