@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import cast
 
 import numpy as np
 
@@ -62,7 +62,7 @@ def keys_of(archive: zipfile.ZipFile) -> set[str]:
 class _Member:
     """One array of an archive, positioned at its data."""
 
-    stream: IO[bytes]
+    stream: zipfile.ZipExtFile
     dtype: np.dtype
     shape: tuple[int, ...]
     fortran_order: bool
@@ -87,7 +87,7 @@ def _open_member(archive: zipfile.ZipFile, key: str, path: Path) -> _Member:
     if key not in keys_of(archive):
         raise EventDataError(f"'{path}' has no array '{key}'; it holds: {', '.join(sorted(keys_of(archive))) or 'none'}.")
     with _damage_reported(path):
-        stream = archive.open(f"{key}.npy")
+        stream = cast(zipfile.ZipExtFile, archive.open(f"{key}.npy"))
     try:
         with _damage_reported(path):
             version = np.lib.format.read_magic(stream)
