@@ -7,7 +7,7 @@ import torch
 from torch.autograd import gradcheck
 
 from tests.helpers import generator
-from torchtrack.camera import MIN_DEPTH_M, Camera, distort, project, projection_gradient, undistort, undistortion_table
+from torchtrack.camera import MIN_DEPTH_M, Camera, distort, distortion_table, project, projection_gradient, undistort, undistortion_table
 from torchtrack.errors import CalibrationError
 
 PINHOLE = Camera(612.3, 610.9, 318.2, 241.7, 640, 480)
@@ -124,6 +124,15 @@ def test_the_table_holds_the_ideal_pixel_of_every_sensor_pixel(camera):
 def test_a_distortion_that_cannot_be_undone_is_refused(camera):
     with pytest.raises(CalibrationError, match=r"cannot be undone at \d+ of 307200 pixels, first at"):
         undistortion_table(camera)
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_the_table_of_sensor_pixels_undoes_the_other(camera):
+    border = 3
+    table = distortion_table(camera, border)
+    assert table.shape == (camera.height + 2 * border, camera.width + 2 * border, 2)
+    for u, v in [(-3, -3), (0, 0), (camera.width + 2, 50), (100, camera.height - 1)]:
+        np.testing.assert_allclose(undistort(table[v + border, u + border][None].numpy(), camera)[0], [u, v], atol=1e-3)
 
 
 def test_no_distortion_changes_nothing():

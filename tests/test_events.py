@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.helpers import random_events
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch, EventWindow, check_events, concatenate, windows_by_count, windows_by_time
+from torchtrack.events import EventBatch, EventWindow, check_events, concatenate, pad_streams, windows_by_count, windows_by_time
 
 
 def batch_at(times) -> EventBatch:
@@ -128,6 +128,29 @@ def test_check_events_compares_with_the_event_before_and_counts_on():
 
 def test_events_at_one_time_are_sorted():
     check_events(batch_at([3, 3, 3]), 64, 48)
+
+
+# ---- streams side by side
+
+
+def test_padding_keeps_every_event_in_its_row():
+    counts = [5, 0, 3]
+    events = concatenate([random_events(count, seed=stream, stream=stream) for stream, count in enumerate(counts)])
+    t_end_us = torch.tensor([20_000, 30_000, 40_000])
+    padded = pad_streams(events, 3, t_end_us)
+    assert padded.mask.sum(1).tolist() == counts
+    for stream in range(3):
+        own, row = events[events.stream_index == stream], padded.mask[stream]
+        assert torch.equal(padded.x[stream][row].int(), own.x)
+        assert torch.equal(padded.y[stream][row].int(), own.y)
+        assert torch.equal(t_end_us[stream] - padded.age_us[stream][row], own.t_us)
+        assert torch.equal(padded.polarity[stream][row], own.polarity)
+
+
+def test_padding_of_no_events():
+    padded = pad_streams(EventBatch.empty(), 2, torch.tensor([0, 0]))
+    assert padded.mask.shape[0] == 2
+    assert not bool(padded.mask.any())
 
 
 # ---- windows by time

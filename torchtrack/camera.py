@@ -159,10 +159,3 @@ def distortion_table(camera: Camera, border_px: int) -> Float[Tensor, "h w 2"]:
     v, u = np.mgrid[-border_px : camera.height + border_px, -border_px : camera.width + border_px]
     sensor = distort(np.stack([u.ravel(), v.ravel()], 1), camera)
     return torch.from_numpy(sensor.reshape(*u.shape, 2).astype(np.float32))
-
-
-def distortion_table(camera: Camera, border_px: int) -> Float[Tensor, "h w 2"]:
-    """Sensor pixel (u, v) of every ideal pixel, float32, for the image and a border of ``border_px`` around it."""
-    v, u = np.mgrid[-border_px : camera.height + border_px, -border_px : camera.width + border_px]
-    sensor = distort(np.stack([u.ravel(), v.ravel()], 1), camera)
-    return torch.from_numpy(sensor.reshape(*u.shape, 2).astype(np.float32))

@@ -5,6 +5,7 @@ does not grow with the file. Pickled objects are never loaded.
 """
 
 import os
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -23,6 +24,8 @@ ZIP_MAGIC = b"PK\x03\x04"
 _EVENT_KEYS = ("t", "x", "y", "p")
 # What zipfile is known to raise over damaged bytes.
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, UnicodeDecodeError, OSError)
+# What numpy is known to raise over headers: it parses them as Python literals.
+_BAD_HEADER = (ValueError, KeyError, TypeError, SyntaxError, tokenize.TokenError)
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -92,7 +95,7 @@ def _open_member(archive: zipfile.ZipFile, key: str, path: Path) -> _Member:
         with _damage_reported(path):
             version = np.lib.format.read_magic(stream)
             shape, fortran_order, dtype = _HEADER_READERS[version](stream)
-    except (ValueError, KeyError) as error:
+    except _BAD_HEADER as error:
         stream.close()
         raise EventDataError(f"'{path}': the array '{key}' has no readable numpy header ({error}).") from error
     if dtype.hasobject:
