@@ -12,7 +12,7 @@ A sequence in one go::
 ========================= ============================================================================
 ``trajectory.py``         smooth motions, known at any time
 ``textures.py meshes.py`` procedural objects
-``surface.py render.py``  images; ``rasterizer.py`` holds the numba kernels
+``surface.py render.py``  images; ``rasterizer.py shading.py`` hold the numba kernels
 ``event_camera.py``       images -> events
 ``frames.py``             when to render, so that nothing moves more than half a pixel
 ``scenes.py``             settings of a scene

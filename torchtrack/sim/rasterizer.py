@@ -1,4 +1,4 @@
-"""Numba kernels of the z-buffer rasteriser (extra ``sim``); :mod:`torchtrack.sim.render` prepares their arrays.
+"""Numba kernels that find the nearest face at every sample (extra ``sim``); :mod:`torchtrack.sim.render` prepares their arrays.
 
 Triangles are drawn in homogeneous coordinates (Olano & Greer 1997, *Triangle scan conversion using 2D homogeneous
 coordinates*): with the corners ``A B C`` of a triangle in the camera frame and the ray ``d = ((u-cx)/fx, (v-cy)/fy, 1)``,
@@ -10,39 +10,15 @@ Samples: phase ``s`` holds one sample of every pixel of the region, ``offsets[s]
 
 import inspect
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
 
 Array = np.ndarray
-Triple = tuple[float, float, float]
 
-# No "nnan" and no "ninf": comparisons must keep their meaning for numbers that are not finite.
-_FAST = {"contract", "arcp", "nsz", "reassoc"}
 # A triangle is seen edge-on, or is a sliver, when its volume with the camera is below this share of its corners' distances.
 _SLIVER = 1e-13
-
-
-class Surface(NamedTuple):
-    """Look of ``f`` faces, camera frame; everything float32 but for the indices."""
-
-    uv: Array  # [f, 3, 2] texture coordinates of the corners, v downwards
-    albedo: Array  # [f, 3] reflectance of the corners, which multiplies the texture
-    normals: Array  # [f, 3, 3] unit normals of the corners
-    is_flat: Array  # [f] bool: the three normals are the same
-    texture: Array  # [f, 3] int64: where its texture starts in ``texels``, its width and height
-    texels: Array  # [n] reflectances of all textures, row by row
-    face_object: Array  # [f] int64
-    gloss: Array  # [f] strength of the highlight
-
-
-class Lighting(NamedTuple):
-    """One distant light and ambient light."""
-
-    ambient: float
-    diffuse: float
-    direction: Array  # [3] unit vector towards the light, camera frame
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -154,160 +130,3 @@ def draw(
         for f in range(ranges[r, 0], ranges[r, 1]):
             if _setup(corners[f], intrinsics, origin, planes[f]):
                 _draw_face(f, corners, intrinsics, origin, offsets, planes, inverse_depth, face_index)
-
-
-@kernel(fastmath=_FAST)
-def _texel(texels: Array, offset: int, width: int, height: int, u: float, v: float) -> float:
-    """Bilinear look-up at texture coordinates, which repeat outside 0..1 (``v`` counts downwards here)."""
-    x = (u - np.floor(u)) * width - 0.5
-    y = (v - np.floor(v)) * height - 0.5
-    x0, y0 = int(np.floor(x)), int(np.floor(y))
-    fx, fy = x - x0, y - y0
-    x1 = x0 + 1 if x0 + 1 < width else 0
-    y1 = y0 + 1 if y0 + 1 < height else 0
-    x0 = x0 if x0 >= 0 else width - 1
-    y0 = y0 if y0 >= 0 else height - 1
-    top = texels[offset + y0 * width + x0] * (1 - fx) + texels[offset + y0 * width + x1] * fx
-    bottom = texels[offset + y1 * width + x0] * (1 - fx) + texels[offset + y1 * width + x1] * fx
-    return top * (1 - fy) + bottom * fy
-
-
-@kernel(fastmath=_FAST)
-def _reflectance(f: int, weights: Triple, surface: Surface) -> float:
-    """Diffuse reflectance of a face at barycentric ``weights``: corner values times texture."""
-    w0, w1, w2 = weights
-    albedo, uv, texture = surface.albedo, surface.uv, surface.texture
-    value = w0 * albedo[f, 0] + w1 * albedo[f, 1] + w2 * albedo[f, 2]
-    offset, width, height = texture[f, 0], texture[f, 1], texture[f, 2]
-    if width * height == 1:
-        return value * surface.texels[offset]
-    u = w0 * uv[f, 0, 0] + w1 * uv[f, 1, 0] + w2 * uv[f, 2, 0]
-    v = w0 * uv[f, 0, 1] + w1 * uv[f, 1, 1] + w2 * uv[f, 2, 1]
-    return value * _texel(surface.texels, offset, width, height, u, v)
-
-
-@kernel(fastmath=_FAST)
-def _weights(planes: Array, f: int, x: float, y: float) -> Triple:
-    """Barycentric coordinates at a point of the region, kept inside the triangle."""
-    w0 = planes[f, 0, 0] * x + planes[f, 0, 1] * y + planes[f, 0, 2]
-    w1 = planes[f, 1, 0] * x + planes[f, 1, 1] * y + planes[f, 1, 2]
-    w2 = planes[f, 2, 0] * x + planes[f, 2, 1] * y + planes[f, 2, 2]
-    w0, w1, w2 = max(w0, 0.0), max(w1, 0.0), max(w2, 0.0)
-    total = w0 + w1 + w2
-    if not total > 0:
-        return 1.0, 0.0, 0.0
-    return w0 / total, w1 / total, w2 / total
-
-
-@kernel(fastmath=_FAST)
-def _normal(f: int, weights: Triple, normals: Array, is_flat: Array) -> Triple:
-    """Unit normal of a face at barycentric ``weights``."""
-    if is_flat[f]:
-        return normals[f, 0, 0], normals[f, 0, 1], normals[f, 0, 2]
-    w0, w1, w2 = weights
-    x = w0 * normals[f, 0, 0] + w1 * normals[f, 1, 0] + w2 * normals[f, 2, 0]
-    y = w0 * normals[f, 0, 1] + w1 * normals[f, 1, 1] + w2 * normals[f, 2, 1]
-    z = w0 * normals[f, 0, 2] + w1 * normals[f, 1, 2] + w2 * normals[f, 2, 2]
-    norm = np.sqrt(x * x + y * y + z * z)
-    if not norm > 1e-6:
-        return normals[f, 0, 0], normals[f, 0, 1], normals[f, 0, 2]
-    return x / norm, y / norm, z / norm
-
-
-@kernel(fastmath=_FAST)
-def _half_vector(u: float, v: float, intrinsics: Array, light: Array) -> Triple:
-    """Unit vector halfway between the directions to the light and to the camera (Blinn 1977)."""
-    x, y = -(u - intrinsics[2]) / intrinsics[0], -(v - intrinsics[3]) / intrinsics[1]
-    norm = np.sqrt(x * x + y * y + 1)
-    x, y, z = x / norm + light[0], y / norm + light[1], -1 / norm + light[2]
-    norm = max(np.sqrt(x * x + y * y + z * z), 1e-6)
-    return x / norm, y / norm, z / norm
-
-
-@kernel()
-def _vote(votes: Array, background: int, depth: Array, object_index: Array, row: int, col: int) -> None:
-    """Give the pixel to whoever holds most of its samples; inverse depth is affine, so its mean is that of the centre."""
-    best, count = -1, float(background)
-    for k in range(len(votes)):
-        if votes[k, 0] > count:
-            best, count = k, votes[k, 0]
-    if best >= 0:
-        object_index[row, col] = best
-        depth[row, col] = count / votes[best, 1]
-
-
-@kernel(fastmath=_FAST)
-def _light(f: int, weights: Triple, half: Triple, surface: Surface, lighting: Lighting) -> tuple[float, float]:
-    """Diffuse light and highlight on a face at barycentric ``weights`` (Blinn 1977)."""
-    nx, ny, nz = _normal(f, weights, surface.normals, surface.is_flat)
-    light = lighting.direction
-    lambert = max(nx * light[0] + ny * light[1] + nz * light[2], 0.0)
-    shine = max(nx * half[0] + ny * half[1] + nz * half[2], 0.0)
-    for _ in range(5):  # to the power of 32
-        shine *= shine
-    return lighting.ambient + lighting.diffuse * lambert, surface.gloss[f] * shine
-
-
-@kernel(fastmath=_FAST)
-def _one_face(f: int, row: int, col: int, planes: Array, offsets: Array, half: Triple, surface: Surface, lighting: Lighting) -> float:
-    """Luminance of a pixel that one face fills: light changes slowly and is taken at the centre, texture at every sample."""
-    diffuse, highlight = _light(f, _weights(planes, f, col, row), half, surface, lighting)
-    # Without a texture the reflectance is nearly affine, so the centre speaks for all.
-    if surface.texture[f, 1] * surface.texture[f, 2] == 1:
-        return _reflectance(f, _weights(planes, f, col, row), surface) * diffuse + highlight
-    total = 0.0
-    for s in range(len(offsets)):
-        total += _reflectance(f, _weights(planes, f, col + offsets[s, 0], row + offsets[s, 1]), surface)
-    return total / len(offsets) * diffuse + highlight
-
-
-@kernel()
-def _common_face(face_index: Array, row: int, col: int) -> int:
-    """The face that all samples of a pixel show; -1 where all show background, -2 where they differ."""
-    face = face_index[0, row, col]
-    for s in range(1, len(face_index)):
-        if face_index[s, row, col] != face:
-            return -2
-    return face
-
-
-@kernel(fastmath=_FAST)
-def shade(
-    face_index: Array,
-    inverse_depth: Array,
-    planes: Array,
-    offsets: Array,
-    surface: Surface,
-    lighting: Lighting,
-    intrinsics: Array,
-    origin: Array,
-    luminance: Array,
-    depth: Array,
-    object_index: Array,
-) -> None:
-    """Average the samples of every pixel into ``luminance`` (which holds the background), ``depth`` and ``object_index [h, w]``."""
-    samples, height, width = face_index.shape
-    votes = np.zeros((surface.face_object.max() + 1, 2))
-    for row in range(height):
-        for col in range(width):
-            common = _common_face(face_index, row, col)
-            if common == -1:
-                continue
-            half = _half_vector(origin[0] + col, origin[1] + row, intrinsics, lighting.direction)
-            votes[:] = 0
-            covered, total = 0, 0.0
-            for s in range(samples):
-                f = face_index[s, row, col]
-                if f < 0:
-                    continue
-                covered += 1
-                votes[surface.face_object[f], 0] += 1
-                votes[surface.face_object[f], 1] += inverse_depth[s, row, col]
-                if common == -2:
-                    weights = _weights(planes, f, col + offsets[s, 0], row + offsets[s, 1])
-                    diffuse, highlight = _light(f, weights, half, surface, lighting)
-                    total += _reflectance(f, weights, surface) * diffuse + highlight
-            if common >= 0:
-                total = samples * _one_face(common, row, col, planes, offsets, half, surface, lighting)
-            luminance[row, col] = (total + (samples - covered) * luminance[row, col]) / samples
-            _vote(votes, samples - covered, depth, object_index, row, col)

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from torchtrack.camera import Camera
 from torchtrack.config.settings import Settings
-from torchtrack.errors import CalibrationError, MissingExtraError, ModelError
+from torchtrack.errors import CalibrationError, MissingExtraError, ModelError, PoseError
 from torchtrack.sim.surface import RenderObject, Scene, merge_objects
 
 # The blur's weights beyond this many standard deviations are below 1e-4.
@@ -120,7 +120,7 @@ class Renderer:
     def __init__(
         self, objects: Sequence[RenderObject], camera: Camera, background: Float[ndarray, "h w"], config: RenderConfig | None = None
     ) -> None:
-        self._kernels = _load_kernels()
+        self._rasterizer, self._shading = _load_kernels()
         self.camera, self.config = camera, config or RenderConfig()
         _check_inputs(objects, camera, background)
         self._scene: Scene = merge_objects(objects)
@@ -129,13 +129,19 @@ class Renderer:
         self._offsets = sample_offsets(self.config.supersampling)
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, self.config.near_m])
         light = np.array(self.config.light_direction)
-        self._lighting = self._kernels.Lighting(
+        self._lighting = self._shading.Lighting(
             self.config.ambient, self.config.diffuse, (light / max(np.linalg.norm(light), 1e-12)).astype(np.float32)
         )
 
     def render(self, T_cam_obj: Float[ndarray, "o 4 4"] | Float[Tensor, "o 4 4"]) -> Frame:
-        """One image of all objects at their poses; parts behind the camera or outside the image are left out."""
-        corners, normals = self._scene.at_poses(np.asarray(T_cam_obj, dtype=np.float64))
+        """One image of all objects at their poses; parts behind the camera or outside the image are left out.
+
+        Raises:
+            PoseError: if there is not one pose per object, or one is not finite.
+        """
+        T_cam_obj = np.asarray(T_cam_obj, dtype=np.float64)
+        _check_poses(T_cam_obj, len(self._scene.object_faces))
+        corners, normals = self._scene.at_poses(T_cam_obj)
         boxes = [self._box(corners[faces]) for faces in self._scene.object_faces]
         regions = merge_regions([box for box in boxes if box is not None])
         luminance = self._background.copy()
@@ -156,9 +162,9 @@ class Renderer:
         inverse_depth, face_index = np.empty(samples, np.float32), np.empty(samples, np.int32)
         planes = np.zeros((len(corners), 3, 3))
         origin = np.array([region.left, region.top], dtype=np.float64)
-        self._kernels.draw(corners, ranges, self._intrinsics, origin, self._offsets, planes, inverse_depth, face_index)
-        surface = self._kernels.Surface(normals=normals, **self._scene.look)
-        self._kernels.shade(
+        self._rasterizer.draw(corners, ranges, self._intrinsics, origin, self._offsets, planes, inverse_depth, face_index)
+        surface = self._shading.Surface(normals=normals, **self._scene.look)
+        self._shading.shade(
             face_index, inverse_depth, planes, self._offsets, surface, self._lighting, self._intrinsics, origin,
             sharp, depth[region.slices], object_index[region.slices],
         )  # fmt: skip
@@ -219,10 +225,15 @@ def _check_inputs(objects: Sequence[RenderObject], camera: Camera, background: n
         raise CalibrationError("the background's luminance must be finite and not negative.")
 
 
-def _load_kernels() -> ModuleType:
+def _check_poses(T_cam_obj: ndarray, objects: int) -> None:
+    if T_cam_obj.shape != (objects, 4, 4) or not np.isfinite(T_cam_obj).all():
+        raise PoseError(f"the renderer needs one finite pose per object, [{objects}, 4, 4]; got shape {list(T_cam_obj.shape)}.")
+
+
+def _load_kernels() -> tuple[ModuleType, ModuleType]:
     """The compiled kernels; numba takes a second to import, so only those who render pay for it."""
     try:
-        from torchtrack.sim import rasterizer
+        from torchtrack.sim import rasterizer, shading
     except ImportError as error:
         raise MissingExtraError("numba", "sim", "Rendering simulated scenes") from error
-    return rasterizer
+    return rasterizer, shading

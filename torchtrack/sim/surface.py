@@ -73,22 +73,21 @@ class RenderObject:
         faces = np.asarray(mesh.faces)
         corners = np.asarray(mesh.vertices, dtype=np.float64)[faces]
         uv, albedo, texture = np.zeros((*faces.shape, 2)), np.full(faces.shape, reflectance), np.ones((1, 1))
-        if (image := _texture_image(mesh)) is not None:
-            uv = np.asarray(mesh.visual.uv, dtype=np.float64)[faces] * [1, -1] + [0, 1]
-            albedo, texture = np.ones(faces.shape), grey_reflectance(image)
+        if (printed := _texture(mesh)) is not None:
+            albedo, texture = np.ones(faces.shape), grey_reflectance(printed[0])
+            uv = printed[1][faces] * [1, -1] + [0, 1]
         elif isinstance(mesh.visual, trimesh.visual.ColorVisuals) and mesh.visual.defined:
             albedo = grey_reflectance(np.asarray(mesh.visual.vertex_colors))[faces]
         return cls(corners, corner_normals(corners, crease_angle_deg), uv, albedo, texture, gloss)
 
 
-def _texture_image(mesh: trimesh.Trimesh) -> ndarray | None:
-    """The texture ``[h, w, 3]`` of a mesh, or None."""
+def _texture(mesh: trimesh.Trimesh) -> tuple[ndarray, ndarray] | None:
+    """The texture ``[h, w, 3]`` of a mesh and its coordinates at the vertices ``[v, 2]``, or None."""
     visual = mesh.visual
     if not isinstance(visual, trimesh.visual.TextureVisuals) or visual.uv is None:
         return None
-    material = visual.material
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    return None if image is None else np.asarray(image.convert("RGB"))
+    image = getattr(visual.material, "baseColorTexture", None) or getattr(visual.material, "image", None)
+    return None if image is None else (np.asarray(image.convert("RGB")), np.asarray(visual.uv, dtype=np.float64))
 
 
 def corner_normals(corners: Float[ndarray, "f 3 3"], crease_angle_deg: float) -> Float[ndarray, "f 3 3"]:
@@ -125,7 +124,7 @@ class Scene:
     Args:
         corners, normals: of every face, in the frame of its object.
         object_faces: which faces belong to each object.
-        look: the other fields of :class:`torchtrack.sim.rasterizer.Surface`.
+        look: the other fields of :class:`torchtrack.sim.shading.Surface`.
     """
 
     corners: Float[ndarray, "f 3 3"]
