@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import generator
 from torch.autograd import gradcheck
 
-from tests.helpers import generator
 from torchtrack.camera import MIN_DEPTH_M, Camera, distort, distortion_table, project, projection_gradient, undistort, undistortion_table
 from torchtrack.errors import CalibrationError
 

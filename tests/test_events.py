@@ -5,12 +5,15 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from helpers import random_events
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.helpers import random_events
 from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch, EventWindow, check_events, concatenate, pad_streams, windows_by_count, windows_by_time
+
+# The same examples in every run, however busy the machine is.
+REPEATABLE = settings(deadline=None, derandomize=True)
 
 
 def batch_at(times) -> EventBatch:
@@ -95,6 +98,7 @@ def test_to_moves_every_field(device):
     assert {getattr(events, name).device.type for name in ("x", "y", "t_us", "polarity", "stream_index")} == {device.type}
 
 
+@REPEATABLE
 @given(times, st.integers(-10, 410), st.integers(-10, 410))
 def test_slice_time_is_half_open(t_us, start, end):
     inside = batch_at(t_us).slice_time(start, end)
@@ -156,6 +160,7 @@ def test_padding_of_no_events():
 # ---- windows by time
 
 
+@REPEATABLE
 @given(times, cut_places, st.integers(1, 90), start_times)
 def test_windows_by_time_hold_every_event_once(t_us, cuts, duration, start):
     events = batch_at(t_us)
@@ -171,6 +176,7 @@ def test_windows_by_time_hold_every_event_once(t_us, cuts, duration, start):
         assert len(windows[-1].events) > 0
 
 
+@REPEATABLE
 @given(times, cut_places, st.integers(1, 90), start_times)
 def test_windows_by_time_do_not_depend_on_how_the_stream_is_cut(t_us, cuts, duration, start):
     events = batch_at(t_us)
@@ -219,7 +225,7 @@ def expected_count_windows(t_us: list[int], count: int, max_age_us: int | None, 
     return windows
 
 
-@settings(max_examples=200)
+@REPEATABLE
 @given(times, cut_places, st.integers(1, 20), st.one_of(st.none(), st.integers(1, 60)), start_times)
 def test_windows_by_count_follow_their_definition(t_us, cuts, count, max_age_us, start):
     events = batch_at(t_us)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers import random_events, random_pose
 from PIL import Image
 
-from tests.helpers import random_events, random_pose
 from torchtrack.camera import Camera
 from torchtrack.errors import CalibrationError, EventDataError, MissingFileError, PoseError, UnknownFormatError
 from torchtrack.events import concatenate

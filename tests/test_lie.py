@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
+from helpers import generator, random_pose, random_twist
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck, gradgradcheck
 
-from tests.helpers import generator, random_pose, random_twist
 from torchtrack import lie
 from torchtrack.errors import PoseError
 
