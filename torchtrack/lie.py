@@ -189,15 +189,29 @@ def check_pose(T: Tensor, name: str = "T_cam_obj", tolerance: float = 1e-3) -> N
         raise PoseError(f"{name}: the last row must be [0, 0, 0, 1]. Check whether the matrix is stored transposed.")
 
 
+def move_about(T: Float[Tensor, "*b 4 4"], rotation: Float[Tensor, "*b 3 3"], move: Float[Tensor, "*b 3"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
+    """Turn by ``rotation`` about the object's centre, and move the centre by ``move``, both in the camera's axes."""
+    turned = rotation @ T[..., :3, :3]
+    shift = ((T[..., :3, :3] - turned) @ centre_obj[..., None]).squeeze(-1)
+    return _assemble(turned, T[..., :3, 3] + shift + move)
+
+
 def retract_about(T: Float[Tensor, "*b 4 4"], delta: Float[Tensor, "*b 6"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
     """Rotate by ``φ`` about the object's centre, and move the centre by ``ρ``, both in the camera's axes.
 
     A chart of SE(3) that is better conditioned than the left perturbation for an object far from the camera.
     """
-    rotation = so3_exp(delta[..., :3]) @ T[..., :3, :3]
-    offset_before = (T[..., :3, :3] @ centre_obj[..., None]).squeeze(-1)
-    offset_after = (rotation @ centre_obj[..., None]).squeeze(-1)
-    return _assemble(rotation, T[..., :3, 3] + offset_before - offset_after + delta[..., 3:])
+    return move_about(T, so3_exp(delta[..., :3]), delta[..., 3:], centre_obj)
+
+
+def cayley(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation of the quaternion ``[φ/2, 1]``: exact rotations that agree with ``so3_exp`` to second order.
+
+    Half the operations of the exponential, and smooth everywhere: the solver's retraction.
+    """
+    skew = hat(phi)
+    factor = 1 / (1 + 0.25 * phi.square().sum(-1))[..., None, None]
+    return torch.eye(3, dtype=phi.dtype, device=phi.device) + factor * (skew + 0.5 * (skew @ skew))
 
 
 def difference_about(T_from: Float[Tensor, "*b 4 4"], T_to: Float[Tensor, "*b 4 4"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6"]:

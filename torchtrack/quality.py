@@ -76,14 +76,13 @@ def pose_covariance(solution: Linearisation, centre_cam: Float[Tensor, "b 3"]) -
 
     From the Gauss-Newton Hessian and the variance of the weighted residuals.
     """
-    weights = solution.robust_weights
-    variance = (weights * solution.residuals.square()).sum(-1) / weights.sum(-1).clamp(min=1)
-    eye = torch.eye(6, dtype=weights.dtype, device=weights.device).repeat(len(weights), 1, 1)
-    inverse, known = solve_positive(solution.hessian, eye)
+    hessian = solution.hessian
+    eye = torch.eye(6, dtype=hessian.dtype, device=hessian.device).repeat(len(hessian), 1, 1)
+    inverse, known = solve_positive(hessian, eye)
     # The solver turns about the object's centre: ρ_left = ρ - φ × c.
     to_left = eye.clone()
     to_left[:, 3:, :3] = hat(centre_cam)
-    covariance = to_left @ (inverse * variance[:, None, None]) @ to_left.transpose(1, 2)
+    covariance = to_left @ (inverse * solution.variance_px2[:, None, None]) @ to_left.transpose(1, 2)
     return torch.where(known[:, None, None], covariance, torch.diag_embed(torch.full_like(centre_cam.repeat(1, 2), torch.inf)))
 
 
