@@ -91,6 +91,7 @@ def test_exp_is_the_matrix_exponential():
 def test_hat_is_the_cross_product():
     a, b = torch.randn(2, 6, 3, generator=generator(), dtype=torch.float64)
     torch.testing.assert_close((lie.hat(a) @ b[..., None]).squeeze(-1), torch.linalg.cross(a, b))
+    assert torch.equal(lie.vee(lie.hat(a)), a)
 
 
 @pytest.mark.parametrize("angle", ANGLES.values(), ids=ANGLES)
@@ -163,6 +164,38 @@ def test_rotation_angle_has_a_finite_gradient_at_zero():
     assert bool(torch.isfinite(rotation.grad).all())
 
 
+# ---- motions about an object's centre
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_retraction_turns_about_the_centre_and_moves_it(batch):
+    T, delta = random_pose(*batch), random_twist(*batch, seed=1, rotation_rad=0.5)
+    centre = torch.randn((*batch, 3), generator=generator(2), dtype=torch.float64)
+    moved = lie.retract_about(T, delta, centre)
+    assert far_from(moved[..., :3, :3], lie.so3_exp(delta[..., :3]) @ T[..., :3, :3]) < 1e-14
+    before, after = (lie.transform_points(pose, centre[..., None, :]).squeeze(-2) for pose in (T, moved))
+    assert far_from(after - before, delta[..., 3:]) < 1e-14
+    assert far_from(lie.difference_about(T, moved, centre), delta) < 1e-13
+
+
+def test_retraction_about_the_camera_is_a_turn_and_a_shift():
+    T, delta = random_pose(4), random_twist(4, seed=1, rotation_rad=0.3)
+    camera_in_object = lie.se3_inverse(T)[:, :3, 3]
+    expected = lie.se3_exp(torch.cat([delta[:, :3], torch.zeros(4, 3, dtype=torch.float64)], -1)) @ T
+    expected[:, :3, 3] += delta[:, 3:]
+    assert far_from(lie.retract_about(T, delta, camera_in_object), expected) < 1e-13
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_cayley_gives_rotations_that_agree_with_exp_to_second_order(batch, dtype):
+    phi = rotation_vectors(1.0, *batch, dtype=dtype)
+    eye = torch.eye(3, dtype=dtype).expand(*batch, 3, 3)
+    for angle in (0.0, 0.01, 1.0, 3.0):
+        rotation = lie.cayley(angle * phi)
+        assert far_from(rotation @ rotation.transpose(-1, -2), eye) < 5 * TOLERANCE[dtype]
+        assert far_from(rotation, lie.so3_exp(angle * phi)) <= angle**3 / 6 + TOLERANCE[dtype]
+
+
 # ---- gradients
 
 GRADIENT_ANGLES = {"identity": 0.0, "tiny": 1e-9, "small": 1e-3, "one": 1.0, "near_pi": math.pi - 1e-3}
@@ -173,6 +206,7 @@ def test_gradients_are_right_everywhere(angle):
     phi = rotation_vectors(angle, 2, seed=5).requires_grad_()
     xi = twists(angle, 2, seed=5).requires_grad_()
     assert gradcheck(lie.so3_exp, phi)
+    assert gradcheck(lie.cayley, phi)
     assert gradcheck(lie.se3_exp, xi)
     assert gradcheck(lie.so3_log, lie.so3_exp(phi.detach()).requires_grad_())
     assert gradcheck(lie.se3_log, lie.se3_exp(xi.detach()).requires_grad_())
