@@ -4,7 +4,6 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Self
 
 import cv2
 import numpy as np
@@ -44,7 +43,7 @@ class OverlayWriter:
         self._video: cv2.VideoWriter | None = None
         self._size = (0, 0)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "OverlayWriter":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
