@@ -69,6 +69,7 @@ class ContourModel(nn.Module):
     texture_tangents: Tensor
     texture_normals: Tensor
     surface_points: Tensor
+    triangles: Tensor
 
     def __init__(self, model: ObjectModel, config: ContourConfig) -> None:
         """Take what ``config`` switches on from ``model``."""
@@ -89,6 +90,8 @@ class ContourModel(nn.Module):
         for name in ("texture_points", "texture_tangents", "texture_normals"):
             self.register_buffer(name, getattr(model, name)[spread].clone())
         self.register_buffer("surface_points", model.surface_points.clone())
+        exact = len(model.triangles) <= config.exact_faces
+        self.register_buffer("triangles", model.triangles.clone() if exact else model.triangles[:0].clone())
 
     def active_edges(self, camera_obj: Float[Tensor, "b 3"], occluding: bool) -> tuple[Bool[Tensor, "b e"], Bool[Tensor, "b e"]]:
         """Which edges are contours for a camera at ``camera_obj`` (object frame), and which of these occlude."""

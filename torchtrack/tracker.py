@@ -23,7 +23,7 @@ from torchtrack.matching import ContourIndex, Observations, index_contours, join
 from torchtrack.object_model import ObjectModel
 from torchtrack.splat import splat_contours
 from torchtrack.time_surface import empty_last_event, object_regions, time_surface, update_last_event
-from torchtrack.visibility import remove_hidden
+from torchtrack.visibility import Scene, remove_hidden
 
 # Contours this far outside the image still find their place on a distorted sensor (px).
 _BORDER_PX = 64
@@ -194,9 +194,8 @@ class Tracker(nn.Module):
         if not config.remove_hidden:
             return contours
         shape = (self.streams, *self.image_size)
-        return remove_hidden(
-            contours, self.models, self.members, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, shape, config
-        )
+        scene = Scene(self.models, self.members, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, shape)
+        return remove_hidden(contours, scene, config)
 
     def _corners(self, contours: Contours, last_event_us: Tensor, t_us: Tensor, window_s: Tensor) -> Corners:
         """Corners of each object's region and their flow."""

@@ -1,10 +1,14 @@
-"""Hidden contours: a coarse depth buffer that all objects of a stream share."""
+"""Hidden contours: behind the object's own faces, or behind any surface of its stream.
+
+A model of few faces is tested against each of them, exactly: a coarse buffer would hide the long thin faces that such
+objects show when they turn. Dense meshes, and objects in front of one another, share one depth buffer per stream.
+"""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchtrack.camera import MIN_DEPTH_M, project
@@ -12,62 +16,114 @@ from torchtrack.config.tracker import ContourConfig
 from torchtrack.contours import Contours
 from torchtrack.lie import transform_points
 
+# A point this far behind a face's plane is behind it, not on it (diameters).
+_ON_FACE = 2e-3
+# Depths are compared in whole micrometres, with the object's number in the low bits.
+_DEPTH_STEPS_PER_M, _OBJECT_BITS = 1e6, 20
+_NOTHING = 2**62
 
-def depth_buffer(
-    models: nn.ModuleList,
-    members: Sequence[Int[Tensor, "g"]],
-    T_cam_obj: Float[Tensor, "b 4 4"],
-    intrinsics: Float[Tensor, "b 4"],
-    stream_index: Int[Tensor, "b"],
-    buffer_shape: tuple[int, int, int],
-    cell_px: int,
-) -> Float[Tensor, "s h w"]:
-    """Least depth (m) of any object's surface samples in each cell; infinite where there is none.
+
+@dataclass(frozen=True)
+class Scene:
+    """The objects of all streams at their poses.
 
     Args:
-        buffer_shape: streams, and rows and columns of cells; samples outside the image fall into the border cells.
+        models: the distinct models.
+        members: for each model, the objects that have it.
+        T_cam_obj: pose of each object.
+        intrinsics: ``[fx, fy, cx, cy]`` of each object's camera.
+        stream_index: stream of each object.
+        diameters_m: diameter of each object.
+        image_shape: streams, height and width of the image.
     """
-    _, rows, columns = buffer_shape
-    cells, depths = [], []
-    for model, index in zip(models, members, strict=True):
-        points = transform_points(T_cam_obj[index], model.surface_points.expand(len(index), -1, -1))
-        cell = _cell(project(points, intrinsics[index]), buffer_shape, cell_px)
-        depth = points[..., 2]
-        cells.append((cell + stream_index[index, None] * (rows * columns)).flatten())
-        depths.append(torch.where(depth > MIN_DEPTH_M, depth, torch.inf).flatten())
-    buffer = T_cam_obj.new_full((buffer_shape[0] * rows * columns,), torch.inf)
-    return buffer.scatter_reduce(0, torch.cat(cells), torch.cat(depths), "amin").view(buffer_shape)
+
+    models: nn.ModuleList
+    members: Sequence[Int[Tensor, "g"]]
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    intrinsics: Float[Tensor, "b 4"]
+    stream_index: Int[Tensor, "b"]
+    diameters_m: Float[Tensor, "b"]
+    image_shape: tuple[int, int, int]
 
 
-def _cell(pixels: Tensor, buffer_shape: tuple[int, int, int], cell_px: int) -> Tensor:
+def hidden_by_faces(points_cam: Float[Tensor, "b m 3"], triangles_cam: Float[Tensor, "b f 3 3"], tolerance_m: Float[Tensor, "b"]) -> Bool[Tensor, "b m"]:
+    """Which points lie behind one of the triangles, as the camera sees them.
+
+    The line of sight to a point crosses a triangle when it is on one side of the three planes through the camera and
+    an edge; all tests of all points and triangles are one matrix product.
+    """
+    corners = triangles_cam.unbind(2)
+    sides = [torch.linalg.cross(corners[i], corners[(i + 1) % 3], dim=-1) for i in range(3)]
+    turn = (sides[0] * corners[2]).sum(-1, keepdim=True).sign()
+    normal = torch.nn.functional.normalize(torch.linalg.cross(corners[1] - corners[0], corners[2] - corners[0], dim=-1), dim=-1)
+    plane = (normal * corners[0]).sum(-1)
+    away = plane.sign()[..., None] * normal
+    tests = torch.cat([*(side * turn for side in sides), away], 1).transpose(1, 2)
+    first, second, third, distance = (points_cam @ tests).chunk(4, -1)
+    behind = distance > (plane.abs() + tolerance_m[:, None])[:, None]
+    return ((first > 0) & (second > 0) & (third > 0) & behind).any(-1)
+
+
+def _hidden_by_self(scene: Scene, points_cam: Tensor) -> Tensor:
+    """Points of objects with few faces that these hide."""
+    hidden = torch.zeros(points_cam.shape[:2], dtype=torch.bool, device=points_cam.device)
+    for model, members in zip(scene.models, scene.members, strict=True):
+        if len(model.triangles) == 0:
+            continue
+        corners = model.triangles.flatten(0, 1).expand(len(members), -1, -1)
+        triangles = transform_points(scene.T_cam_obj[members], corners).unflatten(1, (-1, 3))
+        hidden[members] = hidden_by_faces(points_cam[members], triangles, _ON_FACE * scene.diameters_m[members])
+    return hidden
+
+
+def depth_buffer(scene: Scene, cell_px: int) -> tuple[Float[Tensor, "s p"], Int[Tensor, "s p"], tuple[int, int]]:
+    """Least depth (m) of any surface sample in each cell, the object it belongs to, and (rows, columns) of cells.
+
+    Samples outside the image fall into border cells; cells without samples are infinitely far.
+    """
+    streams, height, width = scene.image_shape
+    grid = (-(-height // cell_px) + 3, -(-width // cell_px) + 3)
+    cells, keys = [], []
+    for model, members in zip(scene.models, scene.members, strict=True):
+        points = transform_points(scene.T_cam_obj[members], model.surface_points.expand(len(members), -1, -1))
+        cell = _cell(project(points, scene.intrinsics[members]), grid, cell_px)
+        depth = (points[..., 2] * _DEPTH_STEPS_PER_M).long()
+        key = (depth << _OBJECT_BITS) + members[:, None]
+        cells.append((cell + scene.stream_index[members, None] * (grid[0] * grid[1])).flatten())
+        keys.append(torch.where(points[..., 2] > MIN_DEPTH_M, key, _NOTHING).flatten())
+    buffer = torch.full((streams * grid[0] * grid[1],), _NOTHING, device=scene.T_cam_obj.device)
+    nearest = buffer.scatter_reduce(0, torch.cat(cells), torch.cat(keys), "amin").view(streams, -1)
+    depth_m = (nearest >> _OBJECT_BITS).to(scene.T_cam_obj.dtype) / _DEPTH_STEPS_PER_M
+    return depth_m, nearest & ((1 << _OBJECT_BITS) - 1), grid
+
+
+def _cell(pixels: Tensor, grid: tuple[int, int], cell_px: int) -> Tensor:
     """Flat index of the cell that each pixel falls into; one border cell on each side takes what lies outside."""
-    _, rows, columns = buffer_shape
+    rows, columns = grid
     # Clamped before the conversion: a far-off pixel does not fit an integer.
     u = (pixels[..., 0] / cell_px).round().clamp(-1, columns - 2).long() + 1
     v = (pixels[..., 1] / cell_px).round().clamp(-1, rows - 2).long() + 1
     return v * columns + u
 
 
-def remove_hidden(
-    contours: Contours,
-    models: nn.ModuleList,
-    members: Sequence[Int[Tensor, "g"]],
-    T_cam_obj: Float[Tensor, "b 4 4"],
-    intrinsics: Float[Tensor, "b 4"],
-    stream_index: Int[Tensor, "b"],
-    diameters_m: Float[Tensor, "b"],
-    image_shape: tuple[int, int, int],
-    config: ContourConfig,
-) -> Contours:
-    """Contours without the points that lie behind a surface of any object of their stream.
+def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -> Tensor:
+    """Points behind another surface in the depth buffer; an object's own counts where it has too many faces for the exact test."""
+    depth_m, owner, grid = depth_buffer(scene, config.depth_cell_px)
+    cell = _cell(contours.pixels, grid, config.depth_cell_px)
+    nearest = depth_m[scene.stream_index].gather(1, cell)
+    number = torch.arange(len(cell), device=cell.device)[:, None]
+    exact = torch.zeros_like(number, dtype=torch.bool)
+    for model, members in zip(scene.models, scene.members, strict=True):
+        exact[members] = len(model.triangles) > 0
+    own = owner[scene.stream_index].gather(1, cell) == number
+    behind = contours.points_cam[..., 2] > nearest + config.depth_margin * scene.diameters_m[:, None]
+    return behind & ~(own & exact)
 
-    Args:
-        image_shape: streams, height and width of the image.
-    """
-    streams, height, width = image_shape
-    cell_px = config.depth_cell_px
-    shape = (streams, -(-height // cell_px) + 3, -(-width // cell_px) + 3)
-    buffer = depth_buffer(models, members, T_cam_obj, intrinsics, stream_index, shape, cell_px)
-    nearest = buffer.flatten(1)[stream_index].gather(1, _cell(contours.pixels, shape, cell_px))
-    visible = contours.points_cam[..., 2] < nearest + config.depth_margin * diameters_m[:, None]
-    return replace(contours, mask=contours.mask & visible)
+
+def remove_hidden(contours: Contours, scene: Scene, config: ContourConfig) -> Contours:
+    """Contours without the points that the object itself or another one of its stream hides."""
+    hidden = _hidden_by_self(scene, contours.points_cam)
+    needs_buffer = len(scene.T_cam_obj) > scene.image_shape[0] or any(len(model.triangles) == 0 for model in scene.models)
+    if needs_buffer:
+        hidden = hidden | _hidden_in_buffer(scene, contours, config)
+    return replace(contours, mask=contours.mask & ~hidden)

@@ -61,6 +61,7 @@ class ContourConfig(_Settings):
     max_edge_points: int = Field(800, ge=16, le=10_000, description="Points sampled on occluding contours, creases and segments.")
     max_texture_points: int = Field(4000, ge=0, le=20_000, description="Points of texture edges.")
     remove_hidden: bool = Field(True, description="Remove contours behind a surface of any object of the stream.")
+    exact_faces: int = Field(512, ge=0, le=5000, description="Models of up to this many faces hide their own contours exactly, face by face.")
     depth_cell_px: int = Field(4, ge=1, le=16, description="Cell of the depth buffer (px).")
     depth_margin: float = Field(0.06, ge=0, le=1, description="A contour is hidden by what is nearer by this share of the object's diameter.")
     splat_radius_px: int = Field(3, ge=1, le=16, description="Closing radius of the splatted point cloud (px).")
@@ -77,7 +78,7 @@ class MatchingConfig(_Settings):
     gates_px: tuple[float, ...] = Field((5, 3, 2, 1.5, 1.5), min_length=1, description="One round of matching and solving per gate (px).")
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
-    max_events: int = Field(3000, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
+    max_events: int = Field(1500, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
 
 class SolverConfig(_Settings):

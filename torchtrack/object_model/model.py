@@ -24,6 +24,7 @@ from torchtrack.object_model.winding import turn_outwards
 
 # Points on texture edges nearer than this fraction of the diameter see the same pixels.
 _SPACING_FRACTION = 0.0025
+NO_TRIANGLES = np.zeros((0, 3, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,7 @@ class ObjectModel:
         texture_normals: unit outward normals of the surface there.
         segments: line segments given by the user, always visible unless hidden.
         surface_points, surface_normals: uniform samples of the surface.
+        triangles: corners of every face, the outside seen anticlockwise.
         mesh: the mesh in metres with its textures, for drawing and export; ``None`` for polylines.
     """
 
@@ -57,6 +59,7 @@ class ObjectModel:
     segments: Float[Tensor, "l 2 3"]
     surface_points: Float[Tensor, "n 3"]
     surface_normals: Float[Tensor, "n 3"]
+    triangles: Float[Tensor, "f 3 3"]
     mesh: trimesh.Trimesh | None
 
     @classmethod
@@ -108,6 +111,7 @@ class ObjectModel:
             edges=contour_edges(surface, table, settings.crease_angle_deg, drop_concave=outwards),
             printed=_print_edges(surface, table, settings),
             samples=sample_surface(surface, settings.surface_point_count),
+            triangles=surface.corners,
             mesh=_drawable(parts, surface),
         )
 
@@ -152,6 +156,7 @@ class ObjectModel:
         printed: SurfacePoints = NO_POINTS,
         segments: np.ndarray = NO_EDGES.points,
         samples: tuple[np.ndarray, np.ndarray] = NO_SAMPLES,
+        triangles: np.ndarray = NO_TRIANGLES,
         mesh: trimesh.Trimesh | None = None,
     ) -> "ObjectModel":
         """The model with the given parts, whose bounding box is that of ``extent [n, 3]``."""
@@ -169,6 +174,7 @@ class ObjectModel:
             segments=_tensor(segments),
             surface_points=_tensor(samples[0]),
             surface_normals=_tensor(samples[1]),
+            triangles=_tensor(triangles),
             mesh=mesh,
         )
 
