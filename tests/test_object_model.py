@@ -326,6 +326,17 @@ def test_gltf_that_names_a_missing_texture(tmp_path: Path):
         assert len(ObjectModel.from_file(tmp_path / "model.gltf").edge_points) == 12
 
 
+@pytest.mark.parametrize("damage", ["image", "coordinates"])
+def test_texture_that_cannot_be_read(tmp_path: Path, damage: str):
+    card = ObjectModel.from_file(textured_quad_obj(tmp_path)).mesh
+    content = card.export(file_type="glb")
+    old, new = (b"\x89PNG\r\n", b"broken") if damage == "image" else (b'"TEXCOORD_0"', b'"TEXCOORD_7"')
+    assert old in content
+    (tmp_path / "card.glb").write_bytes(content.replace(old, new))
+    with pytest.warns(TorchtrackWarning, match=r"the texture of '.*card\.glb' cannot be read: only the geometry"):
+        assert len(ObjectModel.from_file(tmp_path / "card.glb").edge_points) == 4
+
+
 @pytest.mark.parametrize(
     ("file", "creases", "edges"),
     [("lbracket_normal_lbracket.ply", 18, 18), ("satellite_normal_satellite.ply", 252, 252), ("cube_slow_cube.ply", 12, 12)],

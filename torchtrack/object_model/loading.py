@@ -12,6 +12,7 @@ import trimesh
 
 from torchtrack.errors import MissingFileError, ModelError, TorchtrackWarning, UnknownFormatError
 from torchtrack.object_model.settings import METRES_PER_UNIT
+from torchtrack.object_model.surface import texture_image
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 _SMALLEST_M, _LARGEST_M = 0.005, 5.0
@@ -42,7 +43,7 @@ def load_parts(path: str | Path) -> list[trimesh.Trimesh]:
         ModelError: if the file cannot be read, or has no faces.
     """
     path = check_file(path, MESH_SUFFIXES)
-    _warn_missing_textures(path)
+    some_missing = _warn_missing_textures(path)
     try:
         scene = trimesh.load_scene(path, process=False)
     except Exception as error:  # trimesh's readers raise whatever their parsing trips over
@@ -54,6 +55,8 @@ def load_parts(path: str | Path) -> list[trimesh.Trimesh]:
         raise ModelError(
             f"'{path}' has no triangles: the tracker needs a surface. Export it as a triangle mesh, or give its lines with from_polylines."
         )
+    if not some_missing:
+        _warn_unread_textures(path, parts)
     return parts
 
 
@@ -96,15 +99,27 @@ def join_parts(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     return parts[0] if len(parts) == 1 else cast(trimesh.Trimesh, trimesh.util.concatenate(parts))
 
 
-def _warn_missing_textures(path: Path) -> None:
+def _warn_missing_textures(path: Path) -> bool:
+    """Warn of files that a mesh file names and that are not there; says whether there are any."""
     missing = [name for name in _named_files(path) if not (path.parent / name).is_file()]
     if missing:
-        warnings.warn(
+        _warn(
             f"'{path}' names {', '.join(repr(name) for name in missing)}, which cannot be found in '{path.parent}': "
-            "only the geometry is used. Put the file there, or export the model as GLB, which holds its textures.",
-            TorchtrackWarning,
-            stacklevel=4,
+            "only the geometry is used. Put the file there, or export the model as GLB, which holds its textures."
         )
+    return bool(missing)
+
+
+def _warn_unread_textures(path: Path, parts: list[trimesh.Trimesh]) -> None:
+    """Warn if the materials of a glTF file have textures of which none could be read."""
+    materials = _gltf_content(path).get("materials", []) if path.suffix.lower() in (".glb", ".gltf") else []
+    textured = any("baseColorTexture" in material.get("pbrMetallicRoughness", {}) for material in materials)
+    if textured and all(texture_image(part) is None for part in parts):
+        _warn(f"the texture of '{path}' cannot be read: only the geometry is used. Export it with PNG or JPEG images and UV coordinates.")
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, TorchtrackWarning, stacklevel=5)
 
 
 def _named_files(path: Path) -> list[str]:
@@ -113,10 +128,12 @@ def _named_files(path: Path) -> list[str]:
     if suffix == ".obj":
         return _named_by_obj(path)
     if suffix == ".ply":
-        header = path.read_bytes()[:10_000].split(b"end_header")[0].decode("latin-1")
+        with path.open("rb") as stream:
+            header = stream.read(10_000).split(b"end_header")[0].decode("latin-1")
         return re.findall(r"^comment TextureFile (.+?)\s*$", header, re.MULTILINE)
-    if suffix == ".gltf":
-        return _named_by_gltf(path)
+    if suffix in (".glb", ".gltf"):
+        images = _gltf_content(path).get("images", [])
+        return [image["uri"] for image in images if "uri" in image and not image["uri"].startswith("data:")]
     return []
 
 
@@ -131,10 +148,14 @@ def _named_by_obj(path: Path) -> list[str]:
     return named
 
 
-def _named_by_gltf(path: Path) -> list[str]:
-    """Images of a glTF file that are files beside it."""
+def _gltf_content(path: Path) -> dict[str, Any]:
+    """The JSON part of a glTF file; nothing, if it is damaged (its reader will say how)."""
+    with path.open("rb") as stream:
+        header = stream.read(20)
+        # A binary file begins with a header of 12 bytes, then the length and type of the JSON part.
+        text = stream.read(int.from_bytes(header[12:16], "little")) if header[:4] == b"glTF" else header + stream.read()
     try:
-        images = json.loads(path.read_text(encoding="utf-8")).get("images", [])
+        content = json.loads(text)
     except ValueError:
-        return []  # the reader will say what is wrong with the file
-    return [image["uri"] for image in images if "uri" in image and not image["uri"].startswith("data:")]
+        return {}
+    return content if isinstance(content, dict) else {}

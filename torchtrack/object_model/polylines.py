@@ -8,6 +8,7 @@ Two formats, both plain text:
 """
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -46,8 +47,8 @@ def read_polylines(path: str | Path) -> tuple[Polylines, str | None]:
 
 def has_obj_lines(path: Path) -> bool:
     """Whether an OBJ file has lines and no faces."""
-    records = {line.split(maxsplit=1)[0] for line in path.read_text(encoding="latin-1").splitlines() if line.strip()}
-    return "l" in records and "f" not in records
+    text = path.read_text(encoding="latin-1")
+    return re.search(r"^\s*l\s", text, re.MULTILINE) is not None and re.search(r"^\s*f\s", text, re.MULTILINE) is None
 
 
 def _obj_lines(text: str) -> Polylines:

@@ -24,6 +24,8 @@ _BORDER_BLURS = 2.0
 _MOST_REPEATS = 256
 _SUBPIXEL_BITS = 4
 _SAME_UV = 1e-5
+# Faces that map to a line of the texture show none of its edges.
+_LEAST_UV_AREA = 1e-12
 
 
 def texture_edges(surface: Surface, table: EdgeTable, contrast: float) -> SurfacePoints:
@@ -71,7 +73,7 @@ def _place(surface: Surface, number: int, borders: np.ndarray, shape: tuple[int,
     """The faces of a texture in its image, once for every repeat of the image that they touch."""
     uv = surface.corner_uv
     area = _signed_area(uv)
-    face = np.flatnonzero((surface.texture_index == number) & np.isfinite(uv).all((1, 2)) & (np.abs(area) > 0))
+    face = np.flatnonzero((surface.texture_index == number) & np.isfinite(uv).all((1, 2)) & (np.abs(area) > _LEAST_UV_AREA))
     low, high = np.floor(uv[face].min(1)), np.ceil(uv[face].max(1)) - 1
     across, down = (np.maximum(high - low, 0) + 1).astype(np.int64).T
     sane = across * down <= _MOST_REPEATS
