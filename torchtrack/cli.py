@@ -93,22 +93,87 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class Simulate:
+    """Simulate an event camera before moving objects; write a sequence with its ground truth."""
+
+    config: Positional[Annotated[str, arg(metavar="CONFIG")]]
+    """A YAML file of the scene."""
+    output: Annotated[str, arg(aliases=["-o"], metavar="FILE")]
+    """The sequence to write (.npz); its meshes are put beside it."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        from torchtrack.commands import simulate
+
+        return simulate(self.config, self.output, overrides, quiet=self.quiet)
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Simulate a scene, track it, and show the errors: the whole pipeline in one command."""
+
+    config: Positional[Annotated[str, arg(metavar="CONFIG")]]
+    """A YAML file, such as configs/demo.yaml."""
+    output: _Output = None
+    """Folder for the scene and the results."""
+    quiet: bool = False
+    """No progress bars."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        from torchtrack.commands import demo
+
+        return demo(self.config, _given(self, ("config", "quiet")) | overrides, quiet=self.quiet)
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Make a polyline model from a picture: the outlines of dark shapes on a plane that faces the camera."""
+
+    image: Positional[Annotated[str, arg(metavar="IMAGE")]]
+    """What the camera saw."""
+    calibration: Annotated[str, arg(metavar="FILE")]
+    """Calibration of the camera."""
+    output: Annotated[str, arg(aliases=["-o"], metavar="FILE")]
+    """The polylines to write (.json)."""
+    distance_m: float = 1.0
+    """Distance of the plane (m); at the pose of no rotation and translation (0, 0, distance) the model lies on the picture."""
+    width: _Number = None
+    """Sensor width (px), where the calibration does not say it."""
+    height: _Number = None
+    """Sensor height (px), where the calibration does not say it."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        from torchtrack.commands import outline
+
+        _refuse(overrides)
+        return outline(self.image, self.calibration, self.output, self.distance_m, self.width, self.height)
+
+
+@dataclass(frozen=True)
 class Settings:
     """List every setting of a command: its key, type, default, bounds and meaning."""
 
-    command: Positional[Literal["track", "evaluate"]] = "track"
+    command: Positional[Literal["track", "evaluate", "demo", "simulate"]] = "track"
     """The command."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
         from torchtrack.commands import list_settings
 
+        _refuse(overrides)
         return list_settings(self.command)
 
 
 _Command = (
     Annotated[Track, subcommand("track", description=f"{Track.__doc__} {_SETTINGS_HINT.format('track')}")]
     | Annotated[Evaluate, subcommand("evaluate", description=f"{Evaluate.__doc__} {_SETTINGS_HINT.format('evaluate')}")]
+    | Annotated[Simulate, subcommand("simulate")]
+    | Annotated[Demo, subcommand("demo")]
+    | Annotated[Outline, subcommand("outline")]
     | Annotated[Settings, subcommand("settings")]
 )
 
@@ -149,6 +214,12 @@ def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]
             value = following
         overrides[name.replace("-", "_")] = typed(value)
     return options, overrides
+
+
+def _refuse(overrides: dict[str, Any]) -> None:
+    """Raise :class:`ConfigError` where settings are given to a command that has none."""
+    if overrides:
+        raise ConfigError(f"command line: this command takes no settings, got --{', --'.join(overrides)}.")
 
 
 def _given(command: Any, without: tuple[str, ...]) -> dict[str, Any]:

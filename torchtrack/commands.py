@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from torchtrack.config.demo import DemoConfig
 from torchtrack.config.describe import described
 from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.config.load import load, read_yaml
@@ -16,7 +17,11 @@ from torchtrack.config.settings import CommandLineText, Settings
 from torchtrack.eval.evaluate import evaluate as evaluate_all
 from torchtrack.eval.evaluate import find_sequences
 from torchtrack.eval.tables import results_table, run_headline, run_table
+from torchtrack.io import read_calibration
+from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines
 from torchtrack.runner import run
+from torchtrack.sim import SceneConfig, write
+from torchtrack.sim import simulate as simulate_scene
 from torchtrack.sinks.progress import ProgressBar
 
 EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
@@ -32,11 +37,15 @@ def output_console() -> Console:
 
 def track(config_or_source: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
     """Track one source, show the summary; returns the exit code."""
-    console = output_console()
     if Path(config_or_source).suffix.lower() in (".yaml", ".yml"):
         config = load(RunConfig, Path(config_or_source), overrides)
     else:
         config = load(RunConfig, None, {"source": CommandLineText(config_or_source), **overrides})
+    return _run(config, quiet)
+
+
+def _run(config: RunConfig, quiet: bool) -> int:
+    console = output_console()
     progress = [] if quiet else [ProgressBar(Console(stderr=True), config.source.name)]
     summary = run(config, progress)
     console.print(run_headline(summary))
@@ -62,6 +71,37 @@ def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mappi
     return EXIT_FAILED if evaluation.failures else 0
 
 
+def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
+    """Simulate a scene into a sequence; returns the exit code."""
+    path = _simulated(load(SceneConfig, Path(config_file), overrides), Path(output), quiet)
+    output_console().print(f"The sequence is in {path}")
+    return 0
+
+
+def _simulated(scene: SceneConfig, path: Path, quiet: bool) -> Path:
+    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
+        bar = progress.add_task(f"simulating {scene.name}", total=1.0)
+        return write(simulate_scene(scene, lambda share: progress.update(bar, completed=share)), path)
+
+
+def demo(config_file: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
+    """Simulate a scene, track it, show the errors; returns the exit code."""
+    config = load(DemoConfig, Path(config_file), overrides)
+    scene = load(SceneConfig, config.scene)
+    sequence = _simulated(scene, config.output / f"{scene.name}.npz", quiet)
+    shared = {name: getattr(config, name) for name in DemoConfig.model_fields if name in RunConfig.model_fields}
+    return _run(RunConfig(source=sequence, **shared), quiet)
+
+
+def outline(image: str, calibration: str, output: str, distance_m: float, width: int | None, height: int | None) -> int:
+    """Write a polyline model of the dark shapes of a picture; returns the exit code."""
+    camera = read_calibration(calibration, width, height)
+    lines = outline_dark_shapes(read_grey_image(Path(image)), camera, distance_m)
+    write_polylines(Path(output), lines)
+    output_console().print(f"{len(lines)} outlines are in {output}")
+    return 0
+
+
 def _method_overrides(config_file: Path | None, overrides: Mapping[str, Any], chosen: Sequence[str] | None) -> dict[str, Any]:
     """Overrides with what names no method laid over every one; a chosen method that the file does not know is a preset."""
     of_file = (read_yaml(config_file) if config_file else {}).get("methods") or {}
@@ -76,7 +116,7 @@ def _method_overrides(config_file: Path | None, overrides: Mapping[str, Any], ch
 def list_settings(command: str) -> int:
     """Show every setting of a command; returns the exit code."""
     table = Table("setting", "type", "default", "meaning", header_style="bold", box=None)
-    settings: dict[str, type[Settings]] = {"track": RunConfig, "evaluate": EvaluateConfig}
+    settings: dict[str, type[Settings]] = {"track": RunConfig, "evaluate": EvaluateConfig, "demo": DemoConfig, "simulate": SceneConfig}
     for row in described(settings[command]):
         table.add_row(*row)
     output_console().print(table)

@@ -11,11 +11,13 @@ import torch
 
 from torchtrack.config.load import as_yaml
 from torchtrack.config.run import RunConfig, TrackingConfig
-from torchtrack.errors import ConfigError
+from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
 from torchtrack.interrupt import Interrupt
 from torchtrack.session import Session, open_session
 from torchtrack.sinks import Sink
+from torchtrack.sinks.alignment import AlignmentRecord
 from torchtrack.sinks.folder import output_folder
+from torchtrack.sinks.overlay import Overlay
 from torchtrack.sinks.poses import PoseFiles
 from torchtrack.sinks.record import Record
 from torchtrack.sinks.summary import RunSummary, summarise_run
@@ -77,19 +79,48 @@ def run(config: RunConfig, sinks: Sequence[Sink] = ()) -> RunSummary:
             wall_s=time.perf_counter() - begun,
             device=config.device,
             interrupted=interrupt.requested,
-            more=_further_facts(session, config, own),
+            more=_further_facts(config, session.labels, own),
         )
         (folder / "config.yaml").write_text(as_yaml(config), encoding="utf-8")
         write_json(folder / "summary.json", summary.as_json())
     return summary
 
 
-def _optional_sinks(folder: Path, session: Session, config: RunConfig) -> list[Sink]:
-    return []
+def _optional_sinks(folder: Path, session: Session, config: RunConfig) -> list[Overlay | AlignmentRecord]:
+    """The sinks that can be switched on and off."""
+    overlay = [Overlay(folder, session, config.overlay)] if config.overlay.enabled else []
+    return [*overlay, *([AlignmentRecord(session)] if config.alignment else [])]
 
 
-def _further_facts(session: Session, config: RunConfig, sinks: Sequence[Sink]) -> dict[str, dict[str, Any]]:
-    return {}
+def _further_facts(config: RunConfig, labels: Sequence[str], sinks: Sequence[Sink]) -> dict[str, dict[str, Any]]:
+    """By label: what optional sinks measured, and the rotation that is known from elsewhere."""
+    facts: dict[str, dict[str, Any]] = {label: {} for label in labels}
+    if config.reference_angular_velocity is not None:
+        known = {"reference_angular_velocity": read_numbers(config.reference_angular_velocity, 3)}
+        facts = {label: {**found, **known} for label, found in facts.items()}
+    for sink in sinks:
+        if isinstance(sink, AlignmentRecord):
+            facts = {label: {**found, **sink.facts()[label]} for label, found in facts.items()}
+    return facts
+
+
+def read_numbers(path: Path, count: int) -> list[float]:
+    """The numbers of a small text file.
+
+    Raises:
+        MissingFileError: if it is not there.
+        UnknownFormatError: if it does not hold ``count`` numbers and nothing else.
+    """
+    if not path.is_file():
+        raise MissingFileError(f"no file at {path}. Check the path.")
+    words = path.read_text(encoding="utf-8", errors="replace").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count:
+        raise UnknownFormatError(f"'{path}' must hold {count} numbers, got '{' '.join(words)[:60]}'.")
+    return numbers
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -115,7 +115,9 @@ class RunConfig(TrackingConfig):
     )
     overlay: OverlayConfig = OverlayConfig()
     alignment: bool = Field(False, description="Measure how far events lie from the contours, at the tracked and at the initial pose.")
-    reference_angular_velocity: ConfigPath | None = Field(None, description="Text file of three numbers (rad/s) put beside the recovered rotation.")
+    reference_angular_velocity: ConfigPath | None = Field(
+        None, description="Text file of three numbers, for the summary (a camera turns the other way)."
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> "RunConfig":

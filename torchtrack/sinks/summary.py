@@ -49,6 +49,7 @@ class RunSummary:
         event_rate_per_s: events by stream time.
         wall_s: time that it took, with reading and writing.
         real_time_factor: stream time by wall time.
+        tracking_real_time_factor: stream time by the time of the tracker alone, without reading, drawing and writing.
         step_median_ms, step_p95_ms: time of one tracker step.
         objects: by label.
     """
@@ -64,6 +65,7 @@ class RunSummary:
     event_rate_per_s: float
     wall_s: float
     real_time_factor: float
+    tracking_real_time_factor: float
     step_median_ms: float
     step_p95_ms: float
     objects: dict[str, ObjectSummary]
@@ -91,6 +93,7 @@ def summarise_run(
         event_rate_per_s=record.event_count / record.duration_s,
         wall_s=wall_s,
         real_time_factor=record.duration_s / wall_s,
+        tracking_real_time_factor=record.duration_s / (1e-3 * float(step_ms.sum())),
         step_median_ms=float(np.median(step_ms)),
         step_p95_ms=float(np.percentile(step_ms, 95)),
         objects={label: _summarise_object(of, record.duration_s, dict(more.get(label, {}))) for label, of in by_label},

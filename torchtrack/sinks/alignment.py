@@ -1,0 +1,52 @@
+"""Alignment of events and contours over a run, at the tracked pose and at the one that it started from."""
+
+from array import array
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchtrack.camera import undistortion_table
+from torchtrack.contours import reproject
+from torchtrack.eval.alignment import alignment
+from torchtrack.session import Session
+from torchtrack.stepping import Step
+
+
+class AlignmentRecord:
+    """Measures every window; what it found is in :meth:`facts`."""
+
+    def __init__(self, session: Session) -> None:
+        self._labels = session.labels
+        self._initial = session.T_cam_obj
+        self._table = undistortion_table(session.camera).double().numpy()
+        self._intrinsics = session.camera.intrinsics(torch.float64).expand(len(session.labels), 4)
+        self._median_px = {name: [array("d") for _ in session.labels] for name in ("tracked", "initial")}
+        self._share = {name: [array("d") for _ in session.labels] for name in ("tracked", "initial")}
+
+    def add(self, step: Step) -> None:
+        """Measure one window."""
+        events = step.window.events
+        pixels = self._table[events.y.cpu().numpy(), events.x.cpu().numpy()]
+        tracked = step.result.contours
+        as_stored = replace(tracked, points_obj=tracked.points_obj.cpu().double(), tangents_obj=tracked.tangents_obj.cpu().double())
+        initial = reproject(as_stored, self._initial, self._intrinsics)
+        for name, contours in (("tracked", tracked), ("initial", initial)):
+            for index in range(len(self._labels)):
+                seen = tracked.mask[index].cpu()
+                found = alignment(pixels, contours.pixels[index].cpu()[seen].double().numpy(), contours.normals[index].cpu()[seen].double().numpy())
+                self._median_px[name][index].append(found.median_px)
+                self._share[name][index].append(found.share_near)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def facts(self) -> dict[str, dict[str, Any]]:
+        """By label: medians over the windows at the tracked and at the initial pose."""
+        return {label: {"alignment": {name: self._of(name, index) for name in self._median_px}} for index, label in enumerate(self._labels)}
+
+    def _of(self, name: str, index: int) -> dict[str, float]:
+        medians, shares = np.array(self._median_px[name][index]), np.array(self._share[name][index])
+        known = medians[np.isfinite(medians)]
+        return {"median_px": float(np.median(known)) if len(known) else float("nan"), "share_near": float(np.median(shares))}
