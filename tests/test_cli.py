@@ -2,6 +2,8 @@ import json
 import subprocess
 import sys
 
+import cv2
+import numpy as np
 import pytest
 from tiny_sequence import write_tiny_sequence
 
@@ -134,3 +136,38 @@ def test_public_names_are_all_there():
     assert set(torchtrack.__all__) <= set(dir(torchtrack))
     with pytest.raises(AttributeError, match="no attribute 'Trakcer'"):
         _ = torchtrack.Trakcer
+
+
+SCENE = """
+name: small
+duration_s: 0.03
+camera: {width: 160, height: 120, fx: 150, fy: 150}
+objects:
+  - label: cube
+    shape: cube
+    motion: {position_m: [0, 0, 0.6], rotation_deg: [30, 35, 10]}
+"""
+
+
+def test_simulate_and_demo(tmp_path, capsys):
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    assert command("simulate", tmp_path / "scene.yaml", "-o", tmp_path / "alone.npz", "--quiet") == 0
+    (tmp_path / "demo.yaml").write_text("scene: scene.yaml\noverlay: {enabled: false}\n")
+    assert command("demo", tmp_path / "demo.yaml", "-o", tmp_path / "out", "--quiet") == 0
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"small.npz", "small_cube.ply", "trajectory_cube.tum", "poses.csv", "config.yaml", "summary.json"} <= names
+    assert (tmp_path / "out" / "small_cube.ply").read_bytes() == (tmp_path / "alone_cube.ply").read_bytes()
+    output = capsys.readouterr().out
+    assert "cube" in output and str(tmp_path / "out") in output
+
+
+def test_outline_makes_a_model(tmp_path, capsys):
+    picture = np.full((80, 120), 200, np.uint8)
+    picture[20:50, 30:60] = 10
+    cv2.imwrite(str(tmp_path / "frame.png"), picture)
+    (tmp_path / "calib.txt").write_text("100 100 60 40\n")
+    arguments = ("outline", tmp_path / "frame.png", "--calibration", tmp_path / "calib.txt", "-o", tmp_path / "model.json")
+    assert command(*arguments, "--width", 120, "--height", 80) == 0
+    assert len(json.loads((tmp_path / "model.json").read_text())["polylines"]) == 1
+    assert command(*arguments, "--tracker.flow.iterations", 3) == 2
+    assert "takes no settings" in capsys.readouterr().err

@@ -6,13 +6,14 @@ import signal
 import numpy as np
 import pytest
 import torch
+from conftest import REPOSITORY
 from tiny_sequence import CAMERA, write_tiny_sequence
 
 import torchtrack
 from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import WindowConfig
-from torchtrack.errors import CalibrationError, ConfigError, EventDataError, MissingFileError, PoseError
+from torchtrack.errors import CalibrationError, ConfigError, EventDataError, MissingFileError, PoseError, UnknownFormatError
 from torchtrack.events import EventBatch
 from torchtrack.io import read_sequence, read_tum
 from torchtrack.lie import rotation_angle_deg
@@ -248,3 +249,46 @@ def test_a_calibration_that_makes_no_sense(sequence_path, tmp_path):
     path.write_text("0 0 0 0\n")
     with pytest.raises(CalibrationError, match="focal lengths"):
         open_session(RunConfig(source=sequence_path, camera={"calibration": path, "width": 120, "height": 90}))
+
+
+def test_overlay_and_alignment_are_written_when_asked_for(sequence_path, tmp_path):
+    summary = run(RunConfig(source=sequence_path, output=tmp_path / "out", overlay={"stills": 2}, alignment=True))
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert "overlay.mp4" in names
+    assert sum(name.startswith("overlay_") and name.endswith(".png") for name in names) == 2
+    measured = summary.objects["box"].more["alignment"]
+    assert measured["tracked"]["median_px"] < 1
+    assert measured["tracked"]["share_near"] > 0.9
+
+
+def test_planar_shapes_of_a_real_recording(data_dir, tmp_path):
+    config = load(RunConfig, REPOSITORY / "configs" / "track" / "shapes_rotation.yaml", recording_in(data_dir, tmp_path))
+    summary = run(config)
+    facts = json.loads((tmp_path / "out" / "summary.json").read_text())["objects"]["shapes"]
+    tracked, initial = facts["more"]["alignment"]["tracked"]["median_px"], facts["more"]["alignment"]["initial"]["median_px"]
+    assert tracked < 1.5 < 3 < initial
+    assert summary.objects["shapes"].status == {"TRACKING": 20}
+    # The camera turns, so the shapes turn the other way.
+    recovered, of_camera = np.array(facts["angular_velocity_rad_s"]), np.array(facts["more"]["reference_angular_velocity"])
+    assert np.abs(recovered + of_camera).max() < 0.4
+
+
+def recording_in(data_dir, folder):
+    """Overrides that take the recording from where the data is."""
+    recording = data_dir / "recordings" / "shapes_rotation"
+    return {
+        "source": str(recording / "events.txt"),
+        "camera.calibration": str(recording / "calib.txt"),
+        "reference_angular_velocity": str(recording / "motion.txt"),
+        "output": str(folder / "out"),
+        "overlay.enabled": False,
+    }
+
+
+@pytest.mark.parametrize("text", ["1 2", "1 2 x"])
+def test_a_reference_that_is_no_three_numbers(sequence_path, tmp_path, text):
+    (tmp_path / "motion.txt").write_text(text)
+    with pytest.raises(UnknownFormatError, match=r"motion\.txt.* must hold 3 numbers"):
+        run(quick(sequence_path, tmp_path / "out", end_us=6000, reference_angular_velocity=tmp_path / "motion.txt"))
+    with pytest.raises(MissingFileError, match="nowhere"):
+        run(quick(sequence_path, tmp_path / "out", end_us=6000, reference_angular_velocity=tmp_path / "nowhere.txt"))

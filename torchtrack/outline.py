@@ -62,13 +62,20 @@ def outline_dark_shapes(image: UInt8[ndarray, "h w"], camera: Camera, distance_m
 def _dark_contours(image: UInt8[ndarray, "h w"]) -> list[Float[ndarray, "_ 2"]]:
     """Closed contours of dark regions, in pixels, without repeating the first point."""
     large = cv2.resize(image, None, fx=_ENLARGEMENT, fy=_ENLARGEMENT, interpolation=cv2.INTER_CUBIC)
-    _, dark = cv2.threshold(large, 0, 255, cv2.THRESH_BINARY_INV | cv2.THRESH_OTSU)
+    dark = (large < _edge_level(image)).astype(np.uint8)
     edge = round(_BORDER_PX * _ENLARGEMENT / 2)
     dark[:edge], dark[-edge:], dark[:, :edge], dark[:, -edge:] = 0, 0, 0, 0
     contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     big = [contour[:, 0] for contour in contours if cv2.contourArea(contour) >= _MIN_AREA_PX * _ENLARGEMENT**2]
     # Pixel centres: the large pixel i covers the small pixels' coordinates around (i + 0.5) / enlargement - 0.5.
     return [(contour + 0.5) / _ENLARGEMENT - 0.5 for contour in big]
+
+
+def _edge_level(image: UInt8[ndarray, "h w"]) -> float:
+    """The grey halfway between dark and bright, which is where an edge is; Otsu's threshold tells the two apart."""
+    threshold, _ = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
+    bright = image > threshold
+    return float(image[bright].mean() + image[~bright].mean()) / 2 if bright.any() and not bright.all() else 0.0
 
 
 def _simplified(contour: Float[ndarray, "n 2"], tolerance_px: float) -> Float[ndarray, "m 2"]:
