@@ -74,7 +74,7 @@ def _dark_contours(image: UInt8[ndarray, "h w"]) -> list[Float[ndarray, "_ 2"]]:
 def _edge_level(image: UInt8[ndarray, "h w"]) -> float:
     """The grey halfway between dark and bright, which is where an edge is; Otsu's threshold tells the two apart."""
     threshold, _ = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
-    bright = image > threshold
+    bright: ndarray = np.greater(image, threshold)
     return float(image[bright].mean() + image[~bright].mean()) / 2 if bright.any() and not bright.all() else 0.0
 
 
@@ -87,7 +87,7 @@ def _simplified(contour: Float[ndarray, "n 2"], tolerance_px: float) -> Float[nd
 def _inside(line: Float[ndarray, "n 2"], shape: tuple[int, ...]) -> list[Float[ndarray, "_ 2"]]:
     """The parts of a line away from the picture's border: along it run cuts, not edges."""
     limit = np.array([shape[1], shape[0]]) - 1 - _BORDER_PX
-    near_border = ((line < _BORDER_PX) | (line > limit)).any(1)
+    near_border: ndarray = np.any((line < _BORDER_PX) | (line > limit), axis=1)
     cut = near_border[:-1] & near_border[1:]
     parts = np.split(np.arange(len(line)), np.flatnonzero(cut) + 1)
     return [line[part] for part in parts if len(part) >= 2]
