@@ -183,7 +183,7 @@ class EventCamera:
         return replace(after, in_reset=in_reset), self._batch(fired, noise, state.frame_us)
 
     def _updated_level(
-        self, log_level: Float[Tensor, "h w"], luminance: Float[Tensor, "h w"], regions: Sequence[tuple[slice, slice]] | None
+        self, log_level: Float[Tensor, "h w"], luminance: Float[Tensor, "rows columns"], regions: Sequence[tuple[slice, slice]] | None
     ) -> Float[Tensor, "h w"]:
         """Log levels with the given rectangles renewed."""
         if luminance.shape != log_level.shape:

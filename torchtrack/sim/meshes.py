@@ -73,7 +73,7 @@ def _boxes(boxes: Sequence[_Box], patches: Sequence[Image]) -> trimesh.Trimesh:
 
 def cube(size_m: float = 0.12) -> trimesh.Trimesh:
     """A cube with another print on every face."""
-    return _boxes([_Box((size_m,) * 3, (0, 0, 0), (0, 1, 2, 3, 4, 5))], [face(256) for face in textures.CUBE_FACES])
+    return _boxes([_Box((size_m, size_m, size_m), (0.0, 0.0, 0.0), (0, 1, 2, 3, 4, 5))], [face(256) for face in textures.CUBE_FACES])
 
 
 def book(width_m: float = 0.14, height_m: float = 0.2, thickness_m: float = 0.03) -> trimesh.Trimesh:
@@ -86,7 +86,7 @@ def book(width_m: float = 0.14, height_m: float = 0.2, thickness_m: float = 0.03
         textures.page_edges(116, 540),
     ]
     # The spine and the edge opposite run along the height: their boxes' faces have the width along y.
-    return _boxes([_Box((width_m, height_m, thickness_m), (0, 0, 0), (3, 2, 4, 4, 0, 1))], patches)
+    return _boxes([_Box((width_m, height_m, thickness_m), (0.0, 0.0, 0.0), (3, 2, 4, 4, 0, 1))], patches)
 
 
 def satellite(body_m: float = 0.07, span_m: float = 0.23) -> trimesh.Trimesh:
@@ -95,10 +95,10 @@ def satellite(body_m: float = 0.07, span_m: float = 0.23) -> trimesh.Trimesh:
     boom, gap = 0.008, 0.012
     panel = (span_m - body_m) / 2 - gap
     offset = body_m / 2 + gap + panel / 2
-    body = _Box((body_m, body_m, 1.3 * body_m), (0, 0, 0), (0,) * 6)
-    panels = [_Box((panel, 0.006, 1.2 * body_m), (side * offset, 0, 0), (2, 2, 1, 1, 2, 2)) for side in (-1, 1)]
-    booms = [_Box((gap, boom, boom), (side * (body_m + gap) / 2, 0, 0), (2,) * 6) for side in (-1, 1)]
-    mast = _Box((boom, boom, 0.5 * body_m), (0, 0, 0.9 * body_m), (2,) * 6)
+    body = _Box((body_m, body_m, 1.3 * body_m), (0.0, 0.0, 0.0), (0,) * 6)
+    panels = [_Box((panel, 0.006, 1.2 * body_m), (side * offset, 0.0, 0.0), (2, 2, 1, 1, 2, 2)) for side in (-1, 1)]
+    booms = [_Box((gap, boom, boom), (side * (body_m + gap) / 2, 0.0, 0.0), (2,) * 6) for side in (-1, 1)]
+    mast = _Box((boom, boom, 0.5 * body_m), (0.0, 0.0, 0.9 * body_m), (2,) * 6)
     return _boxes([body, *panels, *booms, mast], patches)
 
 

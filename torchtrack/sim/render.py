@@ -38,7 +38,7 @@ class RenderConfig(Settings):
     """How a scene is lit and sampled."""
 
     supersampling: int = Field(4, ge=1, le=8, description="Samples per pixel along each axis.")
-    lens_blur_px: float = Field(0.5, ge=0, le=5, description="Standard deviation of the lens blur, pixels.")
+    lens_blur_px: float = Field(0.4, ge=0, le=5, description="Standard deviation of the lens blur, pixels.")
     near_m: float = Field(0.01, gt=0, description="Surfaces nearer than this are not drawn, m.")
     light_direction: tuple[float, float, float] = Field((-0.4, -0.7, -0.6), description="Direction towards the light, camera frame.")
     ambient: float = Field(0.35, ge=0, le=1, description="Share of light that comes from everywhere.")

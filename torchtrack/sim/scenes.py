@@ -1,6 +1,6 @@
 """Settings of a simulated scene: objects that move before a fixed camera."""
 
-from typing import Literal, Self
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -85,7 +85,7 @@ class SceneConfig(Settings):
     max_motion_px: float = Field(0.5, gt=0.01, le=2, description="Furthest way of any vertex between two frames, pixels.")
 
     @model_validator(mode="after")
-    def _labels_differ(self) -> Self:
+    def _labels_differ(self) -> "SceneConfig":
         labels = [item.label for item in self.objects]
         if len(set(labels)) != len(labels):
             raise ValueError(f"labels must differ, got {', '.join(labels)}")

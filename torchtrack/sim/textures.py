@@ -1,4 +1,4 @@
-"""Printed textures, drawn by code: grey images ``[h, w]`` of sRGB values 0..255, deterministic."""
+"""Printed textures, drawn by code: grey images ``[height, width]`` of sRGB values 0..255, deterministic."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-Image = UInt8[ndarray, "h w"]
+Image = UInt8[ndarray, "_ _"]
 
 # Reflectances of print: paper about 75 %, ink about 7 %.
 PAPER, GREY, INK = 225, 150, 75

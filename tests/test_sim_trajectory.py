@@ -1,0 +1,108 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from pydantic import ValidationError
+
+from torchtrack.camera import Camera
+from torchtrack.lie import check_pose, rotation_angle_deg
+from torchtrack.sim.frames import frame_motion, frame_times, outer_points
+from torchtrack.sim.meshes import make_mesh
+from torchtrack.sim.trajectory import MotionConfig, SinusoidMotion, ground_truth
+
+CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
+CONFIG = MotionConfig(rotation_deg=(20.0, -40.0, 10.0), rotation_amplitude_deg=(30.0, 10.0, 0.0), frequency_hz=1.5)
+
+
+def seconds(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_poses_are_rigid_and_swing_about_the_mean():
+    T = SinusoidMotion.from_config(CONFIG, seed=3).pose(torch.linspace(0, 100, 5001, dtype=torch.float64))
+    check_pose(T, tolerance=1e-9)
+    away = (T[:, :3, 3] - torch.tensor(CONFIG.position_m)).abs().amax(0)
+    amplitude = torch.tensor(CONFIG.translation_amplitude_m, dtype=torch.float64)
+    assert bool((away <= amplitude).all())
+    assert bool((away > 0.95 * amplitude).all())
+    still = SinusoidMotion.from_config(CONFIG.model_copy(update={"rotation_amplitude_deg": (0.0,) * 3})).pose(seconds(0))
+    turned = rotation_angle_deg(T[:, :3, :3], still[:, :3, :3].expand(len(T), 3, 3))
+    assert float(turned.max()) <= math.hypot(30, 10)
+    assert float(turned.max()) > 28
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.5, 3.0])
+def test_speed_runs_through_the_same_poses_faster(speed):
+    t_s = torch.linspace(0, 2, 50, dtype=torch.float64)
+    normal, fast = SinusoidMotion.from_config(CONFIG, 1.0, 7), SinusoidMotion.from_config(CONFIG, speed, 7)
+    assert torch.allclose(fast.pose(t_s), normal.pose(speed * t_s), atol=1e-12)
+
+
+def test_seeds_give_different_motions_and_the_same_seed_the_same():
+    first, again, other = (SinusoidMotion.from_config(CONFIG, seed=seed).pose(seconds(0.3)) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.allclose(first, other, atol=1e-3)
+
+
+def test_ground_truth_is_sampled_every_millisecond_to_the_end():
+    motion = SinusoidMotion.from_config(CONFIG)
+    truth = ground_truth(motion, 10_500)
+    assert truth.t_us.tolist() == [*range(0, 10_001, 1000), 10_500]
+    assert torch.allclose(truth.T_cam_obj[4], motion.pose(seconds(0.004))[0])
+    # Between the samples, interpolation is good to a micrometre.
+    between = truth.at(torch.tensor([1500, 7300]))
+    assert torch.allclose(between, motion.pose(seconds(0.0015, 0.0073)), atol=1e-5)
+
+
+def test_motion_settings_are_checked():
+    with pytest.raises(ValidationError, match="amplitude"):
+        MotionConfig(amplitude=3)
+    with pytest.raises(ValidationError, match="frequency_hz"):
+        MotionConfig(frequency_hz=-1)
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0, 4.0])
+def test_frames_adapt_to_motion(speed):
+    motions = [SinusoidMotion.from_config(CONFIG, speed, seed) for seed in (0, 1)]
+    points = [outer_points(make_mesh("lbracket")), outer_points(make_mesh("satellite"))]
+    t_us, worst_px = frame_times(motions, points, CAMERA, 400_000, 0.5)
+    assert t_us[0] == 0
+    assert t_us[-1] == 400_000
+    assert np.diff(t_us).min() >= 1
+    assert np.diff(t_us).max() <= 10_000
+    motion_px = frame_motion(motions, points, CAMERA, t_us)
+    assert motion_px.max() == worst_px <= 0.5
+    # Frames are not wasted: they are evenly spread over the motion.
+    assert np.median(motion_px) > 0.4
+
+
+def test_frames_grow_in_number_with_speed():
+    counts = []
+    for speed in (1.0, 2.0):
+        motion = SinusoidMotion.from_config(CONFIG, speed)
+        duration_us = round(1e6 / speed)
+        counts.append(len(frame_times([motion], [outer_points(make_mesh("cube"))], CAMERA, duration_us, 0.5)[0]))
+    # Twice as fast for half as long is the same way.
+    assert counts[1] == pytest.approx(counts[0], rel=0.03)
+
+
+def test_without_motion_there_are_frames_all_the_same():
+    motion = SinusoidMotion.from_config(CONFIG, speed=0.0)
+    t_us, worst_px = frame_times([motion], [outer_points(make_mesh("cube"))], CAMERA, 100_000, 0.5)
+    assert worst_px == 0
+    assert 11 <= len(t_us) <= 12
+
+
+def test_points_behind_the_camera_do_not_ask_for_frames():
+    config = CONFIG.model_copy(update={"position_m": (0.0, 0.0, -1.0)})
+    t_us, _ = frame_times([SinusoidMotion.from_config(config)], [outer_points(make_mesh("cube"))], CAMERA, 100_000, 0.5)
+    assert 11 <= len(t_us) <= 12
+
+
+def test_motion_is_the_furthest_way_of_a_vertex():
+    motion = SinusoidMotion.from_config(MotionConfig(rotation_amplitude_deg=(0, 0, 0), translation_amplitude_m=(0.1, 0, 0)))
+    t_us = np.array([0, 1000, 3000])
+    x = motion.pose(torch.from_numpy(t_us) * 1e-6)[:, 0, 3]
+    way = frame_motion([motion], [torch.tensor([[0.0, 0, 0], [0, 0, -0.2], [0, 0, 0.2]], dtype=torch.float64)], CAMERA, t_us)
+    assert way == pytest.approx(600 * torch.diff(x).abs().numpy() / 0.5)
