@@ -50,16 +50,27 @@ def _texel(texels: Array, offset: int, width: int, height: int, u: float, v: flo
 
 
 @kernel(fastmath=_FAST)
+def _coordinates(f: int, weights: Triple, uv: Array) -> tuple[float, float]:
+    """Texture coordinates of a face at barycentric ``weights``."""
+    w0, w1, w2 = weights
+    return w0 * uv[f, 0, 0] + w1 * uv[f, 1, 0] + w2 * uv[f, 2, 0], w0 * uv[f, 0, 1] + w1 * uv[f, 1, 1] + w2 * uv[f, 2, 1]
+
+
+@kernel(fastmath=_FAST)
+def _albedo(f: int, weights: Triple, albedo: Array) -> float:
+    """Reflectance of a face at barycentric ``weights``, its texture apart."""
+    w0, w1, w2 = weights
+    return w0 * albedo[f, 0] + w1 * albedo[f, 1] + w2 * albedo[f, 2]
+
+
+@kernel(fastmath=_FAST)
 def _reflectance(f: int, weights: Triple, surface: Surface) -> float:
     """Diffuse reflectance of a face at barycentric ``weights``: corner values times texture."""
-    w0, w1, w2 = weights
-    albedo, uv, texture = surface.albedo, surface.uv, surface.texture
-    value = w0 * albedo[f, 0] + w1 * albedo[f, 1] + w2 * albedo[f, 2]
+    value, texture = _albedo(f, weights, surface.albedo), surface.texture
     offset, width, height = texture[f, 0], texture[f, 1], texture[f, 2]
     if width * height == 1:
         return value * surface.texels[offset]
-    u = w0 * uv[f, 0, 0] + w1 * uv[f, 1, 0] + w2 * uv[f, 2, 0]
-    v = w0 * uv[f, 0, 1] + w1 * uv[f, 1, 1] + w2 * uv[f, 2, 1]
+    u, v = _coordinates(f, weights, surface.uv)
     return value * _texel(surface.texels, offset, width, height, u, v)
 
 
@@ -127,15 +138,23 @@ def _light(f: int, weights: Triple, half: Triple, surface: Surface, lighting: Li
 
 @kernel(fastmath=_FAST)
 def _one_face(f: int, row: int, col: int, planes: Array, offsets: Array, half: Triple, surface: Surface, lighting: Lighting) -> float:
-    """Luminance of a pixel that one face fills: light changes slowly and is taken at the centre, texture at every sample."""
-    diffuse, highlight = _light(f, _weights(planes, f, col, row), half, surface, lighting)
-    # Without a texture the reflectance is nearly affine, so the centre speaks for all.
-    if surface.texture[f, 1] * surface.texture[f, 2] == 1:
-        return _reflectance(f, _weights(planes, f, col, row), surface) * diffuse + highlight
+    """Luminance of a pixel that one face fills: light and corner values are taken at the centre, texture at every sample."""
+    centre = _weights(planes, f, col, row)
+    diffuse, highlight = _light(f, centre, half, surface, lighting)
+    offset, width, height = surface.texture[f, 0], surface.texture[f, 1], surface.texture[f, 2]
+    if width * height == 1:
+        return _reflectance(f, centre, surface) * diffuse + highlight
+    # Inside a pixel the texture coordinates are as good as affine.
+    u, v = _coordinates(f, centre, surface.uv)
+    u_right, v_right = _coordinates(f, _weights(planes, f, col + 0.25, row), surface.uv)
+    u_below, v_below = _coordinates(f, _weights(planes, f, col, row + 0.25), surface.uv)
     total = 0.0
     for s in range(len(offsets)):
-        total += _reflectance(f, _weights(planes, f, col + offsets[s, 0], row + offsets[s, 1]), surface)
-    return total / len(offsets) * diffuse + highlight
+        dx, dy = 4 * offsets[s, 0], 4 * offsets[s, 1]
+        sample_u = u + (u_right - u) * dx + (u_below - u) * dy
+        sample_v = v + (v_right - v) * dx + (v_below - v) * dy
+        total += _texel(surface.texels, offset, width, height, sample_u, sample_v)
+    return _albedo(f, centre, surface.albedo) * total / len(offsets) * diffuse + highlight
 
 
 @kernel()
