@@ -122,7 +122,7 @@ def _match(
     if config.matching.along_flow:
         matches = match_along_flow(observations, contours, contour_velocity, gate_px, config.matching)
     else:
-        matches = match_nearest(observations, contours, index, seed, seed_velocity, contour_velocity, gate_px)
+        matches = match_nearest(observations, contours, index, seed, seed_velocity, contour_velocity, gate_px, config.matching.dark_shift_px)
     enough = matches.mask.sum(-1, keepdim=True) >= config.quality.min_observations
     matches = replace(matches, mask=matches.mask & enough)
     return both_coordinates(matches) if config.matching.residual == "point" else matches

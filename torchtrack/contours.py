@@ -24,9 +24,9 @@ _MIN_TEXTURE_COSINE = 0.15
 
 
 class ContourKind(IntEnum):
-    """What a contour point comes from."""
+    """What a contour point comes from: the limb of a smooth surface, a sharp edge (occluding or not), and so on."""
 
-    OCCLUDING = 0
+    LIMB = 0
     CREASE = 1
     TEXTURE = 2
     SEGMENT = 3
@@ -63,6 +63,7 @@ class ContourModel(nn.Module):
     edge_end: Tensor
     face_normals: Tensor
     face_offsets: Tensor
+    is_sharp: Tensor
     is_crease: Tensor
     is_segment: Tensor
     texture_points: Tensor
@@ -84,7 +85,9 @@ class ContourModel(nn.Module):
         is_segment = torch.zeros(len(points), dtype=torch.bool)
         is_segment[len(model.edge_points) :] = True
         self.register_buffer("is_segment", is_segment)
-        self.register_buffer("is_crease", torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)]) & config.creases)
+        is_sharp = torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)])
+        self.register_buffer("is_sharp", is_sharp)
+        self.register_buffer("is_crease", is_sharp & config.creases)
         texture_count = min(len(model.texture_points), config.max_texture_points) if config.texture else 0
         spread = torch.linspace(0, max(len(model.texture_points) - 1, 0), texture_count).long()
         for name in ("texture_points", "texture_tangents", "texture_normals"):
@@ -93,13 +96,12 @@ class ContourModel(nn.Module):
         exact = len(model.triangles) <= config.exact_faces
         self.register_buffer("triangles", model.triangles.clone() if exact else model.triangles[:0].clone())
 
-    def active_edges(self, camera_obj: Float[Tensor, "b 3"], occluding: bool) -> tuple[Bool[Tensor, "b e"], Bool[Tensor, "b e"]]:
-        """Which edges are contours for a camera at ``camera_obj`` (object frame), and which of these occlude."""
+    def active_edges(self, camera_obj: Float[Tensor, "b 3"], occluding: bool) -> Bool[Tensor, "b e"]:
+        """Which edges are contours for a camera at ``camera_obj`` (object frame)."""
         facing = torch.einsum("esk,bk->bes", self.face_normals, camera_obj) > self.face_offsets
         front, back = facing.unbind(-1)
-        occludes = front != back
-        crease = self.is_crease & (front | back)
-        return (occludes & occluding) | crease | self.is_segment, occludes
+        active = self.is_crease & (front | back) | self.is_segment
+        return active | (front != back) if occluding else active
 
 
 def group_by_model(models: Sequence[ObjectModel], config: ContourConfig) -> tuple[nn.ModuleList, list[int]]:
@@ -135,13 +137,11 @@ def take_points(values: Float[Tensor, "b n k"], index: Int[Tensor, "b m"]) -> Fl
     return values.reshape(batch * count, width).index_select(0, row.flatten()).view(*index.shape, width)
 
 
-def _edge_points(
-    model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points (object frame), tangents, kinds and mask on the active edges, spread evenly in the image."""
     rotation, translation = T_cam_obj[:, :3, :3], T_cam_obj[:, :3, 3]
     camera_obj = -(rotation.transpose(1, 2) @ translation[..., None]).squeeze(-1)
-    active, occludes = model.active_edges(camera_obj, config.occluding)
+    active = model.active_edges(camera_obj, config.occluding)
     chosen, exists = select_ranked(active, min(_MAX_ACTIVE_EDGES, active.shape[1]))
     start, end = model.edge_start[chosen], model.edge_end[chosen]
     ends_cam = transform_points(T_cam_obj, torch.cat([start, end], 1))
@@ -160,7 +160,7 @@ def _edge_points(
     points = edge_start + along[..., None] * edge_vector
     tangents = torch.nn.functional.normalize(edge_vector, dim=-1)
     original = chosen.gather(1, edge)
-    kind = torch.where(occludes.gather(1, original), int(ContourKind.OCCLUDING), int(ContourKind.CREASE))
+    kind = torch.where(model.is_sharp[original], int(ContourKind.CREASE), int(ContourKind.LIMB))
     kind = torch.where(model.is_segment[original], int(ContourKind.SEGMENT), kind)
     return points, tangents, kind, (cumulative[:, -1:] > 0).expand(-1, count)
 
@@ -215,7 +215,11 @@ def reproject(contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics:
 
 
 def mesh_contours(
-    models: nn.ModuleList, members: Sequence[Int[Tensor, "g"]], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"], config: ContourConfig
+    models: nn.ModuleList,
+    members: Sequence[Int[Tensor, "g"]],
+    T_cam_obj: Float[Tensor, "b 4 4"],
+    intrinsics: Float[Tensor, "b 4"],
+    config: ContourConfig,
 ) -> Contours:
     """Contours of each object at its pose, hidden parts included.
 

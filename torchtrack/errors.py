@@ -55,9 +55,7 @@ class MissingExtraError(TorchtrackError, ImportError):
 
     def __init__(self, library: str, extra: str, purpose: str) -> None:
         """Name the ``library`` that is missing, the ``extra`` that brings it and the ``purpose`` it serves."""
-        super().__init__(
-            f"{purpose} needs the library '{library}', which is not installed. Install it with: pip install 'torchtrack[{extra}]'"
-        )
+        super().__init__(f"{purpose} needs the library '{library}', which is not installed. Install it with: pip install 'torchtrack[{extra}]'")
 
 
 class TorchtrackWarning(UserWarning):

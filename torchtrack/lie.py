@@ -152,9 +152,7 @@ def transform_points(T_a_b: Float[Tensor, "*b 4 4"], points_b: Float[Tensor, "*b
     return points_b @ T_a_b[..., :3, :3].transpose(-1, -2) + T_a_b[..., None, :3, 3]
 
 
-def se3_interpolate(
-    T_start: Float[Tensor, "*b 4 4"], T_end: Float[Tensor, "*b 4 4"], fraction: Float[Tensor, "*b"]
-) -> Float[Tensor, "*b 4 4"]:
+def se3_interpolate(T_start: Float[Tensor, "*b 4 4"], T_end: Float[Tensor, "*b 4 4"], fraction: Float[Tensor, "*b"]) -> Float[Tensor, "*b 4 4"]:
     """Constant-twist interpolation on SE(3): ``T_start`` at fraction 0, ``T_end`` at fraction 1."""
     xi = se3_log(T_end @ se3_inverse(T_start))
     return se3_exp(fraction[..., None] * xi) @ T_start
@@ -189,7 +187,9 @@ def check_pose(T: Tensor, name: str = "T_cam_obj", tolerance: float = 1e-3) -> N
         raise PoseError(f"{name}: the last row must be [0, 0, 0, 1]. Check whether the matrix is stored transposed.")
 
 
-def move_about(T: Float[Tensor, "*b 4 4"], rotation: Float[Tensor, "*b 3 3"], move: Float[Tensor, "*b 3"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
+def move_about(
+    T: Float[Tensor, "*b 4 4"], rotation: Float[Tensor, "*b 3 3"], move: Float[Tensor, "*b 3"], centre_obj: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 4 4"]:
     """Turn by ``rotation`` about the object's centre, and move the centre by ``move``, both in the camera's axes."""
     turned = rotation @ T[..., :3, :3]
     shift = ((T[..., :3, :3] - turned) @ centre_obj[..., None]).squeeze(-1)

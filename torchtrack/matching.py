@@ -13,12 +13,14 @@ from torch import Tensor
 
 from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.contours import Contours, select_ranked, take_points
+from torchtrack.contours import ContourKind, Contours, select_ranked, take_points
 
 # Squared distances are compared in these fractions of a pixel².
 _DISTANCE_STEPS = 16
 # An edge this parallel to the flow (|n·f| below) is not crossed by it.
 _MIN_CROSSING = 0.3
+# Contours slower than this across themselves (px/s) have no clear leading side.
+_SLOW_PX_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class Observations:
     Args:
         pixels: ideal pixels at the time of the event.
         age_s: time from the event to the window's end (s).
+        polarity: +1 where the pixel got brighter, -1 where darker, 0 where unknown.
         mask: which entries exist.
         flow: velocity (px/s); zero where there is none.
         has_flow: where the flow is known.
@@ -35,6 +38,7 @@ class Observations:
 
     pixels: Float[Tensor, "b n 2"]
     age_s: Float[Tensor, "b n"]
+    polarity: Float[Tensor, "b n"]
     mask: Bool[Tensor, "b n"]
     flow: Float[Tensor, "b n 2"]
     has_flow: Bool[Tensor, "b n"]
@@ -128,13 +132,20 @@ def object_plane_velocity(
 
 
 def select_events(
-    pixels: Float[Tensor, "b e 2"], age_s: Float[Tensor, "b e"], mask: Bool[Tensor, "b e"], index: ContourIndex, plane_velocity: Float[Tensor, "b e 2"], count: int
+    pixels: Float[Tensor, "b e 2"],
+    age_s: Float[Tensor, "b e"],
+    polarity: Float[Tensor, "b e"],
+    mask: Bool[Tensor, "b e"],
+    index: ContourIndex,
+    plane_velocity: Float[Tensor, "b e 2"],
+    count: int,
 ) -> Observations:
     """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time."""
     near = mask & (index.look_up(pixels + plane_velocity * age_s[..., None]) >= 0)
     chosen, exists = select_ranked(near, count)
     flow = torch.zeros(*chosen.shape, 2, dtype=pixels.dtype, device=pixels.device)
-    return Observations(take_points(pixels, chosen), age_s.gather(1, chosen), exists, flow, torch.zeros_like(exists))
+    values = take_points(torch.cat([pixels, age_s[..., None], polarity[..., None]], -1), chosen)
+    return Observations(values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
 
 
 def join(first: Observations, second: Observations) -> Observations:
@@ -150,6 +161,7 @@ def match_nearest(
     seed_velocity: Float[Tensor, "b n 2"],
     contour_velocity: Float[Tensor, "b m 2"],
     gate_px: float,
+    dark_shift_px: float,
 ) -> Matches:
     """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
 
@@ -158,19 +170,36 @@ def match_nearest(
         seed: contour point believed so far, -1 where unknown: tells how far the contour moved since it was indexed.
         seed_velocity: velocity of each observation believed so far (px/s).
         contour_velocity: velocity of each contour point (px/s); zero to switch motion compensation off.
+        dark_shift_px: how far events lie to the dark side of a sharp edge.
     """
     known = seed.clamp(min=0)
     moved = take_points(contours.pixels, known) - take_points(index.pixels, known)
     moved = torch.where((seed >= 0)[..., None], moved, torch.zeros_like(moved))
     found = index.look_up(observations.pixels + seed_velocity * observations.age_s[..., None] - moved)
     contour = found.clamp(min=0)
-    targets = observations.pixels + take_points(contour_velocity, contour) * observations.age_s[..., None]
+    normals, velocity = take_points(contours.normals, contour), take_points(contour_velocity, contour)
+    targets = observations.pixels + velocity * observations.age_s[..., None]
+    # The limb of a smooth surface is no step: its shading fades towards it.
+    sharp = contours.kind.gather(1, contour) != int(ContourKind.LIMB)
+    targets = targets - dark_shift_px * towards_dark(observations.polarity * sharp, normals, velocity)
     offset = take_points(contours.pixels, contour) - targets
     mask = observations.mask & (found >= 0) & contours.mask.gather(1, contour) & (offset.norm(dim=-1) < gate_px)
-    return Matches(contour, mask, targets, take_points(contours.normals, contour))
+    return Matches(contour, mask, targets, normals)
 
 
-def match_along_flow(observations: Observations, contours: Contours, contour_velocity: Float[Tensor, "b m 2"], gate_px: float, config: MatchingConfig) -> Matches:
+def towards_dark(polarity: Float[Tensor, "b n"], normals: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
+    """Unit vector across each contour to its darker side; shorter where the contour hardly moves across itself.
+
+    A pixel gets brighter when the bright side moves over it: the dark side is then ahead. A pixel sees the logarithm of
+    a blurred step, whose middle lies at ``Φ⁻¹(1 / (1 + √contrast))`` blur widths: always on the dark side.
+    """
+    across = (normals * velocity).sum(-1)
+    return (polarity * across / (across.abs() + _SLOW_PX_S))[..., None] * normals
+
+
+def match_along_flow(
+    observations: Observations, contours: Contours, contour_velocity: Float[Tensor, "b m 2"], gate_px: float, config: MatchingConfig
+) -> Matches:
     """Match each corner with the contour point nearest to it along the line of its flow, either way (the paper's 3.3).
 
     The paper moves corners along the flow "to locate the edge points"; seen from a pose that is a window old the edge

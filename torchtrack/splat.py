@@ -32,9 +32,7 @@ def _silhouette(pixels: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Ten
     return _close(occupied.view(-1, height, width), radius), cell
 
 
-def boundary_points(
-    pixels: Float[Tensor, "b n 2"], valid: Bool[Tensor, "b n"], radius: int
-) -> tuple[Bool[Tensor, "b n"], Float[Tensor, "b n 2"]]:
+def boundary_points(pixels: Float[Tensor, "b n 2"], valid: Bool[Tensor, "b n"], radius: int) -> tuple[Bool[Tensor, "b n"], Float[Tensor, "b n 2"]]:
     """Which projected points lie on the boundary of the closed point cloud, and the boundary's normal at each."""
     mask, cell = _silhouette(pixels, valid, radius)
     eroded = -max_pool2d(-mask[:, None], 3, 1, 1)[:, 0]
@@ -46,7 +44,11 @@ def boundary_points(
 
 
 def splat_contours(
-    models: nn.ModuleList, members: Sequence[Int[Tensor, "g"]], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"], config: ContourConfig
+    models: nn.ModuleList,
+    members: Sequence[Int[Tensor, "g"]],
+    T_cam_obj: Float[Tensor, "b 4 4"],
+    intrinsics: Float[Tensor, "b 4"],
+    config: ContourConfig,
 ) -> Contours:
     """Boundary points of each object's splatted surface samples.
 

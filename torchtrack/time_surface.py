@@ -71,7 +71,9 @@ def object_regions(
     return Regions(low, extent, (height, width), stream_index)
 
 
-def time_surface(last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], regions: Regions, tau_s: float, dtype: torch.dtype) -> Float[Tensor, "b rh rw"]:
+def time_surface(
+    last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], regions: Regions, tau_s: float, dtype: torch.dtype
+) -> Float[Tensor, "b rh rw"]:
     """Exponentially decayed surface (Eq. 5) of each object's region at ``t_us``; zero outside the sensor."""
     _, height, width = last_event_us.shape
     rows = regions.origin[:, 1, None] + torch.arange(regions.size[0], device=t_us.device)

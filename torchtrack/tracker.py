@@ -214,7 +214,7 @@ class Tracker(nn.Module):
 
     def _observe(self, start: Alignment, index: ContourIndex, events: EventBatch, corners: Corners, t_us: Tensor) -> Observations:
         """Corners and recent events near each object's contours."""
-        seen = Observations(corners.pixels, corners.age_s, corners.mask, corners.flow, corners.has_flow)
+        seen = Observations(corners.pixels, corners.age_s, torch.zeros_like(corners.age_s), corners.mask, corners.flow, corners.has_flow)
         count = self.config.matching.max_events
         if count == 0:
             return seen
@@ -222,7 +222,8 @@ class Tracker(nn.Module):
         stream = torch.arange(self.streams, device=t_us.device)[:, None]
         pixels = self.ideal_pixels[stream, window.y, window.x][self.stream_index]
         age_s = window.age_us[self.stream_index].to(pixels.dtype) * 1e-6
-        recent = select_events(pixels, age_s, window.mask[self.stream_index], index, start.plane_velocity(pixels), count)
+        polarity = 2.0 * window.polarity[self.stream_index].to(pixels.dtype) - 1.0
+        recent = select_events(pixels, age_s, polarity, window.mask[self.stream_index], index, start.plane_velocity(pixels), count)
         return join(seen, recent)
 
     def _conclude(

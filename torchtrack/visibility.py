@@ -46,7 +46,9 @@ class Scene:
     image_shape: tuple[int, int, int]
 
 
-def hidden_by_faces(points_cam: Float[Tensor, "b m 3"], triangles_cam: Float[Tensor, "b f 3 3"], tolerance_m: Float[Tensor, "b"]) -> Bool[Tensor, "b m"]:
+def hidden_by_faces(
+    points_cam: Float[Tensor, "b m 3"], triangles_cam: Float[Tensor, "b f 3 3"], tolerance_m: Float[Tensor, "b"]
+) -> Bool[Tensor, "b m"]:
     """Which points lie behind one of the triangles, as the camera sees them.
 
     The line of sight to a point crosses a triangle when it is on one side of the three planes through the camera and

@@ -53,7 +53,9 @@ class FlowConfig(_Settings):
 class ContourConfig(_Settings):
     """Visible 3D contours of the object at a pose."""
 
-    source: Literal["mesh", "splat"] = Field("mesh", description="Exact contours of the mesh, or the boundary of its splatted point cloud (the paper).")
+    source: Literal["mesh", "splat"] = Field(
+        "mesh", description="Exact contours of the mesh, or the boundary of its splatted point cloud (the paper)."
+    )
     occluding: bool = Field(True, description="Edges between a front and a back face.")
     creases: bool = Field(True, description="Sharp edges of the mesh.")
     texture: bool = Field(True, description="Edges of the texture.")
@@ -78,6 +80,9 @@ class MatchingConfig(_Settings):
     gates_px: tuple[float, ...] = Field((5, 3, 2, 1.5, 1.5), min_length=1, description="One round of matching and solving per gate (px).")
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
+    dark_shift_px: float = Field(
+        0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
+    )
     max_events: int = Field(1500, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
 
