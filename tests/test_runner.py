@@ -236,6 +236,20 @@ def test_a_stream_without_events_says_so(sequence_path, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_damaged_archive(tmp_path):
+    (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 and nothing else")
+    with pytest.raises(EventDataError, match=r"bad\.npz"):
+        open_session(RunConfig(source=tmp_path / "bad.npz"))
+
+
+def test_the_duration_is_known_from_the_truth_or_the_end(sequence_path, tmp_path):
+    assert open_session(RunConfig(source=sequence_path)).known_duration_s == pytest.approx(0.040 - 0.000499)
+    assert open_session(RunConfig(source=sequence_path, end_us=10_499)).known_duration_s == pytest.approx(0.01)
+    obj = {"label": "box", "mesh": sequence_path.with_name("tiny_box.ply"), "initial_pose": pose_settings(sequence_path)}
+    config = RunConfig(source=text_source(sequence_path, tmp_path), camera=camera_settings(), objects=[obj])
+    assert open_session(config).known_duration_s is None
+
+
 def test_missing_source_and_missing_device(sequence_path, tmp_path):
     with pytest.raises(MissingFileError, match="nowhere"):
         run(quick(tmp_path / "nowhere.npz", tmp_path / "out"))

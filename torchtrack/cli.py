@@ -16,8 +16,7 @@ from tyro.conf import Positional, arg, subcommand
 from torchtrack.config.load import typed
 from torchtrack.config.settings import CommandLineText
 from torchtrack.errors import ConfigError, TorchtrackError
-
-EXIT_FAILED, EXIT_WRONG_SETTINGS, EXIT_INTERRUPTED = 1, 2, 130
+from torchtrack.exit_codes import ExitCode
 
 
 def _option(metavar: str, *aliases: str) -> Any:
@@ -179,17 +178,17 @@ _Command = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0, 1 (failed), 2 (wrong settings) or 130 (interrupted)."""
+    """Run one command; returns its :class:`ExitCode`."""
     try:
         options, overrides = split_overrides(sys.argv[1:] if arguments is None else arguments)
         command = tyro.cli(_Command, prog="torchtrack", description="6DoF object pose tracking with an event camera.", args=options)
         code: int = command.run(overrides)
     except ConfigError as error:
-        return _report(error, EXIT_WRONG_SETTINGS)
+        return _report(error, ExitCode.WRONG_SETTINGS)
     except TorchtrackError as error:
-        return _report(error, EXIT_FAILED)
+        return _report(error, ExitCode.FAILED)
     except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+        return ExitCode.INTERRUPTED
     return code
 
 

@@ -17,14 +17,15 @@ from torchtrack.config.settings import CommandLineText, Settings
 from torchtrack.eval.evaluate import evaluate as evaluate_all
 from torchtrack.eval.evaluate import find_sequences
 from torchtrack.eval.tables import results_table, run_headline, run_table
+from torchtrack.exit_codes import ExitCode
 from torchtrack.io import read_calibration
 from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines
 from torchtrack.runner import run
+from torchtrack.session import open_session
 from torchtrack.sim import SceneConfig, write
 from torchtrack.sim import simulate as simulate_scene
 from torchtrack.sinks.progress import ProgressBar
 
-EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
 # Tables need this much where the output is no terminal, which says how wide it is.
 _FILE_WIDTH = 160
 
@@ -46,12 +47,13 @@ def track(config_or_source: str, overrides: Mapping[str, Any], *, quiet: bool) -
 
 def _run(config: RunConfig, quiet: bool) -> int:
     console = output_console()
-    progress = [] if quiet else [ProgressBar(Console(stderr=True), config.source.name)]
-    summary = run(config, progress)
+    session = open_session(config)
+    progress = [] if quiet else [ProgressBar(Console(stderr=True), session.name, session.known_duration_s)]
+    summary = run(config, progress, session)
     console.print(run_headline(summary))
     console.print(run_table(summary))
     console.print(f"Results are in {config.output}")
-    return EXIT_INTERRUPTED if summary.interrupted else 0
+    return ExitCode.INTERRUPTED if summary.interrupted else ExitCode.DONE
 
 
 def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mapping[str, Any], chosen: Sequence[str] | None, *, quiet: bool) -> int:
@@ -68,14 +70,14 @@ def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mappi
     console.print(f"Results are in {config.output}")
     for failure in evaluation.failures:
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {failure.sequence} ({failure.method}): {failure.reason}", markup=False)
-    return EXIT_FAILED if evaluation.failures else 0
+    return ExitCode.FAILED if evaluation.failures else ExitCode.DONE
 
 
 def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
     """Simulate a scene into a sequence; returns the exit code."""
     path = _simulated(load(SceneConfig, Path(config_file), overrides), Path(output), quiet)
     output_console().print(f"The sequence is in {path}")
-    return 0
+    return ExitCode.DONE
 
 
 def _simulated(scene: SceneConfig, path: Path, quiet: bool) -> Path:
@@ -99,7 +101,7 @@ def outline(image: str, calibration: str, output: str, distance_m: float, width:
     lines = outline_dark_shapes(read_grey_image(Path(image)), camera, distance_m)
     write_polylines(Path(output), lines)
     output_console().print(f"{len(lines)} outlines are in {output}")
-    return 0
+    return ExitCode.DONE
 
 
 def _method_overrides(config_file: Path | None, overrides: Mapping[str, Any], chosen: Sequence[str] | None) -> dict[str, Any]:
@@ -120,4 +122,4 @@ def list_settings(command: str) -> int:
     for row in described(settings[command]):
         table.add_row(*row)
     output_console().print(table)
-    return 0
+    return ExitCode.DONE

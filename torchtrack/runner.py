@@ -47,7 +47,7 @@ def session_steps(session: Session, tracker: Tracker, config: TrackingConfig) ->
     return steps(cut_windows(session.chunks(), config.tracker.window, session.start_us), tracker, state)
 
 
-def run(config: RunConfig, sinks: Sequence[Sink] = ()) -> RunSummary:
+def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None = None) -> RunSummary:
     """Track a source and write trajectories, poses, overlay, settings and summary into the output folder.
 
     Ctrl-C ends the run after the window at hand; the outputs are complete up to there. On an error nothing is written.
@@ -55,11 +55,12 @@ def run(config: RunConfig, sinks: Sequence[Sink] = ()) -> RunSummary:
     Args:
         config: what to do.
         sinks: further sinks, such as a progress bar.
+        session: what :func:`open_session` made of ``config``, where that was done before.
 
     Raises:
         TorchtrackError: of the kind that fits, if anything that the run needs is missing or wrong.
     """
-    session = open_session(config)
+    session = session or open_session(config)
     tracker = build_tracker(session, config)
     record = Record(session.ground_truth)
     begun = time.perf_counter()

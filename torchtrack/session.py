@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -14,7 +13,7 @@ from torchtrack.config.run import CameraConfig, ObjectConfig, PoseConfig, RunCon
 from torchtrack.errors import ConfigError, EventDataError
 from torchtrack.events import EventBatch
 from torchtrack.io import EventSource, SequenceObject, Trajectory, open_events, read_calibration, read_sequence, read_tum
-from torchtrack.io.npz import ZIP_MAGIC
+from torchtrack.io.npz import ZIP_MAGIC, keys_of, open_archive
 from torchtrack.lie import check_pose, rotation_from_quaternion
 from torchtrack.object_model import ObjectModel
 from torchtrack.stepping import clipped
@@ -47,6 +46,13 @@ class Session:
     def chunks(self) -> Iterator[EventBatch]:
         """The events after the start and up to the end."""
         return clipped(self.events.chunks(), self.start_us, self.end_us)
+
+    @property
+    def known_duration_s(self) -> float | None:
+        """How long tracking will last, where the end or the truth says it."""
+        ends = [int(truth.t_us[-1]) for truth in self.ground_truth if truth is not None]
+        end_us = self.end_us if self.end_us is not None else max(ends, default=None)
+        return 1e-6 * (end_us - self.start_us) if end_us is not None else None
 
 
 def open_session(config: RunConfig) -> Session:
@@ -98,8 +104,8 @@ def _is_sequence(path: Path) -> bool:
     with path.open("rb") as stream:
         if not stream.read(4).startswith(ZIP_MAGIC):
             return False
-    with np.load(path) as archive:
-        return "K" in archive.files
+    with open_archive(path) as archive:
+        return "K" in keys_of(archive)
 
 
 def _camera(config: CameraConfig) -> Camera:
