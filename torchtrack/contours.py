@@ -71,10 +71,12 @@ class ContourModel(nn.Module):
     texture_normals: Tensor
     surface_points: Tensor
     triangles: Tensor
+    members: Tensor
 
-    def __init__(self, model: ObjectModel, config: ContourConfig) -> None:
-        """Take what ``config`` switches on from ``model``."""
+    def __init__(self, model: ObjectModel, members: Sequence[int], config: ContourConfig) -> None:
+        """Take what ``config`` switches on from ``model``, which the objects numbered ``members`` have."""
         super().__init__()
+        self.register_buffer("members", torch.tensor(members))
         segments = model.segments if config.segments else model.segments[:0]
         points = torch.cat([model.edge_points, segments])
         self.register_buffer("edge_start", points[:, 0].clone())
@@ -104,17 +106,12 @@ class ContourModel(nn.Module):
         return active | (front != back) if occluding else active
 
 
-def group_by_model(models: Sequence[ObjectModel], config: ContourConfig) -> tuple[nn.ModuleList, list[int]]:
-    """One :class:`ContourModel` per distinct object model, and the index of each object's."""
-    distinct: list[ObjectModel] = []
-    index = []
-    for model in models:
-        known = next((i for i, other in enumerate(distinct) if other is model), None)
-        if known is None:
-            distinct.append(model)
-            known = len(distinct) - 1
-        index.append(known)
-    return nn.ModuleList(ContourModel(model, config) for model in distinct), index
+def group_by_model(models: Sequence[ObjectModel], config: ContourConfig) -> list[ContourModel]:
+    """One :class:`ContourModel` per distinct object model, with the objects that have it."""
+    members: dict[int, list[int]] = {}
+    for number, model in enumerate(models):
+        members.setdefault(id(model), []).append(number)
+    return [ContourModel(models[numbers[0]], numbers, config) for numbers in members.values()]
 
 
 def select_ranked(mask: Bool[Tensor, "b n"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
@@ -215,21 +212,12 @@ def reproject(contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics:
 
 
 def mesh_contours(
-    models: nn.ModuleList,
-    members: Sequence[Int[Tensor, "g"]],
-    T_cam_obj: Float[Tensor, "b 4 4"],
-    intrinsics: Float[Tensor, "b 4"],
-    config: ContourConfig,
+    models: Sequence[ContourModel], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"], config: ContourConfig
 ) -> Contours:
-    """Contours of each object at its pose, hidden parts included.
-
-    Args:
-        models: the distinct models.
-        members: for each model, the objects that have it.
-    """
+    """Contours of each object at its pose, hidden parts included."""
     texture_count = max(len(model.texture_points) for model in models)
-    parts = [_model_contours(model, T_cam_obj[i], intrinsics[i], config, texture_count) for model, i in zip(models, members, strict=True)]
-    order = torch.cat(list(members)).argsort()
+    parts = [_model_contours(model, T_cam_obj[model.members], intrinsics[model.members], config, texture_count) for model in models]
+    order = torch.cat([model.members for model in models]).argsort()
     points, tangents, kind, mask = (torch.cat(column)[order] for column in zip(*parts, strict=True))
     return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics)
 

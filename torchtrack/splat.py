@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from kornia.filters import gaussian_blur2d, spatial_gradient
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import ContourKind, Contours, assemble, select_ranked, take_points
+from torchtrack.contours import ContourKind, ContourModel, Contours, assemble, select_ranked, take_points
 from torchtrack.lie import transform_points
 
 
@@ -44,20 +44,11 @@ def boundary_points(pixels: Float[Tensor, "b n 2"], valid: Bool[Tensor, "b n"], 
 
 
 def splat_contours(
-    models: nn.ModuleList,
-    members: Sequence[Int[Tensor, "g"]],
-    T_cam_obj: Float[Tensor, "b 4 4"],
-    intrinsics: Float[Tensor, "b 4"],
-    config: ContourConfig,
+    models: Sequence[ContourModel], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"], config: ContourConfig
 ) -> Contours:
-    """Boundary points of each object's splatted surface samples.
-
-    Args:
-        models: the distinct models.
-        members: for each model, the objects that have it.
-    """
-    parts = [_model_boundary(model.surface_points, T_cam_obj[i], intrinsics[i], config) for model, i in zip(models, members, strict=True)]
-    order = torch.cat(list(members)).argsort()
+    """Boundary points of each object's splatted surface samples."""
+    parts = [_model_boundary(model.surface_points, T_cam_obj[model.members], intrinsics[model.members], config) for model in models]
+    order = torch.cat([model.members for model in models]).argsort()
     points, tangents, mask = (torch.cat(column)[order] for column in zip(*parts, strict=True))
     kind = torch.full(mask.shape, int(ContourKind.SPLAT), device=mask.device)
     return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics)

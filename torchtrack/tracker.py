@@ -14,7 +14,7 @@ from torchtrack import lie, quality
 from torchtrack.alignment import Alignment, AlignmentResult, align, index_radius_px
 from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, undistortion_table
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contours import Contours, group_by_model, mesh_contours
+from torchtrack.contours import ContourModel, Contours, group_by_model, mesh_contours
 from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.errors import PoseError
 from torchtrack.events import EventBatch, pad_streams
@@ -104,10 +104,7 @@ class Tracker(nn.Module):
         streams = list(stream_index) if stream_index is not None else [0] * len(objects)
         _check_setup(objects, cameras, streams)
         self.image_size = (max(c.height for c in cameras), max(c.width for c in cameras))
-        self.models, model_index = group_by_model(objects, self.config.contours)
-        for number in range(len(self.models)):
-            members = torch.tensor([i for i, m in enumerate(model_index) if m == number])
-            self.register_buffer(f"members_{number}", members)
+        self.groups = nn.ModuleList(group_by_model(objects, self.config.contours))
         self.register_buffer("stream_index", torch.tensor(streams))
         self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
         self.register_buffer("ideal_pixels", _stack_tables([undistortion_table(c) for c in cameras]))
@@ -117,9 +114,9 @@ class Tracker(nn.Module):
         self.to(dtype)
 
     @property
-    def members(self) -> list[Tensor]:
-        """For each distinct model, the objects that have it."""
-        return [self.get_buffer(f"members_{number}") for number in range(len(self.models))]
+    def models(self) -> list[ContourModel]:
+        """The distinct models, with the objects that have each."""
+        return [group for group in self.groups if isinstance(group, ContourModel)]
 
     @property
     def streams(self) -> int:
@@ -189,12 +186,12 @@ class Tracker(nn.Module):
         """Visible contours at a pose."""
         config = self.config.contours
         if config.source == "splat":
-            return splat_contours(self.models, self.members, T_cam_obj, self.intrinsics, config)
-        contours = mesh_contours(self.models, self.members, T_cam_obj, self.intrinsics, config)
+            return splat_contours(self.models, T_cam_obj, self.intrinsics, config)
+        contours = mesh_contours(self.models, T_cam_obj, self.intrinsics, config)
         if not config.remove_hidden:
             return contours
         shape = (self.streams, *self.image_size)
-        scene = Scene(self.models, self.members, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, shape)
+        scene = Scene(self.models, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, shape)
         return remove_hidden(contours, scene, config)
 
     def _corners(self, contours: Contours, last_event_us: Tensor, t_us: Tensor, window_s: Tensor) -> Corners:

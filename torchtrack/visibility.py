@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import Contours
+from torchtrack.contours import ContourModel, Contours
 from torchtrack.lie import transform_points
 
 # A point this far behind a face's plane is behind it, not on it (diameters).
@@ -28,8 +28,7 @@ class Scene:
     """The objects of all streams at their poses.
 
     Args:
-        models: the distinct models.
-        members: for each model, the objects that have it.
+        models: the distinct models, with the objects that have each.
         T_cam_obj: pose of each object.
         intrinsics: ``[fx, fy, cx, cy]`` of each object's camera.
         stream_index: stream of each object.
@@ -37,8 +36,7 @@ class Scene:
         image_shape: streams, height and width of the image.
     """
 
-    models: nn.ModuleList
-    members: Sequence[Int[Tensor, "g"]]
+    models: Sequence[ContourModel]
     T_cam_obj: Float[Tensor, "b 4 4"]
     intrinsics: Float[Tensor, "b 4"]
     stream_index: Int[Tensor, "b"]
@@ -69,7 +67,8 @@ def hidden_by_faces(
 def _hidden_by_self(scene: Scene, points_cam: Tensor) -> Tensor:
     """Points of objects with few faces that these hide."""
     hidden = torch.zeros(points_cam.shape[:2], dtype=torch.bool, device=points_cam.device)
-    for model, members in zip(scene.models, scene.members, strict=True):
+    for model in scene.models:
+        members = model.members
         if len(model.triangles) == 0:
             continue
         corners = model.triangles.flatten(0, 1).expand(len(members), -1, -1)
@@ -86,7 +85,8 @@ def depth_buffer(scene: Scene, cell_px: int) -> tuple[Float[Tensor, "s p"], Int[
     streams, height, width = scene.image_shape
     grid = (-(-height // cell_px) + 3, -(-width // cell_px) + 3)
     cells, keys = [], []
-    for model, members in zip(scene.models, scene.members, strict=True):
+    for model in scene.models:
+        members = model.members
         points = transform_points(scene.T_cam_obj[members], model.surface_points.expand(len(members), -1, -1))
         cell = _cell(project(points, scene.intrinsics[members]), grid, cell_px)
         depth = (points[..., 2] * _DEPTH_STEPS_PER_M).long()
@@ -115,8 +115,8 @@ def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -
     nearest = depth_m[scene.stream_index].gather(1, cell)
     number = torch.arange(len(cell), device=cell.device)[:, None]
     exact = torch.zeros_like(number, dtype=torch.bool)
-    for model, members in zip(scene.models, scene.members, strict=True):
-        exact[members] = len(model.triangles) > 0
+    for model in scene.models:
+        exact[model.members] = len(model.triangles) > 0
     own = owner[scene.stream_index].gather(1, cell) == number
     behind = contours.points_cam[..., 2] > nearest + config.depth_margin * scene.diameters_m[:, None]
     return behind & ~(own & exact)
