@@ -4,13 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours, reproject, take_points
 from torchtrack.lie import transform_points
 from torchtrack.matching import (
+    Belief,
     ContourIndex,
     Matches,
     Observations,
@@ -55,18 +56,23 @@ class Alignment:
         """Image velocity of pixels at the depth of the object's centre (px/s)."""
         return object_plane_velocity(pixels, self.velocity, self.centre_cam(self.T_prior), self.intrinsics)
 
-    def contour_velocity(self, contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b m 2"]:
+    def contour_velocity(self, contours: Contours) -> Float[Tensor, "b m 2"]:
         """Image velocity of contour points (px/s)."""
-        return pixel_velocity(contours.points_cam, self.velocity, self.centre_cam(T_cam_obj), self.intrinsics)
+        return pixel_velocity(contours.points_cam, self.velocity, self.centre_cam(self.T_prior), self.intrinsics)
 
 
 @dataclass(frozen=True)
 class AlignmentResult:
-    """The pose after the last round, and what it stands on."""
+    """The pose after the last round, and what it stands on.
+
+    Args:
+        contour_velocity: image velocity of the contour points (px/s); zero without motion compensation.
+    """
 
     solution: Linearisation
     contours: Contours
     matches: Matches
+    contour_velocity: Float[Tensor, "b m 2"]
 
 
 def index_radius_px(config: TrackerConfig) -> int:
@@ -89,43 +95,40 @@ def align(
         extract: makes contours at a pose anew, in the rounds that ``config.contours.refresh_rounds`` names.
     """
     T_cam_obj = start.T_prior
-    seed = torch.full_like(observations.age_s, -1, dtype=torch.int64)
     compensate = 1.0 if config.matching.motion_compensation else 0.0
-    seed_velocity = compensate * start.plane_velocity(observations.pixels)
+    plane = compensate * start.plane_velocity(observations.pixels)
+    belief = Belief(plane, torch.zeros_like(plane))
+    velocity = compensate * start.contour_velocity(contours)
     for number, gate_px in enumerate(config.matching.gates_px):
         if number and number in config.contours.refresh_rounds:
             contours = extract(T_cam_obj)
             index = index_contours(contours, start.image_size, index_radius_px(config))
-            seed = torch.full_like(seed, -1)
-        velocity = compensate * start.contour_velocity(contours, T_cam_obj)
-        matches = _match(observations, contours, index, seed, seed_velocity, velocity, gate_px, config)
+            velocity = compensate * start.contour_velocity(contours)
+            belief = replace(belief, moved=torch.zeros_like(plane))
+        matches, belief = _match(observations, contours, index, belief, velocity, gate_px, config)
         solution = solve_pose(_problem(start, matches, contours, gate_px, config), T_cam_obj, config.solver)
         T_cam_obj = solution.T_cam_obj
         contours = reproject(contours, T_cam_obj, start.intrinsics)
-        if not config.matching.along_flow:
-            seed = torch.where(matches.mask, matches.contour, seed)
-            seed_velocity = torch.where(matches.mask[..., None], take_points(velocity, matches.contour), seed_velocity)
-    return AlignmentResult(solution, contours, matches)
+    return AlignmentResult(solution, contours, matches, velocity)
 
 
 def _match(
     observations: Observations,
     contours: Contours,
     index: ContourIndex,
-    seed: Int[Tensor, "b n"],
-    seed_velocity: Float[Tensor, "b n 2"],
+    belief: Belief,
     contour_velocity: Float[Tensor, "b m 2"],
     gate_px: float,
     config: TrackerConfig,
-) -> Matches:
-    """Matches of one round; none for an object with too few of them."""
+) -> tuple[Matches, Belief]:
+    """Matches of one round, none for an object with too few of them, and what the next round begins with."""
     if config.matching.along_flow:
         matches = match_along_flow(observations, contours, contour_velocity, gate_px, config.matching)
     else:
-        matches = match_nearest(observations, contours, index, seed, seed_velocity, contour_velocity, gate_px, config.matching.dark_shift_px)
+        matches, belief = match_nearest(observations, contours, index, belief, contour_velocity, gate_px, config.matching.dark_shift_px)
     enough = matches.mask.sum(-1, keepdim=True) >= config.quality.min_observations
     matches = replace(matches, mask=matches.mask & enough)
-    return both_coordinates(matches) if config.matching.residual == "point" else matches
+    return (both_coordinates(matches) if config.matching.residual == "point" else matches), belief
 
 
 def _problem(start: Alignment, matches: Matches, contours: Contours, gate_px: float, config: TrackerConfig) -> PoseProblem:

@@ -1,6 +1,6 @@
 """From the time surface to corners: guided filter, Harris response, even selection, newest event.
 
-The filter and the response are kornia's; region borders wide enough for their support keep every object's corners
+Region borders wide enough for their support keep every object's corners
 independent of the other objects of the batch.
 """
 
@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from kornia.feature import harris_response
-from kornia.filters import guided_blur
 from torch import Tensor
 
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig
+from torchtrack.filters import corner_response
 from torchtrack.time_surface import Regions
 
 # Guided filter, Sobel and Harris window reach this far into a region from its border (px).
@@ -42,17 +41,9 @@ class Corners:
     has_flow: Bool[Tensor, "b n"]
 
 
-def filter_surface(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> Float[Tensor, "b h w"]:
-    """Edge-preserving smoothing: the guided filter with the surface as its own guide (kornia)."""
-    image = surface[:, None]
-    filtered = guided_blur(image, image, config.filter_size_px, config.filter_eps, subsample=config.filter_subsample)
-    return filtered[:, 0]
-
-
-def corner_response(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> Float[Tensor, "b h w"]:
+def _response(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> Float[Tensor, "b h w"]:
     """Harris response of the filtered surface, a few regions at a time."""
-    parts = [harris_response(filter_surface(part, config)[:, None])[:, 0] for part in surface.split(_CHUNK)]
-    return torch.cat(parts)
+    return torch.cat([corner_response(part, config) for part in surface.split(_CHUNK)])
 
 
 def select_corners(response: Float[Tensor, "b h w"], regions: Regions, config: CornerConfig) -> tuple[Int[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
@@ -112,10 +103,10 @@ def snap_to_newest(
 def detect_corners(
     surface: Float[Tensor, "b h w"],
     regions: Regions,
-    last_event_us: Int[Tensor, "s h w"],
+    last_event_us: Int[Tensor, "s sensor_h sensor_w"],
     t_us: Int[Tensor, "s"],
     window_s: Float[Tensor, "s"],
-    ideal_pixels: Float[Tensor, "s h w 2"],
+    ideal_pixels: Float[Tensor, "s sensor_h sensor_w 2"],
     surface_config: SurfaceConfig,
     config: CornerConfig,
 ) -> Corners:
@@ -125,7 +116,7 @@ def detect_corners(
         window_s: length of the window of each stream; older corners are dropped with ``fresh_only``.
         ideal_pixels: undistortion table of each stream.
     """
-    response = corner_response(surface, surface_config)
+    response = _response(surface, surface_config)
     local, mask = select_corners(response, regions, config)
     _, height, width = last_event_us.shape
     sensor = local + regions.origin[:, None]

@@ -148,8 +148,11 @@ def se3_adjoint(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6 6"]:
 
 
 def transform_points(T_a_b: Float[Tensor, "*b 4 4"], points_b: Float[Tensor, "*b n 3"]) -> Float[Tensor, "*b n 3"]:
-    """Points of frame b, seen in frame a."""
-    return points_b @ T_a_b[..., :3, :3].transpose(-1, -2) + T_a_b[..., None, :3, 3]
+    """Points of frame b, seen in frame a.
+
+    The product is taken with the coordinates as rows, and stays so in memory: what follows works on long rows.
+    """
+    return (T_a_b[..., :3, :3] @ points_b.transpose(-1, -2) + T_a_b[..., :3, 3:]).transpose(-1, -2)
 
 
 def se3_interpolate(T_start: Float[Tensor, "*b 4 4"], T_end: Float[Tensor, "*b 4 4"], fraction: Float[Tensor, "*b"]) -> Float[Tensor, "*b 4 4"]:

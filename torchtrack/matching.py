@@ -100,15 +100,20 @@ def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: i
     step = torch.arange(-radius_px, radius_px + 1, device=device)
     disc = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1).flatten(0, 1)
     disc = disc[disc.square().sum(-1) <= radius_px**2]
+    # |c + o - p|² of every point p, its central pixel c and every offset o, as one matrix product.
     to_centre = centre.to(contours.pixels.dtype) - contours.pixels
-    distance_sq = (to_centre[:, :, None] + disc.to(to_centre.dtype)).square().sum(-1)
-    key = (distance_sq * _DISTANCE_STEPS).long() * count + torch.arange(count, device=device)[:, None]
-    local = (centre - low[:, None])[:, :, None] + disc
-    # Masked points write to a spare last entry.
-    cell = torch.where(inside[..., None], local[..., 1] * width + local[..., 0], height * width)
+    offsets = disc.to(to_centre.dtype)
+    point_part = torch.cat([to_centre.square().sum(-1, keepdim=True), torch.ones_like(to_centre[..., :1]), 2 * to_centre], -1)
+    offset_part = torch.cat([torch.ones_like(offsets[:, :1]), offsets.square().sum(-1, keepdim=True), offsets], -1)
+    distance_sq = (point_part @ (_DISTANCE_STEPS * offset_part.T)).clamp(min=0)
+    key = distance_sq.long() * count + torch.arange(count, device=device)[:, None]
+    local = centre - low[:, None]
+    # Masked points write to spare entries after the last.
+    first = torch.where(inside, local[..., 1] * width + local[..., 0], height * width + radius_px * (width + 1))
+    cell = first[..., None] + (disc[:, 1] * width + disc[:, 0])
     nothing = torch.iinfo(torch.int64).max
-    keys = torch.full((batch, height * width + 1), nothing, device=device)
-    keys = keys.scatter_reduce(1, cell.flatten(1), key.flatten(1), "amin")[:, :-1]
+    keys = torch.full((batch, height * width + 2 * radius_px * (width + 1) + 1), nothing, device=device)
+    keys = keys.scatter_reduce(1, cell.flatten(1), key.flatten(1), "amin")[:, : height * width]
     return ContourIndex(low, (height, width), torch.where(keys == nothing, -1, keys % count), contours.pixels)
 
 
@@ -153,38 +158,49 @@ def join(first: Observations, second: Observations) -> Observations:
     return Observations(*(torch.cat([getattr(first, name), getattr(second, name)], 1) for name in vars(first)))
 
 
+@dataclass(frozen=True)
+class Belief:
+    """What an observation is believed to belong to, from the last round or from the object's plane.
+
+    Args:
+        velocity: image velocity (px/s) that carries the observation to the window's end.
+        moved: how far its contour moved since the contours were indexed (px).
+    """
+
+    velocity: Float[Tensor, "b n 2"]
+    moved: Float[Tensor, "b n 2"]
+
+
 def match_nearest(
     observations: Observations,
     contours: Contours,
     index: ContourIndex,
-    seed: Int[Tensor, "b n"],
-    seed_velocity: Float[Tensor, "b n 2"],
+    belief: Belief,
     contour_velocity: Float[Tensor, "b m 2"],
     gate_px: float,
     dark_shift_px: float,
-) -> Matches:
+) -> tuple[Matches, Belief]:
     """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
 
     Args:
         contours: at the current pose; ``index`` may be of an earlier one.
-        seed: contour point believed so far, -1 where unknown: tells how far the contour moved since it was indexed.
-        seed_velocity: velocity of each observation believed so far (px/s).
+        belief: where to look for each observation; returned anew for the next round.
         contour_velocity: velocity of each contour point (px/s); zero to switch motion compensation off.
         dark_shift_px: how far events lie to the dark side of a sharp edge.
     """
-    known = seed.clamp(min=0)
-    moved = take_points(contours.pixels, known) - take_points(index.pixels, known)
-    moved = torch.where((seed >= 0)[..., None], moved, torch.zeros_like(moved))
-    found = index.look_up(observations.pixels + seed_velocity * observations.age_s[..., None] - moved)
+    found = index.look_up(observations.pixels + belief.velocity * observations.age_s[..., None] - belief.moved)
     contour = found.clamp(min=0)
-    normals, velocity = take_points(contours.normals, contour), take_points(contour_velocity, contour)
-    targets = observations.pixels + velocity * observations.age_s[..., None]
     # The limb of a smooth surface is no step: its shading fades towards it.
-    sharp = contours.kind.gather(1, contour) != int(ContourKind.LIMB)
-    targets = targets - dark_shift_px * towards_dark(observations.polarity * sharp, normals, velocity)
-    offset = take_points(contours.pixels, contour) - targets
-    mask = observations.mask & (found >= 0) & contours.mask.gather(1, contour) & (offset.norm(dim=-1) < gate_px)
-    return Matches(contour, mask, targets, normals)
+    sharp = (contours.kind != int(ContourKind.LIMB)).to(contour_velocity.dtype)
+    table = torch.cat([contours.pixels, contours.normals, contour_velocity, contours.pixels - index.pixels, sharp[..., None]], -1)
+    values = take_points(table, contour)
+    pixels, normals, velocity, moved = values[..., :8].chunk(4, -1)
+    targets = observations.pixels + velocity * observations.age_s[..., None]
+    targets = targets - dark_shift_px * towards_dark(observations.polarity * values[..., 8], normals, velocity)
+    near = (pixels - targets).square().sum(-1) < gate_px**2
+    matched = observations.mask & (found >= 0) & near
+    keep = matched[..., None]
+    return Matches(contour, matched, targets, normals), Belief(torch.where(keep, velocity, belief.velocity), torch.where(keep, moved, belief.moved))
 
 
 def towards_dark(polarity: Float[Tensor, "b n"], normals: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:

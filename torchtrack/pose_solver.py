@@ -5,7 +5,7 @@ The unknown of each object is a rotation about its centre and a move of its cent
 paper's Eq. 16 and 17 cancel, which cannot be meant.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -122,25 +122,51 @@ def _offset_from_prior(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, cen
     return torch.cat([turned, centre_cam - rows.prior_centre], -1)
 
 
-def linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
-    """Cost, gradient and Gauss-Newton Hessian of ``problem`` at a pose."""
+@dataclass(frozen=True)
+class _Seen:
+    """The matched points as a pose shows them: gradients ``(gx, gy)`` of the residuals in x and y, and the residuals."""
+
+    points_cam: Tensor
+    centre_cam: Tensor
+    inverse_depth: Tensor
+    gradient: tuple[Tensor, Tensor]
+    along: Tensor
+    residuals: Tensor
+
+
+def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor) -> _Seen:
+    """Project the matched points and take their residuals."""
     rotation, translation = T_cam_obj[:, :3, :3], T_cam_obj[:, :3, 3:]
     points_cam = torch.baddbmm(translation, rotation, rows.points)
     inverse_depth = points_cam[:, 2].clamp(min=MIN_DEPTH_M).reciprocal()
     gx, gy = (rows.slope * inverse_depth[:, None]).unbind(1)
     along = gx * points_cam[:, 0] + gy * points_cam[:, 1]
-    residuals = along - rows.offset
     centre_cam = torch.baddbmm(translation, rotation, problem.centre_obj[..., None])[..., 0]
-    jacobian = pose_jacobian(points_cam, centre_cam, (gx, gy, -along * inverse_depth))
-    value, robust = robust_loss(residuals, problem.scale_px, loss)
+    return _Seen(points_cam, centre_cam, inverse_depth, (gx, gy), along, along - rows.offset)
+
+
+def _cost(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, loss: str) -> Tensor:
+    """Robust cost at a pose, prior included."""
+    seen = _see(problem, rows, T_cam_obj)
+    value, _ = robust_loss(seen.residuals, problem.scale_px, loss)
+    from_prior = _offset_from_prior(problem, rows, T_cam_obj, seen.centre_cam)[..., None]
+    prior = (from_prior.transpose(1, 2) @ problem.prior_information @ from_prior)[:, 0, 0]
+    return (value * problem.weights).sum(-1) + 0.5 * prior
+
+
+def linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
+    """Cost, gradient and Gauss-Newton Hessian of ``problem`` at a pose."""
+    seen = _see(problem, rows, T_cam_obj)
+    jacobian = pose_jacobian(seen.points_cam, seen.centre_cam, (*seen.gradient, -seen.along * seen.inverse_depth))
+    value, robust = robust_loss(seen.residuals, problem.scale_px, loss)
     weights = robust * problem.weights
     weighted = jacobian * weights[:, None]
-    from_prior = _offset_from_prior(problem, rows, T_cam_obj, centre_cam)
+    from_prior = _offset_from_prior(problem, rows, T_cam_obj, seen.centre_cam)
     pull = (problem.prior_information @ from_prior[..., None]).squeeze(-1)
-    gradient = (weighted @ residuals[..., None]).squeeze(-1) + pull
+    gradient = (weighted @ seen.residuals[..., None]).squeeze(-1) + pull
     hessian = weighted @ jacobian.transpose(1, 2) + problem.prior_information
     cost = (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1)
-    variance = (weights * residuals.square()).sum(-1) / weights.sum(-1).clamp(min=1)
+    variance = (weights * seen.residuals.square()).sum(-1) / weights.sum(-1).clamp(min=1)
     return Linearisation(T_cam_obj, cost, gradient, hessian, variance)
 
 
@@ -166,28 +192,21 @@ def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
     return solve_positive(damped, -at.gradient[..., None])[0].squeeze(-1)
 
 
-def _choose(better: Tensor, candidate: Linearisation, current: Linearisation) -> Linearisation:
-    """The candidate where it is better, the current one elsewhere."""
-    fields = {}
-    for name, value in vars(candidate).items():
-        condition = better.view(-1, *([1] * (value.dim() - 1)))
-        fields[name] = torch.where(condition, value, getattr(current, name))
-    return Linearisation(**fields)
-
-
 def solve_pose(problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig) -> Linearisation:
     """Minimise each object's cost from ``T_start``: Levenberg-Marquardt with a damping of its own per object.
 
     A step that does not lower an object's cost is undone and its damping raised; its neighbours are not affected.
+
+    Returns:
+        The last linearisation, with the pose that its step led to.
     """
     rows = _as_rows(problem)
-    current = linearise(problem, rows, T_start, config.loss)
-    damping = torch.full_like(current.cost, config.damping)
+    T_cam_obj, damping = T_start, torch.full_like(T_start[:, 0, 0], config.damping)
     for _ in range(config.iterations):
-        step = _damped_step(current, damping)
-        T_next = move_about(current.T_cam_obj, cayley(step[:, :3]), step[:, 3:], problem.centre_obj)
-        candidate = linearise(problem, rows, T_next, config.loss)
-        better = candidate.cost <= current.cost
-        current = _choose(better, candidate, current)
+        at = linearise(problem, rows, T_cam_obj, config.loss)
+        step = _damped_step(at, damping)
+        T_next = move_about(T_cam_obj, cayley(step[:, :3]), step[:, 3:], problem.centre_obj)
+        better = _cost(problem, rows, T_next, config.loss) <= at.cost
+        T_cam_obj = torch.where(better[:, None, None], T_next, T_cam_obj)
         damping = torch.where(better, damping * _DAMPING_DECAY, damping.clamp(min=_DAMPING_START) * _DAMPING_GROWTH)
-    return current
+    return replace(at, T_cam_obj=T_cam_obj)

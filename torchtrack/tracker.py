@@ -228,7 +228,7 @@ class Tracker(nn.Module):
     ) -> tuple[TrackerState, StepResult]:
         """Judge every object, hold those that failed, and make the next state."""
         config, solution, contours = self.config, aligned.solution, aligned.contours
-        velocity = start.contour_velocity(contours, solution.T_cam_obj)
+        velocity = start.contour_velocity(contours)
         share = quality.explained_share(contours, aligned.matches, velocity, self.image_size, config.quality.min_speed_px_s)
         count = aligned.matches.mask.sum(-1)
         step = lie.difference_about(start.T_prior, solution.T_cam_obj, self.centre_obj)
@@ -254,9 +254,14 @@ class Tracker(nn.Module):
 
 
 def _orthonormal(T: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:
-    """The pose with its rotation made exact again: rounding adds up over thousands of steps."""
-    rotation = lie.rotation_from_quaternion(lie.quaternion_from_rotation(T[:, :3, :3]))
-    return torch.cat([torch.cat([rotation, T[:, :3, 3:]], -1), T[:, 3:]], 1)
+    """The pose with its rotation made exact again: rounding adds up over thousands of steps.
+
+    One step of Newton's iteration for the nearest rotation, which squares the deviation.
+    """
+    rotation = T[:, :3, :3]
+    eye = torch.eye(3, dtype=T.dtype, device=T.device)
+    exact = 0.5 * rotation @ (3 * eye - rotation.transpose(1, 2) @ rotation)
+    return torch.cat([torch.cat([exact, T[:, :3, 3:]], -1), T[:, 3:]], 1)
 
 
 def _stack_tables(tables: list[Tensor]) -> Tensor:

@@ -25,9 +25,10 @@ class SurfaceConfig(_Settings):
 
     tau_s: float = Field(0.03, gt=0, le=10, description="Decay constant τ (s).")
     margin_px: int = Field(16, ge=12, le=128, description="Border around an object's contours that its region includes (px).")
+    filters: Literal["sliced", "kornia"] = Field("sliced", description="kornia's guided filter and Harris response, or our faster equal of them.")
     filter_size_px: int = Field(5, ge=3, le=31, description="Side of the guided filter's window (px, odd).")
     filter_eps: float = Field(0.01, gt=0, description="Regularisation of the guided filter, in squared intensity.")
-    filter_subsample: int = Field(1, ge=1, le=4, description="Subsampling of the guided filter's coefficients.")
+    filter_subsample: int = Field(1, ge=1, le=4, description="Subsampling of kornia's guided filter.")
 
 
 class CornerConfig(_Settings):
@@ -89,7 +90,7 @@ class MatchingConfig(_Settings):
 class SolverConfig(_Settings):
     """Levenberg-Marquardt on SE(3) (Eq. 12-17)."""
 
-    iterations: int = Field(2, ge=1, le=100, description="Iterations in each round.")
+    iterations: int = Field(1, ge=1, le=100, description="Iterations in each round.")
     loss: Literal["tukey", "huber", "none"] = Field("tukey", description="Robust loss, with the round's gate as its scale.")
     damping: float = Field(1e-6, ge=0, description="Initial damping, as a share of the Hessian's diagonal.")
     prior: bool = Field(True, description="Hold the pose near the predicted one.")
