@@ -1,10 +1,17 @@
-"""Random inputs for tests, from CPU generators with fixed seeds."""
+"""Random inputs for tests, from CPU generators with fixed seeds, and small scenes with known truth."""
+
+from collections.abc import Sequence
+from functools import cache
 
 import torch
+import trimesh
 from torch import Tensor
 
+from torchtrack.camera import Camera, project
 from torchtrack.events import EventBatch
-from torchtrack.lie import se3_exp, so3_exp
+from torchtrack.io import Trajectory
+from torchtrack.lie import rotation_angle_deg, se3_exp, so3_exp, transform_points
+from torchtrack.object_model import ObjectModel
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -40,3 +47,91 @@ def random_events(count: int, *, width: int = 64, height: int = 48, duration_us:
     t_us = torch.randint(1, duration_us + 1, (count,), generator=rng).sort().values.numpy()
     polarity = torch.randint(2, (count,), generator=rng).numpy()
     return EventBatch.from_numpy(x, y, t_us, polarity, stream)
+
+
+# ---- small scenes for the pipeline
+
+SMALL_CAMERA = Camera(fx=250.0, fy=250.0, cx=99.5, cy=74.5, width=200, height=150)
+BOX_EXTENTS_M = (0.12, 0.10, 0.08)
+
+
+@cache
+def box_model(extents_m: tuple[float, float, float] = BOX_EXTENTS_M) -> ObjectModel:
+    return ObjectModel.from_mesh(trimesh.creation.box(extents_m), name="box")
+
+
+def pose(rotation: Sequence[float] = (0.5, 0.6, 0.1), translation: Sequence[float] = (0.0, 0.0, 0.5), dtype=torch.float64) -> Tensor:
+    """A pose ``[4, 4]`` from a rotation vector (rad) and a translation (m)."""
+    T = torch.eye(4, dtype=dtype)
+    T[:3, :3] = so3_exp(torch.tensor(rotation, dtype=dtype))
+    T[:3, 3] = torch.tensor(translation, dtype=dtype)
+    return T
+
+
+def drifting(
+    T_start: Tensor,
+    duration_us: int,
+    *,
+    turn: Sequence[float] = (0.8, -0.5, 1.2),
+    move: Sequence[float] = (0.15, 0.1, 0.1),
+    step_us: int = 250,
+    start_us: int = 0,
+) -> Trajectory:
+    """A body that turns about its own origin (rad/s) while this moves (m/s), both constant in the camera's axes."""
+    t_us = torch.arange(0, duration_us + 1, step_us)
+    seconds = 1e-6 * t_us.double()[:, None]
+    T = T_start.repeat(len(t_us), 1, 1)
+    T[:, :3, :3] = so3_exp(seconds * torch.tensor(turn, dtype=torch.float64)) @ T_start[:3, :3]
+    T[:, :3, 3] = T_start[:3, 3] + seconds * torch.tensor(move, dtype=torch.float64)
+    return Trajectory(t_us + start_us, T)
+
+
+def edge_events(
+    trajectory: Trajectory, camera: Camera = SMALL_CAMERA, extents_m: tuple[float, float, float] = BOX_EXTENTS_M, *, seed: int = 0, stream: int = 0
+) -> EventBatch:
+    """An event wherever a visible edge of a moving box passes the centre of a pixel, at that very time.
+
+    Along each edge every row (of an upright edge; every column of a level one) fires on its own, as pixels do; the
+    polarity is random. Exact but for the time step of the trajectory, and without noise.
+    """
+    mesh = trimesh.creation.box(extents_m)
+    sharp = mesh.face_adjacency_angles > 0.5
+    ends = torch.from_numpy(mesh.vertices[mesh.face_adjacency_edges[sharp]].copy())
+    normals = torch.from_numpy(mesh.face_normals[mesh.face_adjacency[sharp]].copy())
+    T = trajectory.T_cam_obj
+    ends_cam = transform_points(T, ends.reshape(1, -1, 3).expand(len(T), -1, -1)).unflatten(1, (-1, 2))
+    facing = ((normals @ T[:, None, :3, :3].transpose(-1, -2)) * ends_cam[:, :, :1]).sum(-1) < 0
+    visible = facing.any(-1)
+    pixels = project(ends_cam.flatten(1, 2), camera.intrinsics(torch.float64).expand(len(T), 4)).unflatten(1, (-1, 2))
+    found = [_crossings(pixels[:, edge], visible[:, edge], trajectory.t_us, camera) for edge in range(len(ends))]
+    u, v, t_us = torch.cat(found, 1)
+    t_us, order = t_us.sort(stable=True)
+    polarity = torch.randint(2, (len(t_us),), generator=generator(seed))
+    return EventBatch.from_numpy(u[order].numpy(), v[order].numpy(), t_us.numpy(), polarity.numpy(), stream)
+
+
+def _crossings(ends: Tensor, visible: Tensor, t_us: Tensor, camera: Camera) -> Tensor:
+    """u, v and time ``[3, e]`` of the pixels that one projected edge, ``ends [t, 2, 2]``, passes."""
+    span = (ends[:, 1] - ends[:, 0]).abs()
+    found = []
+    for across, size in ((0, camera.height), (1, camera.width)):
+        steep = visible & (span[:, 1 - across] > span[:, across])
+        lines = torch.arange(size, dtype=torch.float64)
+        first, last = ends[:, 0], ends[:, 1]
+        along = (lines - first[:, 1 - across, None]) / (last - first)[:, 1 - across, None]
+        place = first[:, across, None] + along * (last - first)[:, across, None]
+        exists = steep[:, None] & (along >= 0) & (along <= 1)
+        passed = (place[1:].floor() != place[:-1].floor()) & exists[1:] & exists[:-1]
+        step, line = torch.nonzero(passed, as_tuple=True)
+        before, after = place[step, line], place[step + 1, line]
+        at = torch.maximum(before, after).floor()
+        time = t_us[step] + (t_us[step + 1] - t_us[step]) * (at - before) / (after - before)
+        pixel = [at.long(), line] if across == 0 else [line, at.long()]
+        found.append(torch.stack([*pixel, time.ceil().long()]))
+    u, v, _ = every = torch.cat(found, 1)
+    return every[:, (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)]
+
+
+def pose_errors(T_found: Tensor, T_true: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation (degrees) and translation (mm) between poses ``[..., 4, 4]``."""
+    return rotation_angle_deg(T_found[..., :3, :3], T_true[..., :3, :3]), 1e3 * (T_found - T_true)[..., :3, 3].norm(dim=-1)
