@@ -1,0 +1,363 @@
+"""Contours at a pose: which edges are drawn, how evenly, with which normals; limbs, texture, segments, batches."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+import trimesh
+from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, generator, pose, random_pose
+
+from torchtrack.camera import project
+from torchtrack.config.tracker import ContourConfig
+from torchtrack.contours import ContourKind, ContourModel, group_by_model, image_normals, mesh_contours, reproject, select_ranked, take_points
+from torchtrack.object_model import ObjectModel
+
+CONFIG = ContourConfig(remove_hidden=False)
+INTRINSICS = SMALL_CAMERA.intrinsics(torch.float64)
+# Poses of the box that show one, two and three faces.
+VIEWS = {"one face": pose((0.0, 0.0, 0.3)), "two faces": pose((0.0, 0.8, 0.0)), "three faces": pose()}
+
+
+def contours_of(models, T, config=CONFIG, dtype=torch.float64):
+    """Contours of one model per pose of ``T [b, 4, 4]``."""
+    models = [models] * len(T) if isinstance(models, ObjectModel) else models
+    groups = [group.to(dtype) for group in group_by_model(models, config)]
+    return mesh_contours(groups, T.to(dtype), INTRINSICS.to(dtype).expand(len(T), 4), config)
+
+
+def box_edges(T, extents_m=BOX_EXTENTS_M):
+    """Edges of the box, each as the set of its two faces (axis, side), and the faces that look at the camera."""
+    camera = -T[:3, :3].T @ T[:3, 3]
+    front = {(axis, side) for axis in range(3) for side in (-1, 1) if side * float(camera[axis]) > extents_m[axis] / 2}
+    edges = {
+        frozenset([(a, side_a), (b, side_b)]) for a, b in ((0, 1), (0, 2), (1, 2)) for side_a in (-1, 1) for side_b in (-1, 1)
+    }
+    return edges, front
+
+
+def edges_with_points(points, extents_m=BOX_EXTENTS_M):
+    """The edge of the box on which each point lies."""
+    half = torch.tensor(extents_m, dtype=points.dtype) / 2
+    on_face = (points.abs() - half).abs() < 1e-5
+    assert (on_face.sum(-1) >= 2).all()
+    return [
+        frozenset((axis, 1 if point[axis] > 0 else -1) for axis in range(3) if on[axis]) for point, on in zip(points, on_face, strict=True)
+    ]
+
+
+def visible(contours, number=0):
+    """Points, pixels, normals and kinds of one object, without the padding."""
+    mask = contours.mask[number]
+    return contours.points_obj[number][mask], contours.pixels[number][mask], contours.normals[number][mask], contours.kind[number][mask]
+
+
+def cube_with_prints(points_per_face=40):
+    """The box with dots on every face as its texture."""
+    half = torch.tensor(BOX_EXTENTS_M) / 2
+    points, normals, tangents = [], [], []
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            spots = (torch.rand(points_per_face, 3, generator=generator(axis)) - 0.5) * half
+            spots[:, axis] = side * half[axis]
+            points.append(spots)
+            normals.append(side * torch.eye(3)[axis].expand(points_per_face, 3))
+            tangents.append(torch.eye(3)[(axis + 1) % 3].expand(points_per_face, 3))
+    return replace(box_model(), texture_points=torch.cat(points), texture_normals=torch.cat(normals), texture_tangents=torch.cat(tangents))
+
+
+# ---- which edges
+
+
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+def test_every_edge_of_a_face_that_looks_at_the_camera_is_drawn(view):
+    edges, front = box_edges(view)
+    points, _, _, kind = visible(contours_of(box_model(), view[None]))
+    assert set(edges_with_points(points)) >= {edge for edge in edges if edge & front}
+    assert all(edge & front for edge in edges_with_points(points))
+    assert (kind == int(ContourKind.CREASE)).all()
+
+
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+def test_without_creases_only_the_silhouette_is_drawn(view):
+    edges, front = box_edges(view)
+    points, *_ = visible(contours_of(box_model(), view[None], ContourConfig(creases=False)))
+    on_one_edge = [edge for edge in edges_with_points(points) if len(edge) == 2]
+    assert set(on_one_edge) == {edge for edge in edges if len(edge & front) == 1}
+
+
+def test_the_silhouette_of_three_faces_has_six_edges_and_three_creases_inside():
+    edges, front = box_edges(VIEWS["three faces"])
+    assert len(front) == 3
+    assert (sum(len(edge & front) == 1 for edge in edges), sum(len(edge & front) == 2 for edge in edges)) == (6, 3)
+
+
+def test_with_nothing_switched_on_nothing_is_drawn():
+    config = ContourConfig(occluding=False, creases=False, texture=False, segments=False)
+    assert not contours_of(cube_with_prints(), pose()[None], config).mask.any()
+
+
+# ---- where on them
+
+
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+@pytest.mark.parametrize("close", [1.0, 0.4])
+def test_points_are_spread_evenly_in_the_image(view, close):
+    T = view.clone()
+    T[2, 3] *= close
+    points, pixels, _, _ = visible(contours_of(box_model(), T[None]))
+    gaps = []
+    names = edges_with_points(points)
+    for edge in set(names):
+        on_edge = pixels[[name == edge for name in names]]
+        if len(on_edge) > 2:
+            gaps.append(torch.diff(sorted_along(on_edge), dim=0).norm(dim=-1))
+    gaps = torch.cat(gaps)
+    assert float((gaps / gaps.median() - 1).abs().max()) < 0.2
+
+
+def sorted_along(pixels):
+    """Pixels on a line in their order along it."""
+    direction = pixels[(pixels - pixels[0]).norm(dim=-1).argmax()] - pixels[0]
+    return pixels[(pixels @ direction).argsort()]
+
+
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+def test_normals_are_perpendicular_to_the_projected_edges(view, dtype):
+    points, _, normals, _ = visible(contours_of(box_model(), view[None], dtype=dtype))
+    torch.testing.assert_close(normals.norm(dim=-1), torch.ones(len(normals), dtype=dtype), rtol=1e-5, atol=0)
+    half = torch.tensor(BOX_EXTENTS_M) / 2
+    for point, normal, edge in zip(points, normals, edges_with_points(points), strict=True):
+        if len(edge) != 2:
+            continue
+        (axis,) = {0, 1, 2} - {face[0] for face in edge}
+        ends = point.double().repeat(2, 1)
+        ends[:, axis] = torch.tensor([-1.0, 1.0]) * half[axis]
+        start, end = project((ends @ view[:3, :3].T + view[:3, 3])[None], INTRINSICS[None])[0]
+        direction = (end - start) / (end - start).norm()
+        assert abs(float(normal.double() @ direction)) < 1e-4
+
+
+def test_pixels_are_the_projections_of_the_points(dtype):
+    T = random_pose(5)
+    contours = contours_of(box_model(), T, dtype=dtype)
+    expected = project(contours.points_obj.double() @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3], INTRINSICS.expand(5, 4))
+    torch.testing.assert_close(contours.pixels.double()[contours.mask], expected[contours.mask], rtol=0, atol=1e-3 if dtype == torch.float32 else 1e-9)
+    assert contours.pixels.dtype == dtype
+
+
+@pytest.mark.parametrize("count", [16, 100, 800])
+def test_as_many_points_as_asked_for(count):
+    contours = contours_of(box_model(), pose()[None], ContourConfig(max_edge_points=count, remove_hidden=False))
+    assert contours.mask.shape == (1, count)
+    assert contours.mask.all()
+
+
+# ---- smooth bodies
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.4), (0.08, -0.05, 0.4)])
+def test_the_limb_of_a_sphere_lies_on_its_outline(place):
+    radius_m = 0.05
+    model = ObjectModel.from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=radius_m), name="ball")
+    T = pose((0.3, 0.2, 0.1), place)
+    points, pixels, _, kind = visible(contours_of(model, T[None]))
+    assert (kind == int(ContourKind.LIMB)).all()
+    centre = torch.tensor(place, dtype=torch.float64)
+    outline = torch.asin(radius_m / centre.norm())
+    rays = torch.cat([(pixels - INTRINSICS[2:]) / INTRINSICS[:2], torch.ones_like(pixels[:, :1])], -1)
+    angle = torch.acos((rays @ centre) / rays.norm(dim=-1) / centre.norm())
+    # Half a pixel, seen from the camera.
+    assert float((angle - outline).abs().max()) < 0.5 / SMALL_CAMERA.fx
+    around = torch.atan2(*(pixels - pixels.mean(0)).T)
+    assert float(torch.diff(around.sort().values).max()) < 0.1
+    assert float((points.norm(dim=-1) / radius_m).min()) > 0.995
+
+
+def test_the_limb_of_a_sphere_on_the_axis_is_a_circle():
+    radius_m, depth_m = 0.05, 0.4
+    model = ObjectModel.from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=radius_m), name="ball")
+    _, pixels, normals, _ = visible(contours_of(model, pose((0.0, 0.0, 0.0), (0.0, 0.0, depth_m))[None]))
+    offset = pixels - INTRINSICS[2:]
+    expected = SMALL_CAMERA.fx * radius_m / (depth_m**2 - radius_m**2) ** 0.5
+    torch.testing.assert_close(offset.norm(dim=-1), torch.full((len(offset),), expected, dtype=torch.float64), rtol=0, atol=0.3)
+    across = (normals * offset).sum(-1).abs() / offset.norm(dim=-1)
+    assert float(across.median()) > 0.9
+
+
+# ---- texture and segments
+
+
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+def test_texture_is_drawn_on_the_faces_that_look_at_the_camera(view):
+    _, front = box_edges(view)
+    points, _, _, kind = visible(contours_of(cube_with_prints(), view[None]))
+    half = torch.tensor(BOX_EXTENTS_M, dtype=torch.float64) / 2
+    printed = points[kind == int(ContourKind.TEXTURE)]
+    faces = {
+        (axis, 1 if point[axis] > 0 else -1) for point in printed for axis in range(3) if abs(abs(float(point[axis])) - float(half[axis])) < 1e-6
+    }
+    assert faces == front
+    assert len(printed) == 40 * len(front)
+
+
+def test_texture_at_a_grazing_angle_is_left_out():
+    # The face x = +0.06 is seen at a few degrees.
+    T = pose((0.0, -0.16, 0.0), (0.0, 0.0, 0.5))
+    _, front = box_edges(T)
+    assert (0, 1) in front or (0, -1) in front
+    points, _, _, kind = visible(contours_of(cube_with_prints(), T[None]))
+    printed = points[kind == int(ContourKind.TEXTURE)]
+    assert float((printed[:, 2].abs() - BOX_EXTENTS_M[2] / 2).abs().max()) < 1e-6
+
+
+def test_texture_can_be_switched_off_and_thinned():
+    model = cube_with_prints()
+    kinds = visible(contours_of(model, pose()[None], ContourConfig(texture=False)))[3]
+    assert int(ContourKind.TEXTURE) not in kinds
+    thinned = contours_of(model, pose()[None], ContourConfig(max_texture_points=50, max_edge_points=100))
+    assert thinned.mask.shape == (1, 150)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.2, 3.0])
+def test_segments_are_drawn_from_every_side(turn):
+    model = ObjectModel.from_polylines([[[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]], [[0.0, 0.02, 0.0], [0.03, 0.04, 0.01]]])
+    T = pose((0.1, turn, 0.2))
+    points, pixels, _, kind = visible(contours_of(model, T[None]))
+    assert len(points) == CONFIG.max_edge_points
+    assert (kind == int(ContourKind.SEGMENT)).all()
+    first = (points[:, 1:].abs() < 1e-9).all(-1)
+    lengths = []
+    for segment in model.segments.double():
+        start, end = project((segment @ T[:3, :3].T + T[:3, 3])[None], INTRINSICS[None])[0]
+        lengths.append(float((end - start).norm()))
+    assert float(first.double().mean()) == pytest.approx(lengths[0] / sum(lengths), abs=0.01)
+
+
+def test_segments_can_be_switched_off():
+    model = ObjectModel.from_polylines([[[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]]])
+    assert not contours_of(model, pose()[None], ContourConfig(segments=False)).mask.any()
+
+
+# ---- poses without a picture
+
+
+def test_an_object_behind_the_camera_has_no_contours():
+    assert not contours_of(cube_with_prints(), pose(translation=(0.0, 0.0, -0.5))[None]).mask.any()
+
+
+def test_edges_that_reach_behind_the_camera_are_left_out():
+    T = pose((0.0, 0.0, 0.0), (0.1, 0.0, 0.02))
+    contours = contours_of(box_model(), T[None])
+    assert (contours.points_cam[..., 2][contours.mask] > 0).all()
+    assert torch.isfinite(contours.pixels).all()
+
+
+def test_a_bad_pose_gives_no_contours_and_harms_no_neighbour(dtype):
+    T = torch.stack([pose(), torch.full((4, 4), torch.nan, dtype=torch.float64), pose((0.2, 0.1, 0.0))])
+    together = contours_of(cube_with_prints(), T, dtype=dtype)
+    assert not together.mask[1].any()
+    for number in (0, 2):
+        alone = contours_of(cube_with_prints(), T[number : number + 1], dtype=dtype)
+        assert torch.equal(together.mask[number], alone.mask[0])
+        torch.testing.assert_close(together.pixels[number][together.mask[number]], alone.pixels[0][alone.mask[0]])
+
+
+def test_a_tangent_along_the_line_of_sight_has_no_normal(dtype):
+    points = torch.tensor([[[0.1, 0.2, 0.5], [0.1, 0.2, 0.5]]], dtype=dtype)
+    tangents = torch.stack([points[0, 0] / points[0, 0].norm(), torch.tensor([1.0, 0.0, 0.0], dtype=dtype)])[None]
+    normals, exists = image_normals(points, tangents, INTRINSICS.to(dtype)[None])
+    assert exists.tolist() == [[False, True]]
+    assert torch.isfinite(normals).all()
+    assert normals[0, 1].abs().tolist() == pytest.approx([0, 1])
+
+
+# ---- batches
+
+
+def mixed_models():
+    ball = ObjectModel.from_mesh(trimesh.creation.icosphere(subdivisions=2, radius=0.05), name="ball")
+    lines = ObjectModel.from_polylines([[[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0], [0.05, 0.03, 0.01]]])
+    return [box_model(), ball, cube_with_prints(), lines, box_model()]
+
+
+def test_a_batch_is_its_elements(dtype):
+    models, T = mixed_models(), random_pose(5, seed=3)
+    together = contours_of(models, T, dtype=dtype)
+    for number, model in enumerate(models):
+        alone = contours_of([model], T[number : number + 1], dtype=dtype)
+        for ours, theirs in zip(visible(together, number), visible(alone), strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-4 if dtype == torch.float32 else 1e-9)
+
+
+def test_objects_of_one_model_are_one_group():
+    models = mixed_models()
+    groups = group_by_model(models, CONFIG)
+    assert [group.members.tolist() for group in groups] == [[0, 4], [1], [2], [3]]
+
+
+def test_no_input_is_changed():
+    T = random_pose(2)
+    copy = T.clone()
+    model = ContourModel(box_model(), [0, 1], CONFIG).double()
+    buffers = {name: buffer.clone() for name, buffer in model.named_buffers()}
+    mesh_contours([model], T, INTRINSICS.expand(2, 4), CONFIG)
+    assert torch.equal(T, copy)
+    assert all(torch.equal(buffer, buffers[name]) for name, buffer in model.named_buffers())
+
+
+# ---- from another pose
+
+
+def test_reprojection_keeps_the_points_and_moves_their_pixels(dtype):
+    T = random_pose(3, seed=1)
+    moved = random_pose(3, seed=2)
+    contours = contours_of(box_model(), T, dtype=dtype)
+    again = reproject(contours, moved.to(dtype), INTRINSICS.to(dtype).expand(3, 4))
+    assert torch.equal(again.points_obj, contours.points_obj)
+    assert torch.equal(again.mask, contours.mask)
+    expected = project(contours.points_obj.double() @ moved[:, :3, :3].transpose(1, 2) + moved[:, None, :3, 3], INTRINSICS.expand(3, 4))
+    torch.testing.assert_close(again.pixels.double(), expected, rtol=0, atol=1e-3 if dtype == torch.float32 else 1e-9)
+    back = reproject(again, T.to(dtype), INTRINSICS.to(dtype).expand(3, 4))
+    torch.testing.assert_close(back.pixels, contours.pixels, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(back.normals, contours.normals, rtol=1e-5, atol=1e-5)
+
+
+# ---- helpers of the batch
+
+
+def test_ranked_selection_takes_all_where_they_fit_and_spreads_where_not():
+    mask = torch.zeros(3, 100, dtype=torch.bool)
+    mask[0, [3, 50, 99]] = True
+    mask[1] = True
+    index, exists = select_ranked(mask, 10)
+    assert index[0][exists[0]].tolist() == [3, 50, 99]
+    assert index[1][exists[1]].tolist() == list(range(0, 100, 10))
+    assert not exists[2].any()
+    assert index.shape == exists.shape == (3, 10)
+    assert ((index >= 0) & (index < 100)).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ranked_selection_is_sorted_distinct_and_even(seed):
+    mask = torch.rand((4, 5000), generator=generator(seed)) < 0.3
+    index, exists = select_ranked(mask, 64)
+    assert exists.all()
+    assert mask.gather(1, index).all()
+    assert (torch.diff(index) > 0).all()
+    rank = mask.cumsum(1).gather(1, index) - 1
+    assert int((torch.diff(rank) - (mask.sum(1) / 64)[:, None]).abs().max()) <= 1
+
+
+def test_ranked_selection_does_not_depend_on_the_other_rows():
+    mask = torch.rand((4, 500), generator=generator()) < torch.tensor([0.01, 0.3, 0.9, 0.0])[:, None]
+    index, exists = select_ranked(mask, 40)
+    for row in range(4):
+        alone, there = select_ranked(mask[row : row + 1], 40)
+        assert torch.equal(index[row][exists[row]], alone[0][there[0]])
+
+
+@pytest.mark.parametrize("batch", [1, 4])
+def test_points_are_taken_row_by_row(batch):
+    values = torch.rand((batch, 20, 3), generator=generator())
+    index = torch.randint(20, (batch, 7), generator=generator())
+    assert torch.equal(take_points(values, index), values.gather(1, index[..., None].expand(-1, -1, 3)))
