@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig
 from torchtrack.filters import corner_response
-from torchtrack.time_surface import Regions
+from torchtrack.time_surface import Regions, at_pixels
 
 # Guided filter, Sobel and Harris window reach this far into a region from its border (px).
 _FILTER_REACH_PX = 10
@@ -96,7 +96,7 @@ def snap_to_newest(
     u = (sensor_pixels[..., 0, None, None] + step).clamp(0, width - 1)
     v = (sensor_pixels[..., 1, None, None] + step[:, None]).clamp(0, height - 1)
     u, v = (grid.expand(*sensor_pixels.shape[:2], len(step), len(step)).flatten(2) for grid in (u, v))
-    newest_us, best = last_event_us[stream_index[:, None, None], v, u].max(-1, keepdim=True)
+    newest_us, best = at_pixels(last_event_us, stream_index[:, None, None], u, v).max(-1, keepdim=True)
     return torch.stack([u.gather(-1, best), v.gather(-1, best)], -1).squeeze(-2), newest_us.squeeze(-1)
 
 
@@ -127,7 +127,7 @@ def detect_corners(
     age_s = ((t_us[stream] - newest_us).clamp(0, 10**9) * 1e-6).to(surface.dtype)
     if config.fresh_only:
         mask = mask & (age_s < window_s[stream])
-    pixels = ideal_pixels[stream, sensor[..., 1], sensor[..., 0]].to(surface.dtype)
+    pixels = at_pixels(ideal_pixels, stream, sensor[..., 0], sensor[..., 1])
     return Corners(sensor, pixels, age_s, mask, torch.zeros_like(pixels), torch.zeros_like(mask))
 
 

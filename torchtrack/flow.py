@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchtrack.config.tracker import FlowConfig
 from torchtrack.corners import Corners
+from torchtrack.time_surface import at_pixels
 
 # Floor of the residual's scale (px): events sit on whole pixels, so no smaller scale means anything.
 _MIN_SCALE_PX = 0.3
@@ -32,12 +33,12 @@ def newest_events_around(
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     u, v = u.clamp(0, width - 1), v.clamp(0, height - 1)
     stream = stream_index[:, None, None]
-    corner_us = last_event_us[stream[..., 0], corners.sensor_pixels[..., 1], corners.sensor_pixels[..., 0]]
+    corner_us = at_pixels(last_event_us, stream[..., 0], corners.sensor_pixels[..., 0], corners.sensor_pixels[..., 1])
     span_us = int(config.span_s * 1e6)
-    age_us = (corner_us[..., None] - last_event_us[stream, v, u]).clamp(-span_us - 1, span_us + 1)
+    age_us = (corner_us[..., None] - at_pixels(last_event_us, stream, u, v)).clamp(-span_us - 1, span_us + 1)
     # Events newer than the corner's belong to what follows it: only the trail behind it is its motion.
     mask = inside & (age_us >= 0) & (age_us <= span_us)
-    offsets = ideal_pixels[stream, v, u].to(corners.pixels.dtype) - corners.pixels[..., None, :]
+    offsets = at_pixels(ideal_pixels, stream, u, v) - corners.pixels[..., None, :]
     return offsets, age_us.to(corners.pixels.dtype) * -1e-6, mask
 
 

@@ -112,7 +112,8 @@ def pose_jacobian(
     """
     x, y, z = (points_cam - centre_cam[:, :, None]).unbind(1)
     gx, gy, gz = gradient
-    return torch.stack([y * gz - z * gy, z * gx - x * gz, x * gy - y * gx, gx, gy, gz], 1)
+    turning = (torch.addcmul(a * d, b, c, value=-1) for a, b, c, d in ((y, z, gy, gz), (z, x, gz, gx), (x, y, gx, gy)))
+    return torch.stack([*turning, gx, gy, gz], 1)
 
 
 def _offset_from_prior(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, centre_cam: Tensor) -> Tensor:
@@ -140,7 +141,7 @@ def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor) -> _Seen:
     points_cam = torch.baddbmm(translation, rotation, rows.points)
     inverse_depth = points_cam[:, 2].clamp(min=MIN_DEPTH_M).reciprocal()
     gx, gy = (rows.slope * inverse_depth[:, None]).unbind(1)
-    along = gx * points_cam[:, 0] + gy * points_cam[:, 1]
+    along = torch.addcmul(gx * points_cam[:, 0], gy, points_cam[:, 1])
     centre_cam = torch.baddbmm(translation, rotation, problem.centre_obj[..., None])[..., 0]
     return _Seen(points_cam, centre_cam, inverse_depth, (gx, gy), along, along - rows.offset)
 

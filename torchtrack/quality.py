@@ -8,7 +8,6 @@ from enum import IntEnum
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from torchtrack.config.tracker import QualityConfig
 from torchtrack.contours import Contours
@@ -40,27 +39,29 @@ def explained_share(
 
     One where hardly anything moves: nothing speaks against the pose.
     """
-    height, width = image_size
-    rows, columns = height // _CELL_PX + 1, width // _CELL_PX + 1
-    occupied = torch.zeros(len(contours.mask), rows * columns, dtype=contours.pixels.dtype, device=contours.pixels.device)
+    columns = image_size[1] // _CELL_PX + 3
+    occupied = torch.zeros(len(contours.mask), columns * (image_size[0] // _CELL_PX + 3), dtype=torch.bool, device=contours.mask.device)
     cell, inside = _cells(matches.targets, image_size, columns)
-    occupied = occupied.scatter_reduce(1, cell, (matches.mask & inside).to(occupied.dtype), "amax")
-    near = max_pool2d(occupied.view(-1, 1, rows, columns), 3, 1, 1).flatten(1)
+    # Whatever does not count marks the corner cell, which no neighbour of an image cell is.
+    occupied = occupied.scatter(1, torch.where(matches.mask & inside, cell, 0), True)
     cell, inside = _cells(contours.pixels, image_size, columns)
+    step = torch.arange(-1, 2, device=cell.device)
+    around = (step[:, None] * columns + step).flatten()
+    near = occupied.gather(1, (cell[..., None] + around).flatten(1).clamp(min=1)).view(*cell.shape, 9).any(-1)
     speed = (contours.normals * contour_velocity).sum(-1).abs()
     moving = contours.mask & inside & (speed > min_speed_px_s)
-    explained = moving & (near.gather(1, cell) > 0)
     total = moving.sum(-1)
-    return torch.where(total < _MIN_MOVING_POINTS, 1.0, explained.sum(-1) / total.clamp(min=1)).to(occupied.dtype)
+    share = (moving & near).sum(-1) / total.clamp(min=1)
+    return torch.where(total < _MIN_MOVING_POINTS, 1.0, share).to(contours.pixels.dtype)
 
 
 def _cells(pixels: Tensor, image_size: tuple[int, int], columns: int) -> tuple[Tensor, Tensor]:
-    """Flat cell of each pixel and whether it lies in the image."""
+    """Flat cell of each pixel, in a grid with a border of one cell, and whether it lies in the image."""
     height, width = image_size
     u, v = pixels.unbind(-1)
     inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    cell = torch.where(inside, (v / _CELL_PX).floor() * columns + (u / _CELL_PX).floor(), 0).long()
-    return cell, inside
+    cell = (v / _CELL_PX).floor() * columns + (u / _CELL_PX).floor() + columns + 1
+    return torch.where(inside, cell, columns + 1).long(), inside
 
 
 def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:

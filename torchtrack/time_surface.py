@@ -6,7 +6,7 @@ One map of newest times per stream is kept over the whole sensor; surfaces are o
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchtrack.events import EventBatch
@@ -15,6 +15,13 @@ from torchtrack.events import EventBatch
 NEVER_US = -(2**62)
 # Ages are clamped to this many decay constants: exp(-16) is zero to 1e-7, and exp of large negative numbers is slow.
 _MAX_DECAYS = 16.0
+
+
+def at_pixels(maps: Shaped[Tensor, "s h w *c"], stream: Int[Tensor, "*#p"], u: Int[Tensor, "*#p"], v: Int[Tensor, "*#p"]) -> Shaped[Tensor, "..."]:
+    """``maps[stream, v, u]``, as one selection of rows: several times faster than indexing with three tensors."""
+    _, height, width = maps.shape[:3]
+    row = (stream * height + v) * width + u
+    return maps.flatten(0, 2).index_select(0, row.flatten()).view(*row.shape, *maps.shape[3:])
 
 
 def empty_last_event(streams: int, height: int, width: int, device: torch.device | str | None = None) -> Int[Tensor, "s h w"]:
@@ -80,7 +87,7 @@ def time_surface(
     columns = regions.origin[:, 0, None] + torch.arange(regions.size[1], device=t_us.device)
     inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
     stream = regions.stream_index[:, None, None]
-    newest_us = last_event_us[stream, rows.clamp(0, height - 1)[:, :, None], columns.clamp(0, width - 1)[:, None, :]]
+    newest_us = at_pixels(last_event_us, stream, columns.clamp(0, width - 1)[:, None, :], rows.clamp(0, height - 1)[:, :, None])
     max_age_us = int(_MAX_DECAYS * tau_s * 1e6)
     age_us = (t_us[stream] - newest_us).clamp(0, max_age_us).to(dtype)
     return torch.where(inside & (age_us < max_age_us), torch.exp(age_us * (-1e-6 / tau_s)), age_us.new_zeros(()))

@@ -22,7 +22,7 @@ from torchtrack.flow import estimate_flow
 from torchtrack.matching import ContourIndex, Observations, index_contours, join, select_events
 from torchtrack.object_model import ObjectModel
 from torchtrack.splat import splat_contours
-from torchtrack.time_surface import empty_last_event, object_regions, time_surface, update_last_event
+from torchtrack.time_surface import at_pixels, empty_last_event, object_regions, time_surface, update_last_event
 from torchtrack.visibility import Scene, remove_hidden
 
 # Contours this far outside the image still find their place on a distorted sensor (px).
@@ -203,7 +203,7 @@ class Tracker(nn.Module):
         # Clamped before the conversion: a far-off pixel does not fit an integer.
         limit = self.intrinsics.new_tensor([width - 1, height - 1])
         u, v = torch.minimum((contours.pixels + _BORDER_PX).clamp(min=0), limit).round().long().unbind(-1)
-        sensor = self.sensor_pixels[self.stream_index[:, None], v, u]
+        sensor = at_pixels(self.sensor_pixels, self.stream_index[:, None], u, v)
         regions = object_regions(sensor, contours.mask, self.stream_index, self.image_size, config.surface.margin_px)
         surface = time_surface(last_event_us, t_us, regions, config.surface.tau_s, self.intrinsics.dtype)
         corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config.surface, config.corners)
@@ -217,7 +217,7 @@ class Tracker(nn.Module):
             return seen
         window = pad_streams(events, self.streams, t_us)
         stream = torch.arange(self.streams, device=t_us.device)[:, None]
-        pixels = self.ideal_pixels[stream, window.y, window.x][self.stream_index]
+        pixels = at_pixels(self.ideal_pixels, stream, window.x, window.y)[self.stream_index]
         age_s = window.age_us[self.stream_index].to(pixels.dtype) * 1e-6
         polarity = 2.0 * window.polarity[self.stream_index].to(pixels.dtype) - 1.0
         recent = select_events(pixels, age_s, polarity, window.mask[self.stream_index], index, start.plane_velocity(pixels), count)
@@ -231,26 +231,30 @@ class Tracker(nn.Module):
         velocity = start.contour_velocity(contours)
         share = quality.explained_share(contours, aligned.matches, velocity, self.image_size, config.quality.min_speed_px_s)
         count = aligned.matches.mask.sum(-1)
-        step = lie.difference_about(start.T_prior, solution.T_cam_obj, self.centre_obj)
+        T_found = _orthonormal(solution.T_cam_obj.double())
+        step, moved = self._differences((start.T_prior.double(), state.T_cam_obj), T_found)
         status = quality.judge(share, count, quality.visible_share(contours, self.image_size), step, self.diameter_m, config.quality)
-        failed = status >= int(quality.Status.TOO_FEW_EVENTS)
+        failed = (status >= int(quality.Status.TOO_FEW_EVENTS))[:, None]
         T_held = state.T_cam_obj if config.motion.without_events == "hold" else start.T_prior.double()
-        T_cam_obj = torch.where(failed[:, None, None], T_held, _orthonormal(solution.T_cam_obj.double()))
-        next_velocity = self._next_velocity(state, T_cam_obj, failed, window_s)
+        T_cam_obj = torch.where(failed[..., None], T_held, T_found)
+        next_velocity = self._next_velocity(state, moved, failed, window_s)
         centre_cam = start.centre_cam(T_cam_obj.to(velocity.dtype))
         result = StepResult(t_us, T_cam_obj, quality.pose_covariance(solution, centre_cam), status, share, contours, corners, count)
         return TrackerState(T_cam_obj, next_velocity, t_us, last_event_us), result
 
-    def _next_velocity(self, state: TrackerState, T_cam_obj: Tensor, failed: Tensor, window_s: Tensor) -> Tensor:
-        """Velocity after a window: a running mean of what the poses moved; zero where the pose is held."""
-        dtype = state.velocity.dtype
+    def _differences(self, origins: tuple[Tensor, ...], T_cam_obj: Tensor) -> tuple[Tensor, ...]:
+        """Rotation and move of the centre from each of several poses to ``T_cam_obj``, in one go."""
+        count = len(origins)
+        moved = lie.difference_about(torch.cat(origins), T_cam_obj.repeat(count, 1, 1), self.centre_obj.double().repeat(count, 1))
+        return moved.to(self.centre_obj.dtype).chunk(count)
+
+    def _next_velocity(self, state: TrackerState, moved: Tensor, failed: Tensor, window_s: Tensor) -> Tensor:
+        """Velocity after a window: a running mean of what the poses moved; where a pose failed, kept or zero with it."""
         duration_s = window_s[self.stream_index, None].clamp(min=1e-6)
-        moved = lie.difference_about(state.T_cam_obj, T_cam_obj, self.centre_obj.double()).to(dtype) / duration_s
         gain = self.config.motion.velocity_gain
-        mixed = gain * moved + (1 - gain) * state.velocity
-        if self.config.motion.without_events == "predict":
-            return torch.where(failed[:, None], state.velocity, mixed)
-        return torch.where(failed[:, None], torch.zeros_like(mixed), mixed)
+        mixed = gain * moved / duration_s + (1 - gain) * state.velocity
+        kept = state.velocity if self.config.motion.without_events == "predict" else torch.zeros_like(mixed)
+        return torch.where(failed, kept, mixed)
 
 
 def _orthonormal(T: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:
