@@ -29,9 +29,7 @@ def box_edges(T, extents_m=BOX_EXTENTS_M):
     """Edges of the box, each as the set of its two faces (axis, side), and the faces that look at the camera."""
     camera = -T[:3, :3].T @ T[:3, 3]
     front = {(axis, side) for axis in range(3) for side in (-1, 1) if side * float(camera[axis]) > extents_m[axis] / 2}
-    edges = {
-        frozenset([(a, side_a), (b, side_b)]) for a, b in ((0, 1), (0, 2), (1, 2)) for side_a in (-1, 1) for side_b in (-1, 1)
-    }
+    edges = {frozenset([(a, side_a), (b, side_b)]) for a, b in ((0, 1), (0, 2), (1, 2)) for side_a in (-1, 1) for side_b in (-1, 1)}
     return edges, front
 
 
@@ -40,9 +38,7 @@ def edges_with_points(points, extents_m=BOX_EXTENTS_M):
     half = torch.tensor(extents_m, dtype=points.dtype) / 2
     on_face = (points.abs() - half).abs() < 1e-5
     assert (on_face.sum(-1) >= 2).all()
-    return [
-        frozenset((axis, 1 if point[axis] > 0 else -1) for axis in range(3) if on[axis]) for point, on in zip(points, on_face, strict=True)
-    ]
+    return [frozenset((axis, 1 if point[axis] > 0 else -1) for axis in range(3) if on[axis]) for point, on in zip(points, on_face, strict=True)]
 
 
 def visible(contours, number=0):
@@ -141,7 +137,8 @@ def test_pixels_are_the_projections_of_the_points(dtype):
     T = random_pose(5)
     contours = contours_of(box_model(), T, dtype=dtype)
     expected = project(contours.points_obj.double() @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3], INTRINSICS.expand(5, 4))
-    torch.testing.assert_close(contours.pixels.double()[contours.mask], expected[contours.mask], rtol=0, atol=1e-3 if dtype == torch.float32 else 1e-9)
+    tolerance = 1e-3 if dtype == torch.float32 else 1e-9
+    torch.testing.assert_close(contours.pixels.double()[contours.mask], expected[contours.mask], rtol=0, atol=tolerance)
     assert contours.pixels.dtype == dtype
 
 
@@ -222,7 +219,7 @@ def test_texture_can_be_switched_off_and_thinned():
 def test_segments_are_drawn_from_every_side(turn):
     model = ObjectModel.from_polylines([[[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]], [[0.0, 0.02, 0.0], [0.03, 0.04, 0.01]]])
     T = pose((0.1, turn, 0.2))
-    points, pixels, _, kind = visible(contours_of(model, T[None]))
+    points, _, _, kind = visible(contours_of(model, T[None]))
     assert len(points) == CONFIG.max_edge_points
     assert (kind == int(ContourKind.SEGMENT)).all()
     first = (points[:, 1:].abs() < 1e-9).all(-1)
