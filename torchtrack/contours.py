@@ -204,11 +204,9 @@ def image_normals(
 
 
 def reproject(contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
-    """The same contour points seen from another pose."""
+    """The same contour points seen from a pose nearby: normals are kept, which turn far less than points move."""
     points_cam = transform_points(T_cam_obj, contours.points_obj)
-    tangents_cam = contours.tangents_obj @ T_cam_obj[:, :3, :3].transpose(1, 2)
-    normals, _ = image_normals(points_cam, tangents_cam, intrinsics)
-    return replace(contours, points_cam=points_cam, pixels=project(points_cam, intrinsics), normals=normals)
+    return replace(contours, points_cam=points_cam, pixels=project(points_cam, intrinsics))
 
 
 def mesh_contours(

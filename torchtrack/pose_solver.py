@@ -54,14 +54,12 @@ class Linearisation:
         T_cam_obj: the pose.
         cost: robust cost, prior included.
         gradient, hessian: of the cost; the Hessian is Gauss-Newton's.
-        variance_px2: weighted mean of the squared residuals.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]
     cost: Float[Tensor, "b"]
     gradient: Float[Tensor, "b 6"]
     hessian: Float[Tensor, "b 6 6"]
-    variance_px2: Float[Tensor, "b"]
 
 
 def robust_loss(residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss: str) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
@@ -77,7 +75,8 @@ def robust_loss(residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss
         weight = (c / size).clamp(max=1)
         return torch.where(size <= c, 0.5 * residuals.square(), c * (size - 0.5 * c)), weight
     inside = (1 - (residuals / c).square()).clamp(min=0)
-    return c.square() / 6 * (1 - inside**3), inside.square()
+    weight = inside.square()
+    return c.square() / 6 * (1 - weight * inside), weight
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,6 @@ class _Rows:
     points: Float[Tensor, "b 3 n"]
     slope: Float[Tensor, "b 2 n"]
     offset: Float[Tensor, "b n"]
-    prior_centre: Float[Tensor, "b 3"]
 
 
 def _as_rows(problem: PoseProblem) -> _Rows:
@@ -99,8 +97,7 @@ def _as_rows(problem: PoseProblem) -> _Rows:
     directions = problem.directions.transpose(1, 2)
     focal, principal = problem.intrinsics[:, :2, None], problem.intrinsics[:, 2:, None]
     offset = ((problem.targets.transpose(1, 2) - principal) * directions).sum(1)
-    prior_centre = transform_points(problem.T_prior, problem.centre_obj[:, None])[:, 0]
-    return _Rows(problem.points_obj.transpose(1, 2).contiguous(), directions * focal, offset, prior_centre)
+    return _Rows(problem.points_obj.transpose(1, 2).contiguous(), directions * focal, offset)
 
 
 def pose_jacobian(
@@ -116,11 +113,11 @@ def pose_jacobian(
     return torch.stack([*turning, gx, gy, gz], 1)
 
 
-def _offset_from_prior(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, centre_cam: Tensor) -> Tensor:
+def _offset_from_prior(problem: PoseProblem, T_cam_obj: Tensor) -> Tensor:
     """Rotation ``sin θ · axis`` and move of the centre from the prior's pose: cheap, smooth, and exact to second order."""
     relative = T_cam_obj[:, :3, :3] @ problem.T_prior[:, :3, :3].transpose(1, 2)
-    turned = 0.5 * vee(relative - relative.transpose(1, 2))
-    return torch.cat([turned, centre_cam - rows.prior_centre], -1)
+    centres = [transform_points(T, problem.centre_obj[:, None])[:, 0] for T in (T_cam_obj, problem.T_prior)]
+    return torch.cat([0.5 * vee(relative - relative.transpose(1, 2)), centres[0] - centres[1]], -1)
 
 
 @dataclass(frozen=True)
@@ -146,29 +143,29 @@ def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor) -> _Seen:
     return _Seen(points_cam, centre_cam, inverse_depth, (gx, gy), along, along - rows.offset)
 
 
-def _cost(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, loss: str) -> Tensor:
+def _cost(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Tensor:
     """Robust cost at a pose, prior included."""
-    seen = _see(problem, rows, T_cam_obj)
-    value, _ = robust_loss(seen.residuals, problem.scale_px, loss)
-    from_prior = _offset_from_prior(problem, rows, T_cam_obj, seen.centre_cam)[..., None]
-    prior = (from_prior.transpose(1, 2) @ problem.prior_information @ from_prior)[:, 0, 0]
-    return (value * problem.weights).sum(-1) + 0.5 * prior
+    value, _ = robust_loss(_see(problem, rows, T_cam_obj).residuals, problem.scale_px, loss)
+    pull = (problem.prior_information @ from_prior[..., None]).squeeze(-1)
+    return (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1)
 
 
-def linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
+def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
     """Cost, gradient and Gauss-Newton Hessian of ``problem`` at a pose."""
+    return _linearise(problem, _as_rows(problem), T_cam_obj, _offset_from_prior(problem, T_cam_obj), loss)
+
+
+def _linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Linearisation:
+    """:func:`linearise`, given what does not change from one iteration to the next."""
     seen = _see(problem, rows, T_cam_obj)
     jacobian = pose_jacobian(seen.points_cam, seen.centre_cam, (*seen.gradient, -seen.along * seen.inverse_depth))
     value, robust = robust_loss(seen.residuals, problem.scale_px, loss)
-    weights = robust * problem.weights
-    weighted = jacobian * weights[:, None]
-    from_prior = _offset_from_prior(problem, rows, T_cam_obj, seen.centre_cam)
+    weighted = jacobian * (robust * problem.weights)[:, None]
     pull = (problem.prior_information @ from_prior[..., None]).squeeze(-1)
     gradient = (weighted @ seen.residuals[..., None]).squeeze(-1) + pull
     hessian = weighted @ jacobian.transpose(1, 2) + problem.prior_information
     cost = (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1)
-    variance = (weights * seen.residuals.square()).sum(-1) / weights.sum(-1).clamp(min=1)
-    return Linearisation(T_cam_obj, cost, gradient, hessian, variance)
+    return Linearisation(T_cam_obj, cost, gradient, hessian)
 
 
 def solve_positive(matrix: Float[Tensor, "b 6 6"], right: Float[Tensor, "b 6 k"]) -> tuple[Float[Tensor, "b 6 k"], Bool[Tensor, "b"]]:
@@ -187,9 +184,10 @@ def solve_positive(matrix: Float[Tensor, "b 6 6"], right: Float[Tensor, "b 6 k"]
 
 def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
     """The Levenberg-Marquardt step, damped along the Hessian's diagonal."""
-    diagonal = at.hessian.diagonal(dim1=-2, dim2=-1)
+    damped = at.hessian.clone()
+    diagonal = damped.diagonal(dim1=-2, dim2=-1)
     # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is.
-    damped = at.hessian + torch.diag_embed(diagonal * damping[:, None] + 1e-9 * diagonal.amax(-1, keepdim=True) + 1e-12)
+    diagonal += diagonal * damping[:, None] + (1e-9 * diagonal.amax(-1, keepdim=True) + 1e-12)
     return solve_positive(damped, -at.gradient[..., None])[0].squeeze(-1)
 
 
@@ -203,11 +201,14 @@ def solve_pose(problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: So
     """
     rows = _as_rows(problem)
     T_cam_obj, damping = T_start, torch.full_like(T_start[:, 0, 0], config.damping)
+    from_prior = _offset_from_prior(problem, T_start)
     for _ in range(config.iterations):
-        at = linearise(problem, rows, T_cam_obj, config.loss)
+        at = _linearise(problem, rows, T_cam_obj, from_prior, config.loss)
         step = _damped_step(at, damping)
         T_next = move_about(T_cam_obj, cayley(step[:, :3]), step[:, 3:], problem.centre_obj)
-        better = _cost(problem, rows, T_next, config.loss) <= at.cost
+        # Steps add up to the offset from the prior, to second order.
+        better = _cost(problem, rows, T_next, from_prior + step, config.loss) <= at.cost
         T_cam_obj = torch.where(better[:, None, None], T_next, T_cam_obj)
+        from_prior = from_prior + torch.where(better[:, None], step, 0)
         damping = torch.where(better, damping * _DAMPING_DECAY, damping.clamp(min=_DAMPING_START) * _DAMPING_GROWTH)
     return replace(at, T_cam_obj=T_cam_obj)

@@ -72,18 +72,19 @@ def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tens
     return inside.sum(-1) / contours.mask.sum(-1).clamp(min=1)
 
 
-def pose_covariance(solution: Linearisation, centre_cam: Float[Tensor, "b 3"]) -> Float[Tensor, "b 6 6"]:
+def pose_covariance(solution: Linearisation, observation_count: Int[Tensor, "b"], centre_cam: Float[Tensor, "b 3"]) -> Float[Tensor, "b 6 6"]:
     """Covariance of the left perturbation ``[φ, ρ]`` (rad, m) of the pose; infinite on the diagonal where unknown.
 
-    From the Gauss-Newton Hessian and the variance of the weighted residuals.
+    From the Gauss-Newton Hessian and the variance of the residuals, which is twice the mean robust cost.
     """
     hessian = solution.hessian
+    variance_px2 = 2 * solution.cost / observation_count.clamp(min=1)
     eye = torch.eye(6, dtype=hessian.dtype, device=hessian.device).repeat(len(hessian), 1, 1)
     inverse, known = solve_positive(hessian, eye)
     # The solver turns about the object's centre: ρ_left = ρ - φ × c.
     to_left = eye.clone()
     to_left[:, 3:, :3] = hat(centre_cam)
-    covariance = to_left @ (inverse * solution.variance_px2[:, None, None]) @ to_left.transpose(1, 2)
+    covariance = to_left @ (inverse * variance_px2[:, None, None]) @ to_left.transpose(1, 2)
     return torch.where(known[:, None, None], covariance, torch.diag_embed(torch.full_like(centre_cam.repeat(1, 2), torch.inf)))
 
 

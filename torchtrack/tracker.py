@@ -239,7 +239,7 @@ class Tracker(nn.Module):
         T_cam_obj = torch.where(failed[..., None], T_held, T_found)
         next_velocity = self._next_velocity(state, moved, failed, window_s)
         centre_cam = start.centre_cam(T_cam_obj.to(velocity.dtype))
-        result = StepResult(t_us, T_cam_obj, quality.pose_covariance(solution, centre_cam), status, share, contours, corners, count)
+        result = StepResult(t_us, T_cam_obj, quality.pose_covariance(solution, count, centre_cam), status, share, contours, corners, count)
         return TrackerState(T_cam_obj, next_velocity, t_us, last_event_us), result
 
     def _differences(self, origins: tuple[Tensor, ...], T_cam_obj: Tensor) -> tuple[Tensor, ...]:
