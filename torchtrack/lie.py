@@ -33,6 +33,11 @@ def vee(skew: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     return torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
 
+def chord(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """``sin θ · axis`` of a small rotation: its rotation vector but for ``θ³/6``, at a tenth of the cost."""
+    return 0.5 * vee(rotation - rotation.transpose(-1, -2))
+
+
 def _exp_coefficients(angle_sq: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """``sin θ / θ``, ``(1 - cos θ) / θ²`` and ``(θ - sin θ) / θ³``."""
     small = angle_sq < _SMALL_ANGLE_SQ
@@ -196,7 +201,8 @@ def move_about(
     """Turn by ``rotation`` about the object's centre, and move the centre by ``move``, both in the camera's axes."""
     turned = rotation @ T[..., :3, :3]
     shift = ((T[..., :3, :3] - turned) @ centre_obj[..., None]).squeeze(-1)
-    return _assemble(turned, T[..., :3, 3] + shift + move)
+    top = torch.cat([turned, (T[..., :3, 3] + shift + move)[..., None]], -1)
+    return torch.cat([top, T[..., 3:, :]], -2)
 
 
 def retract_about(T: Float[Tensor, "*b 4 4"], delta: Float[Tensor, "*b 6"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
@@ -220,5 +226,17 @@ def cayley(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 def difference_about(T_from: Float[Tensor, "*b 4 4"], T_to: Float[Tensor, "*b 4 4"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6"]:
     """The ``delta`` with ``retract_about(T_from, delta, centre_obj) == T_to``."""
     phi = so3_log(T_to[..., :3, :3] @ T_from[..., :3, :3].transpose(-1, -2))
+    return torch.cat([phi, _centre_moved(T_from, T_to, centre_obj)], -1)
+
+
+def small_difference_about(
+    T_from: Float[Tensor, "*b 4 4"], T_to: Float[Tensor, "*b 4 4"], centre_obj: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 6"]:
+    """:func:`difference_about` for small rotations, with the :func:`chord` in the place of the rotation vector."""
+    return torch.cat([chord(T_to[..., :3, :3] @ T_from[..., :3, :3].transpose(-1, -2)), _centre_moved(T_from, T_to, centre_obj)], -1)
+
+
+def _centre_moved(T_from: Tensor, T_to: Tensor, centre_obj: Tensor) -> Tensor:
+    """How far the object's centre moves from one pose to the other."""
     moved = (T_to - T_from)[..., :3, :]
-    return torch.cat([phi, (moved[..., :3] @ centre_obj[..., None]).squeeze(-1) + moved[..., 3]], -1)
+    return (moved[..., :3] @ centre_obj[..., None]).squeeze(-1) + moved[..., 3]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.lie import cayley, move_about, transform_points, vee
+from torchtrack.lie import cayley, move_about, small_difference_about
 
 # Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
 _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
@@ -113,13 +113,6 @@ def pose_jacobian(
     return torch.stack([*turning, gx, gy, gz], 1)
 
 
-def _offset_from_prior(problem: PoseProblem, T_cam_obj: Tensor) -> Tensor:
-    """Rotation ``sin θ · axis`` and move of the centre from the prior's pose: cheap, smooth, and exact to second order."""
-    relative = T_cam_obj[:, :3, :3] @ problem.T_prior[:, :3, :3].transpose(1, 2)
-    centres = [transform_points(T, problem.centre_obj[:, None])[:, 0] for T in (T_cam_obj, problem.T_prior)]
-    return torch.cat([0.5 * vee(relative - relative.transpose(1, 2)), centres[0] - centres[1]], -1)
-
-
 @dataclass(frozen=True)
 class _Seen:
     """The matched points as a pose shows them: gradients ``(gx, gy)`` of the residuals in x and y, and the residuals."""
@@ -152,7 +145,7 @@ def _cost(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tens
 
 def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
     """Cost, gradient and Gauss-Newton Hessian of ``problem`` at a pose."""
-    return _linearise(problem, _as_rows(problem), T_cam_obj, _offset_from_prior(problem, T_cam_obj), loss)
+    return _linearise(problem, _as_rows(problem), T_cam_obj, small_difference_about(problem.T_prior, T_cam_obj, problem.centre_obj), loss)
 
 
 def _linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Linearisation:
@@ -201,7 +194,7 @@ def solve_pose(problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: So
     """
     rows = _as_rows(problem)
     T_cam_obj, damping = T_start, torch.full_like(T_start[:, 0, 0], config.damping)
-    from_prior = _offset_from_prior(problem, T_start)
+    from_prior = small_difference_about(problem.T_prior, T_start, problem.centre_obj)
     for _ in range(config.iterations):
         at = _linearise(problem, rows, T_cam_obj, from_prior, config.loss)
         step = _damped_step(at, damping)

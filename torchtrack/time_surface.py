@@ -74,7 +74,7 @@ def object_regions(
     # Origins on a grid of 4 px keep a subsampled filter's phase independent of the other objects' regions.
     low = torch.div(low, 4, rounding_mode="floor") * 4
     extent = high - low + 1
-    width, height = (-(-extent.amax(0) // 32) * 32).tolist()
+    width, height = (-(-extent.amax(0) // 16) * 16).tolist()
     return Regions(low, extent, (height, width), stream_index)
 
 

@@ -21,6 +21,7 @@ from torchtrack.events import EventBatch, pad_streams
 from torchtrack.flow import estimate_flow
 from torchtrack.matching import ContourIndex, Observations, index_contours, join, select_events
 from torchtrack.object_model import ObjectModel
+from torchtrack.pose_solver import Linearisation
 from torchtrack.splat import splat_contours
 from torchtrack.time_surface import at_pixels, empty_last_event, object_regions, time_surface, update_last_event
 from torchtrack.visibility import Scene, remove_hidden
@@ -53,22 +54,30 @@ class StepResult:
     Args:
         t_us: end of the window of each stream (µs).
         T_cam_obj: pose of each object at that time (float64).
-        covariance: of the left perturbation ``[φ, ρ]`` of the pose (rad, m).
         status: :class:`torchtrack.quality.Status` of each object.
         quality: share of the moving contour that events explain.
         contours: visible contours at the pose.
         corners: corners and their flow.
         observation_count: matched observations of each object.
+        solution: the solver's last linearisation.
+        centre_obj: centre of each object, about which the solver turns it (m).
     """
 
     t_us: Int[Tensor, "s"]
     T_cam_obj: Float[Tensor, "b 4 4"]
-    covariance: Float[Tensor, "b 6 6"]
     status: Int[Tensor, "b"]
     quality: Float[Tensor, "b"]
     contours: Contours
     corners: Corners
     observation_count: Int[Tensor, "b"]
+    solution: Linearisation
+    centre_obj: Float[Tensor, "b 3"]
+
+    @property
+    def covariance(self) -> Float[Tensor, "b 6 6"]:
+        """Covariance of the left perturbation ``[φ, ρ]`` of each pose (rad, m); infinite where unknown."""
+        centre_cam = lie.transform_points(self.T_cam_obj.to(self.centre_obj.dtype), self.centre_obj[:, None])[:, 0]
+        return quality.pose_covariance(self.solution, self.observation_count, centre_cam)
 
 
 class Tracker(nn.Module):
@@ -232,24 +241,18 @@ class Tracker(nn.Module):
         share = quality.explained_share(contours, aligned.matches, velocity, self.image_size, config.quality.min_speed_px_s)
         count = aligned.matches.mask.sum(-1)
         T_found = _orthonormal(solution.T_cam_obj.double())
-        step, moved = self._differences((start.T_prior.double(), state.T_cam_obj), T_found)
+        step = lie.small_difference_about(start.T_prior.double(), T_found, self.centre_obj.double()).to(velocity.dtype)
         status = quality.judge(share, count, quality.visible_share(contours, self.image_size), step, self.diameter_m, config.quality)
         failed = (status >= int(quality.Status.TOO_FEW_EVENTS))[:, None]
         T_held = state.T_cam_obj if config.motion.without_events == "hold" else start.T_prior.double()
         T_cam_obj = torch.where(failed[..., None], T_held, T_found)
-        next_velocity = self._next_velocity(state, moved, failed, window_s)
-        centre_cam = start.centre_cam(T_cam_obj.to(velocity.dtype))
-        result = StepResult(t_us, T_cam_obj, quality.pose_covariance(solution, count, centre_cam), status, share, contours, corners, count)
+        next_velocity = self._next_velocity(state, T_found, failed, window_s)
+        result = StepResult(t_us, T_cam_obj, status, share, contours, corners, count, solution, self.centre_obj)
         return TrackerState(T_cam_obj, next_velocity, t_us, last_event_us), result
 
-    def _differences(self, origins: tuple[Tensor, ...], T_cam_obj: Tensor) -> tuple[Tensor, ...]:
-        """Rotation and move of the centre from each of several poses to ``T_cam_obj``, in one go."""
-        count = len(origins)
-        moved = lie.difference_about(torch.cat(origins), T_cam_obj.repeat(count, 1, 1), self.centre_obj.double().repeat(count, 1))
-        return moved.to(self.centre_obj.dtype).chunk(count)
-
-    def _next_velocity(self, state: TrackerState, moved: Tensor, failed: Tensor, window_s: Tensor) -> Tensor:
+    def _next_velocity(self, state: TrackerState, T_found: Tensor, failed: Tensor, window_s: Tensor) -> Tensor:
         """Velocity after a window: a running mean of what the poses moved; where a pose failed, kept or zero with it."""
+        moved = lie.small_difference_about(state.T_cam_obj, T_found, self.centre_obj.double()).to(state.velocity.dtype)
         duration_s = window_s[self.stream_index, None].clamp(min=1e-6)
         gain = self.config.motion.velocity_gain
         mixed = gain * moved / duration_s + (1 - gain) * state.velocity

@@ -46,7 +46,7 @@ class FlowConfig(_Settings):
 
     radius_px: int = Field(6, ge=1, le=20, description="Events within this distance of the corner take part (px).")
     span_s: float = Field(0.02, gt=0, le=1, description="Events up to this old take part (s).")
-    iterations: int = Field(5, ge=1, le=50, description="Reweightings.")
+    iterations: int = Field(3, ge=1, le=50, description="Reweightings.")
     tuning: float = Field(4.685, gt=0, description="b of the bisquare weight (Eq. 8), in units of the residual's scale.")
     min_events: int = Field(8, ge=3, description="Fewer events give no flow.")
 
