@@ -8,15 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.contour_index import ContourIndex, index_contours
 from torchtrack.contours import Contours, reproject, take_points
 from torchtrack.lie import transform_points
 from torchtrack.matching import (
     Belief,
-    ContourIndex,
     Matches,
     Observations,
     both_coordinates,
-    index_contours,
     match_along_flow,
     match_nearest,
     object_plane_velocity,
@@ -75,9 +74,10 @@ class AlignmentResult:
     contour_velocity: Float[Tensor, "b m 2"]
 
 
-def index_radius_px(config: TrackerConfig) -> int:
-    """How far from a contour observations are looked for (px)."""
-    return int(max(config.matching.gates_px)) + _INDEX_MARGIN_PX
+def index_for(contours: Contours, image_size: tuple[int, int], config: TrackerConfig) -> ContourIndex:
+    """The index of contours, wide enough for the first gate."""
+    radius_px = int(max(config.matching.gates_px)) + _INDEX_MARGIN_PX
+    return index_contours(contours, image_size, radius_px, config.matching.index_cell_px)
 
 
 def align(
@@ -102,7 +102,7 @@ def align(
     for number, gate_px in enumerate(config.matching.gates_px):
         if number and number in config.contours.refresh_rounds:
             contours = extract(T_cam_obj)
-            index = index_contours(contours, start.image_size, index_radius_px(config))
+            index = index_for(contours, start.image_size, config)
             velocity = compensate * start.contour_velocity(contours)
             belief = replace(belief, moved=torch.zeros_like(plane))
         matches, belief = _match(observations, contours, index, belief, velocity, gate_px, config)

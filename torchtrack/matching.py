@@ -1,8 +1,7 @@
 """Association of corners and events with contours, with gates, and moved to the window's end.
 
-Many observations look their nearest contour point up in an index: an image of the region in which every pixel holds the
-nearest contour point. It is made once per extraction; when the pose moves by a few pixels, the observation is moved
-back instead. Corners may search along their flow, as the paper does.
+Many observations look their nearest contour point up in an index (:mod:`torchtrack.contour_index`); corners may search
+along their flow, as the paper does.
 """
 
 from dataclasses import dataclass
@@ -13,10 +12,9 @@ from torch import Tensor
 
 from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import MatchingConfig
+from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import ContourKind, Contours, select_ranked, take_points
 
-# Squared distances are compared in these fractions of a pixel².
-_DISTANCE_STEPS = 16
 # An edge this parallel to the flow (|n·f| below) is not crossed by it.
 _MIN_CROSSING = 0.3
 # Contours slower than this across themselves (px/s) have no clear leading side.
@@ -59,62 +57,6 @@ class Matches:
     mask: Bool[Tensor, "b n"]
     targets: Float[Tensor, "b n 2"]
     directions: Float[Tensor, "b n 2"]
-
-
-@dataclass(frozen=True)
-class ContourIndex:
-    """The nearest contour point of every pixel of a region, within a radius.
-
-    Args:
-        origin: ideal pixel (u, v) of the region's first entry.
-        size: (height, width) of the region.
-        nearest: contour index per pixel, -1 where none is near.
-        pixels: where the contour points were when the index was made.
-    """
-
-    origin: Int[Tensor, "b 2"]
-    size: tuple[int, int]
-    nearest: Int[Tensor, "b p"]
-    pixels: Float[Tensor, "b m 2"]
-
-    def look_up(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
-        """Nearest contour point of each pixel, -1 where none is near."""
-        height, width = self.size
-        local = pixels.round() - self.origin[:, None]
-        u, v = local.unbind(-1)
-        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        cell = torch.where(inside, v * width + u, 0).long()
-        return torch.where(inside, self.nearest.gather(1, cell), -1)
-
-
-def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: int) -> ContourIndex:
-    """Index the visible contour points by pixel; those far outside the image (height, width) are left out."""
-    batch, count, _ = contours.pixels.shape
-    device = contours.pixels.device
-    limit = torch.tensor([image_size[1] - 1, image_size[0] - 1], device=device)
-    inside = contours.mask & ((contours.pixels > -radius_px) & (contours.pixels < limit + radius_px)).all(-1)
-    centre = torch.where(inside[..., None], contours.pixels, 0).round().long()
-    low = torch.where(inside[..., None], centre, 2**31).amin(1).clamp(max=2**30) - radius_px
-    span = (torch.where(inside[..., None], centre - low[:, None], 0).amax((0, 1)) + radius_px + 1).tolist()
-    width, height = span
-    step = torch.arange(-radius_px, radius_px + 1, device=device)
-    disc = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1).flatten(0, 1)
-    disc = disc[disc.square().sum(-1) <= radius_px**2]
-    # |c + o - p|² of every point p, its central pixel c and every offset o, as one matrix product.
-    to_centre = centre.to(contours.pixels.dtype) - contours.pixels
-    offsets = disc.to(to_centre.dtype)
-    point_part = torch.cat([to_centre.square().sum(-1, keepdim=True), torch.ones_like(to_centre[..., :1]), 2 * to_centre], -1)
-    offset_part = torch.cat([torch.ones_like(offsets[:, :1]), offsets.square().sum(-1, keepdim=True), offsets], -1)
-    distance_sq = (point_part @ (_DISTANCE_STEPS * offset_part.T)).clamp(min=0)
-    key = distance_sq.long() * count + torch.arange(count, device=device)[:, None]
-    local = centre - low[:, None]
-    # Masked points write to spare entries after the last.
-    first = torch.where(inside, local[..., 1] * width + local[..., 0], height * width + radius_px * (width + 1))
-    cell = first[..., None] + (disc[:, 1] * width + disc[:, 0])
-    nothing = torch.iinfo(torch.int64).max
-    keys = torch.full((batch, height * width + 2 * radius_px * (width + 1) + 1), nothing, device=device)
-    keys = keys.scatter_reduce(1, cell.flatten(1), key.flatten(1), "amin")[:, : height * width]
-    return ContourIndex(low, (height, width), torch.where(keys == nothing, -1, keys % count), contours.pixels)
 
 
 def pixel_velocity(

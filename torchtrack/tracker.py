@@ -11,15 +11,16 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchtrack import lie, quality
-from torchtrack.alignment import Alignment, AlignmentResult, align, index_radius_px
+from torchtrack.alignment import Alignment, AlignmentResult, align, index_for
 from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, undistortion_table
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import ContourModel, Contours, group_by_model, mesh_contours
 from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.errors import PoseError
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.flow import estimate_flow
-from torchtrack.matching import ContourIndex, Observations, index_contours, join, select_events
+from torchtrack.matching import Observations, join, select_events
 from torchtrack.object_model import ObjectModel
 from torchtrack.pose_solver import Linearisation
 from torchtrack.splat import splat_contours
@@ -168,7 +169,7 @@ class Tracker(nn.Module):
         start = self._predict(state, window_s)
         contours = self._extract(start.T_prior)
         corners = self._corners(contours, last_event_us, t_us, window_s)
-        index = index_contours(contours, self.image_size, index_radius_px(self.config))
+        index = index_for(contours, self.image_size, self.config)
         observations = self._observe(start, index, events, corners, t_us)
         aligned = align(start, contours, index, observations, self._extract, self.config)
         return self._conclude(state, start, aligned, corners, last_event_us, t_us, window_s)

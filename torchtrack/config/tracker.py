@@ -79,6 +79,7 @@ class MatchingConfig(_Settings):
         "normal", description="Distance normal to the contour, along the corner's flow, or to the matched point in both coordinates."
     )
     gates_px: tuple[float, ...] = Field((5, 2.5, 1.5, 1.2), min_length=1, description="One round of matching and solving per gate (px).")
+    index_cell_px: int = Field(2, ge=1, le=4, description="Cell of the index of nearest contour points (px).")
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
     dark_shift_px: float = Field(
