@@ -178,6 +178,8 @@ def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, 
         points = T_cam_obj.new_zeros(batch, config.max_edge_points, 3)
         tangents, kind = points, torch.zeros(points.shape[:2], dtype=torch.int64, device=points.device)
         mask = torch.zeros_like(kind, dtype=torch.bool)
+    if texture_count == 0:
+        return points, tangents, kind, mask
     padding = texture_count - own
     pad_points = T_cam_obj.new_zeros(batch, padding, 3)
     texture = torch.cat([model.texture_points.expand(batch, -1, -1), pad_points], 1)

@@ -52,23 +52,25 @@ def irls_flow(
     """
     weight = mask.to(offsets.dtype)
     count = weight.sum(-1)
+    # A row per component: sums along a last axis of two are slow.
+    du, dv = (component.contiguous() for component in offsets.unbind(-1))
     for _ in range(config.iterations):
-        flow = _weighted_flow(offsets, times_s, weight)
-        residual_sq = (offsets - flow[..., None, :] * times_s[..., None]).square().sum(-1)
+        flow_u, flow_v = _weighted_flow(du, dv, times_s, weight)
+        residual_sq = (du - flow_u * times_s).square() + (dv - flow_v * times_s).square()
         scale = (residual_sq.sqrt() * weight).sum(-1) / weight.sum(-1).clamp(min=1e-6)
         bound_sq = (config.tuning * scale.clamp(min=_MIN_SCALE_PX)).square()
         weight = (1 - residual_sq / bound_sq[..., None]).clamp(min=0).square() * mask
-    flow = _weighted_flow(offsets, times_s, weight)
+    flow = torch.cat(_weighted_flow(du, dv, times_s, weight), -1)
     lever = (weight * times_s.square()).sum(-1)
     valid = (count >= config.min_events) & (lever > 0) & torch.isfinite(flow).all(-1)
     return torch.where(valid[..., None], flow, torch.zeros_like(flow)), valid
 
 
-def _weighted_flow(offsets: Tensor, times_s: Tensor, weight: Tensor) -> Tensor:
-    """Closed-form solution of Eq. 9-11."""
+def _weighted_flow(du: Tensor, dv: Tensor, times_s: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Closed-form solution of Eq. 9-11, a component each."""
     weighted_time = weight * times_s
-    lever = (weighted_time * times_s).sum(-1, keepdim=True)
-    return (weighted_time[..., None] * offsets).sum(-2) / lever.clamp(min=1e-12)
+    lever = (weighted_time * times_s).sum(-1, keepdim=True).clamp(min=1e-12)
+    return (weighted_time * du).sum(-1, keepdim=True) / lever, (weighted_time * dv).sum(-1, keepdim=True) / lever
 
 
 def estimate_flow(

@@ -73,9 +73,14 @@ def object_plane_velocity(
     pixels: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b 6"], centre_cam: Float[Tensor, "b 3"], intrinsics: Float[Tensor, "b 4"]
 ) -> Float[Tensor, "b n 2"]:
     """Image velocity (px/s) that a pixel would have at the depth of the object's centre."""
-    depth = centre_cam[:, None, 2:].expand(-1, pixels.shape[1], -1)
-    rays = (pixels - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]
-    return pixel_velocity(torch.cat([rays * depth, depth], -1), velocity, centre_cam, intrinsics)
+    x, y = ((pixels - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]).unbind(-1)
+    # The velocity that the camera's origin would have, were it part of the object.
+    drift = velocity[:, 3:] - torch.linalg.cross(velocity[:, :3], centre_cam)
+    vx, vy, vz = (drift / centre_cam[:, 2:].clamp(min=MIN_DEPTH_M)).unsqueeze(1).unbind(-1)
+    wx, wy, wz = velocity[:, None, :3].unbind(-1)
+    # (ẋ, ẏ) = (X/Z)˙ for a point that turns with ω and drifts with v: the motion field of a plane at one depth.
+    tilt = vz + wx * y - wy * x
+    return torch.stack([vx + wy - wz * y - x * tilt, vy + wz * x - wx - y * tilt], -1) * intrinsics[:, None, :2]
 
 
 def select_events(

@@ -23,7 +23,7 @@ def _paper() -> TrackerConfig:
     return TrackerConfig(
         window=WindowConfig(duration_us=10_000),
         corners=CornerConfig(max_corners=200, snap=False, fresh_only=False),
-        flow=FlowConfig(iterations=10),
+        flow=FlowConfig(radius_px=6, iterations=10),
         contours=ContourConfig(source="splat", texture=False, creases=False),
         matching=MatchingConfig(along_flow=True, residual="point", gates_px=(8.0, 8.0, 8.0), motion_compensation=False, max_events=0),
         solver=SolverConfig(iterations=5, loss="none", damping=1e-3, prior=False),

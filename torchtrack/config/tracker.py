@@ -34,7 +34,7 @@ class SurfaceConfig(_Settings):
 class CornerConfig(_Settings):
     """Harris corners of the filtered surface."""
 
-    max_corners: int = Field(64, ge=0, le=2000, description="Corners per object; 0 switches corners off.")
+    max_corners: int = Field(48, ge=0, le=2000, description="Corners per object; 0 switches corners off.")
     cell_px: int = Field(8, ge=3, le=64, description="At most one corner in a cell of this side (px): corners are spread evenly.")
     relative_threshold: float = Field(1e-3, ge=0, le=1, description="Least Harris response, as a share of the region's largest.")
     snap: bool = Field(True, description="Move each corner to the newest event of its 3x3 neighbourhood.")
@@ -44,7 +44,7 @@ class CornerConfig(_Settings):
 class FlowConfig(_Settings):
     """Event flow of each corner (Eq. 6-11)."""
 
-    radius_px: int = Field(6, ge=1, le=20, description="Events within this distance of the corner take part (px).")
+    radius_px: int = Field(5, ge=1, le=20, description="Events within this distance of the corner take part (px).")
     span_s: float = Field(0.02, gt=0, le=1, description="Events up to this old take part (s).")
     iterations: int = Field(3, ge=1, le=50, description="Reweightings.")
     tuning: float = Field(4.685, gt=0, description="b of the bisquare weight (Eq. 8), in units of the residual's scale.")
@@ -85,7 +85,7 @@ class MatchingConfig(_Settings):
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
-    max_events: int = Field(1500, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
+    max_events: int = Field(1200, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
 
 class SolverConfig(_Settings):
