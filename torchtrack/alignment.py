@@ -97,14 +97,14 @@ def align(
     T_cam_obj = start.T_prior
     compensate = 1.0 if config.matching.motion_compensation else 0.0
     plane = compensate * start.plane_velocity(observations.pixels)
-    belief = Belief(plane, torch.zeros_like(plane))
+    belief = Belief.from_velocity(plane)
     velocity = compensate * start.contour_velocity(contours)
     for number, gate_px in enumerate(config.matching.gates_px):
         if number and number in config.contours.refresh_rounds:
             contours = extract(T_cam_obj)
             index = index_for(contours, start.image_size, config)
             velocity = compensate * start.contour_velocity(contours)
-            belief = replace(belief, moved=torch.zeros_like(plane))
+            belief = Belief.from_velocity(belief.motion[..., :2])
         matches, belief = _match(observations, contours, index, belief, velocity, gate_px, config)
         solution = solve_pose(_problem(start, matches, contours, gate_px, config), T_cam_obj, config.solver)
         T_cam_obj = solution.T_cam_obj

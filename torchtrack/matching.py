@@ -110,12 +110,16 @@ class Belief:
     """What an observation is believed to belong to, from the last round or from the object's plane.
 
     Args:
-        velocity: image velocity (px/s) that carries the observation to the window's end.
-        moved: how far its contour moved since the contours were indexed (px).
+        motion: image velocity (px/s) that carries the observation to the window's end, and how far its contour moved
+            since the contours were indexed (px).
     """
 
-    velocity: Float[Tensor, "b n 2"]
-    moved: Float[Tensor, "b n 2"]
+    motion: Float[Tensor, "b n 4"]
+
+    @classmethod
+    def from_velocity(cls, velocity: Float[Tensor, "b n 2"]) -> "Belief":
+        """A velocity, and contours where they were indexed."""
+        return cls(torch.cat([velocity, torch.zeros_like(velocity)], -1))
 
 
 def match_nearest(
@@ -135,19 +139,21 @@ def match_nearest(
         contour_velocity: velocity of each contour point (px/s); zero to switch motion compensation off.
         dark_shift_px: how far events lie to the dark side of a sharp edge.
     """
-    found = index.look_up(observations.pixels + belief.velocity * observations.age_s[..., None] - belief.moved)
+    believed_velocity, believed_moved = belief.motion.chunk(2, -1)
+    found = index.look_up(torch.addcmul(observations.pixels - believed_moved, believed_velocity, observations.age_s[..., None]))
     contour = found.clamp(min=0)
     # The limb of a smooth surface is no step: its shading fades towards it.
     sharp = (contours.kind != int(ContourKind.LIMB)).to(contour_velocity.dtype)
-    table = torch.cat([contours.pixels, contours.normals, contour_velocity, contours.pixels - index.pixels, sharp[..., None]], -1)
+    moved = contours.pixels - index.pixels
+    table = torch.cat([contours.pixels, contours.normals, contour_velocity, moved, sharp[..., None]], -1)
     values = take_points(table, contour)
-    pixels, normals, velocity, moved = values[..., :8].chunk(4, -1)
-    targets = observations.pixels + velocity * observations.age_s[..., None]
+    pixels, normals, velocity = values[..., :6].chunk(3, -1)
+    targets = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
     targets = targets - dark_shift_px * towards_dark(observations.polarity * values[..., 8], normals, velocity)
     near = (pixels - targets).square().sum(-1) < gate_px**2
     matched = observations.mask & (found >= 0) & near
-    keep = matched[..., None]
-    return Matches(contour, matched, targets, normals), Belief(torch.where(keep, velocity, belief.velocity), torch.where(keep, moved, belief.moved))
+    motion = torch.where(matched[..., None], values[..., 4:8], belief.motion)
+    return Matches(contour, matched, targets, normals), Belief(motion)
 
 
 def towards_dark(polarity: Float[Tensor, "b n"], normals: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:

@@ -36,8 +36,10 @@ def update_last_event(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -
     """
     _, height, width = last_event_us.shape
     pixel = (events.stream_index * height + events.y) * width + events.x
-    updated = last_event_us.flatten().scatter_reduce(0, pixel, events.t_us, "amax")
-    return updated.view_as(last_event_us)
+    updated = last_event_us.clone()
+    # In place on the copy: out of place, the whole map is copied twice.
+    updated.view(-1).scatter_reduce_(0, pixel, events.t_us, "amax")
+    return updated
 
 
 @dataclass(frozen=True)
