@@ -125,8 +125,8 @@ def _match(
     if config.matching.along_flow:
         matches = match_along_flow(observations, contours, contour_velocity, gate_px, config.matching)
     else:
-        matches, belief = match_nearest(observations, contours, index, belief, contour_velocity, gate_px, config.matching.dark_shift_px)
-    enough = matches.mask.sum(-1, keepdim=True) >= config.quality.min_observations
+        matches, belief = match_nearest(observations, contours, index, belief, contour_velocity, gate_px, config.matching)
+    enough = (matches.mask * matches.weights).sum(-1, keepdim=True) >= config.quality.min_observations
     matches = replace(matches, mask=matches.mask & enough)
     return (both_coordinates(matches) if config.matching.residual == "point" else matches), belief
 
@@ -139,7 +139,7 @@ def _problem(start: Alignment, matches: Matches, contours: Contours, gate_px: fl
         points_obj=take_points(contours.points_obj, matches.contour),
         targets=matches.targets,
         directions=matches.directions,
-        weights=matches.mask.to(matches.targets.dtype),
+        weights=matches.mask * matches.weights,
         intrinsics=start.intrinsics,
         centre_obj=start.centre_obj,
         scale_px=torch.full_like(start.centre_obj[:, 0], gate_px),

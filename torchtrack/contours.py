@@ -21,6 +21,8 @@ from torchtrack.object_model import ObjectModel
 _MAX_ACTIVE_EDGES = 8192
 # Texture seen at a grazing angle (cosine below this) is foreshortened beyond use.
 _MIN_TEXTURE_COSINE = 0.15
+# Faces that meet at more than 60° make a sharp edge, whatever its scale; a scanned mesh is rough at smaller angles.
+_SHARP_COSINE = 0.5
 
 
 class ContourKind(IntEnum):
@@ -87,9 +89,8 @@ class ContourModel(nn.Module):
         is_segment = torch.zeros(len(points), dtype=torch.bool)
         is_segment[len(model.edge_points) :] = True
         self.register_buffer("is_segment", is_segment)
-        is_sharp = torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)])
-        self.register_buffer("is_sharp", is_sharp)
-        self.register_buffer("is_crease", is_sharp & config.creases)
+        self.register_buffer("is_sharp", (normals[:, 0] * normals[:, 1]).sum(-1) < _SHARP_COSINE)
+        self.register_buffer("is_crease", torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)]) & config.creases)
         texture_count = min(len(model.texture_points), config.max_texture_points) if config.texture else 0
         spread = torch.linspace(0, max(len(model.texture_points) - 1, 0), texture_count).long()
         for name in ("texture_points", "texture_tangents", "texture_normals"):

@@ -1,13 +1,10 @@
-"""From corners to their event flow: iteratively reweighted least squares with bisquare weights (Eq. 6-11)."""
-
-from dataclasses import replace
+"""From corners, and from any event, to their flow: iteratively reweighted least squares with bisquare weights (Eq. 6-11)."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import FlowConfig
-from torchtrack.corners import Corners
 from torchtrack.time_surface import at_pixels
 
 # Floor of the residual's scale (px): events sit on whole pixels, so no smaller scale means anything.
@@ -15,12 +12,23 @@ _MIN_SCALE_PX = 0.3
 
 
 def newest_events_around(
-    corners: Corners, last_event_us: Int[Tensor, "s h w"], stream_index: Int[Tensor, "b"], ideal_pixels: Float[Tensor, "s h w 2"], config: FlowConfig
+    sensor_pixels: Int[Tensor, "b n 2"],
+    event_us: Int[Tensor, "b n"],
+    last_event_us: Int[Tensor, "s h w"],
+    stream_index: Int[Tensor, "b"],
+    ideal_pixels: Float[Tensor, "s h w 2"],
+    config: FlowConfig,
 ) -> tuple[Float[Tensor, "b n k 2"], Float[Tensor, "b n k"], Bool[Tensor, "b n k"]]:
-    """Offsets (ideal px) and times (s, at most 0) of the events around each corner, relative to the corner's own event.
+    """Offsets (ideal px) and times (s, at most 0) of the events around each corner or event, relative to its own.
 
     The paper sums over all events of the window; we take the newest event of each pixel, which needs no search, keeps
     memory constant at any event rate, and lets slow edges look back further than the window.
+
+    Args:
+        sensor_pixels: sensor pixel (u, v) of each corner or event.
+        event_us: its time (µs).
+        last_event_us: newest event time of every pixel (µs).
+        ideal_pixels: undistortion table of each stream.
     """
     _, height, width = last_event_us.shape
     radius = config.radius_px
@@ -28,18 +36,17 @@ def newest_events_around(
     dv, du = (grid.flatten() for grid in torch.meshgrid(step, step, indexing="ij"))
     disc = du.square() + dv.square() <= radius**2
     du, dv = du[disc], dv[disc]
-    u = corners.sensor_pixels[..., 0, None] + du
-    v = corners.sensor_pixels[..., 1, None] + dv
+    u = sensor_pixels[..., 0, None] + du
+    v = sensor_pixels[..., 1, None] + dv
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     u, v = u.clamp(0, width - 1), v.clamp(0, height - 1)
     stream = stream_index[:, None, None]
-    corner_us = at_pixels(last_event_us, stream[..., 0], corners.sensor_pixels[..., 0], corners.sensor_pixels[..., 1])
     span_us = int(config.span_s * 1e6)
-    age_us = (corner_us[..., None] - at_pixels(last_event_us, stream, u, v)).clamp(-span_us - 1, span_us + 1)
-    # Events newer than the corner's belong to what follows it: only the trail behind it is its motion.
+    age_us = (event_us[..., None] - at_pixels(last_event_us, stream, u, v)).clamp(-1, span_us + 1)
+    # Newer events belong to what follows: only the trail behind an event is its motion.
     mask = inside & (age_us >= 0) & (age_us <= span_us)
-    offsets = at_pixels(ideal_pixels, stream, u, v) - corners.pixels[..., None, :]
-    return offsets, age_us.to(corners.pixels.dtype) * -1e-6, mask
+    here = at_pixels(ideal_pixels, stream[..., 0], sensor_pixels[..., 0], sensor_pixels[..., 1])
+    return at_pixels(ideal_pixels, stream, u, v) - here[..., None, :], age_us.to(here.dtype) * -1e-6, mask
 
 
 def irls_flow(
@@ -71,12 +78,3 @@ def _weighted_flow(du: Tensor, dv: Tensor, times_s: Tensor, weight: Tensor) -> t
     weighted_time = weight * times_s
     lever = (weighted_time * times_s).sum(-1, keepdim=True).clamp(min=1e-12)
     return (weighted_time * du).sum(-1, keepdim=True) / lever, (weighted_time * dv).sum(-1, keepdim=True) / lever
-
-
-def estimate_flow(
-    corners: Corners, last_event_us: Int[Tensor, "s h w"], stream_index: Int[Tensor, "b"], ideal_pixels: Float[Tensor, "s h w 2"], config: FlowConfig
-) -> Corners:
-    """The corners with their flow."""
-    flow, valid = irls_flow(*newest_events_around(corners, last_event_us, stream_index, ideal_pixels, config), config)
-    has_flow = valid & corners.mask
-    return replace(corners, flow=torch.where(has_flow[..., None], flow, torch.zeros_like(flow)), has_flow=has_flow)

@@ -19,6 +19,8 @@ from torchtrack.contours import ContourKind, Contours, select_ranked, take_point
 _MIN_CROSSING = 0.3
 # Contours slower than this across themselves (px/s) have no clear leading side.
 _SLOW_PX_S = 10.0
+# Concentration: side of a patch, patches a side of the image, and offsets that are near and on a contour (px).
+_PATCH_PX, _PATCHES, _SMEAR_PX, _ON_CONTOUR_PX = 16, 128, 3.0, 0.8
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,8 @@ class Observations:
     """What was seen, padded: corners and events.
 
     Args:
-        pixels: ideal pixels at the time of the event.
+        sensor_pixels: sensor pixels of the event.
+        pixels: the same in ideal pixels.
         age_s: time from the event to the window's end (s).
         polarity: +1 where the pixel got brighter, -1 where darker, 0 where unknown.
         mask: which entries exist.
@@ -34,6 +37,7 @@ class Observations:
         has_flow: where the flow is known.
     """
 
+    sensor_pixels: Int[Tensor, "b n 2"]
     pixels: Float[Tensor, "b n 2"]
     age_s: Float[Tensor, "b n"]
     polarity: Float[Tensor, "b n"]
@@ -49,12 +53,14 @@ class Matches:
     Args:
         contour: index of the contour point; 0 where there is none.
         mask: which observations are matched.
+        weights: how far each match is to be trusted, 0 to 1.
         targets: ideal pixels of the observations, moved to the window's end.
         directions: unit directions along which the distance counts.
     """
 
     contour: Int[Tensor, "b n"]
     mask: Bool[Tensor, "b n"]
+    weights: Float[Tensor, "b n"]
     targets: Float[Tensor, "b n 2"]
     directions: Float[Tensor, "b n 2"]
 
@@ -84,6 +90,7 @@ def object_plane_velocity(
 
 
 def select_events(
+    sensor_pixels: Int[Tensor, "b e 2"],
     pixels: Float[Tensor, "b e 2"],
     age_s: Float[Tensor, "b e"],
     polarity: Float[Tensor, "b e"],
@@ -97,7 +104,8 @@ def select_events(
     chosen, exists = select_ranked(near, count)
     flow = torch.zeros(*chosen.shape, 2, dtype=pixels.dtype, device=pixels.device)
     values = take_points(torch.cat([pixels, age_s[..., None], polarity[..., None]], -1), chosen)
-    return Observations(values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
+    sensor = take_points(sensor_pixels, chosen)
+    return Observations(sensor, values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
 
 
 def join(first: Observations, second: Observations) -> Observations:
@@ -129,7 +137,7 @@ def match_nearest(
     belief: Belief,
     contour_velocity: Float[Tensor, "b m 2"],
     gate_px: float,
-    dark_shift_px: float,
+    config: MatchingConfig,
 ) -> tuple[Matches, Belief]:
     """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
 
@@ -137,7 +145,6 @@ def match_nearest(
         contours: at the current pose; ``index`` may be of an earlier one.
         belief: where to look for each observation; returned anew for the next round.
         contour_velocity: velocity of each contour point (px/s); zero to switch motion compensation off.
-        dark_shift_px: how far events lie to the dark side of a sharp edge.
     """
     believed_velocity, believed_moved = belief.motion.chunk(2, -1)
     found = index.look_up(torch.addcmul(observations.pixels - believed_moved, believed_velocity, observations.age_s[..., None]))
@@ -149,11 +156,33 @@ def match_nearest(
     values = take_points(table, contour)
     pixels, normals, velocity = values[..., :6].chunk(3, -1)
     targets = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
-    targets = targets - dark_shift_px * towards_dark(observations.polarity * values[..., 8], normals, velocity)
+    targets = targets - config.dark_shift_px * towards_dark(observations.polarity * values[..., 8], normals, velocity)
     near = (pixels - targets).square().sum(-1) < gate_px**2
     matched = observations.mask & (found >= 0) & near
     motion = torch.where(matched[..., None], values[..., 4:8], belief.motion)
-    return Matches(contour, matched, targets, normals), Belief(motion)
+    offset = ((pixels - targets) * normals).sum(-1)
+    weights = concentration(offset, targets, observations.mask & (found >= 0), config) if config.concentration else torch.ones_like(offset)
+    return Matches(contour, matched, weights, targets, normals), Belief(motion)
+
+
+def concentration(
+    offset: Float[Tensor, "b n"], targets: Float[Tensor, "b n 2"], near: Bool[Tensor, "b n"], config: MatchingConfig
+) -> Float[Tensor, "b n"]:
+    """How closely the observations around each one lie on the contour, 0 to 1.
+
+    Events of a contour, moved to the window's end with the contour's own motion, gather within a pixel of it. What moves
+    otherwise (an occluder, the background, another object) is smeared over the whole gate. So: in each patch of the
+    image, the share of the observations near a contour that are on it, against the best patches of the object.
+    """
+    patch = (targets / _PATCH_PX).floor().long().clamp(0, _PATCHES - 1)
+    cell = patch[..., 1] * _PATCHES + patch[..., 0]
+    counted = near & (offset.abs() < _SMEAR_PX)
+    on = (counted & (offset.abs() < _ON_CONTOUR_PX)).to(offset.dtype)
+    total = torch.zeros(len(offset), _PATCHES**2, dtype=offset.dtype, device=offset.device)
+    near_count = total.scatter_add(1, cell, counted.to(offset.dtype)).gather(1, cell)
+    on_count = total.scatter_add(1, cell, on).gather(1, cell)
+    share = (on_count + 1) / (near_count + 2)
+    return ((share - config.smeared_share) / (config.gathered_share - config.smeared_share)).clamp(0, 1)
 
 
 def towards_dark(polarity: Float[Tensor, "b n"], normals: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
@@ -185,12 +214,13 @@ def match_along_flow(
     distance, contour = torch.where(allowed, along.square() + across.square(), torch.inf).min(-1)
     targets = observations.pixels + take_points(contour_velocity, contour) * observations.age_s[..., None]
     directions = heading if config.residual == "flow" else take_points(contours.normals, contour)
-    return Matches(contour, observations.mask & observations.has_flow & torch.isfinite(distance), targets, directions)
+    mask = observations.mask & observations.has_flow & torch.isfinite(distance)
+    return Matches(contour, mask, torch.ones_like(targets[..., 0]), targets, directions)
 
 
 def both_coordinates(matches: Matches) -> Matches:
     """The same matches with the distance in u and in v, as two observations each."""
     axes = torch.eye(2, dtype=matches.targets.dtype, device=matches.targets.device)
     directions = torch.cat([axes[axis].expand_as(matches.targets) for axis in range(2)], 1)
-    contour, mask = (torch.cat([value, value], 1) for value in (matches.contour, matches.mask))
-    return Matches(contour, mask, torch.cat([matches.targets, matches.targets], 1), directions)
+    contour, mask, weights, targets = (torch.cat([v, v], 1) for v in (matches.contour, matches.mask, matches.weights, matches.targets))
+    return Matches(contour, mask, weights, targets, directions)

@@ -25,9 +25,11 @@ def _paper() -> TrackerConfig:
         corners=CornerConfig(max_corners=200, snap=False, fresh_only=False),
         flow=FlowConfig(radius_px=6, iterations=10),
         contours=ContourConfig(source="splat", texture=False, creases=False),
-        matching=MatchingConfig(along_flow=True, residual="point", gates_px=(8.0, 8.0, 8.0), motion_compensation=False, max_events=0),
+        matching=MatchingConfig(
+            along_flow=True, residual="point", gates_px=(8.0, 8.0, 8.0), motion_compensation=False, max_events=0, flow_gate=False
+        ),
         solver=SolverConfig(iterations=5, loss="none", damping=1e-3, prior=False),
-        motion=MotionConfig(model="hold"),
+        motion=MotionConfig(model="hold", without_events="hold"),
         quality=QualityConfig(min_observations=6),
     )
 

@@ -82,6 +82,9 @@ class MatchingConfig(_Settings):
     index_cell_px: int = Field(2, ge=1, le=4, description="Cell of the index of nearest contour points (px).")
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
+    concentration: bool = Field(True, description="Trust observations less where those around them are smeared across the contour.")
+    smeared_share: float = Field(0.35, ge=0, le=1, description="Share of observations on the contour at which a patch counts for nothing.")
+    gathered_share: float = Field(0.6, ge=0, le=1, description="Share of observations on the contour at which a patch counts in full.")
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
@@ -104,7 +107,8 @@ class MotionConfig(_Settings):
 
     model: Literal["constant_velocity", "hold"] = Field("constant_velocity", description="Carry the velocity on, or start from the last pose.")
     velocity_gain: float = Field(0.6, gt=0, le=1, description="Share of a new window in the velocity.")
-    without_events: Literal["predict", "hold"] = Field("hold", description="What the pose does in a window with too few events.")
+    without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
+    coast_s: float = Field(0.02, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
 
 
 class QualityConfig(_Settings):
