@@ -187,7 +187,7 @@ def test_outliers_do_not_move_the_solution(share, dtype):
     for loss in LOSSES:
         found = solve_pose(problem, start, replace_config(loss=loss)).T_cam_obj
         errors[loss] = max(float(error.max()) for error in pose_errors(found.double(), T_true))
-    assert errors["tukey"] < 0.5
+    assert errors["tukey"] < 0.7
     assert errors["tukey"] < errors["huber"] < errors["none"]
 
 
