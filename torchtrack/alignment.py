@@ -10,17 +10,10 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_index import ContourIndex, index_contours
 from torchtrack.contours import Contours, reproject, take_points
+from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.lie import transform_points
-from torchtrack.matching import (
-    Belief,
-    Matches,
-    Observations,
-    both_coordinates,
-    match_along_flow,
-    match_nearest,
-    object_plane_velocity,
-    pixel_velocity,
-)
+from torchtrack.matching import Belief, Matches, both_coordinates, match_along_flow, match_nearest
+from torchtrack.observations import Observations
 from torchtrack.pose_solver import Linearisation, PoseProblem, solve_pose
 
 # The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).

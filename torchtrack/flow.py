@@ -1,10 +1,13 @@
-"""From corners, and from any event, to their flow: iteratively reweighted least squares with bisquare weights (Eq. 6-11)."""
+"""From corners to their event flow: iteratively reweighted least squares with bisquare weights (Eq. 6-11)."""
+
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import FlowConfig
+from torchtrack.corners import Corners
 from torchtrack.time_surface import at_pixels
 
 # Floor of the residual's scale (px): events sit on whole pixels, so no smaller scale means anything.
@@ -19,14 +22,14 @@ def newest_events_around(
     ideal_pixels: Float[Tensor, "s h w 2"],
     config: FlowConfig,
 ) -> tuple[Float[Tensor, "b n k 2"], Float[Tensor, "b n k"], Bool[Tensor, "b n k"]]:
-    """Offsets (ideal px) and times (s, at most 0) of the events around each corner or event, relative to its own.
+    """Offsets (ideal px) and times (s, at most 0) of the events around each corner, relative to its own.
 
     The paper sums over all events of the window; we take the newest event of each pixel, which needs no search, keeps
     memory constant at any event rate, and lets slow edges look back further than the window.
 
     Args:
-        sensor_pixels: sensor pixel (u, v) of each corner or event.
-        event_us: its time (µs).
+        sensor_pixels: sensor pixel (u, v) of each corner.
+        event_us: time of the event there (µs).
         last_event_us: newest event time of every pixel (µs).
         ideal_pixels: undistortion table of each stream.
     """
@@ -43,7 +46,7 @@ def newest_events_around(
     stream = stream_index[:, None, None]
     span_us = int(config.span_s * 1e6)
     age_us = (event_us[..., None] - at_pixels(last_event_us, stream, u, v)).clamp(-1, span_us + 1)
-    # Newer events belong to what follows: only the trail behind an event is its motion.
+    # Newer events belong to what follows: only the trail behind a corner is its motion.
     mask = inside & (age_us >= 0) & (age_us <= span_us)
     here = at_pixels(ideal_pixels, stream[..., 0], sensor_pixels[..., 0], sensor_pixels[..., 1])
     return at_pixels(ideal_pixels, stream, u, v) - here[..., None, :], age_us.to(here.dtype) * -1e-6, mask
@@ -78,3 +81,18 @@ def _weighted_flow(du: Tensor, dv: Tensor, times_s: Tensor, weight: Tensor) -> t
     weighted_time = weight * times_s
     lever = (weighted_time * times_s).sum(-1, keepdim=True).clamp(min=1e-12)
     return (weighted_time * du).sum(-1, keepdim=True) / lever, (weighted_time * dv).sum(-1, keepdim=True) / lever
+
+
+def estimate_flow(
+    corners: Corners,
+    last_event_us: Int[Tensor, "s h w"],
+    t_us: Int[Tensor, "s"],
+    stream_index: Int[Tensor, "b"],
+    ideal_pixels: Float[Tensor, "s h w 2"],
+    config: FlowConfig,
+) -> Corners:
+    """The corners at ``t_us`` with their flow."""
+    event_us = t_us[stream_index, None] - (corners.age_s.double() * 1e6).round().long()
+    flow, valid = irls_flow(*newest_events_around(corners.sensor_pixels, event_us, last_event_us, stream_index, ideal_pixels, config), config)
+    has_flow = valid & corners.mask
+    return replace(corners, flow=torch.where(has_flow[..., None], flow, torch.zeros_like(flow)), has_flow=has_flow)

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.contour_index import ContourIndex
-from torchtrack.contours import ContourKind, Contours, select_ranked, take_points
+from torchtrack.contours import ContourKind, Contours, take_points
+from torchtrack.observations import Observations
 
 # An edge this parallel to the flow (|n·f| below) is not crossed by it.
 _MIN_CROSSING = 0.3
@@ -21,29 +21,6 @@ _MIN_CROSSING = 0.3
 _SLOW_PX_S = 10.0
 # Concentration: side of a patch, patches a side of the image, and offsets that are near and on a contour (px).
 _PATCH_PX, _PATCHES, _SMEAR_PX, _ON_CONTOUR_PX = 16, 128, 3.0, 0.8
-
-
-@dataclass(frozen=True)
-class Observations:
-    """What was seen, padded: corners and events.
-
-    Args:
-        sensor_pixels: sensor pixels of the event.
-        pixels: the same in ideal pixels.
-        age_s: time from the event to the window's end (s).
-        polarity: +1 where the pixel got brighter, -1 where darker, 0 where unknown.
-        mask: which entries exist.
-        flow: velocity (px/s); zero where there is none.
-        has_flow: where the flow is known.
-    """
-
-    sensor_pixels: Int[Tensor, "b n 2"]
-    pixels: Float[Tensor, "b n 2"]
-    age_s: Float[Tensor, "b n"]
-    polarity: Float[Tensor, "b n"]
-    mask: Bool[Tensor, "b n"]
-    flow: Float[Tensor, "b n 2"]
-    has_flow: Bool[Tensor, "b n"]
 
 
 @dataclass(frozen=True)
@@ -63,54 +40,6 @@ class Matches:
     weights: Float[Tensor, "b n"]
     targets: Float[Tensor, "b n 2"]
     directions: Float[Tensor, "b n 2"]
-
-
-def pixel_velocity(
-    points_cam: Float[Tensor, "b m 3"], velocity: Float[Tensor, "b 6"], centre_cam: Float[Tensor, "b 3"], intrinsics: Float[Tensor, "b 4"]
-) -> Float[Tensor, "b m 2"]:
-    """Image velocity (px/s) of points that turn about ``centre_cam`` and move with it: ``velocity`` is [rad/s, m/s]."""
-    rotating = torch.linalg.cross(velocity[:, None, :3].expand_as(points_cam), points_cam - centre_cam[:, None], dim=-1)
-    moving = rotating + velocity[:, None, 3:]
-    inverse_depth = points_cam[..., 2:].clamp(min=MIN_DEPTH_M).reciprocal()
-    return (moving[..., :2] - points_cam[..., :2] * inverse_depth * moving[..., 2:]) * inverse_depth * intrinsics[:, None, :2]
-
-
-def object_plane_velocity(
-    pixels: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b 6"], centre_cam: Float[Tensor, "b 3"], intrinsics: Float[Tensor, "b 4"]
-) -> Float[Tensor, "b n 2"]:
-    """Image velocity (px/s) that a pixel would have at the depth of the object's centre."""
-    x, y = ((pixels - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]).unbind(-1)
-    # The velocity that the camera's origin would have, were it part of the object.
-    drift = velocity[:, 3:] - torch.linalg.cross(velocity[:, :3], centre_cam)
-    vx, vy, vz = (drift / centre_cam[:, 2:].clamp(min=MIN_DEPTH_M)).unsqueeze(1).unbind(-1)
-    wx, wy, wz = velocity[:, None, :3].unbind(-1)
-    # (ẋ, ẏ) = (X/Z)˙ for a point that turns with ω and drifts with v: the motion field of a plane at one depth.
-    tilt = vz + wx * y - wy * x
-    return torch.stack([vx + wy - wz * y - x * tilt, vy + wz * x - wx - y * tilt], -1) * intrinsics[:, None, :2]
-
-
-def select_events(
-    sensor_pixels: Int[Tensor, "b e 2"],
-    pixels: Float[Tensor, "b e 2"],
-    age_s: Float[Tensor, "b e"],
-    polarity: Float[Tensor, "b e"],
-    mask: Bool[Tensor, "b e"],
-    index: ContourIndex,
-    plane_velocity: Float[Tensor, "b e 2"],
-    count: int,
-) -> Observations:
-    """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time."""
-    near = mask & (index.look_up(pixels + plane_velocity * age_s[..., None]) >= 0)
-    chosen, exists = select_ranked(near, count)
-    flow = torch.zeros(*chosen.shape, 2, dtype=pixels.dtype, device=pixels.device)
-    values = take_points(torch.cat([pixels, age_s[..., None], polarity[..., None]], -1), chosen)
-    sensor = take_points(sensor_pixels, chosen)
-    return Observations(sensor, values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
-
-
-def join(first: Observations, second: Observations) -> Observations:
-    """Observations of both, for each object."""
-    return Observations(*(torch.cat([getattr(first, name), getattr(second, name)], 1) for name in vars(first)))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ The only state is an immutable :class:`TrackerState`; ``step`` is pure: the same
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -19,9 +19,9 @@ from torchtrack.contours import ContourModel, Contours, group_by_model, mesh_con
 from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.errors import PoseError
 from torchtrack.events import EventBatch, pad_streams
-from torchtrack.flow import irls_flow, newest_events_around
-from torchtrack.matching import Observations, join, select_events
+from torchtrack.flow import estimate_flow
 from torchtrack.object_model import ObjectModel
+from torchtrack.observations import Observations, corner_observations, join, select_events
 from torchtrack.pose_solver import Linearisation
 from torchtrack.splat import splat_contours
 from torchtrack.time_surface import at_pixels, empty_last_event, object_regions, time_surface, update_last_event
@@ -170,9 +170,7 @@ class Tracker(nn.Module):
         contours = self._extract(start.T_prior)
         corners = self._corners(contours, last_event_us, t_us, window_s)
         index = index_for(contours, self.image_size, self.config)
-        observations = self._with_flow(self._observe(start, index, events, corners, t_us), last_event_us, t_us)
-        count = corners.mask.shape[1]
-        corners = replace(corners, flow=observations.flow[:, :count], has_flow=observations.has_flow[:, :count])
+        observations = self._observe(start, index, events, corners, t_us)
         aligned = align(start, contours, index, observations, self._extract, self.config)
         return self._conclude(state, start, aligned, corners, last_event_us, t_us, window_s)
 
@@ -207,7 +205,7 @@ class Tracker(nn.Module):
         return remove_hidden(contours, scene, config)
 
     def _corners(self, contours: Contours, last_event_us: Tensor, t_us: Tensor, window_s: Tensor) -> Corners:
-        """Corners of each object's region."""
+        """Corners of each object's region and their flow."""
         config = self.config
         if config.corners.max_corners == 0:
             return no_corners(contours.pixels)
@@ -218,38 +216,21 @@ class Tracker(nn.Module):
         sensor = at_pixels(self.sensor_pixels, self.stream_index[:, None], u, v)
         regions = object_regions(sensor, contours.mask, self.stream_index, self.image_size, config.surface.margin_px)
         surface = time_surface(last_event_us, t_us, regions, config.surface.tau_s, self.intrinsics.dtype)
-        return detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config.surface, config.corners)
+        corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config.surface, config.corners)
+        return estimate_flow(corners, last_event_us, t_us, self.stream_index, self.ideal_pixels, config.flow)
 
     def _observe(self, start: Alignment, index: ContourIndex, events: EventBatch, corners: Corners, t_us: Tensor) -> Observations:
         """Corners and recent events near each object's contours."""
-        unknown = torch.zeros_like(corners.age_s)
-        seen = Observations(
-            corners.sensor_pixels, corners.pixels, corners.age_s, unknown, corners.mask, torch.zeros_like(corners.pixels), unknown.bool()
-        )
-        count = self.config.matching.max_events
+        seen, count = corner_observations(corners), self.config.matching.max_events
         if count == 0:
             return seen
         window = pad_streams(events, self.streams, t_us)
         stream = torch.arange(self.streams, device=t_us.device)[:, None]
-        sensor = torch.stack([window.x, window.y], -1)[self.stream_index]
         pixels = at_pixels(self.ideal_pixels, stream, window.x, window.y)[self.stream_index]
         age_s = window.age_us[self.stream_index].to(pixels.dtype) * 1e-6
         polarity = 2.0 * window.polarity[self.stream_index].to(pixels.dtype) - 1.0
         mask = window.mask[self.stream_index]
-        return join(seen, select_events(sensor, pixels, age_s, polarity, mask, index, start.plane_velocity(pixels), count))
-
-    def _with_flow(self, observations: Observations, last_event_us: Tensor, t_us: Tensor) -> Observations:
-        """The observations with the flow of the corners among them, which come first."""
-        count = observations.mask.shape[1] - self.config.matching.max_events
-        sensor, age_us = observations.sensor_pixels[:, :count], (observations.age_s[:, :count] * 1e6).round().long()
-        event_us = t_us[self.stream_index, None] - age_us
-        around = newest_events_around(sensor, event_us, last_event_us, self.stream_index, self.ideal_pixels, self.config.flow)
-        flow, valid = irls_flow(*around, self.config.flow)
-        return replace(
-            observations,
-            flow=torch.cat([flow, observations.flow[:, count:]], 1),
-            has_flow=torch.cat([valid, observations.has_flow[:, count:]], 1) & observations.mask,
-        )
+        return join(seen, select_events(pixels, age_s, polarity, mask, index, start.plane_velocity(pixels), count))
 
     def _conclude(
         self, state: TrackerState, start: Alignment, aligned: AlignmentResult, corners: Corners, last_event_us: Tensor, t_us: Tensor, window_s: Tensor
@@ -270,11 +251,10 @@ class Tracker(nn.Module):
         return TrackerState(T_cam_obj, next_velocity, t_us, last_event_us), result
 
     def _next_velocity(self, state: TrackerState, T_found: Tensor, failed: Tensor, share: Tensor, window_s: Tensor) -> Tensor:
-        """Velocity after a window: a running mean of what the poses moved; where a pose failed, kept or zero with it."""
+        """Velocity after a window: a running mean of what the poses moved, as far as events explain it."""
         moved = lie.small_difference_about(state.T_cam_obj, T_found, self.centre_obj.double()).to(state.velocity.dtype)
         duration_s = window_s[self.stream_index, None].clamp(min=1e-6)
-        gain = self.config.motion.velocity_gain
-        gain = gain * share[:, None]
+        gain = self.config.motion.velocity_gain * share[:, None]
         mixed = gain * moved / duration_s + (1 - gain) * state.velocity
         # Coasting dies away: a pose that nothing confirms must not leave for good.
         fading = torch.exp(-duration_s / self.config.motion.coast_s)

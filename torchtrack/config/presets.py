@@ -26,7 +26,7 @@ def _paper() -> TrackerConfig:
         flow=FlowConfig(radius_px=6, iterations=10),
         contours=ContourConfig(source="splat", texture=False, creases=False),
         matching=MatchingConfig(
-            along_flow=True, residual="point", gates_px=(8.0, 8.0, 8.0), motion_compensation=False, max_events=0, flow_gate=False
+            along_flow=True, residual="point", gates_px=(8.0, 8.0, 8.0), motion_compensation=False, max_events=0, concentration=False
         ),
         solver=SolverConfig(iterations=5, loss="none", damping=1e-3, prior=False),
         motion=MotionConfig(model="hold", without_events="hold"),

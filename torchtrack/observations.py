@@ -1,0 +1,59 @@
+"""What is matched with contours: the corners, and recent events near the contours."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchtrack.contour_index import ContourIndex
+from torchtrack.contours import select_ranked, take_points
+from torchtrack.corners import Corners
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What was seen, padded: corners and events.
+
+    Args:
+        pixels: ideal pixels at the time of the event.
+        age_s: time from the event to the window's end (s).
+        polarity: +1 where the pixel got brighter, -1 where darker, 0 where unknown.
+        mask: which entries exist.
+        flow: velocity (px/s); zero where there is none.
+        has_flow: where the flow is known.
+    """
+
+    pixels: Float[Tensor, "b n 2"]
+    age_s: Float[Tensor, "b n"]
+    polarity: Float[Tensor, "b n"]
+    mask: Bool[Tensor, "b n"]
+    flow: Float[Tensor, "b n 2"]
+    has_flow: Bool[Tensor, "b n"]
+
+
+def corner_observations(corners: Corners) -> Observations:
+    """The corners as observations; their polarity is not known."""
+    return Observations(corners.pixels, corners.age_s, torch.zeros_like(corners.age_s), corners.mask, corners.flow, corners.has_flow)
+
+
+def select_events(
+    pixels: Float[Tensor, "b e 2"],
+    age_s: Float[Tensor, "b e"],
+    polarity: Float[Tensor, "b e"],
+    mask: Bool[Tensor, "b e"],
+    index: ContourIndex,
+    plane_velocity: Float[Tensor, "b e 2"],
+    count: int,
+) -> Observations:
+    """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time."""
+    near = mask & (index.look_up(pixels + plane_velocity * age_s[..., None]) >= 0)
+    chosen, exists = select_ranked(near, count)
+    flow = torch.zeros(*chosen.shape, 2, dtype=pixels.dtype, device=pixels.device)
+    values = take_points(torch.cat([pixels, age_s[..., None], polarity[..., None]], -1), chosen)
+    return Observations(values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
+
+
+def join(first: Observations, second: Observations) -> Observations:
+    """Observations of both, for each object."""
+    return Observations(*(torch.cat([getattr(first, name), getattr(second, name)], 1) for name in vars(first)))
