@@ -8,8 +8,7 @@ import torch
 from helpers import generator
 
 from torchtrack.config.tracker import FlowConfig
-from torchtrack.corners import Corners
-from torchtrack.flow import estimate_flow, irls_flow, newest_events_around
+from torchtrack.flow import irls_flow, newest_events_around
 from torchtrack.time_surface import empty_last_event
 
 NOW_US = 50_000_000
@@ -40,13 +39,17 @@ def numpy_irls(offsets, times_s, iterations, tuning):
     return flow
 
 
-def corner_at(pixels, width=60, height=50, scale=1.0, dtype=torch.float64):
-    """Corners of one object at given sensor pixels."""
-    sensor = torch.tensor([pixels])
-    count = sensor.shape[1]
-    nothing = torch.zeros(1, count, 2, dtype=dtype)
-    mask = torch.ones(1, count, dtype=torch.bool)
-    return Corners(sensor, scale * sensor.to(dtype), nothing[..., 0], mask, nothing, ~mask)
+def events_around(pixels, last_event_us, *, scale=1.0, streams=None, config=None):
+    """Offsets, times and mask of the events around the newest events at sensor pixels, one or more per object."""
+    sensor = torch.tensor(pixels)
+    streams = torch.zeros(len(sensor), dtype=torch.int64) if streams is None else torch.tensor(streams)
+    event_us = last_event_us[streams[:, None], sensor[..., 1], sensor[..., 0]]
+    return newest_events_around(sensor, event_us, last_event_us, streams, table(len(last_event_us), scale=scale), config or FlowConfig())
+
+
+def flow_at(pixels, last_event_us, **kwargs):
+    """Flow of one or more pixels per object, and where there is one."""
+    return irls_flow(*events_around(pixels, last_event_us, **kwargs), FlowConfig())
 
 
 def table(streams=1, width=60, height=50, scale=1.0):
@@ -151,61 +154,61 @@ def test_no_events_and_bad_numbers_give_no_flow_and_harm_no_neighbour(dtype):
 def test_an_edge_gives_its_normal_flow(angle_deg):
     normal = (math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg)))
     speed = 400.0
-    corners = estimate_flow(corner_at([(30, 25)]), sweeping_edge(normal, speed), torch.tensor([0]), table(), FlowConfig())
-    assert corners.has_flow.all()
-    flow = corners.flow[0, 0]
-    assert float(flow @ torch.tensor(normal, dtype=flow.dtype)) == pytest.approx(speed, rel=0.02)
-    assert abs(float(flow[0] * normal[1] - flow[1] * normal[0])) < 0.05 * speed
+    flow, valid = flow_at([[(30, 25)]], sweeping_edge(normal, speed))
+    assert valid.all()
+    assert float(flow[0, 0] @ torch.tensor(normal)) == pytest.approx(speed, rel=0.02)
+    assert abs(float(flow[0, 0, 0] * normal[1] - flow[0, 0, 1] * normal[0])) < 0.05 * speed
 
 
-def test_only_the_trail_behind_the_corner_counts():
-    """An event newer than the corner's, or older than the span, belongs to something else."""
+def test_only_the_trail_behind_the_event_counts():
+    """An event newer than the one in the middle, or older than the span, belongs to something else."""
     last = empty_last_event(1, 50, 60)
     last[0, 25, 30] = NOW_US
     last[0, 25, 29], last[0, 25, 28], last[0, 25, 27], last[0, 25, 31] = NOW_US - 1000, NOW_US - 20_000, NOW_US - 20_001, NOW_US + 1
-    offsets, times_s, mask = newest_events_around(corner_at([(30, 25)]), last, torch.tensor([0]), table(), FlowConfig(radius_px=3, span_s=0.02))
+    offsets, times_s, mask = events_around([[(30, 25)]], last, config=FlowConfig(radius_px=3, span_s=0.02))
     seen = sorted((*offset, time) for offset, time in zip(offsets[mask].tolist(), times_s[mask].tolist(), strict=True))
     assert seen == [pytest.approx(row) for row in ((-2, 0, -0.02), (-1, 0, -0.001), (0, 0, 0))]
 
 
+def test_an_event_that_is_not_the_newest_of_its_pixel_has_its_own_time():
+    last = empty_last_event(1, 50, 60)
+    last[0, 25, 30], last[0, 25, 29], last[0, 25, 31] = NOW_US, NOW_US - 9000, NOW_US - 2000
+    _, times_s, mask = newest_events_around(
+        torch.tensor([[[30, 25]]]), torch.tensor([[NOW_US - 4000]]), last, torch.tensor([0]), table(), FlowConfig(radius_px=3)
+    )
+    assert times_s[mask].tolist() == pytest.approx([-5e-3])
+
+
 @pytest.mark.parametrize("radius", [1, 3, 6])
 def test_events_are_taken_from_a_disc(radius):
-    last = torch.full((1, 50, 60), NOW_US)
-    offsets, _, mask = newest_events_around(corner_at([(30, 25)]), last, torch.tensor([0]), table(), FlowConfig(radius_px=radius))
+    offsets, _, mask = events_around([[(30, 25)]], torch.full((1, 50, 60), NOW_US), config=FlowConfig(radius_px=radius))
     expected = {(u, v) for u in range(-radius, radius + 1) for v in range(-radius, radius + 1) if u * u + v * v <= radius * radius}
     assert {tuple(offset) for offset in offsets[mask].tolist()} == expected
     assert int(mask.sum()) == len(expected)
 
 
 def test_events_beyond_the_border_of_the_sensor_do_not_count():
-    last = torch.full((1, 50, 60), NOW_US)
-    offsets, _, mask = newest_events_around(corner_at([(0, 49)]), last, torch.tensor([0]), table(), FlowConfig(radius_px=2))
+    offsets, _, mask = events_around([[(0, 49)]], torch.full((1, 50, 60), NOW_US), config=FlowConfig(radius_px=2))
     assert {tuple(offset) for offset in offsets[mask].tolist()} == {(0, 0), (1, 0), (2, 0), (0, -1), (1, -1), (0, -2)}
 
 
 def test_flow_is_in_ideal_pixels():
-    last = sweeping_edge((1.0, 0.0), 400.0)
-    corners = estimate_flow(corner_at([(30, 25)], scale=2.0), last, torch.tensor([0]), table(scale=2.0), FlowConfig())
-    assert corners.flow[0, 0].tolist() == pytest.approx([800.0, 0.0], abs=1.0)
+    flow, _ = flow_at([[(30, 25)]], sweeping_edge((1.0, 0.0), 400.0), scale=2.0)
+    assert flow[0, 0].tolist() == pytest.approx([800.0, 0.0], abs=1.0)
 
 
 def test_flow_is_of_the_stream_of_the_object():
     last = torch.cat([sweeping_edge((1.0, 0.0), 400.0), sweeping_edge((0.0, 1.0), 200.0)])
-    one = corner_at([(30, 25)])
-    both = Corners(*(torch.cat([getattr(one, name)] * 2) for name in vars(one)))
-    flow = estimate_flow(both, last, torch.tensor([1, 0]), table(2), FlowConfig()).flow[:, 0]
-    assert flow[0].tolist() == pytest.approx([0.0, 200.0], abs=1.0)
-    assert flow[1].tolist() == pytest.approx([400.0, 0.0], abs=1.0)
+    flow, _ = flow_at([[(30, 25)], [(30, 25)]], last, streams=[1, 0])
+    assert flow[0, 0].tolist() == pytest.approx([0.0, 200.0], abs=1.0)
+    assert flow[1, 0].tolist() == pytest.approx([400.0, 0.0], abs=1.0)
 
 
-def test_masked_corners_and_corners_without_an_event_have_no_flow():
-    corners = corner_at([(30, 25), (10, 10)])
-    corners.mask[0, 0] = False
+def test_pixels_that_never_fired_have_no_flow_and_the_map_is_left_as_it_was():
     last = sweeping_edge((1.0, 0.0), 400.0)
-    last[0, 10, 10] = empty_last_event(1, 1, 1)[0, 0, 0]
+    last[0, :20, :20] = empty_last_event(1, 1, 1)
     before = last.clone()
-    estimated = estimate_flow(corners, last, torch.tensor([0]), table(), FlowConfig())
-    assert not estimated.has_flow.any()
-    assert (estimated.flow == 0).all()
+    flow, valid = flow_at([[(10, 10), (30, 25)]], last)
+    assert valid.tolist() == [[False, True]]
+    assert flow[0, 0].tolist() == [0, 0]
     assert torch.equal(last, before)
-    assert not corners.has_flow.any()
