@@ -8,7 +8,8 @@ import torch
 from helpers import generator
 
 from torchtrack.config.tracker import FlowConfig
-from torchtrack.flow import irls_flow, newest_events_around
+from torchtrack.corners import Corners
+from torchtrack.flow import estimate_flow, irls_flow, newest_events_around
 from torchtrack.time_surface import empty_last_event
 
 NOW_US = 50_000_000
@@ -212,3 +213,26 @@ def test_pixels_that_never_fired_have_no_flow_and_the_map_is_left_as_it_was():
     assert valid.tolist() == [[False, True]]
     assert flow[0, 0].tolist() == [0, 0]
     assert torch.equal(last, before)
+
+
+# ---- flow of corners
+
+
+def corners_at(pixels, ages_us, mask, dtype):
+    """Corners of one object whose newest events are ``ages_us`` old."""
+    sensor, nothing = torch.tensor([pixels]), torch.zeros(1, len(pixels), 2, dtype=dtype)
+    age_s = torch.tensor([ages_us], dtype=torch.float64).to(dtype) * 1e-6
+    return Corners(sensor, sensor.to(dtype), age_s, torch.tensor([mask]), nothing, torch.zeros(1, len(pixels), dtype=torch.bool))
+
+
+def test_corners_get_their_flow_from_their_own_event_on(dtype):
+    """The edge is at 30 px now; what lies 10 px behind fired 25 ms ago, and has the same flow."""
+    last = sweeping_edge((1.0, 0.0), 400.0)
+    corners = corners_at([(30, 25), (20, 25), (30, 12)], [0, 25_000, 0], [True, True, False], dtype)
+    found = estimate_flow(corners, last, torch.tensor([NOW_US]), torch.tensor([0]), table().to(dtype), FlowConfig())
+    assert found.has_flow.tolist() == [[True, True, False]]
+    assert found.flow.dtype == dtype
+    assert found.flow[0, :2].tolist() == [pytest.approx([400.0, 0.0], abs=1.0)] * 2
+    assert found.flow[0, 2].tolist() == [0, 0]
+    assert torch.equal(found.sensor_pixels, corners.sensor_pixels)
+    assert not corners.has_flow.any()

@@ -1,0 +1,456 @@
+"""Association of observations with contours: the index, motion compensation, gates, the dark side, the paper's search."""
+
+import math
+
+import pytest
+import torch
+from helpers import SMALL_CAMERA, box_model, generator, pose, random_pose, random_twist
+
+from torchtrack.camera import project
+from torchtrack.config.tracker import ContourConfig, MatchingConfig
+from torchtrack.contour_index import index_contours
+from torchtrack.contours import ContourKind, Contours, group_by_model, mesh_contours, reproject
+from torchtrack.image_motion import object_plane_velocity, pixel_velocity
+from torchtrack.lie import retract_about, transform_points
+from torchtrack.matching import Belief, both_coordinates, concentration, match_along_flow, match_nearest, towards_dark
+from torchtrack.observations import Observations, join, select_events
+
+IMAGE_SIZE = (150, 200)
+
+
+def contours_at(pixels, normals=None, kind=ContourKind.CREASE, mask=None, dtype=torch.float64):
+    """Contours ``[b, m]`` at given pixels, all at a depth of one metre."""
+    pixels = torch.as_tensor(pixels, dtype=dtype)
+    normals = torch.tensor([1.0, 0.0], dtype=dtype).expand_as(pixels) if normals is None else torch.as_tensor(normals, dtype=dtype)
+    points = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1)
+    mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
+    return Contours(points, torch.zeros_like(points), torch.full(mask.shape, int(kind)), mask, points, pixels, normals)
+
+
+def upright_line(u, dtype=torch.float64, **kwargs):
+    """Points every pixel on the line at ``u``, whose normal is (1, 0)."""
+    v = torch.arange(20.0, 120.0, dtype=dtype)
+    return contours_at(torch.stack([torch.full_like(v, u), v], -1)[None], dtype=dtype, **kwargs)
+
+
+def seen(pixels, *, age_s=0.0, polarity=0.0, flow=None, mask=None, dtype=torch.float64):
+    """Observations ``[b, n]``."""
+    pixels = torch.as_tensor(pixels, dtype=dtype)
+    mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
+    flow = torch.zeros_like(pixels) if flow is None else torch.as_tensor(flow, dtype=dtype).expand_as(pixels)
+    age = torch.as_tensor(age_s, dtype=dtype).expand(mask.shape)
+    polarity = torch.as_tensor(polarity, dtype=dtype).expand(mask.shape)
+    return Observations(pixels, age, polarity, mask, flow, flow.norm(dim=-1) > 0)
+
+
+def matching(**settings):
+    """Settings without what corrects and weights the matches, unless it is asked for."""
+    return MatchingConfig(**{"dark_shift_px": 0.0, "concentration": False, **settings})
+
+
+def nearest(observations, contours, *, velocity=(0.0, 0.0), believed=None, gate_px=3.0, index=None, cell_px=1, **settings):
+    """The matches of ``match_nearest``, with all contours moving at ``velocity`` (px/s)."""
+    moving = torch.as_tensor(velocity, dtype=contours.pixels.dtype).expand_as(contours.pixels)
+    believed = torch.as_tensor(velocity if believed is None else believed, dtype=contours.pixels.dtype).expand_as(observations.pixels)
+    index = index or index_contours(contours, IMAGE_SIZE, 8, cell_px)
+    return match_nearest(observations, contours, index, Belief.from_velocity(believed), moving, gate_px, matching(**settings))
+
+
+def brute_force(contours, places, number):
+    """Distance of every visible contour point to each place, infinite for masked ones."""
+    distance = (contours.pixels[number][None] - places[:, None]).norm(dim=-1)
+    return torch.where(contours.mask[number], distance, torch.inf)
+
+
+def random_contours(batch, count, seed=0, dtype=torch.float64):
+    rng = generator(seed)
+    pixels = torch.rand((batch, count, 2), generator=rng, dtype=torch.float64) * torch.tensor([220.0, 170.0]) - 10
+    return contours_at(pixels.to(dtype), mask=torch.rand((batch, count), generator=rng) < 0.8, dtype=dtype)
+
+
+# ---- the index
+
+
+@pytest.mark.parametrize("cell_px", [1, 2, 3])
+@pytest.mark.parametrize("radius_px", [4, 7])
+def test_the_index_finds_the_nearest_contour_within_the_radius(cell_px, radius_px, dtype):
+    contours = random_contours(3, 300, dtype=dtype)
+    index = index_contours(contours, IMAGE_SIZE, radius_px, cell_px)
+    places = torch.rand((3, 2000, 2), generator=generator(1), dtype=torch.float64).to(dtype) * torch.tensor([200, 150], dtype=dtype)
+    found = index.look_up(places)
+    # What is found is nearest to the centre of the place's cell, to a sixteenth of a squared pixel.
+    centres = (places / cell_px).round() * cell_px
+    rounding = 2**-0.5 * cell_px
+    for number in range(3):
+        distance = brute_force(contours, centres[number], number)
+        best = distance.amin(1)
+        there = found[number] >= 0
+        assert there[best < radius_px - rounding].all()
+        assert not there[best > radius_px + rounding].any()
+        ours = distance.gather(1, found[number].clamp(min=0)[:, None])[:, 0]
+        sure = there & (best < radius_px - rounding)
+        assert int(sure.sum()) > 100
+        assert float((ours.square() - best.square())[sure].max()) <= 1 / 16 + 1e-3
+
+
+def test_contours_that_are_masked_are_not_found():
+    contours = contours_at([[[50.0, 50.0], [52.0, 50.0]]], mask=[[False, True]])
+    assert index_contours(contours, IMAGE_SIZE, 5, 1).look_up(torch.tensor([[[50.0, 50.0]]], dtype=torch.float64)).tolist() == [[1]]
+
+
+def test_nothing_is_found_far_away_or_outside_the_region():
+    index = index_contours(upright_line(80.0), IMAGE_SIZE, 5, 1)
+    places = [[80.0, 60.0], [88.0, 60.0], [80.0, -400.0], [1e9, 60.0], [-1e9, -1e9], [torch.inf, 0.0], [torch.nan, 60.0]]
+    found = index.look_up(torch.tensor([places], dtype=torch.float64))[0].tolist()
+    assert found == [40, -1, -1, -1, -1, -1, -1]
+
+
+def test_contours_far_outside_the_image_cost_nothing():
+    far = contours_at([[[50.0, 50.0], [1e6, 50.0], [50.0, -3e5], [torch.nan, 1.0]]])
+    index = index_contours(far, IMAGE_SIZE, 5, 1)
+    assert max(index.size) < 20
+    assert index.look_up(torch.tensor([[[51.0, 50.0]]], dtype=torch.float64)).tolist() == [[0]]
+
+
+def test_objects_without_contours_have_an_empty_index():
+    contours = contours_at([[[50.0, 50.0]], [[60.0, 60.0]]], mask=[[False], [True]])
+    index = index_contours(contours, IMAGE_SIZE, 5, 1)
+    assert index.look_up(torch.tensor([[[50.0, 50.0]], [[60.0, 61.0]]], dtype=torch.float64)).tolist() == [[-1], [0]]
+    nothing = index_contours(contours_at([[[50.0, 50.0]]], mask=[[False]]), IMAGE_SIZE, 5, 1)
+    assert nothing.look_up(torch.tensor([[[50.0, 50.0]]], dtype=torch.float64)).tolist() == [[-1]]
+
+
+def test_the_index_of_an_object_does_not_depend_on_the_others(dtype):
+    contours = random_contours(3, 60, seed=2, dtype=dtype)
+    places = torch.rand((3, 500, 2), generator=generator(3), dtype=torch.float64).to(dtype) * torch.tensor([200, 150], dtype=dtype)
+    together = index_contours(contours, IMAGE_SIZE, 6, 2).look_up(places)
+    for number in range(3):
+        own = Contours(*(getattr(contours, name)[number : number + 1] for name in vars(contours)))
+        assert torch.equal(index_contours(own, IMAGE_SIZE, 6, 2).look_up(places[number : number + 1])[0], together[number])
+
+
+# ---- velocities in the image
+
+
+def moved(points_cam, velocity, centre_cam, seconds):
+    """Points after turning about the centre and moving with it."""
+    T = torch.eye(4, dtype=points_cam.dtype).repeat(len(points_cam), 1, 1)
+    return transform_points(retract_about(T, velocity * seconds, centre_cam), points_cam)
+
+
+def test_pixel_velocity_is_the_derivative_of_the_projection():
+    velocity = random_twist(3, translation_m=0.3)
+    centre = torch.tensor([[0.05, -0.02, 0.5]], dtype=torch.float64).expand(3, 3)
+    points = centre[:, None] + 0.05 * torch.randn((3, 20, 3), generator=generator(), dtype=torch.float64)
+    intrinsics = SMALL_CAMERA.intrinsics(torch.float64).expand(3, 4)
+    step = 1e-6
+    expected = project(moved(points, velocity, centre, step), intrinsics) - project(moved(points, velocity, centre, -step), intrinsics)
+    torch.testing.assert_close(pixel_velocity(points, velocity, centre, intrinsics), expected / (2 * step), rtol=1e-6, atol=1e-5)
+
+
+def test_velocity_of_the_objects_plane_is_that_of_points_at_its_depth(dtype):
+    velocity = random_twist(3, translation_m=0.3, dtype=dtype)
+    centre = torch.tensor([[0.05, -0.02, 0.5], [0.0, 0.1, 0.8], [-0.2, 0.0, 0.3]], dtype=dtype)
+    intrinsics = SMALL_CAMERA.intrinsics(dtype).expand(3, 4)
+    pixels = torch.rand((3, 40, 2), generator=generator(), dtype=dtype) * 150
+    depth = centre[:, None, 2:].expand(3, 40, 1)
+    points = torch.cat([(pixels - intrinsics[:, None, 2:]) / intrinsics[:, None, :2] * depth, depth], -1)
+    expected = pixel_velocity(points, velocity, centre, intrinsics)
+    torch.testing.assert_close(object_plane_velocity(pixels, velocity, centre, intrinsics), expected, rtol=1e-4, atol=1e-2)
+
+
+# ---- events near contours
+
+
+def choose(pixels, contours, *, age_s=0.0, velocity=(0.0, 0.0), count=100, mask=None):
+    observations = seen(pixels, age_s=age_s, mask=mask, polarity=1.0)
+    speed = torch.tensor(velocity, dtype=torch.float64).expand_as(observations.pixels)
+    index = index_contours(contours, IMAGE_SIZE, 5, 1)
+    return select_events(observations.pixels, observations.age_s, observations.polarity, observations.mask, index, speed, count)
+
+
+def test_events_near_a_contour_are_taken_and_others_left():
+    chosen = choose([[[80.0, 60.0], [84.0, 60.0], [95.0, 60.0], [78.0, 60.0], [79.0, 60.0]]], upright_line(80.0), mask=[[True] * 4 + [False]])
+    assert chosen.pixels[chosen.mask].tolist() == [[80, 60], [84, 60], [78, 60]]
+    assert chosen.polarity[chosen.mask].tolist() == [1, 1, 1]
+    assert not chosen.has_flow.any()
+
+
+def test_events_are_judged_where_they_are_at_the_end_of_the_window():
+    chosen = choose([[[60.0, 60.0], [80.0, 60.0]]], upright_line(80.0), age_s=0.02, velocity=(1000.0, 0.0))
+    assert chosen.pixels[chosen.mask].tolist() == [[60, 60]]
+    assert chosen.age_s[chosen.mask].tolist() == [0.02]
+
+
+def test_no_more_events_than_asked_for_spread_evenly():
+    places = [[[80.0, 20.0 + 0.1 * i] for i in range(900)]]
+    chosen = choose(places, upright_line(80.0), count=90)
+    assert chosen.mask.all()
+    assert chosen.pixels.shape == (1, 90, 2)
+    gaps = torch.diff(chosen.pixels[0, :, 1])
+    torch.testing.assert_close(gaps, torch.ones_like(gaps), rtol=0, atol=1e-9)
+
+
+def test_joined_observations_are_those_of_both():
+    both = join(seen([[[1.0, 2.0]]], age_s=0.1, flow=[3.0, 4.0]), seen([[[5.0, 6.0], [7.0, 8.0]]], polarity=-1.0, mask=[[True, False]]))
+    assert both.pixels.tolist() == [[[1, 2], [5, 6], [7, 8]]]
+    assert both.age_s.tolist() == [[0.1, 0, 0]]
+    assert both.polarity.tolist() == [[0, -1, -1]]
+    assert both.mask.tolist() == [[True, True, False]]
+    assert both.has_flow.tolist() == [[True, False, False]]
+
+
+# ---- the nearest contour
+
+
+def test_observations_are_matched_with_the_nearest_contour_along_its_normal(dtype):
+    contours = upright_line(80.0, dtype=dtype)
+    matches, _ = nearest(seen([[[81.0, 60.2], [78.5, 99.8]]], dtype=dtype), contours)
+    assert matches.mask.all()
+    assert matches.contour.tolist() == [[40, 80]]
+    assert matches.directions.tolist() == [[[1, 0], [1, 0]]]
+    assert matches.targets.dtype == dtype
+
+
+@pytest.mark.parametrize("gate_px", [1.0, 2.5])
+def test_the_gate_is_strict(gate_px):
+    contours = contours_at([[[80.0, 60.0]]])
+    places = [[[80.0 + gate_px - 0.01, 60.0], [80.0 + gate_px, 60.0], [80.0, 60.0 - gate_px + 0.01], [80.0, 60.0 + gate_px + 0.01]]]
+    matches, _ = nearest(seen(places), contours, gate_px=gate_px)
+    assert matches.mask.tolist() == [[True, False, True, False]]
+
+
+def test_masked_observations_and_those_far_away_have_no_match():
+    matches, _ = nearest(seen([[[80.0, 60.0], [80.0, 61.0], [140.0, 60.0]]], mask=[[False, True, True]]), upright_line(80.0))
+    assert matches.mask.tolist() == [[False, True, False]]
+    assert matches.contour[0, 2] == 0
+
+
+def test_observations_are_moved_to_the_end_of_the_window():
+    """An edge at 80 px that moves at 500 px/s fired at 76 px 8 ms ago."""
+    matches, _ = nearest(seen([[[76.0, 60.0]]], age_s=8e-3), upright_line(80.0), velocity=(500.0, 0.0), gate_px=0.5)
+    assert matches.mask.all()
+    assert matches.targets[0, 0].tolist() == pytest.approx([80.0, 60.0])
+    without, _ = nearest(seen([[[76.0, 60.0]]], age_s=8e-3), upright_line(80.0), gate_px=5.0)
+    assert without.targets[0, 0].tolist() == pytest.approx([76.0, 60.0])
+
+
+def test_the_velocity_is_the_contours_own_not_what_was_believed():
+    """Believed 400 px/s, the contour that is found moves at 500: the target is carried with 500."""
+    observation = seen([[[76.0, 60.0]]], age_s=8e-3)
+    matches, belief = nearest(observation, upright_line(80.0), velocity=(500.0, 0.0), believed=(400.0, 0.0))
+    assert matches.targets[0, 0].tolist() == pytest.approx([80.0, 60.0])
+    still, index = torch.zeros(1, 100, 2).double(), index_contours(upright_line(80.0), IMAGE_SIZE, 8, 1)
+    again, _ = match_nearest(observation, upright_line(80.0), index, belief, still, 9.0, matching())
+    # It is now looked for where the matched contour's velocity puts it.
+    assert again.contour.tolist() == [[40]]
+
+
+def test_an_index_of_an_earlier_pose_still_finds_the_contours():
+    """The contours moved by 4 px since they were indexed: after a first match, observations are moved back."""
+    before = upright_line(80.0)
+    index = index_contours(before, IMAGE_SIZE, 5, 1)
+    after = upright_line(84.0)
+    observation = seen([[[84.5, 60.0]]])
+    first, belief = nearest(observation, after, index=index)
+    assert first.mask.all()
+    far = upright_line(87.0)
+    second = match_nearest(seen([[[86.5, 60.0]]]), far, index, belief, torch.zeros(1, 100, 2).double(), 3.0, matching())[0]
+    assert second.mask.all()
+    assert second.contour.tolist() == [[40]]
+
+
+def test_unmatched_observations_keep_what_was_believed():
+    _, belief = nearest(seen([[[140.0, 60.0]]], age_s=8e-3), upright_line(80.0), velocity=(500.0, 0.0), believed=(-10.0, 3.0))
+    _, expected = nearest(seen([[[140.0, 60.0]]], age_s=8e-3), upright_line(80.0), velocity=(700.0, 0.0), believed=(-10.0, 3.0))
+    for name in vars(belief):
+        assert torch.equal(getattr(belief, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize(("polarity", "speed", "shift"), [(1.0, 490.0, -0.98), (-1.0, 490.0, 0.98), (1.0, -490.0, 0.98), (0.0, 490.0, 0.0)])
+def test_events_are_moved_back_from_the_dark_side(polarity, speed, shift):
+    """Brighter where the bright side moves over the pixel: the dark side, on which the event lies, is ahead."""
+    matches, _ = nearest(seen([[[80.0, 60.0]]], polarity=polarity), upright_line(80.0), velocity=(speed, 0.0), dark_shift_px=1.0)
+    assert matches.targets[0, 0].tolist() == pytest.approx([80.0 + shift, 60.0])
+
+
+def test_the_limb_of_a_smooth_surface_has_no_dark_side():
+    contours = upright_line(80.0, kind=ContourKind.LIMB)
+    matches, _ = nearest(seen([[[80.0, 60.0]]], polarity=1.0), contours, velocity=(490.0, 0.0), dark_shift_px=1.0)
+    assert matches.targets[0, 0].tolist() == [80.0, 60.0]
+
+
+def test_the_dark_side_does_not_depend_on_the_sign_of_the_normal(dtype):
+    normals = torch.nn.functional.normalize(torch.randn((2, 50, 2), generator=generator(), dtype=dtype), dim=-1)
+    velocity = 300 * torch.randn((2, 50, 2), generator=generator(1), dtype=dtype)
+    polarity = torch.randn((2, 50), generator=generator(2), dtype=dtype).sign()
+    dark = towards_dark(polarity, normals, velocity)
+    torch.testing.assert_close(towards_dark(polarity, -normals, velocity), dark)
+    assert (dark.norm(dim=-1) <= 1).all()
+    ahead = (dark * velocity).sum(-1) * polarity
+    assert (ahead >= 0).all()
+
+
+def test_matches_of_an_object_do_not_depend_on_the_others(dtype):
+    contours = random_contours(3, 200, seed=5, dtype=dtype)
+    observations = seen(torch.rand((3, 300, 2), generator=generator(6), dtype=torch.float64) * torch.tensor([200, 150]), age_s=4e-3, dtype=dtype)
+    together, _ = nearest(observations, contours, velocity=(200.0, -100.0), cell_px=2)
+    for number in range(3):
+        own = Contours(*(getattr(contours, name)[number : number + 1] for name in vars(contours)))
+        one = Observations(*(getattr(observations, name)[number : number + 1] for name in vars(observations)))
+        alone, _ = nearest(one, own, velocity=(200.0, -100.0), cell_px=2)
+        for name in vars(alone):
+            torch.testing.assert_close(getattr(alone, name)[0], getattr(together, name)[number])
+
+
+def test_events_of_a_moving_box_are_all_matched_within_a_pixel():
+    """True contours 5 ms ago, seen from the pose now: compensation leaves only the rounding to pixels."""
+    T_now = random_pose(1, seed=8)
+    velocity = torch.tensor([[1.0, -2.0, 3.0, 0.2, 0.1, 0.3]], dtype=torch.float64)
+    centre_obj = torch.zeros(1, 3, dtype=torch.float64)
+    T_before = retract_about(T_now, -5e-3 * velocity, centre_obj)
+    intrinsics = SMALL_CAMERA.intrinsics(torch.float64)[None]
+    config = ContourConfig()
+    contours = mesh_contours([group.double() for group in group_by_model([box_model()], config)], T_now, intrinsics, config)
+    earlier = reproject(contours, T_before, intrinsics)
+    observations = seen(earlier.pixels.round(), age_s=5e-3)
+    speed = pixel_velocity(contours.points_cam, velocity, T_now[:, :3, 3], intrinsics)
+    index = index_contours(contours, IMAGE_SIZE, 8, 1)
+    plane = object_plane_velocity(observations.pixels, velocity, T_now[:, :3, 3], intrinsics)
+    inside = ((earlier.pixels > 0) & (earlier.pixels < torch.tensor([199, 149]))).all(-1)
+    assert int(inside.sum()) > 200
+    matches, _ = match_nearest(observations, contours, index, Belief.from_velocity(plane), speed, 1.5, matching())
+    assert float(matches.mask[inside].double().mean()) > 0.97
+    still = torch.zeros_like(plane)
+    uncompensated, _ = match_nearest(observations, contours, index, Belief.from_velocity(still), still, 1.5, matching())
+    residual = [
+        ((contours.pixels[0][m.contour[0]] - m.targets[0]) * m.directions[0]).sum(-1)[m.mask[0]].abs().mean() for m in (matches, uncompensated)
+    ]
+    assert float(residual[0]) < 0.35
+    assert float(residual[0]) < 0.7 * float(residual[1])
+
+
+# ---- concentration
+
+
+def line_with_offsets(*groups):
+    """Observations beside the line at 80 px: for each group of rows (first, last), offsets spread over ±``spread`` px."""
+    places = []
+    for first, last, spread in groups:
+        v = torch.arange(first, last, 0.25, dtype=torch.float64)
+        places.append(torch.stack([80 + spread * (2 * torch.rand(len(v), generator=generator(first), dtype=torch.float64) - 1), v], -1))
+    return torch.cat(places)[None]
+
+
+def test_observations_gathered_on_a_contour_are_trusted_and_smeared_ones_are_not():
+    places = line_with_offsets((32, 64, 0.6), (80, 112, 2.9))
+    matches, _ = nearest(seen(places), upright_line(80.0), gate_px=4.0, concentration=True, smeared_share=0.4)
+    gathered = places[0, :, 1] < 64
+    assert float(matches.weights[0][gathered].min()) == 1
+    assert float(matches.weights[0][~gathered].max()) < 0.2
+    assert ((matches.weights >= 0) & (matches.weights <= 1)).all()
+
+
+def test_without_concentration_every_match_is_trusted():
+    matches, _ = nearest(seen(line_with_offsets((32, 64, 2.9))), upright_line(80.0), gate_px=4.0)
+    assert (matches.weights == 1).all()
+
+
+def test_observations_without_a_contour_nearby_do_not_count_against_others():
+    targets = torch.cat([torch.full((1, 40, 2), 70.0), torch.full((1, 40, 2), 71.0)], 1)
+    offset = torch.cat([torch.zeros(1, 40), torch.full((1, 40), 2.0)], 1)
+    config = MatchingConfig(smeared_share=0.35, gathered_share=0.6)
+    near = torch.arange(80)[None] < 40
+    assert (concentration(offset, targets, near, config)[0, :40] == 1).all()
+    assert (concentration(offset, targets, torch.ones_like(near), config)[0, :40] < 1).all()
+
+
+def test_the_concentration_of_an_object_does_not_depend_on_the_others():
+    places = torch.cat([line_with_offsets((32, 96, 0.6)), line_with_offsets((32, 96, 2.9))])
+    contours = contours_at(upright_line(80.0).pixels.expand(2, -1, -1))
+    together, _ = nearest(seen(places), contours, gate_px=4.0, concentration=True)
+    for number in range(2):
+        alone, _ = nearest(seen(places[number : number + 1]), upright_line(80.0), gate_px=4.0, concentration=True)
+        assert torch.equal(together.weights[number], alone.weights[0])
+
+
+# ---- along the flow
+
+
+def along(observations, contours, *, gate_px=8.0, velocity=(0.0, 0.0), **settings):
+    moving = torch.tensor(velocity, dtype=contours.pixels.dtype).expand_as(contours.pixels)
+    return match_along_flow(observations, contours, moving, gate_px, MatchingConfig(along_flow=True, **settings))
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_corners_are_matched_along_their_flow_either_way(direction, dtype):
+    matches = along(seen([[[75.0, 60.0], [86.0, 60.0]]], flow=[direction * 100.0, 0.0], dtype=dtype), upright_line(80.0, dtype=dtype))
+    assert matches.mask.all()
+    assert matches.contour.tolist() == [[40, 40]]
+
+
+def test_the_match_lies_along_the_flow_where_another_is_nearer():
+    """Flow at 45°: the nearest point of the line is straight across, the match 5 px further down."""
+    matches = along(seen([[[75.0, 60.0]]], flow=[100.0, 100.0]), upright_line(80.0), flow_tolerance_px=0.2)
+    assert matches.mask.all()
+    assert matches.contour.tolist() == [[45]]
+
+
+def test_of_several_edges_along_the_flow_the_nearest_is_taken():
+    v = torch.arange(20.0, 120.0, dtype=torch.float64)
+    pixels = torch.cat([torch.stack([torch.full_like(v, u), v], -1) for u in (73.0, 78.0, 81.0)])[None]
+    matches = along(seen([[[76.0, 60.0]]], flow=[100.0, 0.0]), contours_at(pixels))
+    assert float(pixels[0, int(matches.contour[0, 0]), 0]) == 78.0
+
+
+def test_the_search_ends_at_the_gate():
+    assert not along(seen([[[70.0, 60.0]]], flow=[100.0, 0.0]), upright_line(80.0), gate_px=9.0).mask.any()
+    assert along(seen([[[70.0, 60.0]]], flow=[100.0, 0.0]), upright_line(80.0), gate_px=11.0).mask.all()
+
+
+def test_edges_that_the_flow_hardly_crosses_are_no_match():
+    contours = upright_line(80.0)
+    for angle_deg, expected in ((0, True), (60, True), (78, False), (90, False)):
+        flow = [100 * math.cos(math.radians(angle_deg)), 100 * math.sin(math.radians(angle_deg))]
+        assert bool(along(seen([[[79.5, 60.0]]], flow=flow), contours).mask.all()) == expected
+
+
+def test_contours_beside_the_line_of_the_flow_are_no_match():
+    contours = contours_at([[[85.0, 62.5]]])
+    assert not along(seen([[[80.0, 60.0]]], flow=[100.0, 0.0]), contours, flow_tolerance_px=2.0).mask.any()
+    assert along(seen([[[80.0, 60.0]]], flow=[100.0, 0.0]), contours, flow_tolerance_px=3.0).mask.all()
+
+
+def test_without_flow_or_masked_there_is_no_match():
+    contours = upright_line(80.0)
+    assert not along(seen([[[80.0, 60.0]]]), contours).mask.any()
+    assert not along(seen([[[80.0, 60.0]]], flow=[1.0, 0.0], mask=[[False]]), contours).mask.any()
+    assert not along(seen([[[80.0, 60.0]]], flow=[1.0, 0.0]), upright_line(80.0, mask=torch.zeros(1, 100, dtype=torch.bool))).mask.any()
+
+
+@pytest.mark.parametrize(("residual", "expected"), [("normal", [1.0, 0.0]), ("flow", [0.6, 0.8])])
+def test_the_distance_counts_along_the_normal_or_the_flow(residual, expected):
+    matches = along(seen([[[79.0, 60.0]]], flow=[60.0, 80.0]), upright_line(80.0), residual=residual)
+    assert matches.mask.all()
+    assert matches.directions[0, 0].tolist() == pytest.approx(expected)
+
+
+def test_targets_along_the_flow_are_moved_to_the_end_of_the_window():
+    matches = along(seen([[[76.0, 60.0]]], age_s=8e-3, flow=[100.0, 0.0]), upright_line(80.0), velocity=(500.0, 0.0))
+    assert matches.targets[0, 0].tolist() == pytest.approx([80.0, 60.0])
+
+
+def test_both_coordinates_count_each_match_in_u_and_in_v(dtype):
+    matches = along(seen([[[79.0, 60.0], [140.0, 60.0]]], flow=[100.0, 0.0], dtype=dtype), upright_line(80.0, dtype=dtype))
+    both = both_coordinates(matches)
+    assert both.mask.tolist() == [[True, False, True, False]]
+    assert both.contour.tolist() == [[40, 0, 40, 0]]
+    assert both.weights.tolist() == [[1, 1, 1, 1]]
+    assert both.directions[0, [0, 2]].tolist() == [[1, 0], [0, 1]]
+    assert torch.equal(both.targets, torch.cat([matches.targets, matches.targets], 1))
+
+
+def test_box_contours_keep_their_kind_so_that_limbs_are_known():
+    config = ContourConfig()
+    contours = mesh_contours(group_by_model([box_model()], config), pose()[None].float(), SMALL_CAMERA.intrinsics()[None], config)
+    assert (contours.kind == int(ContourKind.CREASE)).all()
