@@ -87,7 +87,7 @@ def align(
         contours: visible contours at ``start.T_prior``, and ``index`` of them.
         extract: makes contours at a pose anew, in the rounds that ``config.contours.refresh_rounds`` names.
     """
-    T_cam_obj = start.T_prior
+    T_cam_obj, from_prior = start.T_prior, torch.zeros_like(start.velocity)
     compensate = 1.0 if config.matching.motion_compensation else 0.0
     plane = compensate * start.plane_velocity(observations.pixels)
     belief = Belief.from_velocity(plane)
@@ -99,8 +99,8 @@ def align(
             velocity = compensate * start.contour_velocity(contours)
             belief = Belief.from_velocity(belief.motion[..., :2])
         matches, belief = _match(observations, contours, index, belief, velocity, gate_px, config)
-        solution = solve_pose(_problem(start, matches, contours, gate_px, config), T_cam_obj, config.solver)
-        T_cam_obj = solution.T_cam_obj
+        solution = solve_pose(_problem(start, matches, contours, gate_px, config), T_cam_obj, config.solver, from_prior)
+        T_cam_obj, from_prior = solution.T_cam_obj, solution.from_prior
         contours = reproject(contours, T_cam_obj, start.intrinsics)
     return AlignmentResult(solution, contours, matches, velocity)
 

@@ -54,12 +54,14 @@ class Linearisation:
         T_cam_obj: the pose.
         cost: robust cost, prior included.
         gradient, hessian: of the cost; the Hessian is Gauss-Newton's.
+        from_prior: rotation and move of the centre from the prior's pose.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]
     cost: Float[Tensor, "b"]
     gradient: Float[Tensor, "b 6"]
     hessian: Float[Tensor, "b 6 6"]
+    from_prior: Float[Tensor, "b 6"]
 
 
 def robust_loss(residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss: str) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
@@ -158,7 +160,7 @@ def _linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior:
     gradient = (weighted @ seen.residuals[..., None]).squeeze(-1) + pull
     hessian = weighted @ jacobian.transpose(1, 2) + problem.prior_information
     cost = (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1)
-    return Linearisation(T_cam_obj, cost, gradient, hessian)
+    return Linearisation(T_cam_obj, cost, gradient, hessian, from_prior)
 
 
 def solve_positive(matrix: Float[Tensor, "b 6 6"], right: Float[Tensor, "b 6 k"]) -> tuple[Float[Tensor, "b 6 k"], Bool[Tensor, "b"]]:
@@ -184,17 +186,23 @@ def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
     return solve_positive(damped, -at.gradient[..., None])[0].squeeze(-1)
 
 
-def solve_pose(problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig) -> Linearisation:
+def solve_pose(
+    problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig, from_prior: Float[Tensor, "b 6"] | None = None
+) -> Linearisation:
     """Minimise each object's cost from ``T_start``: Levenberg-Marquardt with a damping of its own per object.
 
     A step that does not lower an object's cost is undone and its damping raised; its neighbours are not affected.
+
+    Args:
+        from_prior: offset of ``T_start`` from the prior's pose, where it is known.
 
     Returns:
         The last linearisation, with the pose that its step led to.
     """
     rows = _as_rows(problem)
     T_cam_obj, damping = T_start, torch.full_like(T_start[:, 0, 0], config.damping)
-    from_prior = small_difference_about(problem.T_prior, T_start, problem.centre_obj)
+    if from_prior is None:
+        from_prior = small_difference_about(problem.T_prior, T_start, problem.centre_obj)
     for _ in range(config.iterations):
         at = _linearise(problem, rows, T_cam_obj, from_prior, config.loss)
         step = _damped_step(at, damping)
@@ -204,4 +212,4 @@ def solve_pose(problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: So
         T_cam_obj = torch.where(better[:, None, None], T_next, T_cam_obj)
         from_prior = from_prior + torch.where(better[:, None], step, 0)
         damping = torch.where(better, damping * _DAMPING_DECAY, damping.clamp(min=_DAMPING_START) * _DAMPING_GROWTH)
-    return replace(at, T_cam_obj=T_cam_obj)
+    return replace(at, T_cam_obj=T_cam_obj, from_prior=from_prior)

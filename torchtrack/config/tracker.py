@@ -34,7 +34,7 @@ class SurfaceConfig(_Settings):
 class CornerConfig(_Settings):
     """Harris corners of the filtered surface."""
 
-    max_corners: int = Field(48, ge=0, le=2000, description="Corners per object; 0 switches corners off.")
+    max_corners: int = Field(32, ge=0, le=2000, description="Corners per object; 0 switches corners off.")
     cell_px: int = Field(8, ge=3, le=64, description="At most one corner in a cell of this side (px): corners are spread evenly.")
     relative_threshold: float = Field(1e-3, ge=0, le=1, description="Least Harris response, as a share of the region's largest.")
     snap: bool = Field(True, description="Move each corner to the newest event of its 3x3 neighbourhood.")
@@ -88,7 +88,7 @@ class MatchingConfig(_Settings):
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
-    max_events: int = Field(1200, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
+    max_events: int = Field(1000, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
 
 class SolverConfig(_Settings):
