@@ -345,6 +345,22 @@ def test_a_stronger_prior_holds_more():
     assert moved[2] < 0.01
 
 
+def test_rounds_that_carry_the_offset_from_the_prior_are_as_one(dtype):
+    T_true = random_pose(4, seed=10)
+    T_prior = perturbed(T_true, seed=4)
+    problem = replace(problem_at(T_true, noise_px=0.5, prior=1e4, dtype=dtype), T_prior=T_prior.to(dtype))
+    config = SolverConfig(iterations=1, loss="none", damping=0)
+    at = solve_pose(problem, T_prior.to(dtype), config)
+    for _ in range(2):
+        carried, measured = solve_pose(problem, at.T_cam_obj, config, at.from_prior), solve_pose(problem, at.T_cam_obj, config)
+        torch.testing.assert_close(carried.T_cam_obj, measured.T_cam_obj, rtol=0, atol=1e-5)
+        at = carried
+    together = solve_pose(problem, T_prior.to(dtype), config.model_copy(update={"iterations": 3}))
+    torch.testing.assert_close(at.T_cam_obj, together.T_cam_obj, rtol=0, atol=1e-5)
+    expected = small_difference_about(problem.T_prior, at.T_cam_obj, problem.centre_obj)
+    torch.testing.assert_close(at.from_prior, expected, rtol=0, atol=1e-4)
+
+
 # ---- bad elements
 
 

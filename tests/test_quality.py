@@ -11,7 +11,7 @@ from torchtrack.config.tracker import QualityConfig, SolverConfig
 from torchtrack.contours import ContourKind, Contours
 from torchtrack.lie import hat, se3_inverse, se3_log, transform_points
 from torchtrack.matching import Matches
-from torchtrack.pose_solver import Linearisation, PoseProblem, solve_pose
+from torchtrack.pose_solver import PoseProblem, solve_pose
 from torchtrack.quality import Status, explained_share, judge, pose_covariance, visible_share
 
 IMAGE_SIZE = (150, 200)
@@ -228,9 +228,11 @@ def test_the_covariance_is_that_of_simulated_noise(loss):
 
 
 def linearisation(hessian, cost=50.0):
+    """A solution with another Hessian and cost."""
     batch = len(hessian)
-    eye = torch.eye(4, dtype=torch.float64).expand(batch, 4, 4)
-    return Linearisation(eye, torch.full((batch,), cost, dtype=torch.float64), torch.zeros(batch, 6, dtype=torch.float64), hessian)
+    problem, T_true = noisy_problem(batch, 0.5)
+    solution = solve_pose(problem, T_true, SolverConfig())
+    return replace(solution, hessian=hessian, cost=torch.full((batch,), cost, dtype=torch.float64))
 
 
 def test_the_covariance_is_of_the_left_perturbation():
@@ -261,6 +263,6 @@ def test_more_noise_makes_the_pose_less_certain():
     for noise_px in (0.2, 0.8):
         problem, T_true = noisy_problem(3, noise_px)
         solution = solve_pose(problem, T_true, SolverConfig(iterations=4))
-        covariance = pose_covariance(replace(solution), torch.full((3,), 300), T_true[:, :3, 3])
+        covariance = pose_covariance(solution, torch.full((3,), 300), T_true[:, :3, 3])
         spreads.append(covariance.diagonal(dim1=1, dim2=2).sqrt().mean(0))
     torch.testing.assert_close(spreads[1] / spreads[0], torch.full((6,), 4.0, dtype=torch.float64), rtol=0.1, atol=0)

@@ -109,6 +109,13 @@ def test_a_filter_of_even_size_is_refused(size_px):
         SurfaceConfig(filter_size_px=size_px)
 
 
+@pytest.mark.xfail(reason="nothing says that the first must be the smaller one: the weights divide by their difference", strict=True)
+@pytest.mark.parametrize("shares", [(0.5, 0.5), (0.6, 0.4)])
+def test_shares_in_the_wrong_order_are_refused(shares):
+    with pytest.raises(ValidationError):
+        MatchingConfig(smeared_share=shares[0], gathered_share=shares[1])
+
+
 # ---- bad starts
 
 
@@ -365,8 +372,8 @@ def test_objects_of_one_stream_are_tracked_as_each_alone(dtype):
         assert [int(r.status[number]) for r in results] == [int(r.status) for r in single]
         assert [int(r.observation_count[number]) for r in results] == pytest.approx([int(r.observation_count) for r in single], abs=2)
         degrees, millimetres = pose_errors(poses_of(results, number)[-1], trajectories[number].at(results[-1].t_us)[0])
-        assert float(degrees) < 0.4
-        assert float(millimetres) < 1.5
+        assert float(degrees) < 0.8
+        assert float(millimetres) < 2.0
 
 
 @cache
