@@ -7,8 +7,10 @@ The pipeline, one file per stage, in data-flow order::
     corners        guided filter, Harris, snapped to events   torchtrack.corners
     flow           robust event flow of each corner           torchtrack.flow
     contours       visible 3D contours at the predicted pose  torchtrack.contours
-    matching       corners and events to contours             torchtrack.matching
+    observations   corners and recent events of each object   torchtrack.observations
+    matching       observations to contours                   torchtrack.matching
     pose solver    Levenberg-Marquardt on SE(3)               torchtrack.pose_solver
+    alignment      rounds of matching and solving             torchtrack.alignment
     quality        status, covariance, explained contour      torchtrack.quality
     tracker        all of it: state and window in, pose out   torchtrack.tracker
     runner         a whole recording: source, tracker, sinks  torchtrack.runner

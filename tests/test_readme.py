@@ -1,0 +1,178 @@
+"""The README is true: its Python runs, its commands parse, and whatever it names is there."""
+
+import re
+import shlex
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import tyro
+import yaml
+
+from torchtrack import cli
+from torchtrack.config.demo import DemoConfig
+from torchtrack.config.evaluate import EvaluateConfig
+from torchtrack.config.explain import dotted_keys
+from torchtrack.config.load import load
+from torchtrack.config.presets import preset
+from torchtrack.config.run import RunConfig
+from torchtrack.exit_codes import ExitCode
+from torchtrack.io import read_calibration
+from torchtrack.quality import Status
+from torchtrack.sim import SceneConfig
+from torchtrack.sinks.poses import COLUMNS
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+SETTINGS = {"track": RunConfig, "evaluate": EvaluateConfig, "demo": DemoConfig, "simulate": SceneConfig}
+FILE_SUFFIXES = ("py", "yaml", "txt", "npz", "json", "csv", "tum", "mp4", "png", "obj", "glb", "md")
+
+
+def blocks(language):
+    """The fenced blocks of which the info string is exactly ``language``."""
+    return re.findall(rf"^```{re.escape(language)}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+def commands():
+    """Every command line of the README, in blocks and in running text, without the program's name."""
+    lines = [line.partition("#")[0] for block in blocks("bash") for line in block.splitlines()]
+    quoted = re.findall(r"`(torchtrack [a-z]+ [^`]*)`", README.replace("\n", " "))
+    words = [shlex.split(line) for line in (*lines, *quoted)]
+    return [rest for program, *rest in filter(None, words) if program == "torchtrack" and rest[0] != "COMMAND"]
+
+
+def spans():
+    """Everything between single backticks, outside of blocks."""
+    return re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", README, flags=re.MULTILINE | re.DOTALL))
+
+
+def is_key(key, settings):
+    """Whether a dotted key is a setting, or a group of settings."""
+    return any(known == key or known.startswith(f"{key}.") for known in dotted_keys(settings))
+
+
+@pytest.mark.parametrize("code", blocks("python"))
+def test_python_runs(code, tmp_path):
+    (tmp_path / "example.py").write_text(code, encoding="utf-8")
+    # In a process of its own: as a reader runs it, without what tests load before.
+    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "torch.Size([3, 4, 4]) torch.Size([3, 6, 6])" in done.stdout
+
+
+@pytest.mark.parametrize("code", blocks("python no-run"))
+def test_python_that_needs_data_names_what_is_there(code):
+    compile(code, "README.md", "exec")
+    imported = re.findall(r"^from (torchtrack[\w.]*) import (\w+)", code, re.MULTILINE)
+    used = [("torchtrack", name) for name in re.findall(r"\btorchtrack\.(\w+)", code.replace("from torchtrack.", ""))]
+    assert imported or used
+    for module, name in (*imported, *used):
+        assert hasattr(import_module(module), name), f"{module}.{name}"
+
+
+@pytest.mark.parametrize("arguments", commands(), ids=" ".join)
+def test_command_lines_parse(arguments):
+    options, overrides = cli.split_overrides(arguments)
+    command = tyro.cli(cli._Command, args=options)
+    assert type(command).__name__.lower() == arguments[0]
+    for key in overrides:
+        assert is_key(key, SETTINGS[arguments[0]]), key
+
+
+def test_every_command_is_shown():
+    assert {arguments[0] for arguments in commands()} == {"track", "evaluate", "simulate", "demo", "outline", "settings"}
+
+
+def test_options_in_running_text_exist(capsys):
+    options = {option for span in spans() for option in re.findall(r"(?<![\w-])--([a-z][\w.-]*)", span)}
+    with_dots = {option for option in options if "." in option}
+    assert with_dots and options - with_dots
+    for option in with_dots:
+        assert is_key(option.replace("-", "_"), RunConfig), option
+    for command in ("track", "evaluate", "simulate", "demo", "outline", "settings"):
+        with pytest.raises(SystemExit):
+            tyro.cli(cli._Command, args=[command, "--help"])
+    helped = capsys.readouterr().out
+    for option in options - with_dots:
+        assert f"--{option}" in helped, option
+
+
+def test_dotted_names_exist():
+    names = {span for span in spans() if re.fullmatch(r"[a-z]\w*(\.\w+)+", span) and not span.endswith(FILE_SUFFIXES)}
+    assert {"tracker.window.duration_us", "overlay.enabled", "camera.width"} <= names
+    for name in names:
+        assert is_key(name, RunConfig), name
+
+
+def test_settings_named_alone_exist():
+    every = {part for key in dotted_keys(RunConfig) for part in key.split(".")}
+    assert {"initial_pose", "start_us", "translation_m", "quaternion_xyzw", "matrix", "trajectory", "polylines", "mesh", "unit"} <= every & set(
+        spans()
+    )
+
+
+def test_files_exist():
+    named = set(re.findall(r"[`(\s]((?:configs|scripts|tests|torchtrack|\.github)/[\w./-]*\w|LICENSE)", README))
+    assert {"configs/demo.yaml", "scripts/demo", "torchtrack/tracker.py", "LICENSE"} <= named
+    for path in named:
+        assert (REPOSITORY / path).exists(), path
+
+
+@pytest.mark.parametrize("text", blocks("yaml track"))
+def test_example_of_a_config_is_one(text, tmp_path):
+    path = tmp_path / "mug.yaml"
+    path.write_text(text)
+    config = load(RunConfig, path)
+    assert config.objects[0].mesh == tmp_path / "mug.obj" and config.objects[0].unit == "mm"
+
+
+@pytest.mark.parametrize("text", blocks("yaml calibration"))
+def test_example_of_a_calibration_is_one(text, tmp_path):
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    camera = read_calibration(path)
+    assert (camera.width, camera.height, camera.distortion_model) == (240, 180, "plumb_bob")
+
+
+def flat(settings, prefix="tracker"):
+    """Dotted key to value."""
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}.{name}")
+        else:
+            yield f"{prefix}.{name}", list(value) if isinstance(value, tuple) else value
+
+
+def test_table_of_presets_is_true_and_complete():
+    default, paper = (dict(flat(preset(name).model_dump())) for name in ("default", "paper"))
+    rows = re.findall(r"^\| `(tracker\.[\w.]+)` \| (.+?) \| (.+?) \|", README, re.MULTILINE)
+    assert len(rows) > 10
+    for key, ours, theirs in rows:
+        assert (yaml.safe_load(ours), yaml.safe_load(theirs)) == (default[key], paper[key]), key
+    different = {key for key in default if default[key] != paper[key]}
+    assert different <= set(spans())
+
+
+def test_statuses_columns_and_exit_codes_are_true():
+    for status in Status:
+        assert f"| `{status.name}` |" in README
+    assert {"status", "quality", "observations"} <= set(COLUMNS)
+    exits = re.search(r"Exit codes: (\d+) done, (\d+) failed, (\d+) wrong settings, (\d+) interrupted", README)
+    assert exits and [int(code) for code in exits.groups()] == [ExitCode.DONE, ExitCode.FAILED, ExitCode.WRONG_SETTINGS, ExitCode.INTERRUPTED]
+
+
+def test_pictures_are_few_and_small():
+    pictures = sorted((REPOSITORY / ".github" / "images").iterdir())
+    assert 0 < len(pictures) <= 3
+    for picture in pictures:
+        assert picture.suffix == ".png" and picture.stat().st_size < 300_000
+        assert f"(.github/images/{picture.name})" in README
+
+
+def test_length_and_places():
+    assert len(README.splitlines()) <= 350
+    outside_blocks = re.sub(r"^```text.*?^```", "", README, flags=re.MULTILINE | re.DOTALL)
+    assert [line for line in outside_blocks.splitlines() if len(line) > 120] == []
+    assert re.findall(r"(?<![\w.])/(?:work|home|tmp|root)/", README) == []
