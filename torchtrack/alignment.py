@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -25,7 +25,8 @@ class Alignment:
     """Where the rounds begin, and what holds them there.
 
     Args:
-        T_prior: predicted pose.
+        T_prior: predicted pose; some pose in view where the predicted one is not usable.
+        usable: which predictions are finite poses before the camera.
         prior_information: information of the prediction in the solver's chart.
         velocity: rotation and velocity of the centre (rad/s, m/s).
         centre_obj: centre of each object (m).
@@ -34,6 +35,7 @@ class Alignment:
     """
 
     T_prior: Float[Tensor, "b 4 4"]
+    usable: Bool[Tensor, "b"]
     prior_information: Float[Tensor, "b 6 6"]
     velocity: Float[Tensor, "b 6"]
     centre_obj: Float[Tensor, "b 3"]
@@ -58,13 +60,13 @@ class AlignmentResult:
     """The pose after the last round, and what it stands on.
 
     Args:
-        contour_velocity: image velocity of the contour points (px/s); zero without motion compensation.
+        observation_count: matched observations of each object.
     """
 
     solution: Linearisation
     contours: Contours
     matches: Matches
-    contour_velocity: Float[Tensor, "b m 2"]
+    observation_count: Int[Tensor, "b"]
 
 
 def index_for(contours: Contours, image_size: tuple[int, int], config: TrackerConfig) -> ContourIndex:
@@ -99,10 +101,11 @@ def align(
             velocity = compensate * start.contour_velocity(contours)
             belief = Belief.from_velocity(belief.motion[..., :2])
         matches, belief = _match(observations, contours, index, belief, velocity, gate_px, config)
-        solution = solve_pose(_problem(start, matches, contours, gate_px, config), T_cam_obj, config.solver, from_prior)
+        rows = both_coordinates(matches) if config.matching.residual == "point" else matches
+        solution = solve_pose(_problem(start, rows, contours, gate_px, config), T_cam_obj, config.solver, from_prior)
         T_cam_obj, from_prior = solution.T_cam_obj, solution.from_prior
         contours = reproject(contours, T_cam_obj, start.intrinsics)
-    return AlignmentResult(solution, contours, matches, velocity)
+    return AlignmentResult(solution, contours, matches, matches.mask.sum(-1))
 
 
 def _match(
@@ -120,8 +123,7 @@ def _match(
     else:
         matches, belief = match_nearest(observations, contours, index, belief, contour_velocity, gate_px, config.matching)
     enough = (matches.mask * matches.weights).sum(-1, keepdim=True) >= config.quality.min_observations
-    matches = replace(matches, mask=matches.mask & enough)
-    return (both_coordinates(matches) if config.matching.residual == "point" else matches), belief
+    return replace(matches, mask=matches.mask & enough), belief
 
 
 def _problem(start: Alignment, matches: Matches, contours: Contours, gate_px: float, config: TrackerConfig) -> PoseProblem:

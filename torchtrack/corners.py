@@ -14,8 +14,8 @@ from torchtrack.config.tracker import CornerConfig, SurfaceConfig
 from torchtrack.filters import corner_response
 from torchtrack.time_surface import Regions, at_pixels
 
-# Guided filter, Sobel and Harris window reach this far into a region from its border (px).
-_FILTER_REACH_PX = 10
+# Sobel, Harris window and local maximum reach this far into a region from its border (px), beside the guided filter.
+_RESPONSE_REACH_PX = 6
 # Large temporaries page-fault on the CPU: regions are filtered this many at a time.
 _CHUNK = 8
 
@@ -46,12 +46,14 @@ def _response(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> Float[T
     return torch.cat([corner_response(part, config) for part in surface.split(_CHUNK)])
 
 
-def select_corners(response: Float[Tensor, "b h w"], regions: Regions, config: CornerConfig) -> tuple[Int[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
+def select_corners(
+    response: Float[Tensor, "b h w"], regions: Regions, config: CornerConfig, filter_size_px: int
+) -> tuple[Int[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
     """The strongest local maxima, at most one per cell: pixels within the region, and which of them are corners."""
     batch, height, width = response.shape
     cell = config.cell_px
     rows, columns = height // cell, width // cell
-    own = _own_area(response, regions)
+    own = _own_area(response, regions, 2 * (filter_size_px // 2) + _RESPONSE_REACH_PX)
     cells = own[:, : rows * cell, : columns * cell].reshape(batch, rows, cell, columns, cell).permute(0, 1, 3, 2, 4).flatten(3).flatten(1, 2)
     score, within = cells.max(-1)
     count = min(config.max_corners, score.shape[1])
@@ -63,12 +65,11 @@ def select_corners(response: Float[Tensor, "b h w"], regions: Regions, config: C
     return torch.stack([u, v], -1), strong & (best > 0) & _is_local_maximum(own, u, v, best)
 
 
-def _own_area(response: Tensor, regions: Regions) -> Tensor:
+def _own_area(response: Tensor, regions: Regions, reach: int) -> Tensor:
     """The response, zero where it depends on what lies outside the object's own region."""
     height, width = response.shape[-2:]
     v = torch.arange(height, device=response.device)[:, None]
     u = torch.arange(width, device=response.device)
-    reach = _FILTER_REACH_PX
     last_u, last_v = (regions.extent - reach).unbind(-1)
     own = (u >= reach) & (v >= reach) & (u < last_u[:, None, None]) & (v < last_v[:, None, None])
     return torch.where(own, response, response.new_zeros(()))
@@ -117,7 +118,7 @@ def detect_corners(
         ideal_pixels: undistortion table of each stream.
     """
     response = _response(surface, surface_config)
-    local, mask = select_corners(response, regions, config)
+    local, mask = select_corners(response, regions, config, surface_config.filter_size_px)
     _, height, width = last_event_us.shape
     sensor = local + regions.origin[:, None]
     limit = torch.tensor([width - 1, height - 1], device=sensor.device)

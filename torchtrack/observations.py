@@ -10,6 +10,10 @@ from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import select_ranked, take_points
 from torchtrack.corners import Corners
 
+_GOLDEN_RATIO = 0.6180339887498949
+# Lots are drawn for a little less than what there is room for, as their number varies.
+_FILL = 0.95
+
 
 @dataclass(frozen=True)
 class Observations:
@@ -46,9 +50,18 @@ def select_events(
     plane_velocity: Float[Tensor, "b e 2"],
     count: int,
 ) -> Observations:
-    """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time."""
+    """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time.
+
+    Which of them are taken hangs on each event's own number, not on how many come before it: a pose that is a little
+    different takes almost the same events.
+    """
     near = mask & (index.look_up(pixels + plane_velocity * age_s[..., None]) >= 0)
-    chosen, exists = select_ranked(near, count)
+    number = torch.arange(mask.shape[1], device=mask.device, dtype=torch.float64)
+    # Multiples of the golden ratio fill the unit interval evenly, whichever stretch of them is taken.
+    lot = (number * _GOLDEN_RATIO) % 1
+    total = near.sum(-1, keepdim=True)
+    share = torch.where(total > count, _FILL * count / total.clamp(min=1), 1.0)
+    chosen, exists = select_ranked(near & (lot < share), count)
     flow = torch.zeros(*chosen.shape, 2, dtype=pixels.dtype, device=pixels.device)
     values = take_points(torch.cat([pixels, age_s[..., None], polarity[..., None]], -1), chosen)
     return Observations(values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))

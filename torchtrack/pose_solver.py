@@ -171,18 +171,18 @@ def solve_positive(matrix: Float[Tensor, "b 6 6"], right: Float[Tensor, "b 6 k"]
     eye = torch.eye(6, dtype=matrix.dtype, device=matrix.device)
     # A sum is finite only where every entry is.
     sane = torch.isfinite(matrix.sum((-1, -2)) + right.sum((-1, -2)))
-    factor, info = torch.linalg.cholesky_ex(torch.where(sane[:, None, None], matrix, eye))
-    good = sane & (info == 0)
-    factor = torch.where(good[:, None, None], factor, eye)
+    with torch.no_grad():
+        good = sane & (torch.linalg.cholesky_ex(torch.where(sane[:, None, None], matrix, eye)).info == 0)
+    factor = torch.linalg.cholesky_ex(torch.where(good[:, None, None], matrix, eye)).L
     return torch.cholesky_solve(torch.where(good[:, None, None], right, 0), factor), good
 
 
 def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
     """The Levenberg-Marquardt step, damped along the Hessian's diagonal."""
-    damped = at.hessian.clone()
-    diagonal = damped.diagonal(dim1=-2, dim2=-1)
+    diagonal = at.hessian.diagonal(dim1=-2, dim2=-1)
     # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is.
-    diagonal += diagonal * damping[:, None] + (1e-9 * diagonal.amax(-1, keepdim=True) + 1e-12)
+    floor = 1e-9 * diagonal.amax(-1, keepdim=True) + 1e-12
+    damped = at.hessian + torch.diag_embed(diagonal * damping[:, None] + floor)
     return solve_positive(damped, -at.gradient[..., None])[0].squeeze(-1)
 
 

@@ -58,7 +58,11 @@ def _model_boundary(surface_points: Tensor, T_cam_obj: Tensor, intrinsics: Tenso
     """Boundary points, tangents (both object frame) and mask of the objects of one model."""
     points = surface_points.expand(len(T_cam_obj), -1, -1)
     points_cam = transform_points(T_cam_obj, points)
-    on_boundary, normals = boundary_points(project(points_cam, intrinsics), points_cam[..., 2] > MIN_DEPTH_M, config.splat_radius_px)
+    pixels = project(points_cam, intrinsics)
+    # Twice the image's half size about its centre: what lies beyond is no boundary in the image, and may be endless.
+    principal = intrinsics[:, None, 2:]
+    near_image = ((pixels - principal).abs() < 2 * principal.abs() + 1).all(-1)
+    on_boundary, normals = boundary_points(pixels, near_image & (points_cam[..., 2] > MIN_DEPTH_M), config.splat_radius_px)
     index, mask = select_ranked(on_boundary, config.max_edge_points)
     normals = take_points(normals, index)
     # A tangent parallel to the image plane: only its projection matters.

@@ -15,9 +15,9 @@ from torchtrack.alignment import Alignment, AlignmentResult, align, index_for
 from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, undistortion_table
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_index import ContourIndex
-from torchtrack.contours import ContourModel, Contours, group_by_model, mesh_contours
+from torchtrack.contours import ContourModel, Contours, group_by_model, mesh_contours, reproject
 from torchtrack.corners import Corners, detect_corners, no_corners
-from torchtrack.errors import PoseError
+from torchtrack.errors import ModelError, PoseError
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.flow import estimate_flow
 from torchtrack.object_model import ObjectModel
@@ -29,6 +29,8 @@ from torchtrack.visibility import Scene, remove_hidden
 
 # Contours this far outside the image still find their place on a distorted sensor (px).
 _BORDER_PX = 64
+# Nothing that is tracked is farther away (m).
+_MAX_DEPTH_M = 1e4
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,8 @@ class Tracker(nn.Module):
         self.config = config or TrackerConfig()
         self.object_names = tuple(model.name for model in objects)
         streams = list(stream_index) if stream_index is not None else [0] * len(objects)
-        _check_setup(objects, cameras, streams)
+        _check_setup(objects, cameras, streams, self.config)
+        self._shared = len(set(streams)) < len(streams)
         self.image_size = (max(c.height for c in cameras), max(c.width for c in cameras))
         self.groups = nn.ModuleList(group_by_model(objects, self.config.contours))
         self.register_buffer("stream_index", torch.tensor(streams))
@@ -190,7 +193,17 @@ class Tracker(nn.Module):
         solver = self.config.solver
         sigma = velocity.new_tensor([solver.prior_rotation_rad] * 3 + [solver.prior_translation_m] * 3)
         information = torch.diag(sigma.pow(-2) if solver.prior else torch.zeros_like(sigma)).expand(len(velocity), 6, 6)
-        return Alignment(T_prior, information, velocity, self.centre_obj, self.intrinsics, self.image_size)
+        T_prior, usable = self._before_camera(T_prior)
+        return Alignment(T_prior, usable, information, torch.where(usable[:, None], velocity, 0), self.centre_obj, self.intrinsics, self.image_size)
+
+    def _before_camera(self, T_cam_obj: Tensor) -> tuple[Tensor, Tensor]:
+        """The poses with a harmless one in the place of those that are not finite or not before the camera, and which are."""
+        depth = lie.transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2]
+        usable = torch.isfinite(T_cam_obj).flatten(1).all(-1) & (depth > MIN_DEPTH_M) & (depth < _MAX_DEPTH_M)
+        harmless = torch.eye(4, dtype=T_cam_obj.dtype, device=T_cam_obj.device).repeat(len(T_cam_obj), 1, 1)
+        harmless[:, :3, 3] = -self.centre_obj
+        harmless[:, 2, 3] += _MAX_DEPTH_M
+        return torch.where(usable[:, None, None], T_cam_obj, harmless), usable
 
     def _extract(self, T_cam_obj: Tensor) -> Contours:
         """Visible contours at a pose."""
@@ -201,7 +214,7 @@ class Tracker(nn.Module):
         if not config.remove_hidden:
             return contours
         shape = (self.streams, *self.image_size)
-        scene = Scene(self.models, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, shape)
+        scene = Scene(self.models, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, shape, self._shared)
         return remove_hidden(contours, scene, config)
 
     def _corners(self, contours: Contours, last_event_us: Tensor, t_us: Tensor, window_s: Tensor) -> Corners:
@@ -239,14 +252,18 @@ class Tracker(nn.Module):
         config, solution, contours = self.config, aligned.solution, aligned.contours
         velocity = start.contour_velocity(contours)
         share = quality.explained_share(contours, aligned.matches, velocity, self.image_size, config.quality.min_speed_px_s)
-        count = aligned.matches.mask.sum(-1)
+        count = aligned.observation_count
         T_found = _orthonormal(solution.T_cam_obj.double())
         step = lie.small_difference_about(start.T_prior.double(), T_found, self.centre_obj.double()).to(velocity.dtype)
         status = quality.judge(share, count, quality.visible_share(contours, self.image_size), step, self.diameter_m, config.quality)
+        status = torch.where(start.usable, status, int(quality.Status.DIVERGED))
         failed = (status >= int(quality.Status.TOO_FEW_EVENTS))[:, None]
-        T_held = state.T_cam_obj if config.motion.without_events == "hold" else start.T_prior.double()
+        T_held = state.T_cam_obj
+        if config.motion.without_events == "predict":
+            T_held = torch.where(start.usable[:, None, None], _orthonormal(start.T_prior.double()), T_held)
         T_cam_obj = torch.where(failed[..., None], T_held, T_found)
         next_velocity = self._next_velocity(state, T_found, failed, share, window_s)
+        contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
         result = StepResult(t_us, T_cam_obj, status, share, contours, corners, count, solution, self.centre_obj)
         return TrackerState(T_cam_obj, next_velocity, t_us, last_event_us), result
 
@@ -279,11 +296,16 @@ def _stack_tables(tables: list[Tensor]) -> Tensor:
     return torch.stack([nn.functional.pad(t, (0, 0, 0, width - t.shape[1], 0, height - t.shape[0])) for t in tables])
 
 
-def _check_setup(objects: Sequence[ObjectModel], cameras: list[Camera], streams: list[int]) -> None:
-    """Raise ``ValueError`` unless objects, cameras and streams fit together."""
+def _check_setup(objects: Sequence[ObjectModel], cameras: list[Camera], streams: list[int], config: TrackerConfig) -> None:
+    """Raise ``ValueError`` unless objects, cameras and streams fit together, and ``ModelError`` for a model without contours."""
     if not objects:
         raise ValueError("a tracker needs at least one object.")
     if len(streams) != len(objects):
         raise ValueError(f"stream_index needs one entry per object: got {len(streams)} for {len(objects)} objects.")
     if not all(0 <= s < len(cameras) for s in streams):
         raise ValueError(f"stream_index must be within the {len(cameras)} cameras given (one per stream), got {streams}.")
+    for model in objects:
+        if config.contours.source == "splat" and len(model.surface_points) == 0:
+            raise ModelError(
+                f"'{model.name}' has no surface to take splatted contours from: give a mesh, or set contours.source to 'mesh', which takes polylines."
+            )

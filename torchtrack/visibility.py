@@ -34,6 +34,7 @@ class Scene:
         stream_index: stream of each object.
         diameters_m: diameter of each object.
         image_shape: streams, height and width of the image.
+        shared: whether any stream has more than one object.
     """
 
     models: Sequence[ContourModel]
@@ -42,6 +43,7 @@ class Scene:
     stream_index: Int[Tensor, "b"]
     diameters_m: Float[Tensor, "b"]
     image_shape: tuple[int, int, int]
+    shared: bool
 
 
 def hidden_by_faces(
@@ -109,23 +111,38 @@ def _cell(pixels: Tensor, grid: tuple[int, int], cell_px: int) -> Tensor:
 
 
 def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -> Tensor:
-    """Points behind another surface in the depth buffer; an object's own counts where it has too many faces for the exact test."""
+    """Points behind another surface in the depth buffer; an object's own counts where it has too many faces for the exact test.
+
+    Beside the limb of a curved surface that surface is nearer, in the same cell even; beyond it, it ends. So a point is
+    hidden only where it is also behind what lies a cell to each side of its contour.
+    """
     depth_m, owner, grid = depth_buffer(scene, config.depth_cell_px)
-    cell = _cell(contours.pixels, grid, config.depth_cell_px)
-    nearest = depth_m[scene.stream_index].gather(1, cell)
-    number = torch.arange(len(cell), device=cell.device)[:, None]
-    exact = torch.zeros_like(number, dtype=torch.bool)
+    stream, cell_px = scene.stream_index, config.depth_cell_px
+    _, height, width = scene.image_shape
+    limit = contours.pixels.new_tensor([width - 1, height - 1])
+    hidden = ((contours.pixels >= 0) & (contours.pixels <= limit)).all(-1)
+    own_counts = ~_tested_exactly(scene)
+    number = torch.arange(len(stream), device=stream.device)[:, None]
+    farthest_m = contours.points_cam[..., 2] - config.depth_margin * scene.diameters_m[:, None]
+    for side in (0, -cell_px, cell_px):
+        cell = _cell(contours.pixels + side * contours.normals, grid, cell_px)
+        other = owner[stream].gather(1, cell) != number
+        hidden = hidden & (farthest_m > depth_m[stream].gather(1, cell)) & (other | own_counts)
+    return hidden
+
+
+def _tested_exactly(scene: Scene) -> Tensor:
+    """Which objects are tested against their own faces: a column."""
+    exact = torch.zeros(len(scene.T_cam_obj), 1, dtype=torch.bool, device=scene.T_cam_obj.device)
     for model in scene.models:
         exact[model.members] = len(model.triangles) > 0
-    own = owner[scene.stream_index].gather(1, cell) == number
-    behind = contours.points_cam[..., 2] > nearest + config.depth_margin * scene.diameters_m[:, None]
-    return behind & ~(own & exact)
+    return exact
 
 
 def remove_hidden(contours: Contours, scene: Scene, config: ContourConfig) -> Contours:
     """Contours without the points that the object itself or another one of its stream hides."""
     hidden = _hidden_by_self(scene, contours.points_cam)
-    needs_buffer = len(scene.T_cam_obj) > scene.image_shape[0] or any(len(model.triangles) == 0 for model in scene.models)
+    needs_buffer = scene.shared or any(len(model.triangles) == 0 for model in scene.models)
     if needs_buffer:
         hidden = hidden | _hidden_in_buffer(scene, contours, config)
     return replace(contours, mask=contours.mask & ~hidden)

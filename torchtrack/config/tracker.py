@@ -2,16 +2,12 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field, field_validator, model_validator
+
+from torchtrack.config.settings import Settings
 
 
-class _Settings(BaseModel):
-    """Frozen, and a name that is not known is an error."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class WindowConfig(_Settings):
+class WindowConfig(Settings):
     """How the stream is cut into windows, one pose each."""
 
     mode: Literal["time", "count"] = Field("time", description="Windows of equal duration, or of an equal number of events.")
@@ -20,7 +16,7 @@ class WindowConfig(_Settings):
     max_age_us: int = Field(20_000, ge=100, description="In mode 'count', a window is closed after this long (µs) with fewer events.")
 
 
-class SurfaceConfig(_Settings):
+class SurfaceConfig(Settings):
     """The time surface (Eq. 5) and its guided filter."""
 
     tau_s: float = Field(0.03, gt=0, le=10, description="Decay constant τ (s).")
@@ -30,8 +26,15 @@ class SurfaceConfig(_Settings):
     filter_eps: float = Field(0.01, gt=0, description="Regularisation of the guided filter, in squared intensity.")
     filter_subsample: int = Field(1, ge=1, le=4, description="Subsampling of kornia's guided filter.")
 
+    @field_validator("filter_size_px")
+    @classmethod
+    def _odd(cls, size: int) -> int:
+        if size % 2 == 0:
+            raise ValueError(f"the filter's window needs a middle pixel: give an odd size, such as {size + 1}")
+        return size
 
-class CornerConfig(_Settings):
+
+class CornerConfig(Settings):
     """Harris corners of the filtered surface."""
 
     max_corners: int = Field(32, ge=0, le=2000, description="Corners per object; 0 switches corners off.")
@@ -41,7 +44,7 @@ class CornerConfig(_Settings):
     fresh_only: bool = Field(True, description="Drop corners whose neighbourhood has no event within the window.")
 
 
-class FlowConfig(_Settings):
+class FlowConfig(Settings):
     """Event flow of each corner (Eq. 6-11)."""
 
     radius_px: int = Field(5, ge=1, le=20, description="Events within this distance of the corner take part (px).")
@@ -51,7 +54,7 @@ class FlowConfig(_Settings):
     min_events: int = Field(8, ge=3, description="Fewer events give no flow.")
 
 
-class ContourConfig(_Settings):
+class ContourConfig(Settings):
     """Visible 3D contours of the object at a pose."""
 
     source: Literal["mesh", "splat"] = Field(
@@ -71,27 +74,33 @@ class ContourConfig(_Settings):
     refresh_rounds: tuple[int, ...] = Field((0,), description="Rounds of matching before which contours are extracted anew.")
 
 
-class MatchingConfig(_Settings):
+class MatchingConfig(Settings):
     """Association of corners and events with contours."""
 
     along_flow: bool = Field(False, description="Corners search along their flow (the paper), instead of the nearest contour.")
     residual: Literal["normal", "flow", "point"] = Field(
         "normal", description="Distance normal to the contour, along the corner's flow, or to the matched point in both coordinates."
     )
-    gates_px: tuple[float, ...] = Field((5, 2.5, 1.5, 1.2), min_length=1, description="One round of matching and solving per gate (px).")
+    gates_px: tuple[float, ...] = Field((5.0, 2.5, 1.5, 1.2), min_length=1, description="One round of matching and solving per gate (px).")
     index_cell_px: int = Field(2, ge=1, le=4, description="Cell of the index of nearest contour points (px).")
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
     concentration: bool = Field(True, description="Trust observations less where those around them are smeared across the contour.")
-    smeared_share: float = Field(0.35, ge=0, le=1, description="Share of observations on the contour at which a patch counts for nothing.")
-    gathered_share: float = Field(0.6, ge=0, le=1, description="Share of observations on the contour at which a patch counts in full.")
+    gathered_spread_px: float = Field(1.2, gt=0, description="Spread of the observations across a contour up to which a patch counts in full (px).")
+    smeared_spread_px: float = Field(1.55, gt=0, description="Spread of the observations across a contour at which a patch counts for nothing (px).")
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
     max_events: int = Field(1000, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
+    @model_validator(mode="after")
+    def _spreads_in_order(self) -> "MatchingConfig":
+        if self.smeared_spread_px <= self.gathered_spread_px:
+            raise ValueError(f"smeared_spread_px ({self.smeared_spread_px}) must be larger than gathered_spread_px ({self.gathered_spread_px})")
+        return self
 
-class SolverConfig(_Settings):
+
+class SolverConfig(Settings):
     """Levenberg-Marquardt on SE(3) (Eq. 12-17)."""
 
     iterations: int = Field(1, ge=1, le=100, description="Iterations in each round.")
@@ -102,7 +111,7 @@ class SolverConfig(_Settings):
     prior_translation_m: float = Field(0.003, gt=0, description="Standard deviation of the prediction's translation (m), per 1 px of residual noise.")
 
 
-class MotionConfig(_Settings):
+class MotionConfig(Settings):
     """Prediction of the next pose."""
 
     model: Literal["constant_velocity", "hold"] = Field("constant_velocity", description="Carry the velocity on, or start from the last pose.")
@@ -111,7 +120,7 @@ class MotionConfig(_Settings):
     coast_s: float = Field(0.02, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
 
 
-class QualityConfig(_Settings):
+class QualityConfig(Settings):
     """When a pose is trusted."""
 
     min_observations: int = Field(30, ge=6, description="Fewer matched observations: the pose is not updated.")
@@ -123,7 +132,7 @@ class QualityConfig(_Settings):
     max_step_translation: float = Field(0.5, gt=0, description="A larger move against the prediction within one window has diverged (diameters).")
 
 
-class TrackerConfig(_Settings):
+class TrackerConfig(Settings):
     """All settings of the tracker."""
 
     window: WindowConfig = WindowConfig()
