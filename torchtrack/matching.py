@@ -19,8 +19,8 @@ from torchtrack.observations import Observations
 _MIN_CROSSING = 0.3
 # Contours slower than this across themselves (px/s) have no clear leading side.
 _SLOW_PX_S = 10.0
-# Concentration: side of a patch (px), patches a side of the image, and offsets that are near a contour (px).
-_PATCH_PX, _PATCHES, _SMEAR_PX = 16, 128, 3.0
+# Concentration: side of a patch, patches a side of the image, and offsets that are near and on a contour (px).
+_PATCH_PX, _PATCHES, _SMEAR_PX, _ON_CONTOUR_PX = 16, 128, 3.0, 0.8
 
 
 @dataclass(frozen=True)
@@ -91,31 +91,29 @@ def match_nearest(
     motion = torch.where(matched[..., None], values[..., 4:8], belief.motion)
     weights = torch.ones_like(observations.age_s)
     if config.concentration:
-        across = ((pixels - targets) * normals).sum(-1, keepdim=True) * normals
-        weights = concentration(across, targets, observations.mask & (found >= 0), config)
+        offsets = ((pixels - targets) * normals).sum(-1)
+        weights = concentration(offsets, targets, observations.mask & (found >= 0), config)
     return Matches(contour, matched, weights, targets, normals), Belief(motion)
 
 
 def concentration(
-    offsets: Float[Tensor, "b n 2"], targets: Float[Tensor, "b n 2"], near: Bool[Tensor, "b n"], config: MatchingConfig
+    offsets: Float[Tensor, "b n"], targets: Float[Tensor, "b n 2"], near: Bool[Tensor, "b n"], config: MatchingConfig
 ) -> Float[Tensor, "b n"]:
-    """How closely the observations around each one lie on one curve, 0 to 1.
+    """How closely the observations around each one lie on the contour, 0 to 1.
 
-    Events of a contour, moved to the window's end with the contour's own motion, gather on a thin curve, be it displaced
-    from the contour or not. What moves otherwise (an occluder, the background, another object) is smeared across it. So:
-    in each patch of the image, the spread of the offsets about their mean; a patch that is off the contour as a whole
-    counts in full, or a pose that has begun to slip would never be pulled back.
+    Events of a contour, moved to the window's end with the contour's own motion, gather within a pixel of it. What moves
+    otherwise (an occluder, the background, another object) is smeared over the whole gate. So: in each patch of the
+    image, the share of the observations near a contour that are on it. No patch counts for nothing: one that is off the
+    contour as a whole must still pull a pose back that has begun to slip.
     """
     patch = (targets / _PATCH_PX).floor().long().clamp(0, _PATCHES - 1)
-    cell = (patch[..., 1] * _PATCHES + patch[..., 0])[..., None].expand(-1, -1, 4)
-    counted = (near & (offsets.square().sum(-1) < _SMEAR_PX**2)).to(offsets.dtype)[..., None]
-    moments = torch.cat([torch.ones_like(counted), offsets, offsets.square().sum(-1, keepdim=True)], -1) * counted
-    total = torch.zeros(len(offsets), _PATCHES**2, 4, dtype=offsets.dtype, device=offsets.device)
-    count, mean_u, mean_v, square = total.scatter_add(1, cell, moments).gather(1, cell).unbind(-1)
-    count = count.clamp(min=1)
-    variance = square / count - (mean_u.square() + mean_v.square()) / count.square()
-    low, high = config.gathered_spread_px**2, config.smeared_spread_px**2
-    return ((high - variance) / (high - low)).clamp(0, 1)
+    cell = (patch[..., 1] * _PATCHES + patch[..., 0])[..., None].expand(-1, -1, 2)
+    counted = near & (offsets.abs() < _SMEAR_PX)
+    counts = torch.stack([counted, counted & (offsets.abs() < _ON_CONTOUR_PX)], -1).to(offsets.dtype)
+    total = torch.zeros(len(offsets), _PATCHES**2, 2, dtype=offsets.dtype, device=offsets.device)
+    near_count, on_count = total.scatter_add(1, cell, counts).gather(1, cell).unbind(-1)
+    share = (on_count + 1) / (near_count + 2)
+    return ((share - config.smeared_share) / (config.gathered_share - config.smeared_share)).clamp(config.least_trust, 1)
 
 
 def towards_dark(polarity: Float[Tensor, "b n"], normals: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:

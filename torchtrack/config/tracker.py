@@ -86,17 +86,18 @@ class MatchingConfig(Settings):
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
     concentration: bool = Field(True, description="Trust observations less where those around them are smeared across the contour.")
-    gathered_spread_px: float = Field(1.2, gt=0, description="Spread of the observations across a contour up to which a patch counts in full (px).")
-    smeared_spread_px: float = Field(1.55, gt=0, description="Spread of the observations across a contour at which a patch counts for nothing (px).")
+    smeared_share: float = Field(0.35, ge=0, lt=1, description="Share of observations on the contour at which a patch counts least.")
+    gathered_share: float = Field(0.6, gt=0, le=1, description="Share of observations on the contour at which a patch counts in full.")
+    least_trust: float = Field(0.02, ge=0, le=1, description="What a smeared patch still counts.")
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
     max_events: int = Field(1000, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
     @model_validator(mode="after")
-    def _spreads_in_order(self) -> "MatchingConfig":
-        if self.smeared_spread_px <= self.gathered_spread_px:
-            raise ValueError(f"smeared_spread_px ({self.smeared_spread_px}) must be larger than gathered_spread_px ({self.gathered_spread_px})")
+    def _shares_in_order(self) -> "MatchingConfig":
+        if self.gathered_share <= self.smeared_share:
+            raise ValueError(f"gathered_share ({self.gathered_share}) must be larger than smeared_share ({self.smeared_share})")
         return self
 
 
