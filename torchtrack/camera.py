@@ -159,3 +159,9 @@ def distortion_table(camera: Camera, border_px: int) -> Float[Tensor, "h w 2"]:
     v, u = np.mgrid[-border_px : camera.height + border_px, -border_px : camera.width + border_px]
     sensor = distort(np.stack([u.ravel(), v.ravel()], 1), camera)
     return torch.from_numpy(sensor.reshape(*u.shape, 2).astype(np.float32))
+
+
+def stack_tables(tables: list[Float[Tensor, "_ _ 2"]]) -> Float[Tensor, "s h w 2"]:
+    """Tables of cameras of different sizes as one tensor; what lies outside a smaller sensor is never looked up."""
+    height, width = max(t.shape[0] for t in tables), max(t.shape[1] for t in tables)
+    return torch.stack([torch.nn.functional.pad(t, (0, 0, 0, width - t.shape[1], 0, height - t.shape[0])) for t in tables])

@@ -166,6 +166,17 @@ def se3_interpolate(T_start: Float[Tensor, "*b 4 4"], T_end: Float[Tensor, "*b 4
     return se3_exp(fraction[..., None] * xi) @ T_start
 
 
+def orthonormalise(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """A pose whose rotation is exact again: rounding adds up over thousands of products.
+
+    One step of Newton's iteration for the nearest rotation, which squares the deviation.
+    """
+    rotation = T[..., :3, :3]
+    eye = torch.eye(3, dtype=T.dtype, device=T.device)
+    exact = 0.5 * rotation @ (3 * eye - rotation.transpose(-1, -2) @ rotation)
+    return torch.cat([torch.cat([exact, T[..., :3, 3:]], -1), T[..., 3:, :]], -2)
+
+
 def rotation_angle_deg(rotation_a: Float[Tensor, "*b 3 3"], rotation_b: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     """Angle between two rotations in degrees: the paper's δR.
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchtrack import lie, quality
 from torchtrack.alignment import Alignment, AlignmentResult, align, index_for
-from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, undistortion_table
+from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import ContourModel, Contours, group_by_model, mesh_contours, reproject
@@ -120,8 +120,8 @@ class Tracker(nn.Module):
         self.groups = nn.ModuleList(group_by_model(objects, self.config.contours))
         self.register_buffer("stream_index", torch.tensor(streams))
         self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
-        self.register_buffer("ideal_pixels", _stack_tables([undistortion_table(c) for c in cameras]))
-        self.register_buffer("sensor_pixels", _stack_tables([distortion_table(c, _BORDER_PX) for c in cameras]))
+        self.register_buffer("ideal_pixels", stack_tables([undistortion_table(c) for c in cameras]))
+        self.register_buffer("sensor_pixels", stack_tables([distortion_table(c, _BORDER_PX) for c in cameras]))
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
         self.to(dtype)
@@ -253,14 +253,14 @@ class Tracker(nn.Module):
         velocity = start.contour_velocity(contours)
         share = quality.explained_share(contours, aligned.matches, velocity, self.image_size, config.quality.min_speed_px_s)
         count = aligned.observation_count
-        T_found = _orthonormal(solution.T_cam_obj.double())
+        T_found = lie.orthonormalise(solution.T_cam_obj.double())
         step = lie.small_difference_about(start.T_prior.double(), T_found, self.centre_obj.double()).to(velocity.dtype)
         status = quality.judge(share, count, quality.visible_share(contours, self.image_size), step, self.diameter_m, config.quality)
         status = torch.where(start.usable, status, int(quality.Status.DIVERGED))
         failed = (status >= int(quality.Status.TOO_FEW_EVENTS))[:, None]
         T_held = state.T_cam_obj
         if config.motion.without_events == "predict":
-            T_held = torch.where(start.usable[:, None, None], _orthonormal(start.T_prior.double()), T_held)
+            T_held = torch.where(start.usable[:, None, None], lie.orthonormalise(start.T_prior.double()), T_held)
         T_cam_obj = torch.where(failed[..., None], T_held, T_found)
         next_velocity = self._next_velocity(state, T_found, failed, share, window_s)
         contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
@@ -277,23 +277,6 @@ class Tracker(nn.Module):
         fading = torch.exp(-duration_s / self.config.motion.coast_s)
         kept = state.velocity * fading if self.config.motion.without_events == "predict" else torch.zeros_like(mixed)
         return torch.where(failed, kept, mixed)
-
-
-def _orthonormal(T: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:
-    """The pose with its rotation made exact again: rounding adds up over thousands of steps.
-
-    One step of Newton's iteration for the nearest rotation, which squares the deviation.
-    """
-    rotation = T[:, :3, :3]
-    eye = torch.eye(3, dtype=T.dtype, device=T.device)
-    exact = 0.5 * rotation @ (3 * eye - rotation.transpose(1, 2) @ rotation)
-    return torch.cat([torch.cat([exact, T[:, :3, 3:]], -1), T[:, 3:]], 1)
-
-
-def _stack_tables(tables: list[Tensor]) -> Tensor:
-    """Tables of cameras of different sizes as one tensor; pixels outside a smaller sensor are never looked up."""
-    height, width = max(t.shape[0] for t in tables), max(t.shape[1] for t in tables)
-    return torch.stack([nn.functional.pad(t, (0, 0, 0, width - t.shape[1], 0, height - t.shape[0])) for t in tables])
 
 
 def _check_setup(objects: Sequence[ObjectModel], cameras: list[Camera], streams: list[int], config: TrackerConfig) -> None:
