@@ -8,10 +8,12 @@ import trimesh
 from torch import Tensor
 
 from torchtrack.camera import Camera, project
+from torchtrack.contours import ContourKind, Contours
 from torchtrack.events import EventBatch
 from torchtrack.io import Trajectory
 from torchtrack.lie import rotation_angle_deg, se3_exp, so3_exp, transform_points
 from torchtrack.object_model import ObjectModel
+from torchtrack.observations import Observations
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -22,6 +24,17 @@ def random_twist(*batch: int, seed: int = 0, rotation_rad: float = 1.0, translat
     """Twists ``[*batch, 6]`` whose parts are normally distributed with the given deviations."""
     scale = torch.tensor([rotation_rad] * 3 + [translation_m] * 3, dtype=dtype)
     return torch.randn((*batch, 6), generator=generator(seed), dtype=dtype) * scale
+
+
+def rotation_vectors(angle: float, *batch: int, seed: int = 0, dtype=torch.float64) -> Tensor:
+    """Vectors ``[*batch, 3]`` of one length (rad), with axes all over the sphere."""
+    axis = torch.randn((*batch, 3), generator=generator(seed), dtype=torch.float64)
+    return (angle * axis / axis.norm(dim=-1, keepdim=True)).to(dtype)
+
+
+def far_from(T: Tensor, other: Tensor) -> float:
+    """The largest difference of any two entries."""
+    return float((T - other).abs().max()) if T.numel() else 0.0
 
 
 def random_pose(*batch: int, seed: int = 0, depth_m: tuple[float, float] = (0.4, 0.8), spread_m: float = 0.05, dtype=torch.float64) -> Tensor:
@@ -135,3 +148,33 @@ def _crossings(ends: Tensor, visible: Tensor, t_us: Tensor, camera: Camera) -> T
 def pose_errors(T_found: Tensor, T_true: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation (degrees) and translation (mm) between poses ``[..., 4, 4]``."""
     return rotation_angle_deg(T_found[..., :3, :3], T_true[..., :3, :3]), 1e3 * (T_found - T_true)[..., :3, 3].norm(dim=-1)
+
+
+# ---- contours and observations at given pixels
+
+IMAGE_SIZE = (150, 200)
+
+
+def contours_at(pixels, normals=None, kind=ContourKind.CREASE, mask=None, dtype=torch.float64):
+    """Contours ``[b, m]`` at given pixels, all at a depth of one metre."""
+    pixels = torch.as_tensor(pixels, dtype=dtype)
+    normals = torch.tensor([1.0, 0.0], dtype=dtype).expand_as(pixels) if normals is None else torch.as_tensor(normals, dtype=dtype)
+    points = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1)
+    mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
+    return Contours(points, torch.zeros_like(points), torch.full(mask.shape, int(kind)), mask, points, pixels, normals)
+
+
+def upright_line(u, dtype=torch.float64, **kwargs):
+    """Points every pixel on the line at ``u``, whose normal is (1, 0)."""
+    v = torch.arange(20.0, 120.0, dtype=dtype)
+    return contours_at(torch.stack([torch.full_like(v, u), v], -1)[None], dtype=dtype, **kwargs)
+
+
+def seen(pixels, *, age_s=0.0, polarity=0.0, flow=None, mask=None, dtype=torch.float64):
+    """Observations ``[b, n]``."""
+    pixels = torch.as_tensor(pixels, dtype=dtype)
+    mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
+    flow = torch.zeros_like(pixels) if flow is None else torch.as_tensor(flow, dtype=dtype).expand_as(pixels)
+    age = torch.as_tensor(age_s, dtype=dtype).expand(mask.shape)
+    polarity = torch.as_tensor(polarity, dtype=dtype).expand(mask.shape)
+    return Observations(pixels, age, polarity, mask, flow, flow.norm(dim=-1) > 0)

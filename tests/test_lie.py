@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers import generator, random_pose, random_twist
+from helpers import far_from, generator, random_pose, random_twist, rotation_vectors
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck, gradgradcheck
 
@@ -25,19 +25,10 @@ ANGLES = {
 }
 
 
-def rotation_vectors(angle: float, *batch: int, seed: int = 0, dtype=torch.float64) -> torch.Tensor:
-    axis = torch.randn((*batch, 3), generator=generator(seed), dtype=torch.float64)
-    return (angle * axis / axis.norm(dim=-1, keepdim=True)).to(dtype)
-
-
 def twists(angle: float, *batch: int, seed: int = 0, dtype=torch.float64) -> torch.Tensor:
     phi = rotation_vectors(angle, *batch, seed=seed)
     rho = torch.randn((*batch, 3), generator=generator(seed + 1), dtype=torch.float64)
     return torch.cat([phi, rho], -1).to(dtype)
-
-
-def far_from(T: torch.Tensor, other: torch.Tensor) -> float:
-    return float((T - other).abs().max()) if T.numel() else 0.0
 
 
 # ---- values
@@ -162,38 +153,6 @@ def test_rotation_angle_has_a_finite_gradient_at_zero():
     rotation = torch.eye(3, dtype=torch.float64, requires_grad=True)
     lie.rotation_angle_deg(torch.eye(3, dtype=torch.float64), rotation).backward()
     assert bool(torch.isfinite(rotation.grad).all())
-
-
-# ---- motions about an object's centre
-
-
-@pytest.mark.parametrize("batch", BATCHES)
-def test_retraction_turns_about_the_centre_and_moves_it(batch):
-    T, delta = random_pose(*batch), random_twist(*batch, seed=1, rotation_rad=0.5)
-    centre = torch.randn((*batch, 3), generator=generator(2), dtype=torch.float64)
-    moved = lie.retract_about(T, delta, centre)
-    assert far_from(moved[..., :3, :3], lie.so3_exp(delta[..., :3]) @ T[..., :3, :3]) < 1e-14
-    before, after = (lie.transform_points(pose, centre[..., None, :]).squeeze(-2) for pose in (T, moved))
-    assert far_from(after - before, delta[..., 3:]) < 1e-14
-    assert far_from(lie.difference_about(T, moved, centre), delta) < 1e-13
-
-
-def test_retraction_about_the_camera_is_a_turn_and_a_shift():
-    T, delta = random_pose(4), random_twist(4, seed=1, rotation_rad=0.3)
-    camera_in_object = lie.se3_inverse(T)[:, :3, 3]
-    expected = lie.se3_exp(torch.cat([delta[:, :3], torch.zeros(4, 3, dtype=torch.float64)], -1)) @ T
-    expected[:, :3, 3] += delta[:, 3:]
-    assert far_from(lie.retract_about(T, delta, camera_in_object), expected) < 1e-13
-
-
-@pytest.mark.parametrize("batch", BATCHES)
-def test_cayley_gives_rotations_that_agree_with_exp_to_second_order(batch, dtype):
-    phi = rotation_vectors(1.0, *batch, dtype=dtype)
-    eye = torch.eye(3, dtype=dtype).expand(*batch, 3, 3)
-    for angle in (0.0, 0.01, 1.0, 3.0):
-        rotation = lie.cayley(angle * phi)
-        assert far_from(rotation @ rotation.transpose(-1, -2), eye) < 5 * TOLERANCE[dtype]
-        assert far_from(rotation, lie.so3_exp(angle * phi)) <= angle**3 / 6 + TOLERANCE[dtype]
 
 
 # ---- gradients

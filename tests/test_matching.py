@@ -1,46 +1,18 @@
-"""Association of observations with contours: the index, motion compensation, gates, the dark side, the paper's search."""
+"""Association of observations with contours: the index, motion compensation, gates, concentration, the dark side, the paper's search."""
 
 import math
 
 import pytest
 import torch
-from helpers import SMALL_CAMERA, box_model, generator, pose, random_pose, random_twist
+from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, pose, random_pose, seen, upright_line
 
-from torchtrack.camera import project
 from torchtrack.config.tracker import ContourConfig, MatchingConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contours import ContourKind, Contours, group_by_model, mesh_contours, reproject
 from torchtrack.image_motion import object_plane_velocity, pixel_velocity
-from torchtrack.lie import retract_about, transform_points
+from torchtrack.lie import retract_about
 from torchtrack.matching import Belief, both_coordinates, concentration, match_along_flow, match_nearest, towards_dark
-from torchtrack.observations import Observations, join, select_events
-
-IMAGE_SIZE = (150, 200)
-
-
-def contours_at(pixels, normals=None, kind=ContourKind.CREASE, mask=None, dtype=torch.float64):
-    """Contours ``[b, m]`` at given pixels, all at a depth of one metre."""
-    pixels = torch.as_tensor(pixels, dtype=dtype)
-    normals = torch.tensor([1.0, 0.0], dtype=dtype).expand_as(pixels) if normals is None else torch.as_tensor(normals, dtype=dtype)
-    points = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1)
-    mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
-    return Contours(points, torch.zeros_like(points), torch.full(mask.shape, int(kind)), mask, points, pixels, normals)
-
-
-def upright_line(u, dtype=torch.float64, **kwargs):
-    """Points every pixel on the line at ``u``, whose normal is (1, 0)."""
-    v = torch.arange(20.0, 120.0, dtype=dtype)
-    return contours_at(torch.stack([torch.full_like(v, u), v], -1)[None], dtype=dtype, **kwargs)
-
-
-def seen(pixels, *, age_s=0.0, polarity=0.0, flow=None, mask=None, dtype=torch.float64):
-    """Observations ``[b, n]``."""
-    pixels = torch.as_tensor(pixels, dtype=dtype)
-    mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
-    flow = torch.zeros_like(pixels) if flow is None else torch.as_tensor(flow, dtype=dtype).expand_as(pixels)
-    age = torch.as_tensor(age_s, dtype=dtype).expand(mask.shape)
-    polarity = torch.as_tensor(polarity, dtype=dtype).expand(mask.shape)
-    return Observations(pixels, age, polarity, mask, flow, flow.norm(dim=-1) > 0)
+from torchtrack.observations import Observations
 
 
 def matching(**settings):
@@ -127,77 +99,6 @@ def test_the_index_of_an_object_does_not_depend_on_the_others(dtype):
     for number in range(3):
         own = Contours(*(getattr(contours, name)[number : number + 1] for name in vars(contours)))
         assert torch.equal(index_contours(own, IMAGE_SIZE, 6, 2).look_up(places[number : number + 1])[0], together[number])
-
-
-# ---- velocities in the image
-
-
-def moved(points_cam, velocity, centre_cam, seconds):
-    """Points after turning about the centre and moving with it."""
-    T = torch.eye(4, dtype=points_cam.dtype).repeat(len(points_cam), 1, 1)
-    return transform_points(retract_about(T, velocity * seconds, centre_cam), points_cam)
-
-
-def test_pixel_velocity_is_the_derivative_of_the_projection():
-    velocity = random_twist(3, translation_m=0.3)
-    centre = torch.tensor([[0.05, -0.02, 0.5]], dtype=torch.float64).expand(3, 3)
-    points = centre[:, None] + 0.05 * torch.randn((3, 20, 3), generator=generator(), dtype=torch.float64)
-    intrinsics = SMALL_CAMERA.intrinsics(torch.float64).expand(3, 4)
-    step = 1e-6
-    expected = project(moved(points, velocity, centre, step), intrinsics) - project(moved(points, velocity, centre, -step), intrinsics)
-    torch.testing.assert_close(pixel_velocity(points, velocity, centre, intrinsics), expected / (2 * step), rtol=1e-6, atol=1e-5)
-
-
-def test_velocity_of_the_objects_plane_is_that_of_points_at_its_depth(dtype):
-    velocity = random_twist(3, translation_m=0.3, dtype=dtype)
-    centre = torch.tensor([[0.05, -0.02, 0.5], [0.0, 0.1, 0.8], [-0.2, 0.0, 0.3]], dtype=dtype)
-    intrinsics = SMALL_CAMERA.intrinsics(dtype).expand(3, 4)
-    pixels = torch.rand((3, 40, 2), generator=generator(), dtype=dtype) * 150
-    depth = centre[:, None, 2:].expand(3, 40, 1)
-    points = torch.cat([(pixels - intrinsics[:, None, 2:]) / intrinsics[:, None, :2] * depth, depth], -1)
-    expected = pixel_velocity(points, velocity, centre, intrinsics)
-    torch.testing.assert_close(object_plane_velocity(pixels, velocity, centre, intrinsics), expected, rtol=1e-4, atol=1e-2)
-
-
-# ---- events near contours
-
-
-def choose(pixels, contours, *, age_s=0.0, velocity=(0.0, 0.0), count=100, mask=None):
-    observations = seen(pixels, age_s=age_s, mask=mask, polarity=1.0)
-    speed = torch.tensor(velocity, dtype=torch.float64).expand_as(observations.pixels)
-    index = index_contours(contours, IMAGE_SIZE, 5, 1)
-    return select_events(observations.pixels, observations.age_s, observations.polarity, observations.mask, index, speed, count)
-
-
-def test_events_near_a_contour_are_taken_and_others_left():
-    chosen = choose([[[80.0, 60.0], [84.0, 60.0], [95.0, 60.0], [78.0, 60.0], [79.0, 60.0]]], upright_line(80.0), mask=[[True] * 4 + [False]])
-    assert chosen.pixels[chosen.mask].tolist() == [[80, 60], [84, 60], [78, 60]]
-    assert chosen.polarity[chosen.mask].tolist() == [1, 1, 1]
-    assert not chosen.has_flow.any()
-
-
-def test_events_are_judged_where_they_are_at_the_end_of_the_window():
-    chosen = choose([[[60.0, 60.0], [80.0, 60.0]]], upright_line(80.0), age_s=0.02, velocity=(1000.0, 0.0))
-    assert chosen.pixels[chosen.mask].tolist() == [[60, 60]]
-    assert chosen.age_s[chosen.mask].tolist() == [0.02]
-
-
-def test_no_more_events_than_asked_for_spread_evenly():
-    places = [[[80.0, 20.0 + 0.1 * i] for i in range(900)]]
-    chosen = choose(places, upright_line(80.0), count=90)
-    assert chosen.mask.all()
-    assert chosen.pixels.shape == (1, 90, 2)
-    gaps = torch.diff(chosen.pixels[0, :, 1])
-    torch.testing.assert_close(gaps, torch.ones_like(gaps), rtol=0, atol=1e-9)
-
-
-def test_joined_observations_are_those_of_both():
-    both = join(seen([[[1.0, 2.0]]], age_s=0.1, flow=[3.0, 4.0]), seen([[[5.0, 6.0], [7.0, 8.0]]], polarity=-1.0, mask=[[True, False]]))
-    assert both.pixels.tolist() == [[[1, 2], [5, 6], [7, 8]]]
-    assert both.age_s.tolist() == [[0.1, 0, 0]]
-    assert both.polarity.tolist() == [[0, -1, -1]]
-    assert both.mask.tolist() == [[True, True, False]]
-    assert both.has_flow.tolist() == [[True, False, False]]
 
 
 # ---- the nearest contour
@@ -349,6 +250,51 @@ def test_observations_gathered_on_a_contour_are_trusted_and_smeared_ones_are_not
     assert float(matches.weights[0][gathered].min()) == 1
     assert float(matches.weights[0][~gathered].max()) < 0.2
     assert ((matches.weights >= 0) & (matches.weights <= 1)).all()
+
+
+@pytest.mark.parametrize("least_trust", [0.0, 0.02, 0.3])
+def test_a_smeared_patch_is_trusted_least_and_a_gathered_one_fully(least_trust, dtype):
+    """Patches of 16 px: one gathered, one smeared, one of each half, exactly."""
+    patches = torch.tensor([20.0, 40.0, 60.0], dtype=dtype).repeat_interleave(100)
+    targets = torch.stack([patches, patches], -1)[None]
+    on = torch.cat([torch.ones(100), torch.zeros(100), torch.arange(100) % 2]).to(dtype)
+    offsets = torch.where(on > 0, 0.3, -2.0).to(dtype)[None]
+    config = MatchingConfig(smeared_share=0.25, gathered_share=0.75, least_trust=least_trust)
+    weights = concentration(offsets, targets, torch.ones(1, 300, dtype=torch.bool), config)[0].view(3, 100)
+    assert weights.dtype == dtype
+    torch.testing.assert_close(weights, torch.tensor([1.0, least_trust, 0.5], dtype=dtype)[:, None].expand(3, 100), rtol=0, atol=1e-6)
+
+
+def test_trust_rises_with_the_share_on_the_contour():
+    shares = []
+    for on in range(0, 101, 10):
+        offsets = torch.where(torch.arange(100) < on, 0.0, 2.0).double()[None]
+        near, targets = torch.ones(1, 100, dtype=torch.bool), torch.full((1, 100, 2), 50.0, dtype=torch.float64)
+        shares.append(float(concentration(offsets, targets, near, MatchingConfig())[0, 0]))
+    assert shares == sorted(shares)
+    assert shares[:3] == [MatchingConfig().least_trust] * 3
+    assert shares[-3:] == [1.0] * 3
+    assert len(set(shares)) >= 5
+
+
+@pytest.mark.parametrize(("offset", "near", "expected"), [(0.0, True, 1.0), (2.0, True, 0.02), (2.0, False, 0.6)], ids=["on", "beside", "none"])
+def test_of_a_single_observation_the_share_is_drawn_towards_a_half(offset, near, expected):
+    """One on the contour counts as two of three, one beside it as one of three, and none as one of two."""
+    config = MatchingConfig(smeared_share=0.35, gathered_share=0.6, least_trust=0.02)
+    weight = concentration(torch.tensor([[offset]]), torch.full((1, 1, 2), 50.0), torch.tensor([[near]]), config)
+    assert float(weight) == pytest.approx(expected, abs=1e-6)
+
+
+def test_observations_far_from_the_contour_count_neither_way():
+    offsets = torch.cat([torch.zeros(40), torch.full((40,), 3.5)]).double()[None]
+    targets, near = torch.full((1, 80, 2), 50.0, dtype=torch.float64), torch.ones(1, 80, dtype=torch.bool)
+    assert (concentration(offsets, targets, near, MatchingConfig()) == 1).all()
+
+
+def test_places_outside_the_image_have_patches_too():
+    targets = torch.tensor([[[-1e9, 50.0], [1e9, 1e9], [50.0, -3.0]]])
+    weights = concentration(torch.zeros(1, 3), targets, torch.ones(1, 3, dtype=torch.bool), MatchingConfig())
+    assert torch.isfinite(weights).all()
 
 
 def test_without_concentration_every_match_is_trusted():

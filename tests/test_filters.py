@@ -1,0 +1,141 @@
+"""Guided filter and Harris response: the sliced sums are kornia's, at borders too, and do not depend on the batch."""
+
+import pytest
+import torch
+from helpers import generator
+from kornia.feature import harris_response
+from kornia.filters import guided_blur
+from pydantic import ValidationError
+
+from torchtrack.config.tracker import SurfaceConfig
+from torchtrack.filters import corner_response, separable_filter, sliced_guided_filter, sliced_harris
+
+SHAPES = [(1, 16, 16), (1, 32, 32), (3, 64, 96), (9, 40, 33)]
+# Of the largest value.
+AGREEMENT = {torch.float32: 1e-5, torch.float64: 1e-12}
+
+
+def surfaces(*shape, seed=0, dtype=torch.float64):
+    return torch.rand(shape, generator=generator(seed), dtype=torch.float64).square().to(dtype)
+
+
+def decaying_square(dtype):
+    """A surface as events leave it: mostly zero, with steps, and touching two borders."""
+    image = torch.zeros(1, 48, 64, dtype=dtype)
+    image[0, :20, :30] = torch.linspace(0, 1, 30, dtype=dtype)
+    image[0, 30:40, 40:50] = 1
+    return image
+
+
+def assert_agree(ours, theirs):
+    assert ours.shape == theirs.shape
+    assert ours.dtype == theirs.dtype
+    largest = float(theirs.abs().max())
+    assert largest > 1e-4
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=largest * AGREEMENT[ours.dtype])
+
+
+# ---- the same as kornia's
+
+
+@pytest.mark.parametrize("size_px", [3, 5, 9, 15])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_sliced_guided_filter_is_that_of_kornia(shape, size_px, dtype):
+    surface = surfaces(*shape, dtype=dtype)
+    assert_agree(sliced_guided_filter(surface, size_px, 0.01), guided_blur(surface[:, None], surface[:, None], size_px, 0.01)[:, 0])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_sliced_harris_response_is_that_of_kornia(shape, dtype):
+    image = surfaces(*shape, seed=1, dtype=dtype)
+    assert_agree(sliced_harris(image), harris_response(image[:, None], 0.04)[:, 0])
+
+
+@pytest.mark.parametrize("size_px", [3, 5, 9, 15])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_both_settings_give_the_same_response(shape, size_px, dtype):
+    surface = surfaces(*shape, seed=2, dtype=dtype)
+    ours, theirs = (corner_response(surface, SurfaceConfig(filters=filters, filter_size_px=size_px)) for filters in ("sliced", "kornia"))
+    assert_agree(ours, theirs)
+
+
+@pytest.mark.parametrize("eps", [1e-4, 0.01, 0.5])
+def test_they_agree_on_steps_and_flat_ground(eps, dtype):
+    surface = decaying_square(dtype)
+    ours, theirs = (corner_response(surface, SurfaceConfig(filters=filters, filter_eps=eps)) for filters in ("sliced", "kornia"))
+    assert_agree(ours, theirs)
+
+
+def test_they_agree_at_every_border(dtype):
+    """Where the sums reach beyond the image: the outermost rows and columns alone."""
+    surface = surfaces(2, 40, 56, seed=3, dtype=dtype)
+    ours, theirs = (corner_response(surface, SurfaceConfig(filters=filters)) for filters in ("sliced", "kornia"))
+    for border in (ours[:, :4] - theirs[:, :4], ours[:, -4:] - theirs[:, -4:], ours[..., :4] - theirs[..., :4], ours[..., -4:] - theirs[..., -4:]):
+        assert float(border.abs().max()) <= AGREEMENT[dtype] * float(theirs.abs().max())
+
+
+def test_the_response_is_that_of_kornia_after_the_guided_filter():
+    surface, config = surfaces(2, 48, 48, seed=1, dtype=torch.float32), SurfaceConfig()
+    filtered = guided_blur(surface[:, None], surface[:, None], config.filter_size_px, config.filter_eps)
+    torch.testing.assert_close(corner_response(surface, config), harris_response(filtered)[:, 0], rtol=0, atol=1e-7)
+
+
+# ---- what they do
+
+
+@pytest.mark.parametrize("filters", ["sliced", "kornia"])
+def test_corners_respond_more_than_edges_and_edges_less_than_nothing(filters):
+    surface = torch.zeros(1, 96, 96)
+    surface[0, 30:61, 30:61] = 1
+    response = corner_response(surface, SurfaceConfig(filters=filters))[0]
+    assert float(response[30, 30]) > 1e-3
+    assert float(response[45, 30]) < 0
+    assert float(response[45, 45].abs()) < 1e-6
+
+
+def test_the_guided_filter_keeps_strong_edges_and_smooths_weak_noise():
+    step = torch.zeros(1, 32, 32, dtype=torch.float64)
+    step[..., 16:] = 1
+    noise = 0.02 * torch.randn(step.shape, generator=generator(4), dtype=torch.float64)
+    filtered = sliced_guided_filter(step + noise, 5, 0.01)
+    assert float((filtered[..., 16] - filtered[..., 15]).min()) > 0.9
+    assert float(filtered[..., :12].std()) < 0.3 * float(noise[..., :12].std())
+
+
+@pytest.mark.parametrize("value", [0.0, 0.7])
+def test_a_flat_surface_stays_flat_and_has_no_response(value, dtype):
+    flat = torch.full((2, 24, 24), value, dtype=dtype)
+    torch.testing.assert_close(sliced_guided_filter(flat, 5, 0.01), flat, rtol=0, atol=1e-6)
+    assert float(corner_response(flat, SurfaceConfig()).abs().max()) < 1e-10
+
+
+@pytest.mark.parametrize("border", ["reflect", "replicate", "constant"])
+def test_separable_filters_correlate_with_the_outer_product(border, dtype):
+    """Kernels that are not symmetric, of different lengths, so that neither axes nor direction can be mistaken."""
+    image, vertical, horizontal = surfaces(2, 12, 15, seed=5, dtype=dtype), (0.2, 0.5, -0.1), (0.3, 0.0, 0.4, -0.6, 0.1)
+    padded = torch.nn.functional.pad(image[:, None], (2, 2, 1, 1), border)
+    kernel = torch.outer(torch.tensor(vertical, dtype=dtype), torch.tensor(horizontal, dtype=dtype))
+    expected = torch.nn.functional.conv2d(padded, kernel[None, None])[:, 0]
+    torch.testing.assert_close(separable_filter(image, vertical, horizontal, border), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("filters", ["sliced", "kornia"])
+def test_the_response_of_a_surface_does_not_depend_on_the_rest_of_the_batch(filters, dtype):
+    surface, config = surfaces(5, 32, 48, seed=6, dtype=dtype), SurfaceConfig(filters=filters)
+    together = corner_response(surface, config)
+    alone = torch.cat([corner_response(part, config) for part in surface.split(1)])
+    torch.testing.assert_close(together, alone, rtol=0, atol=AGREEMENT[dtype] * float(alone.abs().max()))
+
+
+@pytest.mark.parametrize("filters", ["sliced", "kornia"])
+def test_the_filters_leave_their_input_as_it_was(filters):
+    surface = surfaces(2, 48, 48, seed=1)
+    copy = surface.clone()
+    corner_response(surface, SurfaceConfig(filters=filters))
+    assert torch.equal(surface, copy)
+
+
+@pytest.mark.parametrize("size_px", [4, 6])
+def test_a_filter_of_even_size_is_refused_with_the_next_odd_one(size_px):
+    with pytest.raises(ValidationError, match=f"give an odd size, such as {size_px + 1}"):
+        SurfaceConfig(filter_size_px=size_px)

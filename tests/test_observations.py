@@ -1,0 +1,143 @@
+"""Observations: which events near the contours are taken, how many, how evenly, and how steadily."""
+
+import pytest
+import torch
+from helpers import IMAGE_SIZE, contours_at, generator, seen, upright_line
+
+from torchtrack.contour_index import index_contours
+from torchtrack.observations import join, select_events
+
+# Events of a window, and those near a contour among them.
+EVENTS, NEAR = 6000, 4000
+
+
+def numbered(near, count):
+    """Numbers of the events taken of ``near [b, e]``: one set per object."""
+    events = near.shape[1]
+    number = torch.arange(events, dtype=torch.float64).expand(len(near), events)
+    pixels = torch.stack([torch.where(near, 80.0, 10.0), torch.full_like(number, 60.0)], -1)
+    lines = contours_at(upright_line(80.0).pixels.expand(len(near), -1, -1))
+    index = index_contours(lines, IMAGE_SIZE, 5, 1)
+    chosen = select_events(pixels, number, torch.ones_like(number), torch.ones_like(near), index, torch.zeros_like(pixels), count)
+    assert chosen.pixels.shape == (len(near), count, 2)
+    return [row[mask].long().tolist() for row, mask in zip(chosen.age_s, chosen.mask, strict=True)]
+
+
+def random_near(seed=0, total=NEAR):
+    near = torch.zeros(1, EVENTS, dtype=torch.bool)
+    near[0, torch.randperm(EVENTS, generator=generator(seed))[:total]] = True
+    return near
+
+
+# ---- events near contours
+
+
+def choose(pixels, contours, *, age_s=0.0, velocity=(0.0, 0.0), count=100, mask=None):
+    observations = seen(pixels, age_s=age_s, mask=mask, polarity=1.0)
+    speed = torch.tensor(velocity, dtype=torch.float64).expand_as(observations.pixels)
+    index = index_contours(contours, IMAGE_SIZE, 5, 1)
+    return select_events(observations.pixels, observations.age_s, observations.polarity, observations.mask, index, speed, count)
+
+
+def test_events_near_a_contour_are_taken_and_others_left():
+    chosen = choose([[[80.0, 60.0], [84.0, 60.0], [95.0, 60.0], [78.0, 60.0], [79.0, 60.0]]], upright_line(80.0), mask=[[True] * 4 + [False]])
+    assert chosen.pixels[chosen.mask].tolist() == [[80, 60], [84, 60], [78, 60]]
+    assert chosen.polarity[chosen.mask].tolist() == [1, 1, 1]
+    assert not chosen.has_flow.any()
+
+
+def test_events_are_judged_where_they_are_at_the_end_of_the_window():
+    chosen = choose([[[60.0, 60.0], [80.0, 60.0]]], upright_line(80.0), age_s=0.02, velocity=(1000.0, 0.0))
+    assert chosen.pixels[chosen.mask].tolist() == [[60, 60]]
+    assert chosen.age_s[chosen.mask].tolist() == [0.02]
+
+
+@pytest.mark.parametrize("count", [90, 300, 1200])
+@pytest.mark.parametrize("seed", range(3))
+def test_nearly_as_many_events_are_taken_as_asked_for_and_never_more(count, seed):
+    (chosen,) = numbered(random_near(seed), count)
+    assert 0.85 * count <= len(chosen) <= count
+    assert len(set(chosen)) == len(chosen)
+    assert chosen == sorted(chosen)
+
+
+@pytest.mark.parametrize("total", [0, 1, 299, 300])
+def test_where_there_are_few_all_are_taken(total):
+    near = random_near(total=total)
+    (chosen,) = numbered(near, 300)
+    assert chosen == near[0].nonzero()[:, 0].tolist()
+
+
+def test_the_events_of_an_even_stream_are_spread_evenly():
+    """Multiples of the golden ratio leave gaps of three lengths at most, which are neighbouring Fibonacci numbers."""
+    (chosen,) = numbered(torch.ones(1, 900, dtype=torch.bool), 90)
+    assert 80 <= len(chosen) <= 90
+    gaps = torch.diff(torch.tensor(chosen)).double()
+    assert gaps.unique().tolist() == [5, 8, 13]
+    assert chosen[0] < 2 * float(gaps.mean())
+    assert chosen[-1] > 899 - 2 * float(gaps.mean())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_events_taken_are_spread_in_time_as_those_near_a_contour_are(seed):
+    near = random_near(seed)
+    (chosen,) = numbered(near, 600)
+    taken = torch.zeros(EVENTS).index_fill(0, torch.tensor(chosen), 1.0)
+    shares = taken.view(10, -1).sum(1) / near[0].view(10, -1).sum(1)
+    assert float(shares.min()) > 0.7 * float(shares.mean())
+    assert float(shares.max()) < 1.3 * float(shares.mean())
+
+
+@pytest.mark.parametrize("count", [300, 1200])
+def test_an_event_more_or_less_changes_few_choices(count):
+    """Else the smallest difference between poses would become another set of events, and grow."""
+    near = random_near()
+    (before,) = numbered(near, count)
+    changed = []
+    for removed in near[0].nonzero()[::97, 0].tolist():
+        without = near.clone()
+        without[0, removed] = False
+        (after,) = numbered(without, count)
+        assert removed not in after
+        changed.append(len(set(before) ^ set(after)))
+    assert len(changed) > 40
+    assert max(changed) <= 0.02 * count
+    assert sum(changed) / len(changed) < 2
+
+
+def test_events_far_from_the_contours_change_no_choice():
+    near = random_near()
+    (before,) = numbered(near, 600)
+    more = torch.cat([near, torch.zeros(1, 2000, dtype=torch.bool)], 1)
+    assert numbered(more, 600)[0] == before
+
+
+def test_the_choice_of_an_object_does_not_depend_on_the_others():
+    near = torch.cat([random_near(0), random_near(1, 500), random_near(2, 0)])
+    together = numbered(near, 600)
+    assert together == [numbered(near[number : number + 1], 600)[0] for number in range(3)]
+
+
+def test_values_go_with_their_events(dtype):
+    place = torch.stack([torch.full((400,), 80.0, dtype=dtype), torch.linspace(20, 119, 400, dtype=dtype)], -1)[None]
+    age_s, polarity = torch.linspace(0, 5e-3, 400, dtype=dtype)[None], torch.where(torch.arange(400) % 2 == 0, 1, -1).to(dtype)[None]
+    index = index_contours(upright_line(80.0, dtype), IMAGE_SIZE, 5, 1)
+    chosen = select_events(place, age_s, polarity, torch.ones(1, 400, dtype=torch.bool), index, torch.zeros_like(place), 50)
+    number = ((chosen.pixels[0, :, 1] - 20) / 99 * 399).round().long()[chosen.mask[0]]
+    assert len(number) > 40
+    for found, given in ((chosen.pixels, place), (chosen.age_s, age_s), (chosen.polarity, polarity)):
+        assert torch.equal(found[0][chosen.mask[0]], given[0][number])
+    assert chosen.pixels.dtype == chosen.flow.dtype == dtype
+    assert not chosen.has_flow.any()
+
+
+# ---- both
+
+
+def test_joined_observations_are_those_of_both():
+    both = join(seen([[[1.0, 2.0]]], age_s=0.1, flow=[3.0, 4.0]), seen([[[5.0, 6.0], [7.0, 8.0]]], polarity=-1.0, mask=[[True, False]]))
+    assert both.pixels.tolist() == [[[1, 2], [5, 6], [7, 8]]]
+    assert both.age_s.tolist() == [[0.1, 0, 0]]
+    assert both.polarity.tolist() == [[0, -1, -1]]
+    assert both.mask.tolist() == [[True, True, False]]
+    assert both.has_flow.tolist() == [[True, False, False]]

@@ -1,0 +1,75 @@
+"""Boxes that are tracked from exact events, for the tests of the tracker."""
+
+from dataclasses import fields, is_dataclass
+from functools import cache
+
+import torch
+from helpers import SMALL_CAMERA, box_model, drifting, edge_events, pose
+
+from torchtrack import Tracker
+from torchtrack.camera import Camera
+from torchtrack.config.tracker import (
+    MotionConfig,
+    TrackerConfig,
+)
+from torchtrack.events import concatenate
+
+WINDOW_US = 5_000
+WIDE_CAMERA = Camera(fx=250.0, fy=250.0, cx=159.5, cy=74.5, width=320, height=150)
+SAME_POSE = {torch.float32: 1e-5, torch.float64: 1e-9}
+HOLD = TrackerConfig(motion=MotionConfig(without_events="hold"))
+PREDICT = TrackerConfig(motion=MotionConfig(without_events="predict"))
+
+
+def merged(*batches):
+    """Events of one stream in time order."""
+    events = concatenate(batches)
+    return events[events.t_us.sort(stable=True).indices]
+
+
+def windows(events, count, start_us=0):
+    return [(events.slice_time(start_us + k * WINDOW_US, start_us + (k + 1) * WINDOW_US), start_us + (k + 1) * WINDOW_US) for k in range(count)]
+
+
+def follow(tracker, state, stream_windows):
+    """The last state, and the result of every window."""
+    results = []
+    for events, end_us in stream_windows:
+        state, result = tracker.step(state, events, end_us)
+        results.append(result)
+    return state, results
+
+
+def poses_of(results, number=0):
+    return torch.stack([result.T_cam_obj[number] for result in results])
+
+
+def tensors_of(value):
+    """All tensors of nested dataclasses, in order."""
+    if torch.is_tensor(value):
+        return [value]
+    return [tensor for field in fields(value) for tensor in tensors_of(getattr(value, field.name))] if is_dataclass(value) else []
+
+
+def assert_same(first, second):
+    for ours, theirs in zip(tensors_of(first), tensors_of(second), strict=True):
+        assert torch.equal(ours, theirs) or (torch.isnan(ours) == torch.isnan(theirs)).all()
+
+
+def moving_box(T_start, count, camera=SMALL_CAMERA, *, seed=0, stream=0, **motion):
+    """True poses and events of a box over ``count`` windows."""
+    trajectory = drifting(T_start, count * WINDOW_US, **motion)
+    return trajectory, edge_events(trajectory, camera, seed=seed, stream=stream)
+
+
+@cache
+def started(dtype=torch.float32, config=None, count=5):
+    """A tracker in full motion: it, its state and its last result, the next window's events, and the true poses."""
+    trajectory, events = moving_box(pose(), count + 1)
+    tracker = Tracker([box_model()], SMALL_CAMERA, config, dtype=dtype)
+    state, results = follow(tracker, tracker.init(pose()[None], 0), windows(events, count))
+    return tracker, state, results[-1], windows(events, count + 1)[-1], trajectory
+
+
+def tracker_of(count=1, **kwargs):
+    return Tracker([box_model()] * count, SMALL_CAMERA, **kwargs)
