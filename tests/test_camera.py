@@ -7,7 +7,17 @@ import torch
 from helpers import generator
 from torch.autograd import gradcheck
 
-from torchtrack.camera import MIN_DEPTH_M, Camera, distort, distortion_table, project, projection_gradient, undistort, undistortion_table
+from torchtrack.camera import (
+    MIN_DEPTH_M,
+    Camera,
+    distort,
+    distortion_table,
+    project,
+    projection_gradient,
+    stack_tables,
+    undistort,
+    undistortion_table,
+)
 from torchtrack.errors import CalibrationError
 
 PINHOLE = Camera(612.3, 610.9, 318.2, 241.7, 640, 480)
@@ -177,3 +187,12 @@ def test_calibrations_that_make_no_sense(change, message):
 def test_a_camera_matrix_must_be_3x3():
     with pytest.raises(CalibrationError, match="3x3"):
         Camera.from_matrix(np.eye(4), 640, 480)
+
+
+def test_tables_of_cameras_of_different_sizes_stack_without_change() -> None:
+    small, large = (Camera(100.0, 100.0, w / 2, h / 2, w, h) for w, h in ((8, 6), (10, 12)))
+    tables = [undistortion_table(camera) for camera in (small, large)]
+    stacked = stack_tables(tables)
+    assert stacked.shape == (2, 12, 10, 2)
+    assert torch.equal(stacked[0, :6, :8], tables[0])
+    assert torch.equal(stacked[1], tables[1])
