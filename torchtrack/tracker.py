@@ -271,7 +271,9 @@ class Tracker(nn.Module):
         """Velocity after a window: a running mean of what the poses moved, as far as events explain it."""
         moved = lie.small_difference_about(state.T_cam_obj, T_found, self.centre_obj.double()).to(state.velocity.dtype)
         duration_s = window_s[self.stream_index, None].clamp(min=1e-6)
-        gain = self.config.motion.velocity_gain * share[:, None]
+        # A pose that events hardly explain says nothing of the motion.
+        trust = torch.where(share > self.config.quality.uncertain_below, share, 0)
+        gain = self.config.motion.velocity_gain * trust[:, None]
         mixed = gain * moved / duration_s + (1 - gain) * state.velocity
         # Coasting dies away: a pose that nothing confirms must not leave for good.
         fading = torch.exp(-duration_s / self.config.motion.coast_s)
