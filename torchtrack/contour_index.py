@@ -22,7 +22,7 @@ class ContourIndex:
 
     Args:
         origin: cell (column, row) of the region's first entry; cell (0, 0) is centred at pixel (0, 0).
-        size: rows and columns of the region.
+        size: rows and columns of the region, whose outermost cells are empty.
         cell_px: side of a cell.
         nearest: contour index per cell, -1 where none is near.
         pixels: where the contour points were when the index was made.
@@ -37,10 +37,10 @@ class ContourIndex:
     def look_up(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
         """The contour point nearest to the centre of each pixel's cell, -1 where none is near."""
         rows, columns = self.size
-        column, row = ((pixels / self.cell_px).round() - self.origin[:, None]).unbind(-1)
-        inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
-        cell = torch.where(inside, row * columns + column, 0).long()
-        return torch.where(inside, self.nearest.gather(1, cell), -1)
+        place = torch.nan_to_num((pixels / self.cell_px).round() - self.origin[:, None], nan=0.0)
+        # The region's border is empty: whatever lies outside finds nothing there.
+        column, row = torch.minimum(place.clamp(min=0), place.new_tensor([columns - 1, rows - 1])).unbind(-1)
+        return self.nearest.gather(1, torch.add(column, row, alpha=columns).long())
 
 
 def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: int, cell_px: int) -> ContourIndex:
@@ -54,8 +54,8 @@ def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: i
     inside = contours.mask & ((contours.pixels > -radius_px) & (contours.pixels < limit + radius_px)).all(-1)
     centre = torch.where(inside[..., None], contours.pixels / cell_px, 0).round().long()
     reach = -(-radius_px // cell_px)
-    low = torch.where(inside[..., None], centre, 2**31).amin(1).clamp(max=2**30) - reach
-    columns, rows = (torch.where(inside[..., None], centre - low[:, None], 0).amax((0, 1)) + reach + 1).tolist()
+    low = torch.where(inside[..., None], centre, 2**31).amin(1).clamp(max=2**30) - reach - 1
+    columns, rows = (torch.where(inside[..., None], centre - low[:, None], 0).amax((0, 1)) + reach + 2).tolist()
     disc = _disc(reach, radius_px / cell_px, device)
     distance_sq = _squared_distances(contours.pixels, cell_px * centre, cell_px * disc)
     key = (_DISTANCE_STEPS * distance_sq).long() * count + torch.arange(count, device=device)[:, None]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import softsign
 
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.contour_index import ContourIndex
@@ -123,7 +124,7 @@ def towards_dark(polarity: Float[Tensor, "b n"], normals: Float[Tensor, "b n 2"]
     a blurred step, whose middle lies at ``Φ⁻¹(1 / (1 + √contrast))`` blur widths: always on the dark side.
     """
     across = (normals * velocity).sum(-1)
-    return (polarity * across / (across.abs() + _SLOW_PX_S))[..., None] * normals
+    return (polarity * softsign(across / _SLOW_PX_S))[..., None] * normals
 
 
 def match_along_flow(
