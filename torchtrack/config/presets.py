@@ -10,6 +10,7 @@ from torchtrack.config.tracker import (
     MotionConfig,
     QualityConfig,
     SolverConfig,
+    SurfaceConfig,
     TrackerConfig,
     WindowConfig,
 )
@@ -22,6 +23,7 @@ def _paper() -> TrackerConfig:
     """Corners alone, matched along their flow with the splatted boundary, from the last pose, without a prior."""
     return TrackerConfig(
         window=WindowConfig(duration_us=10_000),
+        surface=SurfaceConfig(margin_px=16),
         corners=CornerConfig(max_corners=200, snap=False, fresh_only=False),
         flow=FlowConfig(radius_px=6, iterations=10),
         contours=ContourConfig(source="splat", texture=False, creases=False),
