@@ -21,7 +21,7 @@ _MIN_CROSSING = 0.3
 # Contours slower than this across themselves (px/s) have no clear leading side.
 _SLOW_PX_S = 10.0
 # Concentration: side of a patch, patches a side of the image, and offsets that are near and on a contour (px).
-_PATCH_PX, _PATCHES, _SMEAR_PX, _ON_CONTOUR_PX = 16, 128, 3.0, 0.8
+_PATCH_PX, _PATCHES, _SMEAR_PX, _ON_CONTOUR_PX = 16, 64, 3.0, 0.8
 
 
 @dataclass(frozen=True)
@@ -107,12 +107,14 @@ def concentration(
     image, the share of the observations near a contour that are on it. No patch counts for nothing: one that is off the
     contour as a whole must still pull a pose back that has begun to slip.
     """
-    patch = (targets / _PATCH_PX).floor().long().clamp(0, _PATCHES - 1)
-    cell = (patch[..., 1] * _PATCHES + patch[..., 0])[..., None].expand(-1, -1, 2)
-    counted = near & (offsets.abs() < _SMEAR_PX)
-    counts = torch.stack([counted, counted & (offsets.abs() < _ON_CONTOUR_PX)], -1).to(offsets.dtype)
-    total = torch.zeros(len(offsets), _PATCHES**2, 2, dtype=offsets.dtype, device=offsets.device)
-    near_count, on_count = total.scatter_add(1, cell, counts).gather(1, cell).unbind(-1)
+    # Patches wrap around: no object is so large that two of its own would meet.
+    u, v = (targets / _PATCH_PX).floor().long().remainder(_PATCHES).unbind(-1)
+    cell = torch.add(u, v, alpha=_PATCHES)
+    distance = offsets.abs()
+    nothing = torch.zeros(len(offsets), _PATCHES**2, dtype=offsets.dtype, device=offsets.device)
+    near_count, on_count = (
+        nothing.scatter_add(1, cell, (near & (distance < limit)).to(offsets.dtype)).gather(1, cell) for limit in (_SMEAR_PX, _ON_CONTOUR_PX)
+    )
     share = (on_count + 1) / (near_count + 2)
     return ((share - config.smeared_share) / (config.gathered_share - config.smeared_share)).clamp(config.least_trust, 1)
 
