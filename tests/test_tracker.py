@@ -189,7 +189,8 @@ def test_the_state_of_inference_can_be_carried_on():
     tracker, state, _, (events, end_us), _ = started()
     with torch.inference_mode():
         after, _ = tracker.step(state, events, end_us)
-    tracker.step(after, EventBatch.empty(), end_us + WINDOW_US)
+    later, _ = tracker.step(after, EventBatch.empty(), end_us + WINDOW_US)
+    assert later.t_us.tolist() == [end_us + WINDOW_US]
 
 
 # ---- windows without events
