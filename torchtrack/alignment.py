@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -57,16 +57,11 @@ class Alignment:
 
 @dataclass(frozen=True)
 class AlignmentResult:
-    """The pose after the last round, and what it stands on.
-
-    Args:
-        observation_count: matched observations of each object.
-    """
+    """The pose after the last round, and what it stands on."""
 
     solution: Linearisation
     contours: Contours
     matches: Matches
-    observation_count: Int[Tensor, "b"]
 
 
 def index_for(contours: Contours, image_size: tuple[int, int], config: TrackerConfig) -> ContourIndex:
@@ -105,7 +100,7 @@ def align(
         solution = solve_pose(_problem(start, rows, contours, gate_px, config), T_cam_obj, config.solver, from_prior)
         T_cam_obj, from_prior = solution.T_cam_obj, solution.from_prior
         contours = reproject(contours, T_cam_obj, start.intrinsics)
-    return AlignmentResult(solution, contours, matches, matches.mask.sum(-1))
+    return AlignmentResult(solution, contours, matches)
 
 
 def _match(

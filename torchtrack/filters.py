@@ -4,6 +4,8 @@ kornia's run as convolutions with one channel, which a CPU does slowly. The ``sl
 instead; they are the same to 1e-5 (a test holds them to it) and several times faster on the CPU.
 """
 
+from functools import cache
+
 import torch
 from jaxtyping import Float
 from kornia.feature import harris_response
@@ -65,10 +67,16 @@ def sliced_guided_filter(surface: Float[Tensor, "b h w"], size_px: int, eps: flo
     return mean_slope * surface + mean_offset
 
 
+@cache
+def _harris_window() -> tuple[float, ...]:
+    """Weights of the Gaussian window along one axis; they never change."""
+    return tuple(get_gaussian_kernel1d(_HARRIS_WINDOW_PX, _HARRIS_SIGMA_PX, dtype=torch.float64)[0].tolist())
+
+
 def sliced_harris(image: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
     """Harris response ``det M - k tr² M`` with Sobel gradients and a 7x7 Gaussian window."""
     du = separable_filter(image, _SOBEL_SMOOTH, _SOBEL_DIFFERENCE, "replicate")
     dv = separable_filter(image, _SOBEL_DIFFERENCE, _SOBEL_SMOOTH, "replicate")
-    window = tuple(get_gaussian_kernel1d(_HARRIS_WINDOW_PX, _HARRIS_SIGMA_PX, dtype=torch.float64)[0].tolist())
+    window = _harris_window()
     uu, vv, uv = separable_filter(torch.cat([du * du, dv * dv, du * dv]), window, window, "reflect").chunk(3)
     return uu * vv - uv.square() - _HARRIS_K * (uu + vv).square()

@@ -141,8 +141,13 @@ def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor) -> _Seen:
 def _cost(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Tensor:
     """Robust cost at a pose, prior included."""
     value, _ = robust_loss(_see(problem, rows, T_cam_obj).residuals, problem.scale_px, loss)
+    return _with_prior(problem, value, from_prior)[0]
+
+
+def _with_prior(problem: PoseProblem, value: Tensor, from_prior: Tensor) -> tuple[Tensor, Tensor]:
+    """Cost of each object from its observations' losses and the prior, and the prior's gradient."""
     pull = (problem.prior_information @ from_prior[..., None]).squeeze(-1)
-    return (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1)
+    return (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1), pull
 
 
 def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
@@ -156,10 +161,9 @@ def _linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior:
     jacobian = pose_jacobian(seen.points_cam, seen.centre_cam, (*seen.gradient, -seen.along * seen.inverse_depth))
     value, robust = robust_loss(seen.residuals, problem.scale_px, loss)
     weighted = jacobian * (robust * problem.weights)[:, None]
-    pull = (problem.prior_information @ from_prior[..., None]).squeeze(-1)
+    cost, pull = _with_prior(problem, value, from_prior)
     gradient = (weighted @ seen.residuals[..., None]).squeeze(-1) + pull
     hessian = weighted @ jacobian.transpose(1, 2) + problem.prior_information
-    cost = (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1)
     return Linearisation(T_cam_obj, cost, gradient, hessian, from_prior)
 
 

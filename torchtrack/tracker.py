@@ -252,7 +252,7 @@ class Tracker(nn.Module):
         config, solution, contours = self.config, aligned.solution, aligned.contours
         velocity = start.contour_velocity(contours)
         share = quality.explained_share(contours, aligned.matches, velocity, self.image_size, config.quality.min_speed_px_s)
-        count = aligned.observation_count
+        count = aligned.matches.mask.sum(-1)
         T_found = lie.orthonormalise(solution.T_cam_obj.double())
         step = lie.small_difference_about(start.T_prior.double(), T_found, self.centre_obj.double()).to(velocity.dtype)
         status = quality.judge(share, count, quality.visible_share(contours, self.image_size), step, self.diameter_m, config.quality)
