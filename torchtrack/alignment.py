@@ -14,7 +14,7 @@ from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.lie import transform_points
 from torchtrack.matching import Belief, Matches, both_coordinates, match_along_flow, match_nearest
 from torchtrack.observations import Observations
-from torchtrack.pose_solver import Linearisation, PoseProblem, solve_pose
+from torchtrack.pose_solver import Linearisation, PoseProblem, pose_jacobian, solve_pose
 
 # The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).
 _INDEX_MARGIN_PX = 2
@@ -36,7 +36,8 @@ class Alignment:
 
     T_prior: Float[Tensor, "b 4 4"]
     usable: Bool[Tensor, "b"]
-    prior_information: Float[Tensor, "b 6 6"]
+    prior_information: Float[Tensor, "b 12 12"]
+    prior_covariance: Float[Tensor, "b 6 6"]
     velocity: Float[Tensor, "b 6"]
     centre_obj: Float[Tensor, "b 3"]
     intrinsics: Float[Tensor, "b 4"]
@@ -64,9 +65,29 @@ class AlignmentResult:
     matches: Matches
 
 
-def index_for(contours: Contours, image_size: tuple[int, int], config: TrackerConfig) -> ContourIndex:
+# Contour points whose uncertainty is looked at.
+_LOOKED_AT = 64
+
+
+def gate_scale(start: Alignment, contours: Contours, config: TrackerConfig) -> Float[Tensor, "b"]:
+    """How much wider than configured the first gate must be for what the prediction may be off: at least 1."""
+    limit = config.matching.max_gate_px / config.matching.gates_px[0]
+    if limit <= 1:
+        return torch.ones_like(start.velocity[:, 0])
+    step = max(contours.mask.shape[1] // _LOOKED_AT, 1)
+    points, normals, mask = contours.points_cam[:, ::step], contours.normals[:, ::step], contours.mask[:, ::step]
+    inverse_depth = points[..., 2].clamp(min=1e-3).reciprocal()
+    slope = normals * start.intrinsics[:, None, :2] * inverse_depth[..., None]
+    along = (slope * points[..., :2]).sum(-1) * inverse_depth
+    jacobian = pose_jacobian(points.transpose(1, 2), start.centre_cam(start.T_prior), (*slope.unbind(-1), -along))
+    variance = (jacobian * (start.prior_covariance @ jacobian)).sum(1)
+    sigma_px = ((variance * mask).sum(-1) / mask.sum(-1).clamp(min=1)).sqrt()
+    return (config.matching.gate_sigmas * sigma_px / config.matching.gates_px[0]).clamp(1, limit)
+
+
+def index_for(contours: Contours, image_size: tuple[int, int], config: TrackerConfig, scale: float = 1.0) -> ContourIndex:
     """The index of contours, wide enough for the first gate."""
-    radius_px = int(max(config.matching.gates_px)) + _INDEX_MARGIN_PX
+    radius_px = int(scale * max(config.matching.gates_px)) + _INDEX_MARGIN_PX
     return index_contours(contours, image_size, radius_px, config.matching.index_cell_px)
 
 
@@ -74,6 +95,7 @@ def align(
     start: Alignment,
     contours: Contours,
     index: ContourIndex,
+    scale: Float[Tensor, "b"],
     observations: Observations,
     extract: Callable[[Float[Tensor, "b 4 4"]], Contours],
     config: TrackerConfig,
@@ -84,22 +106,26 @@ def align(
         contours: visible contours at ``start.T_prior``, and ``index`` of them.
         extract: makes contours at a pose anew, in the rounds that ``config.contours.refresh_rounds`` names.
     """
-    T_cam_obj, from_prior = start.T_prior, torch.zeros_like(start.velocity)
+    T_cam_obj, from_prior = start.T_prior, torch.zeros_like(start.velocity.repeat(1, 2))
     compensate = 1.0 if config.matching.motion_compensation else 0.0
     plane = compensate * start.plane_velocity(observations.pixels)
     belief = Belief.from_velocity(plane)
     velocity = compensate * start.contour_velocity(contours)
-    for number, gate_px in enumerate(config.matching.gates_px):
+    rounds = len(config.matching.gates_px)
+    for number, base_px in enumerate(config.matching.gates_px):
+        widen = scale ** (1 - number / max(rounds - 1, 1))
+        gate_px = base_px * widen
         if number and number in config.contours.refresh_rounds:
             contours = extract(T_cam_obj)
             index = index_for(contours, start.image_size, config)
             velocity = compensate * start.contour_velocity(contours)
             belief = Belief.from_velocity(belief.motion[..., :2])
-        matches, belief = _match(observations, contours, index, belief, velocity, gate_px, config)
+        matches, belief = _match(observations, contours, index, belief, velocity, gate_px, widen, config)
         rows = both_coordinates(matches) if config.matching.residual == "point" else matches
-        solution = solve_pose(_problem(start, rows, contours, gate_px, config), T_cam_obj, config.solver, from_prior)
+        solution = solve_pose(_problem(start, rows, contours, gate_px, config, from_prior[:, 6:], observations.age_s), T_cam_obj, config.solver, from_prior)
         T_cam_obj, from_prior = solution.T_cam_obj, solution.from_prior
         contours = reproject(contours, T_cam_obj, start.intrinsics)
+        velocity = compensate * pixel_velocity(contours.points_cam, start.velocity + from_prior[:, 6:], start.centre_cam(T_cam_obj), start.intrinsics)
     return AlignmentResult(solution, contours, matches)
 
 
@@ -109,22 +135,21 @@ def _match(
     index: ContourIndex,
     belief: Belief,
     contour_velocity: Float[Tensor, "b m 2"],
-    gate_px: float,
+    gate_px: Float[Tensor, "b"],
+    widen: Float[Tensor, "b"],
     config: TrackerConfig,
 ) -> tuple[Matches, Belief]:
     """Matches of one round, none for an object with too few of them, and what the next round begins with."""
     if config.matching.along_flow:
         matches = match_along_flow(observations, contours, contour_velocity, gate_px, config.matching)
     else:
-        matches, belief = match_nearest(observations, contours, index, belief, contour_velocity, gate_px, config.matching)
+        matches, belief = match_nearest(observations, contours, index, belief, contour_velocity, gate_px, widen, config.matching)
     enough = (matches.mask * matches.weights).sum(-1, keepdim=True) >= config.quality.min_observations
     return replace(matches, mask=matches.mask & enough), belief
 
 
-def _problem(start: Alignment, matches: Matches, contours: Contours, gate_px: float, config: TrackerConfig) -> PoseProblem:
+def _problem(start: Alignment, matches: Matches, contours: Contours, gate_px: Tensor, config: TrackerConfig, compensated: Tensor, ages_s: Tensor) -> PoseProblem:
     """The least squares problem of one round; objects without a match stay where they are."""
-    idle = ~matches.mask.any(-1)
-    information = torch.where(idle[:, None, None], torch.zeros_like(start.prior_information), start.prior_information)
     return PoseProblem(
         points_obj=take_points(contours.points_obj, matches.contour),
         targets=matches.targets,
@@ -132,7 +157,9 @@ def _problem(start: Alignment, matches: Matches, contours: Contours, gate_px: fl
         weights=matches.mask * matches.weights,
         intrinsics=start.intrinsics,
         centre_obj=start.centre_obj,
-        scale_px=torch.full_like(start.centre_obj[:, 0], gate_px),
+        scale_px=gate_px,
         T_prior=start.T_prior,
-        prior_information=information,
+        prior_information=start.prior_information,
+        ages_s=ages_s,
+        compensated=compensated,
     )

@@ -66,7 +66,8 @@ def match_nearest(
     index: ContourIndex,
     belief: Belief,
     contour_velocity: Float[Tensor, "b m 2"],
-    gate_px: float,
+    gate_px: Float[Tensor, "b"],
+    widen: Float[Tensor, "b"],
     config: MatchingConfig,
 ) -> tuple[Matches, Belief]:
     """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
@@ -87,13 +88,13 @@ def match_nearest(
     pixels, normals, velocity = values[..., :6].chunk(3, -1)
     targets = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
     targets = targets - config.dark_shift_px * towards_dark(observations.polarity * values[..., 8], normals, velocity)
-    near = (pixels - targets).square().sum(-1) < gate_px**2
+    near = (pixels - targets).square().sum(-1) < gate_px[:, None] ** 2
     matched = observations.mask & (found >= 0) & near
     motion = torch.where(matched[..., None], values[..., 4:8], belief.motion)
     weights = torch.ones_like(observations.age_s)
     if config.concentration:
         offsets = ((pixels - targets) * normals).sum(-1)
-        weights = concentration(offsets, targets, observations.mask & (found >= 0), config)
+        weights = concentration(offsets / widen[:, None], targets, observations.mask & (found >= 0), config)
     return Matches(contour, matched, weights, targets, normals), Belief(motion)
 
 
@@ -130,7 +131,7 @@ def towards_dark(polarity: Float[Tensor, "b n"], normals: Float[Tensor, "b n 2"]
 
 
 def match_along_flow(
-    observations: Observations, contours: Contours, contour_velocity: Float[Tensor, "b m 2"], gate_px: float, config: MatchingConfig
+    observations: Observations, contours: Contours, contour_velocity: Float[Tensor, "b m 2"], gate_px: Float[Tensor, "b"], config: MatchingConfig
 ) -> Matches:
     """Match each corner with the contour point nearest to it along the line of its flow, either way (the paper's 3.3).
 
@@ -144,7 +145,7 @@ def match_along_flow(
     along = (offsets * heading[:, :, None]).sum(-1)
     across = offsets[..., 1] * heading[..., None, 0] - offsets[..., 0] * heading[..., None, 1]
     crossing = (contours.normals[:, None] * heading[:, :, None]).sum(-1).abs()
-    allowed = contours.mask[:, None] & (across.abs() < config.flow_tolerance_px) & (along.abs() < gate_px) & (crossing > _MIN_CROSSING)
+    allowed = contours.mask[:, None] & (across.abs() < config.flow_tolerance_px) & (along.abs() < gate_px[:, None, None]) & (crossing > _MIN_CROSSING)
     distance, contour = torch.where(allowed, along.square() + across.square(), torch.inf).min(-1)
     targets = observations.pixels + take_points(contour_velocity, contour) * observations.age_s[..., None]
     directions = heading if config.residual == "flow" else take_points(contours.normals, contour)

@@ -33,6 +33,8 @@ class PoseProblem:
         scale_px: scale of the robust loss, per object.
         T_prior: pose the prior draws to.
         prior_information: information of the prior in the solver's chart; zero for no prior.
+        ages_s: time from each observation to the pose (s).
+        compensated: offset of the velocity from the prior's that ``targets`` were moved with.
     """
 
     points_obj: Float[Tensor, "b n 3"]
@@ -43,7 +45,9 @@ class PoseProblem:
     centre_obj: Float[Tensor, "b 3"]
     scale_px: Float[Tensor, "b"]
     T_prior: Float[Tensor, "b 4 4"]
-    prior_information: Float[Tensor, "b 6 6"]
+    prior_information: Float[Tensor, "b 12 12"]
+    ages_s: Float[Tensor, "b n"]
+    compensated: Float[Tensor, "b 6"]
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,7 @@ class _Seen:
     residuals: Tensor
 
 
-def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor) -> _Seen:
+def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor) -> _Seen:
     """Project the matched points and take their residuals."""
     rotation, translation = T_cam_obj[:, :3, :3], T_cam_obj[:, :3, 3:]
     points_cam = torch.baddbmm(translation, rotation, rows.points)
@@ -135,12 +139,16 @@ def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor) -> _Seen:
     gx, gy = (rows.slope * inverse_depth[:, None]).unbind(1)
     along = torch.addcmul(gx * points_cam[:, 0], gy, points_cam[:, 1])
     centre_cam = torch.baddbmm(translation, rotation, problem.centre_obj[..., None])[..., 0]
-    return _Seen(points_cam, centre_cam, inverse_depth, (gx, gy), along, along - rows.offset)
+    gz = -along * inverse_depth
+    difference = from_prior[:, 6:] - problem.compensated
+    x, y, z = (torch.linalg.cross(difference[:, :3, None].expand_as(points_cam), points_cam - centre_cam[..., None], dim=1) + difference[:, 3:, None]).unbind(1)
+    moved = gx * x + gy * y + gz * z
+    return _Seen(points_cam, centre_cam, inverse_depth, (gx, gy), along, along - rows.offset - problem.ages_s * moved)
 
 
 def _cost(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Tensor:
     """Robust cost at a pose, prior included."""
-    value, _ = robust_loss(_see(problem, rows, T_cam_obj).residuals, problem.scale_px, loss)
+    value, _ = robust_loss(_see(problem, rows, T_cam_obj, from_prior).residuals, problem.scale_px, loss)
     return _with_prior(problem, value, from_prior)[0]
 
 
@@ -157,8 +165,9 @@ def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str
 
 def _linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Linearisation:
     """:func:`linearise`, given what does not change from one iteration to the next."""
-    seen = _see(problem, rows, T_cam_obj)
+    seen = _see(problem, rows, T_cam_obj, from_prior)
     jacobian = pose_jacobian(seen.points_cam, seen.centre_cam, (*seen.gradient, -seen.along * seen.inverse_depth))
+    jacobian = torch.cat([jacobian, -problem.ages_s[:, None] * jacobian], 1)
     value, robust = robust_loss(seen.residuals, problem.scale_px, loss)
     weighted = jacobian * (robust * problem.weights)[:, None]
     cost, pull = _with_prior(problem, value, from_prior)
@@ -172,7 +181,7 @@ def solve_positive(matrix: Float[Tensor, "b 6 6"], right: Float[Tensor, "b 6 k"]
 
     The matrix is made sane before it is factorised: masking afterwards would leave gradients that are not finite.
     """
-    eye = torch.eye(6, dtype=matrix.dtype, device=matrix.device)
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     # A sum is finite only where every entry is.
     sane = torch.isfinite(matrix.sum((-1, -2)) + right.sum((-1, -2)))
     with torch.no_grad():
@@ -185,13 +194,13 @@ def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
     """The Levenberg-Marquardt step, damped along the Hessian's diagonal."""
     diagonal = at.hessian.diagonal(dim1=-2, dim2=-1)
     # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is.
-    floor = 1e-9 * diagonal.amax(-1, keepdim=True) + 1e-12
+    floor = 1e-9 * diagonal + 1e-12
     damped = at.hessian + torch.diag_embed(diagonal * damping[:, None] + floor)
     return solve_positive(damped, -at.gradient[..., None])[0].squeeze(-1)
 
 
 def solve_pose(
-    problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig, from_prior: Float[Tensor, "b 6"] | None = None
+    problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig, from_prior: Float[Tensor, "b 12"] | None = None
 ) -> Linearisation:
     """Minimise each object's cost from ``T_start``: Levenberg-Marquardt with a damping of its own per object.
 
@@ -206,11 +215,11 @@ def solve_pose(
     rows = _as_rows(problem)
     T_cam_obj, damping = T_start, torch.full_like(T_start[:, 0, 0], config.damping)
     if from_prior is None:
-        from_prior = small_difference_about(problem.T_prior, T_start, problem.centre_obj)
+        from_prior = torch.cat([small_difference_about(problem.T_prior, T_start, problem.centre_obj), torch.zeros_like(problem.compensated)], -1)
     for _ in range(config.iterations):
         at = _linearise(problem, rows, T_cam_obj, from_prior, config.loss)
         step = _damped_step(at, damping)
-        T_next = move_about(T_cam_obj, cayley(step[:, :3]), step[:, 3:], problem.centre_obj)
+        T_next = move_about(T_cam_obj, cayley(step[:, :3]), step[:, 3:6], problem.centre_obj)
         # Steps add up to the offset from the prior, to second order.
         better = _cost(problem, rows, T_next, from_prior + step, config.loss) <= at.cost
         T_cam_obj = torch.where(better[:, None, None], T_next, T_cam_obj)

@@ -43,7 +43,7 @@ def explained_share(
     occupied = torch.zeros(len(contours.mask), columns * (image_size[0] // _CELL_PX + 3), dtype=torch.bool, device=contours.mask.device)
     cell, inside = _cells(matches.targets, image_size, columns)
     # Whatever does not count marks the corner cell, which no neighbour of an image cell is.
-    occupied = occupied.scatter(1, torch.where(matches.mask & inside, cell, 0), True)
+    occupied = occupied.scatter(1, torch.where(matches.mask & inside & (matches.weights > 0.3), cell, 0), True)
     cell, inside = _cells(contours.pixels, image_size, columns)
     step = torch.arange(-1, 2, device=cell.device)
     around = (step[:, None] * columns + step).flatten()

@@ -11,12 +11,13 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchtrack import lie, quality
-from torchtrack.alignment import Alignment, AlignmentResult, align, index_for
+from torchtrack.alignment import Alignment, AlignmentResult, align, gate_scale, index_for
 from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import ContourModel, Contours, group_by_model, mesh_contours, reproject
 from torchtrack.corners import Corners, detect_corners, no_corners
+from torchtrack.motion import initial_covariance, predict_covariance
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.flow import estimate_flow
@@ -46,6 +47,7 @@ class TrackerState:
 
     T_cam_obj: Float[Tensor, "b 4 4"]
     velocity: Float[Tensor, "b 6"]
+    covariance: Float[Tensor, "b 12 12"]
     t_us: Int[Tensor, "s"]
     last_event_us: Int[Tensor, "s h w"]
 
@@ -152,7 +154,7 @@ class Tracker(nn.Module):
                 raise PoseError(f"object '{name}' is behind the camera (depth {z:.3f} m): the z axis must point from the camera to the scene.")
         times = torch.as_tensor(t_us, dtype=torch.int64, device=T_cam_obj.device).expand(self.streams).clone()
         velocity = torch.zeros(len(T_cam_obj), 6, dtype=self.intrinsics.dtype, device=T_cam_obj.device)
-        return TrackerState(T_cam_obj.clone(), velocity, times, empty_last_event(self.streams, *self.image_size, device=T_cam_obj.device))
+        return TrackerState(T_cam_obj.clone(), velocity, initial_covariance(self.diameter_m, self.config.motion), times, empty_last_event(self.streams, *self.image_size, device=T_cam_obj.device))
 
     def forward(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """The same as :meth:`step`."""
@@ -172,9 +174,10 @@ class Tracker(nn.Module):
         start = self._predict(state, window_s)
         contours = self._extract(start.T_prior)
         corners = self._corners(contours, last_event_us, t_us, window_s)
-        index = index_for(contours, self.image_size, self.config)
+        scale = gate_scale(start, contours, self.config)
+        index = index_for(contours, self.image_size, self.config, float(scale.max()))
         observations = self._observe(start, index, events, corners, t_us)
-        aligned = align(start, contours, index, observations, self._extract, self.config)
+        aligned = align(start, contours, index, scale, observations, self._extract, self.config)
         return self._conclude(state, start, aligned, corners, last_event_us, t_us, window_s)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
@@ -191,10 +194,10 @@ class Tracker(nn.Module):
         T_start = state.T_cam_obj.to(velocity.dtype)
         T_prior = lie.retract_about(T_start, velocity * window_s[self.stream_index, None], self.centre_obj)
         solver = self.config.solver
-        sigma = velocity.new_tensor([solver.prior_rotation_rad] * 3 + [solver.prior_translation_m] * 3)
-        information = torch.diag(sigma.pow(-2) if solver.prior else torch.zeros_like(sigma)).expand(len(velocity), 6, 6)
+        covariance = predict_covariance(state.covariance, velocity, window_s[self.stream_index], self.diameter_m, self.config.motion)
+        information = (solver.observation_px**2 * torch.linalg.inv(covariance)).to(velocity.dtype)
         T_prior, usable = self._before_camera(T_prior)
-        return Alignment(T_prior, usable, information, torch.where(usable[:, None], velocity, 0), self.centre_obj, self.intrinsics, self.image_size)
+        return Alignment(T_prior, usable, information, covariance[:, :6, :6].to(velocity.dtype), torch.where(usable[:, None], velocity, 0), self.centre_obj, self.intrinsics, self.image_size)
 
     def _before_camera(self, T_cam_obj: Tensor) -> tuple[Tensor, Tensor]:
         """The poses with a harmless one in the place of those that are not finite or not before the camera, and which are."""
@@ -257,28 +260,28 @@ class Tracker(nn.Module):
         step = lie.small_difference_about(start.T_prior.double(), T_found, self.centre_obj.double()).to(velocity.dtype)
         status = quality.judge(share, count, quality.visible_share(contours, self.image_size), step, self.diameter_m, config.quality)
         status = torch.where(start.usable, status, int(quality.Status.DIVERGED))
-        failed = (status >= int(quality.Status.TOO_FEW_EVENTS))[:, None]
+        failed = (status >= int(quality.Status.LOST))[:, None]
         T_held = state.T_cam_obj
         if config.motion.without_events == "predict":
             T_held = torch.where(start.usable[:, None, None], lie.orthonormalise(start.T_prior.double()), T_held)
         T_cam_obj = torch.where(failed[..., None], T_held, T_found)
-        next_velocity = self._next_velocity(state, T_found, failed, share, window_s)
+        next_velocity, covariance = self._next_velocity(state, start, solution, failed, share, window_s)
         contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
         result = StepResult(t_us, T_cam_obj, status, share, contours, corners, count, solution, self.centre_obj)
-        return TrackerState(T_cam_obj, next_velocity, t_us, last_event_us), result
+        return TrackerState(T_cam_obj, next_velocity, covariance, t_us, last_event_us), result
 
-    def _next_velocity(self, state: TrackerState, T_found: Tensor, failed: Tensor, share: Tensor, window_s: Tensor) -> Tensor:
+    def _next_velocity(self, state: TrackerState, start: Alignment, solution: Linearisation, failed: Tensor, share: Tensor, window_s: Tensor) -> tuple[Tensor, Tensor]:
         """Velocity after a window: a running mean of what the poses moved, as far as events explain it."""
-        moved = lie.small_difference_about(state.T_cam_obj, T_found, self.centre_obj.double()).to(state.velocity.dtype)
         duration_s = window_s[self.stream_index, None].clamp(min=1e-6)
-        # A pose that events hardly explain says nothing of the motion.
-        trust = torch.where(share > self.config.quality.uncertain_below, share, 0)
-        gain = self.config.motion.velocity_gain * trust[:, None]
-        mixed = gain * moved / duration_s + (1 - gain) * state.velocity
-        # Coasting dies away: a pose that nothing confirms must not leave for good.
+        px = self.config.solver.observation_px
+        predicted = torch.linalg.inv(start.prior_information.double()) * px**2
+        posterior = torch.linalg.inv(solution.hessian.double()) * px**2
+        low, high = self.config.quality.lost_below, self.config.quality.uncertain_below
+        trust = torch.where(failed, 0, ((share[:, None] - low) / (high - low)).clamp(0, 1))
+        found = state.velocity + trust * solution.from_prior[:, 6:]
         fading = torch.exp(-duration_s / self.config.motion.coast_s)
-        kept = state.velocity * fading if self.config.motion.without_events == "predict" else torch.zeros_like(mixed)
-        return torch.where(failed, kept, mixed)
+        mixed = predicted + trust[..., None] * (posterior - predicted)
+        return torch.where(failed, state.velocity * fading, found), mixed
 
 
 def _check_setup(objects: Sequence[ObjectModel], cameras: list[Camera], streams: list[int], config: TrackerConfig) -> None:

@@ -82,6 +82,8 @@ class MatchingConfig(Settings):
         "normal", description="Distance normal to the contour, along the corner's flow, or to the matched point in both coordinates."
     )
     gates_px: tuple[float, ...] = Field((5.0, 2.5, 1.5, 1.2), min_length=1, description="One round of matching and solving per gate (px).")
+    max_gate_px: float = Field(16.0, gt=0, description="The first gate opens up to this where the prediction is uncertain (px).")
+    gate_sigmas: float = Field(3.0, gt=0, description="Width of the first gate, in standard deviations of the prediction in the image.")
     index_cell_px: int = Field(2, ge=1, le=4, description="Cell of the index of nearest contour points (px).")
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
@@ -108,6 +110,7 @@ class SolverConfig(Settings):
     loss: Literal["tukey", "huber", "none"] = Field("tukey", description="Robust loss, with the round's gate as its scale.")
     damping: float = Field(1e-6, ge=0, description="Initial damping, as a share of the Hessian's diagonal.")
     prior: bool = Field(True, description="Hold the pose near the predicted one.")
+    observation_px: float = Field(1.5, gt=0, description="Standard deviation of one observation (px), with its share of what all have in common.")
     prior_rotation_rad: float = Field(0.006, gt=0, description="Standard deviation of the prediction's rotation (rad), per 1 px of residual noise.")
     prior_translation_m: float = Field(0.003, gt=0, description="Standard deviation of the prediction's translation (m), per 1 px of residual noise.")
 
@@ -116,9 +119,14 @@ class MotionConfig(Settings):
     """Prediction of the next pose."""
 
     model: Literal["constant_velocity", "hold"] = Field("constant_velocity", description="Carry the velocity on, or start from the last pose.")
+    initial_shift: float = Field(0.02, gt=0, description="Standard deviation of the initial pose (diameters).")
+    initial_speed_m_s: float = Field(1.0, gt=0, description="Standard deviation of the initial speed (m/s).")
+    acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
+    acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
+    drift_m_s: float = Field(0.0, ge=0, description="Further uncertainty of each predicted pose (m/s).")
     velocity_gain: float = Field(0.6, gt=0, le=1, description="Share of a new window in the velocity.")
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
-    coast_s: float = Field(0.02, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
+    coast_s: float = Field(0.1, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
 
 
 class QualityConfig(Settings):
