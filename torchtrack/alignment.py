@@ -99,6 +99,8 @@ def align(
     observations: Observations,
     extract: Callable[[Float[Tensor, "b 4 4"]], Contours],
     config: TrackerConfig,
+    T_cam_obj: Tensor | None = None,
+    from_prior: Tensor | None = None,
 ) -> AlignmentResult:
     """Match and solve, one round per gate.
 
@@ -106,11 +108,13 @@ def align(
         contours: visible contours at ``start.T_prior``, and ``index`` of them.
         extract: makes contours at a pose anew, in the rounds that ``config.contours.refresh_rounds`` names.
     """
-    T_cam_obj, from_prior = start.T_prior, torch.zeros_like(start.velocity.repeat(1, 2))
+    if T_cam_obj is None:
+        T_cam_obj, from_prior = start.T_prior, torch.zeros_like(start.velocity.repeat(1, 2))
+    start_now = replace(start, velocity=start.velocity + from_prior[:, 6:])
     compensate = 1.0 if config.matching.motion_compensation else 0.0
-    plane = compensate * start.plane_velocity(observations.pixels)
+    plane = compensate * start_now.plane_velocity(observations.pixels)
     belief = Belief.from_velocity(plane)
-    velocity = compensate * start.contour_velocity(contours)
+    velocity = compensate * start_now.contour_velocity(contours)
     rounds = len(config.matching.gates_px)
     for number, base_px in enumerate(config.matching.gates_px):
         widen = scale ** (1 - number / max(rounds - 1, 1))

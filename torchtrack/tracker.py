@@ -24,6 +24,7 @@ from torchtrack.flow import estimate_flow
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import Observations, corner_observations, join, select_events
 from torchtrack.pose_solver import Linearisation
+from torchtrack.search import search
 from torchtrack.splat import splat_contours
 from torchtrack.time_surface import at_pixels, empty_last_event, object_regions, time_surface, update_last_event
 from torchtrack.visibility import Scene, remove_hidden
@@ -178,7 +179,8 @@ class Tracker(nn.Module):
         index = index_for(contours, self.image_size, self.config, float(scale.max()))
         observations = self._observe(start, index, events, corners, t_us)
         aligned = align(start, contours, index, scale, observations, self._extract, self.config)
-        return self._conclude(state, start, aligned, corners, last_event_us, t_us, window_s)
+        aligned, share, count = self._search(start, aligned, events, t_us, scale)
+        return self._conclude(share, count, state, start, aligned, corners, last_event_us, t_us, window_s)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""
@@ -248,14 +250,37 @@ class Tracker(nn.Module):
         mask = window.mask[self.stream_index]
         return join(seen, select_events(pixels, age_s, polarity, mask, index, start.plane_velocity(pixels), count))
 
+    def _search(self, start, aligned, events, t_us, scale):
+        velocity = start.contour_velocity(aligned.contours)
+        share = quality.explained_share(aligned.contours, aligned.matches, velocity, self.image_size, self.config.quality.min_speed_px_s)
+        count = aligned.matches.mask.sum(-1)
+        wanted = (scale >= self.config.search.from_sigma_px * self.config.matching.gate_sigmas / self.config.matching.gates_px[0]) | (share < self.config.search.below_share) & (scale>1)
+        for k in wanted.nonzero()[:, 0].tolist() if self.config.search.hypotheses else []:
+            window = pad_streams(events, self.streams, t_us)
+            stream = torch.arange(self.streams, device=t_us.device)[:, None]
+            pixels = at_pixels(self.ideal_pixels, stream, window.x, window.y)[self.stream_index]
+            age_s = window.age_us[self.stream_index].to(pixels.dtype) * 1e-6
+            polarity = 2.0 * window.polarity[self.stream_index].to(pixels.dtype) - 1.0
+            covariance = torch.linalg.inv(start.prior_information[k].double()) * self.config.solver.observation_px**2
+            shares, numbers, many = search(self, start, k, covariance, pixels, age_s, polarity, window.mask[self.stream_index], self.config.search.hypotheses)
+            best = int(shares.argmax())
+            mine = float(share[k]) if count[k] >= self.config.quality.min_observations else 0.0
+            if float(shares[best]) > mine + 0.05:
+                put = lambda a, b: torch.cat([a[:k], b[best : best + 1], a[k + 1 :]])
+                s, m = aligned.solution, many.solution
+                solution = Linearisation(*(put(getattr(s, f), getattr(m, f)) for f in vars(s)))
+                pad = lambda t, n: torch.cat([t, t.new_zeros(t.shape[0], n - t.shape[1], *t.shape[2:])], 1)
+                contours = Contours(*(put(getattr(aligned.contours, f), pad(getattr(many.contours, f), aligned.contours.mask.shape[1])) for f in vars(aligned.contours)))
+                aligned = AlignmentResult(solution, contours, aligned.matches)
+                share, count = put(share, shares), put(count, numbers)
+        return aligned, share, count
+
     def _conclude(
-        self, state: TrackerState, start: Alignment, aligned: AlignmentResult, corners: Corners, last_event_us: Tensor, t_us: Tensor, window_s: Tensor
+        self, share, count, state: TrackerState, start: Alignment, aligned: AlignmentResult, corners: Corners, last_event_us: Tensor, t_us: Tensor, window_s: Tensor
     ) -> tuple[TrackerState, StepResult]:
         """Judge every object, hold those that failed, and make the next state."""
         config, solution, contours = self.config, aligned.solution, aligned.contours
-        velocity = start.contour_velocity(contours)
-        share = quality.explained_share(contours, aligned.matches, velocity, self.image_size, config.quality.min_speed_px_s)
-        count = aligned.matches.mask.sum(-1)
+        velocity = start.velocity
         T_found = lie.orthonormalise(solution.T_cam_obj.double())
         step = lie.small_difference_about(start.T_prior.double(), T_found, self.centre_obj.double()).to(velocity.dtype)
         status = quality.judge(share, count, quality.visible_share(contours, self.image_size), step, self.diameter_m, config.quality)

@@ -115,6 +115,14 @@ class SolverConfig(Settings):
     prior_translation_m: float = Field(0.003, gt=0, description="Standard deviation of the prediction's translation (m), per 1 px of residual noise.")
 
 
+class SearchConfig(Settings):
+    """Many poses tried where one prediction is too uncertain."""
+
+    hypotheses: int = Field(24, ge=0, le=1000, description="Poses tried at once; 0 switches the search off.")
+    from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
+    below_share: float = Field(0.5, ge=0, le=1, description="Share of the moving contour explained by events below which others are tried.")
+
+
 class MotionConfig(Settings):
     """Prediction of the next pose."""
 
@@ -152,4 +160,5 @@ class TrackerConfig(Settings):
     matching: MatchingConfig = MatchingConfig()
     solver: SolverConfig = SolverConfig()
     motion: MotionConfig = MotionConfig()
+    search: SearchConfig = SearchConfig()
     quality: QualityConfig = QualityConfig()
