@@ -41,6 +41,8 @@ class Matches:
     weights: Float[Tensor, "b n"]
     targets: Float[Tensor, "b n 2"]
     directions: Float[Tensor, "b n 2"]
+    offsets: Float[Tensor, "b n"]
+    near: Bool[Tensor, "b n"]
 
 
 @dataclass(frozen=True)
@@ -92,10 +94,10 @@ def match_nearest(
     matched = observations.mask & (found >= 0) & near
     motion = torch.where(matched[..., None], values[..., 4:8], belief.motion)
     weights = torch.ones_like(observations.age_s)
+    offsets, around = ((pixels - targets) * normals).sum(-1) / widen[:, None], observations.mask & (found >= 0)
     if config.concentration:
-        offsets = ((pixels - targets) * normals).sum(-1)
-        weights = concentration(offsets / widen[:, None], targets, observations.mask & (found >= 0), config)
-    return Matches(contour, matched, weights, targets, normals), Belief(motion)
+        weights = concentration(offsets, targets, around, config)
+    return Matches(contour, matched, weights, targets, normals, offsets, around), Belief(motion)
 
 
 def concentration(
@@ -108,16 +110,29 @@ def concentration(
     image, the share of the observations near a contour that are on it. No patch counts for nothing: one that is off the
     contour as a whole must still pull a pose back that has begun to slip.
     """
-    # Patches wrap around: no object is so large that two of its own would meet.
-    u, v = (targets / _PATCH_PX).floor().long().remainder(_PATCHES).unbind(-1)
-    cell = torch.add(u, v, alpha=_PATCHES)
-    distance = offsets.abs()
-    nothing = torch.zeros(len(offsets), _PATCHES**2, dtype=offsets.dtype, device=offsets.device)
-    near_count, on_count = (
-        nothing.scatter_add(1, cell, (near & (distance < limit)).to(offsets.dtype)).gather(1, cell) for limit in (_SMEAR_PX, _ON_CONTOUR_PX)
-    )
+    cell = patch(targets)
+    on_count, near_count = (count.gather(1, cell) for count in patch_counts(offsets, targets, near))
     share = (on_count + 1) / (near_count + 2)
     return ((share - config.smeared_share) / (config.gathered_share - config.smeared_share)).clamp(config.least_trust, 1)
+
+
+def patch(pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
+    """The patch of the image that each pixel lies in.
+
+    Patches wrap around: no object is so large that two of its own would meet.
+    """
+    u, v = (pixels / _PATCH_PX).floor().long().remainder(_PATCHES).unbind(-1)
+    return torch.add(u, v, alpha=_PATCHES)
+
+
+def patch_counts(
+    offsets: Float[Tensor, "b n"], targets: Float[Tensor, "b n 2"], near: Bool[Tensor, "b n"]
+) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b p"]]:
+    """Observations on a contour, and near one, in each patch."""
+    cell, distance = patch(targets), offsets.abs()
+    nothing = torch.zeros(len(offsets), _PATCHES**2, dtype=offsets.dtype, device=offsets.device)
+    on, around = (nothing.scatter_add(1, cell, (near & (distance < limit)).to(offsets.dtype)) for limit in (_ON_CONTOUR_PX, _SMEAR_PX))
+    return on, around
 
 
 def towards_dark(polarity: Float[Tensor, "b n"], normals: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
@@ -150,12 +165,13 @@ def match_along_flow(
     targets = observations.pixels + take_points(contour_velocity, contour) * observations.age_s[..., None]
     directions = heading if config.residual == "flow" else take_points(contours.normals, contour)
     mask = observations.mask & observations.has_flow & torch.isfinite(distance)
-    return Matches(contour, mask, torch.ones_like(targets[..., 0]), targets, directions)
+    offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
+    return Matches(contour, mask, torch.ones_like(targets[..., 0]), targets, directions, offsets, mask)
 
 
 def both_coordinates(matches: Matches) -> Matches:
     """The same matches with the distance in u and in v, as two observations each."""
     axes = torch.eye(2, dtype=matches.targets.dtype, device=matches.targets.device)
     directions = torch.cat([axes[axis].expand_as(matches.targets) for axis in range(2)], 1)
-    contour, mask, weights, targets = (torch.cat([v, v], 1) for v in (matches.contour, matches.mask, matches.weights, matches.targets))
-    return Matches(contour, mask, weights, targets, directions)
+    contour, mask, weights, targets, offsets, near = (torch.cat([getattr(matches, name)] * 2, 1) for name in ("contour", "mask", "weights", "targets", "offsets", "near"))
+    return Matches(contour, mask, weights, targets, directions, offsets, near)

@@ -12,11 +12,11 @@ from torch import Tensor
 from torchtrack.config.tracker import QualityConfig
 from torchtrack.contours import Contours
 from torchtrack.lie import hat
-from torchtrack.matching import Matches
+from torchtrack.matching import Matches, patch, patch_counts
 from torchtrack.pose_solver import Linearisation, solve_positive
 
-# Side of the cells in which observations count as explaining a contour (px).
-_CELL_PX = 4
+# A patch explains its contours when this many observations are on them, and this share of those near them.
+_MIN_ON_CONTOUR, _LEAST_SHARE = 3, 0.5
 # Fewer moving contour points than this say nothing.
 _MIN_MOVING_POINTS = 16
 
@@ -39,29 +39,23 @@ def explained_share(
 
     One where hardly anything moves: nothing speaks against the pose.
     """
-    columns = image_size[1] // _CELL_PX + 3
-    occupied = torch.zeros(len(contours.mask), columns * (image_size[0] // _CELL_PX + 3), dtype=torch.bool, device=contours.mask.device)
-    cell, inside = _cells(matches.targets, image_size, columns)
-    # Whatever does not count marks the corner cell, which no neighbour of an image cell is.
-    occupied = occupied.scatter(1, torch.where(matches.mask & inside & (matches.weights > 0.3), cell, 0), True)
-    cell, inside = _cells(contours.pixels, image_size, columns)
-    step = torch.arange(-1, 2, device=cell.device)
-    around = (step[:, None] * columns + step).flatten()
-    near = occupied.gather(1, (cell[..., None] + around).flatten(1).clamp(min=1)).view(*cell.shape, 9).any(-1)
+    inside = _inside(contours.pixels, image_size)
+    on_count, near_count = patch_counts(matches.offsets, matches.targets, matches.near)
+    cell = patch(contours.pixels)
+    on, near = on_count.gather(1, cell), near_count.gather(1, cell)
+    explained = (on >= _MIN_ON_CONTOUR) & (on + 1 > _LEAST_SHARE * (near + 2))
     speed = (contours.normals * contour_velocity).sum(-1).abs()
     moving = contours.mask & inside & (speed > min_speed_px_s)
     total = moving.sum(-1)
-    share = (moving & near).sum(-1) / total.clamp(min=1)
+    share = (moving & explained).sum(-1) / total.clamp(min=1)
     return torch.where(total < _MIN_MOVING_POINTS, 1.0, share).to(contours.pixels.dtype)
 
 
-def _cells(pixels: Tensor, image_size: tuple[int, int], columns: int) -> tuple[Tensor, Tensor]:
-    """Flat cell of each pixel, in a grid with a border of one cell, and whether it lies in the image."""
+def _inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """Which pixels lie in the image."""
     height, width = image_size
     u, v = pixels.unbind(-1)
-    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    cell = (v / _CELL_PX).floor() * columns + (u / _CELL_PX).floor() + columns + 1
-    return torch.where(inside, cell, columns + 1).long(), inside
+    return (u >= 0) & (v >= 0) & (u < width) & (v < height)
 
 
 def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
