@@ -262,7 +262,7 @@ class Tracker(nn.Module):
             age_s = window.age_us[self.stream_index].to(pixels.dtype) * 1e-6
             polarity = 2.0 * window.polarity[self.stream_index].to(pixels.dtype) - 1.0
             covariance = torch.linalg.inv(start.prior_information[k].double()) * self.config.solver.observation_px**2
-            shares, numbers, many = search(self, start, k, covariance, pixels, age_s, polarity, window.mask[self.stream_index], self.config.search.hypotheses)
+            shares, numbers, many = search(self, start, k, covariance, pixels, age_s, polarity, window.mask[self.stream_index], self.config.search.hypotheses, aligned.contours)
             best = int(shares.argmax())
             mine = float(share[k]) if count[k] >= self.config.quality.min_observations else 0.0
             if float(shares[best]) > mine + 0.05:

@@ -118,7 +118,8 @@ class SolverConfig(Settings):
 class SearchConfig(Settings):
     """Many poses tried where one prediction is too uncertain."""
 
-    hypotheses: int = Field(24, ge=0, le=1000, description="Poses tried at once; 0 switches the search off.")
+    drawn: int = Field(256, ge=0, description="Poses drawn and looked at.")
+    hypotheses: int = Field(8, ge=0, le=1000, description="Poses tried at once; 0 switches the search off.")
     from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
     below_share: float = Field(0.4, ge=0, le=1, description="Share of the moving contour explained by events below which others are tried.")
 
@@ -134,7 +135,7 @@ class MotionConfig(Settings):
     drift_m_s: float = Field(0.0, ge=0, description="Further uncertainty of each predicted pose (m/s).")
     velocity_gain: float = Field(0.6, gt=0, le=1, description="Share of a new window in the velocity.")
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
-    coast_s: float = Field(0.1, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
+    coast_s: float = Field(0.2, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
 
 
 class QualityConfig(Settings):
