@@ -180,7 +180,7 @@ class Tracker(nn.Module):
         observations = self._observe(start, index, events, corners, t_us)
         aligned = align(start, contours, index, scale, observations, self._extract, self.config)
         aligned, share, count = self._search(start, aligned, events, t_us, scale)
-        return self._conclude(share, count, state, start, aligned, corners, last_event_us, t_us, window_s)
+        return self._conclude(scale, share, count, state, start, aligned, corners, last_event_us, t_us, window_s)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""
@@ -276,7 +276,7 @@ class Tracker(nn.Module):
         return aligned, share, count
 
     def _conclude(
-        self, share, count, state: TrackerState, start: Alignment, aligned: AlignmentResult, corners: Corners, last_event_us: Tensor, t_us: Tensor, window_s: Tensor
+        self, scale, share, count, state: TrackerState, start: Alignment, aligned: AlignmentResult, corners: Corners, last_event_us: Tensor, t_us: Tensor, window_s: Tensor
     ) -> tuple[TrackerState, StepResult]:
         """Judge every object, hold those that failed, and make the next state."""
         config, solution, contours = self.config, aligned.solution, aligned.contours
@@ -285,24 +285,26 @@ class Tracker(nn.Module):
         step = lie.small_difference_about(start.T_prior.double(), T_found, self.centre_obj.double()).to(velocity.dtype)
         status = quality.judge(share, count, quality.visible_share(contours, self.image_size), step, self.diameter_m, config.quality)
         status = torch.where(start.usable, status, int(quality.Status.DIVERGED))
+        q = config.quality
+        needed = q.lost_below + (q.caught_above - q.lost_below) * (scale - 1).clamp(0, 1)
+        status = torch.where((share < needed) & (status < 2), int(quality.Status.LOST), status)
         failed = (status >= int(quality.Status.LOST))[:, None]
         T_held = state.T_cam_obj
         if config.motion.without_events == "predict":
             T_held = torch.where(start.usable[:, None, None], lie.orthonormalise(start.T_prior.double()), T_held)
         T_cam_obj = torch.where(failed[..., None], T_held, T_found)
-        next_velocity, covariance = self._next_velocity(state, start, solution, failed, share, window_s)
+        next_velocity, covariance = self._next_velocity(state, start, solution, failed, share, needed, window_s)
         contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
         result = StepResult(t_us, T_cam_obj, status, share, contours, corners, count, solution, self.centre_obj)
         return TrackerState(T_cam_obj, next_velocity, covariance, t_us, last_event_us), result
 
-    def _next_velocity(self, state: TrackerState, start: Alignment, solution: Linearisation, failed: Tensor, share: Tensor, window_s: Tensor) -> tuple[Tensor, Tensor]:
+    def _next_velocity(self, state: TrackerState, start: Alignment, solution: Linearisation, failed: Tensor, share: Tensor, needed: Tensor, window_s: Tensor) -> tuple[Tensor, Tensor]:
         """Velocity after a window: a running mean of what the poses moved, as far as events explain it."""
         duration_s = window_s[self.stream_index, None].clamp(min=1e-6)
         px = self.config.solver.observation_px
         predicted = torch.linalg.inv(start.prior_information.double()) * px**2
         posterior = torch.linalg.inv(solution.hessian.double()) * px**2
-        low, high = self.config.quality.lost_below, self.config.quality.uncertain_below
-        trust = torch.where(failed, 0, ((share[:, None] - low) / (high - low)).clamp(0, 1))
+        trust = torch.where(failed, 0, ((share - needed)[:, None] / 0.2).clamp(0, 1))
         found = state.velocity + trust * solution.from_prior[:, 6:]
         fading = torch.exp(-duration_s / self.config.motion.coast_s)
         mixed = predicted + trust[..., None] * (posterior - predicted)

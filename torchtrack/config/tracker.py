@@ -118,7 +118,7 @@ class SolverConfig(Settings):
 class SearchConfig(Settings):
     """Many poses tried where one prediction is too uncertain."""
 
-    drawn: int = Field(256, ge=0, description="Poses drawn and looked at.")
+    drawn: int = Field(1000, ge=0, description="Poses drawn and looked at.")
     hypotheses: int = Field(8, ge=0, le=1000, description="Poses tried at once; 0 switches the search off.")
     from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
     below_share: float = Field(0.4, ge=0, le=1, description="Share of the moving contour explained by events below which others are tried.")
@@ -128,7 +128,7 @@ class MotionConfig(Settings):
     """Prediction of the next pose."""
 
     model: Literal["constant_velocity", "hold"] = Field("constant_velocity", description="Carry the velocity on, or start from the last pose.")
-    initial_shift: float = Field(0.02, gt=0, description="Standard deviation of the initial pose (diameters).")
+    initial_shift: float = Field(0.005, gt=0, description="Standard deviation of the initial pose (diameters).")
     initial_speed_m_s: float = Field(0.5, gt=0, description="Standard deviation of the initial speed (m/s).")
     acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
@@ -145,6 +145,7 @@ class QualityConfig(Settings):
     min_visible_share: float = Field(0.2, ge=0, le=1, description="A smaller share of the contour inside the image: out of view.")
     uncertain_below: float = Field(0.4, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is uncertain.")
     lost_below: float = Field(0.2, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is lost.")
+    caught_above: float = Field(0.45, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object counts as found again.")
     min_speed_px_s: float = Field(30.0, ge=0, description="Contours moving slower than this across themselves need not fire (px/s).")
     max_step_rotation_rad: float = Field(0.5, gt=0, description="A larger rotation against the prediction within one window has diverged (rad).")
     max_step_translation: float = Field(0.5, gt=0, description="A larger move against the prediction within one window has diverged (diameters).")
