@@ -49,6 +49,7 @@ class TrackerState:
     T_cam_obj: Float[Tensor, "b 4 4"]
     velocity: Float[Tensor, "b 6"]
     covariance: Float[Tensor, "b 12 12"]
+    usual_share: Float[Tensor, "b"]
     t_us: Int[Tensor, "s"]
     last_event_us: Int[Tensor, "s h w"]
 
@@ -155,7 +156,7 @@ class Tracker(nn.Module):
                 raise PoseError(f"object '{name}' is behind the camera (depth {z:.3f} m): the z axis must point from the camera to the scene.")
         times = torch.as_tensor(t_us, dtype=torch.int64, device=T_cam_obj.device).expand(self.streams).clone()
         velocity = torch.zeros(len(T_cam_obj), 6, dtype=self.intrinsics.dtype, device=T_cam_obj.device)
-        return TrackerState(T_cam_obj.clone(), velocity, initial_covariance(self.diameter_m, self.config.motion), times, empty_last_event(self.streams, *self.image_size, device=T_cam_obj.device))
+        return TrackerState(T_cam_obj.clone(), velocity, initial_covariance(self.diameter_m, self.config.motion), torch.zeros_like(velocity[:, 0]), times, empty_last_event(self.streams, *self.image_size, device=T_cam_obj.device))
 
     def forward(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """The same as :meth:`step`."""
@@ -179,7 +180,7 @@ class Tracker(nn.Module):
         index = index_for(contours, self.image_size, self.config, float(scale.max()))
         observations = self._observe(start, index, events, corners, t_us)
         aligned = align(start, contours, index, scale, observations, self._extract, self.config)
-        aligned, share, count = self._search(start, aligned, events, t_us, scale)
+        aligned, share, count = self._search(state, start, aligned, events, t_us, scale)
         return self._conclude(scale, share, count, state, start, aligned, corners, last_event_us, t_us, window_s)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
@@ -250,11 +251,11 @@ class Tracker(nn.Module):
         mask = window.mask[self.stream_index]
         return join(seen, select_events(pixels, age_s, polarity, mask, index, start.plane_velocity(pixels), count))
 
-    def _search(self, start, aligned, events, t_us, scale):
+    def _search(self, state, start, aligned, events, t_us, scale):
         velocity = start.contour_velocity(aligned.contours)
         share = quality.explained_share(aligned.contours, aligned.matches, velocity, self.image_size, self.config.quality.min_speed_px_s)
         count = aligned.matches.mask.sum(-1)
-        wanted = (scale >= self.config.search.from_sigma_px * self.config.matching.gate_sigmas / self.config.matching.gates_px[0]) | (share < self.config.search.below_share) & (scale>1)
+        wanted = (share < self.config.search.dropped_to * state.usual_share) | (scale >= self.config.search.from_sigma_px * self.config.matching.gate_sigmas / self.config.matching.gates_px[0]) | (share < self.config.search.below_share) & (scale>1)
         for k in wanted.nonzero()[:, 0].tolist() if self.config.search.hypotheses else []:
             window = pad_streams(events, self.streams, t_us)
             stream = torch.arange(self.streams, device=t_us.device)[:, None]
@@ -262,10 +263,11 @@ class Tracker(nn.Module):
             age_s = window.age_us[self.stream_index].to(pixels.dtype) * 1e-6
             polarity = 2.0 * window.polarity[self.stream_index].to(pixels.dtype) - 1.0
             covariance = torch.linalg.inv(start.prior_information[k].double()) * self.config.solver.observation_px**2
+            covariance = covariance * (self.config.search.least_sigma_px / (float(scale[k]) * self.config.matching.gates_px[0] / self.config.matching.gate_sigmas)) ** 2 if scale[k] * self.config.matching.gates_px[0] / self.config.matching.gate_sigmas < self.config.search.least_sigma_px else covariance
             shares, numbers, many = search(self, start, k, covariance, pixels, age_s, polarity, window.mask[self.stream_index], self.config.search.hypotheses, aligned.contours)
             best = int(shares.argmax())
             mine = float(share[k]) if count[k] >= self.config.quality.min_observations else 0.0
-            if float(shares[best]) > mine + 0.05:
+            if float(shares[best]) > mine + 0.1:
                 put = lambda a, b: torch.cat([a[:k], b[best : best + 1], a[k + 1 :]])
                 s, m = aligned.solution, many.solution
                 solution = Linearisation(*(put(getattr(s, f), getattr(m, f)) for f in vars(s)))
@@ -293,10 +295,11 @@ class Tracker(nn.Module):
         if config.motion.without_events == "predict":
             T_held = torch.where(start.usable[:, None, None], lie.orthonormalise(start.T_prior.double()), T_held)
         T_cam_obj = torch.where(failed[..., None], T_held, T_found)
+        usual = torch.where(failed[:, 0], state.usual_share, state.usual_share + 0.1 * (share - state.usual_share))
         next_velocity, covariance = self._next_velocity(state, start, solution, failed, share, needed, window_s)
         contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
         result = StepResult(t_us, T_cam_obj, status, share, contours, corners, count, solution, self.centre_obj)
-        return TrackerState(T_cam_obj, next_velocity, covariance, t_us, last_event_us), result
+        return TrackerState(T_cam_obj, next_velocity, covariance, usual, t_us, last_event_us), result
 
     def _next_velocity(self, state: TrackerState, start: Alignment, solution: Linearisation, failed: Tensor, share: Tensor, needed: Tensor, window_s: Tensor) -> tuple[Tensor, Tensor]:
         """Velocity after a window: a running mean of what the poses moved, as far as events explain it."""
@@ -304,7 +307,7 @@ class Tracker(nn.Module):
         px = self.config.solver.observation_px
         predicted = torch.linalg.inv(start.prior_information.double()) * px**2
         posterior = torch.linalg.inv(solution.hessian.double()) * px**2
-        trust = torch.where(failed, 0, ((share - needed)[:, None] / 0.2).clamp(0, 1))
+        trust = torch.where(failed, 0, ((share - self.config.quality.lost_below)[:, None] / 0.2).clamp(0, 1))
         found = state.velocity + trust * solution.from_prior[:, 6:]
         fading = torch.exp(-duration_s / self.config.motion.coast_s)
         mixed = predicted + trust[..., None] * (posterior - predicted)

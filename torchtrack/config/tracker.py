@@ -121,6 +121,8 @@ class SearchConfig(Settings):
     drawn: int = Field(1000, ge=0, description="Poses drawn and looked at.")
     hypotheses: int = Field(8, ge=0, le=1000, description="Poses tried at once; 0 switches the search off.")
     from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
+    dropped_to: float = Field(0.8, ge=0, le=1, description="Share of the usual explained share below which others are tried.")
+    least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
     below_share: float = Field(0.4, ge=0, le=1, description="Share of the moving contour explained by events below which others are tried.")
 
 
