@@ -156,8 +156,11 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     along = (along * z0 / (z1 + along * (z0 - z1)).clamp(min=MIN_DEPTH_M)).clamp(0, 1)
     edge_start, edge_vector = take_points(start, edge), take_points(end - start, edge)
     points = edge_start + along[..., None] * edge_vector
-    tangents = torch.nn.functional.normalize(edge_vector, dim=-1)
     original = chosen.gather(1, edge)
+    # The normal in the image is to point out of the object: tangents turn with it on their right.
+    outward = model.face_normals[original].sum(2)
+    side = (torch.linalg.cross(edge_vector, outward, dim=-1) * (points - camera_obj[:, None])).sum(-1, keepdim=True)
+    tangents = torch.nn.functional.normalize(torch.where(side > 0, edge_vector, -edge_vector), dim=-1)
     kind = torch.where(model.is_sharp[original], int(ContourKind.CREASE), int(ContourKind.LIMB))
     kind = torch.where(model.is_segment[original], int(ContourKind.SEGMENT), kind)
     return points, tangents, kind, (cumulative[:, -1:] > 0).expand(-1, count)

@@ -97,6 +97,9 @@ def match_nearest(
     offsets, around = ((pixels - targets) * normals).sum(-1) / widen[:, None], observations.mask & (found >= 0)
     if config.concentration:
         weights = concentration(offsets, targets, around, config)
+    if config.polarity_floor < 1:
+        across = (normals * velocity).sum(-1)
+        weights = weights * agreement(observations.polarity * softsign(across / _SLOW_PX_S), offsets, targets, around, config)
     return Matches(contour, matched, weights, targets, normals, offsets, around), Belief(motion)
 
 
@@ -114,6 +117,14 @@ def concentration(
     on_count, near_count = (count.gather(1, cell) for count in patch_counts(offsets, targets, near))
     share = (on_count + 1) / (near_count + 2)
     return ((share - config.smeared_share) / (config.gathered_share - config.smeared_share)).clamp(config.least_trust, 1)
+
+
+def agreement(sign, offsets, targets, near, config):
+    cell = patch(targets)
+    on = (near & (offsets.abs() < _ON_CONTOUR_PX)).to(offsets.dtype)
+    nothing = torch.zeros(len(offsets), _PATCHES**2, dtype=offsets.dtype, device=offsets.device)
+    vote = nothing.scatter_add(1, cell, on * sign).gather(1, cell) / (nothing.scatter_add(1, cell, on).gather(1, cell) + 2)
+    return (1 + (sign * vote * config.polarity_gain).clamp(max=0)).clamp(min=config.polarity_floor)
 
 
 def patch(pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:

@@ -91,6 +91,8 @@ class MatchingConfig(Settings):
     smeared_share: float = Field(0.35, ge=0, lt=1, description="Share of observations on the contour at which a patch counts least.")
     gathered_share: float = Field(0.6, gt=0, le=1, description="Share of observations on the contour at which a patch counts in full.")
     least_trust: float = Field(0.02, ge=0, le=1, description="What a smeared patch still counts.")
+    polarity_floor: float = 0.05
+    polarity_gain: float = 1.5
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
