@@ -109,8 +109,8 @@ def align(
         extract: makes contours at a pose anew, in the rounds that ``config.contours.refresh_rounds`` names.
     """
     if T_cam_obj is None:
-        T_cam_obj, from_prior = start.T_prior, torch.zeros_like(start.velocity.repeat(1, 2))
-    start_now = replace(start, velocity=start.velocity + from_prior[:, 6:])
+        T_cam_obj, from_prior = start.T_prior, torch.zeros(len(start.velocity), 13).to(start.velocity)
+    start_now = replace(start, velocity=start.velocity + from_prior[:, 6:12])
     compensate = 1.0 if config.matching.motion_compensation else 0.0
     plane = compensate * start_now.plane_velocity(observations.pixels)
     belief = Belief.from_velocity(plane)
@@ -126,10 +126,10 @@ def align(
             belief = Belief.from_velocity(belief.motion[..., :2])
         matches, belief = _match(observations, contours, index, belief, velocity, gate_px, widen, config)
         rows = both_coordinates(matches) if config.matching.residual == "point" else matches
-        solution = solve_pose(_problem(start, rows, contours, gate_px, config, from_prior[:, 6:], observations.age_s), T_cam_obj, config.solver, from_prior)
+        solution = solve_pose(_problem(start, rows, contours, gate_px, config, from_prior[:, 6:12], observations.age_s), T_cam_obj, config.solver, from_prior)
         T_cam_obj, from_prior = solution.T_cam_obj, solution.from_prior
         contours = reproject(contours, T_cam_obj, start.intrinsics)
-        velocity = compensate * pixel_velocity(contours.points_cam, start.velocity + from_prior[:, 6:], start.centre_cam(T_cam_obj), start.intrinsics)
+        velocity = compensate * pixel_velocity(contours.points_cam, start.velocity + from_prior[:, 6:12], start.centre_cam(T_cam_obj), start.intrinsics)
     return AlignmentResult(solution, contours, matches)
 
 
@@ -166,4 +166,5 @@ def _problem(start: Alignment, matches: Matches, contours: Contours, gate_px: Te
         prior_information=start.prior_information,
         ages_s=ages_s,
         compensated=compensated,
+        swelling=take_points((contours.kind <= config.solver.swelling_kind).to(ages_s)[..., None], matches.contour)[..., 0],
     )

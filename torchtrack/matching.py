@@ -99,7 +99,8 @@ def match_nearest(
         weights = concentration(offsets, targets, around, config)
     if config.polarity_floor < 1:
         across = (normals * velocity).sum(-1)
-        weights = weights * agreement(observations.polarity * softsign(across / _SLOW_PX_S), offsets, targets, around, config)
+        outward = take_points((contours.kind <= 1).to(across)[..., None], contour)[..., 0]
+        weights = weights * agreement(outward * observations.polarity * softsign(across / _SLOW_PX_S), offsets, targets, around, config)
     return Matches(contour, matched, weights, targets, normals, offsets, around), Belief(motion)
 
 

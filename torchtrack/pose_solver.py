@@ -48,6 +48,7 @@ class PoseProblem:
     prior_information: Float[Tensor, "b 12 12"]
     ages_s: Float[Tensor, "b n"]
     compensated: Float[Tensor, "b 6"]
+    swelling: Float[Tensor, "b n"]
 
 
 @dataclass(frozen=True)
@@ -140,10 +141,10 @@ def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tenso
     along = torch.addcmul(gx * points_cam[:, 0], gy, points_cam[:, 1])
     centre_cam = torch.baddbmm(translation, rotation, problem.centre_obj[..., None])[..., 0]
     gz = -along * inverse_depth
-    difference = from_prior[:, 6:] - problem.compensated
+    difference = from_prior[:, 6:12] - problem.compensated
     x, y, z = (torch.linalg.cross(difference[:, :3, None].expand_as(points_cam), points_cam - centre_cam[..., None], dim=1) + difference[:, 3:, None]).unbind(1)
     moved = gx * x + gy * y + gz * z
-    return _Seen(points_cam, centre_cam, inverse_depth, (gx, gy), along, along - rows.offset - problem.ages_s * moved)
+    return _Seen(points_cam, centre_cam, inverse_depth, (gx, gy), along, along - rows.offset - problem.ages_s * moved + problem.swelling * from_prior[:, 12:])
 
 
 def _cost(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Tensor:
@@ -167,7 +168,7 @@ def _linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior:
     """:func:`linearise`, given what does not change from one iteration to the next."""
     seen = _see(problem, rows, T_cam_obj, from_prior)
     jacobian = pose_jacobian(seen.points_cam, seen.centre_cam, (*seen.gradient, -seen.along * seen.inverse_depth))
-    jacobian = torch.cat([jacobian, -problem.ages_s[:, None] * jacobian], 1)
+    jacobian = torch.cat([jacobian, -problem.ages_s[:, None] * jacobian, problem.swelling[:, None]], 1)
     value, robust = robust_loss(seen.residuals, problem.scale_px, loss)
     weighted = jacobian * (robust * problem.weights)[:, None]
     cost, pull = _with_prior(problem, value, from_prior)

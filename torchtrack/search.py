@@ -23,8 +23,8 @@ def offsets(covariance: Tensor, count: int) -> Tensor:
     pose = covariance[:6, :6]
     factor = torch.linalg.cholesky(pose)
     drawn = normal @ factor.T
-    carried = torch.linalg.solve(pose, covariance[:6, 6:])
-    return torch.cat([drawn, drawn @ carried], -1)
+    carried = torch.linalg.solve(pose, covariance[:6, 6:12])
+    return torch.cat([drawn, drawn @ carried, torch.zeros_like(drawn[:, :1])], -1)
 
 
 def repeated(model: ContourModel, count: int) -> ContourModel:
@@ -76,7 +76,7 @@ def search(tracker, start: Alignment, k: int, covariance: Tensor, pixels, age_s,
     row = lambda t: t[k : k + 1].expand(count, *t.shape[1:])
     T_start = lie.retract_about(row(start.T_prior), delta[:, :6], row(start.centre_obj))
     many = Alignment(row(start.T_prior), row(start.usable), row(start.prior_information), row(start.prior_covariance), row(start.velocity), row(start.centre_obj), row(start.intrinsics), start.image_size)
-    one = Alignment(T_start, many.usable, many.prior_information, many.prior_covariance, many.velocity + delta[:, 6:], many.centre_obj, many.intrinsics, many.image_size)
+    one = Alignment(T_start, many.usable, many.prior_information, many.prior_covariance, many.velocity + delta[:, 6:12], many.centre_obj, many.intrinsics, many.image_size)
 
     def extract(T: Tensor) -> Contours:
         contours = mesh_contours([model], T, many.intrinsics, config.contours)

@@ -198,7 +198,10 @@ class Tracker(nn.Module):
         T_prior = lie.retract_about(T_start, velocity * window_s[self.stream_index, None], self.centre_obj)
         solver = self.config.solver
         covariance = predict_covariance(state.covariance, velocity, window_s[self.stream_index], self.diameter_m, self.config.motion)
-        information = (solver.observation_px**2 * torch.linalg.inv(covariance)).to(velocity.dtype)
+        information = torch.zeros(len(covariance), 13, 13, dtype=torch.float64)
+        information[:, :12, :12] = torch.linalg.inv(covariance)
+        information[:, 12, 12] = solver.swelling_px ** -2
+        information = (solver.observation_px**2 * information).to(velocity.dtype)
         T_prior, usable = self._before_camera(T_prior)
         return Alignment(T_prior, usable, information, covariance[:, :6, :6].to(velocity.dtype), torch.where(usable[:, None], velocity, 0), self.centre_obj, self.intrinsics, self.image_size)
 
@@ -262,7 +265,7 @@ class Tracker(nn.Module):
             pixels = at_pixels(self.ideal_pixels, stream, window.x, window.y)[self.stream_index]
             age_s = window.age_us[self.stream_index].to(pixels.dtype) * 1e-6
             polarity = 2.0 * window.polarity[self.stream_index].to(pixels.dtype) - 1.0
-            covariance = torch.linalg.inv(start.prior_information[k].double()) * self.config.solver.observation_px**2
+            covariance = torch.linalg.inv(start.prior_information[k].double())[:12, :12] * self.config.solver.observation_px**2
             covariance = covariance * (self.config.search.least_sigma_px / (float(scale[k]) * self.config.matching.gates_px[0] / self.config.matching.gate_sigmas)) ** 2 if scale[k] * self.config.matching.gates_px[0] / self.config.matching.gate_sigmas < self.config.search.least_sigma_px else covariance
             shares, numbers, many = search(self, start, k, covariance, pixels, age_s, polarity, window.mask[self.stream_index], self.config.search.hypotheses, aligned.contours)
             best = int(shares.argmax())
@@ -306,9 +309,10 @@ class Tracker(nn.Module):
         duration_s = window_s[self.stream_index, None].clamp(min=1e-6)
         px = self.config.solver.observation_px
         predicted = torch.linalg.inv(start.prior_information.double()) * px**2
-        posterior = torch.linalg.inv(solution.hessian.double()) * px**2
+        posterior = torch.linalg.inv(solution.hessian.double())[:, :12, :12] * px**2
+        predicted = predicted[:, :12, :12]
         trust = torch.where(failed, 0, ((share - self.config.quality.lost_below)[:, None] / 0.2).clamp(0, 1))
-        found = state.velocity + trust * solution.from_prior[:, 6:]
+        found = state.velocity + trust * solution.from_prior[:, 6:12]
         fading = torch.exp(-duration_s / self.config.motion.coast_s)
         mixed = predicted + trust[..., None] * (posterior - predicted)
         return torch.where(failed, state.velocity * fading, found), mixed

@@ -113,6 +113,8 @@ class SolverConfig(Settings):
     damping: float = Field(1e-6, ge=0, description="Initial damping, as a share of the Hessian's diagonal.")
     prior: bool = Field(True, description="Hold the pose near the predicted one.")
     observation_px: float = Field(1.5, gt=0, description="Standard deviation of one observation (px), with its share of what all have in common.")
+    swelling_px: float = 0.2
+    swelling_kind: int = 0
     prior_rotation_rad: float = Field(0.006, gt=0, description="Standard deviation of the prediction's rotation (rad), per 1 px of residual noise.")
     prior_translation_m: float = Field(0.003, gt=0, description="Standard deviation of the prediction's translation (m), per 1 px of residual noise.")
 
