@@ -135,7 +135,7 @@ class MotionConfig(Settings):
 
     model: Literal["constant_velocity", "hold"] = Field("constant_velocity", description="Carry the velocity on, or start from the last pose.")
     initial_shift: float = Field(0.005, gt=0, description="Standard deviation of the initial pose (diameters).")
-    initial_speed_m_s: float = Field(0.5, gt=0, description="Standard deviation of the initial speed (m/s).")
+    initial_speed_m_s: float = Field(0.3, gt=0, description="Standard deviation of the initial speed (m/s).")
     acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
     drift_m_s: float = Field(0.0, ge=0, description="Further uncertainty of each predicted pose (m/s).")
