@@ -40,7 +40,7 @@ class Track:
     output: _Output = None
     """Folder for the results."""
     preset: _Preset = None
-    """Tracker settings to start from: default or paper."""
+    """Method to track with: default, paper, line, ls or nns."""
     models: _Models = None
     """Use a sequence's textured models where it has them, or geometry alone."""
     start_us: _Number = None

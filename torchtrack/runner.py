@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from torchtrack.baselines import tracker_class
 from torchtrack.config.load import as_yaml
 from torchtrack.config.run import RunConfig, TrackingConfig
 from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
@@ -30,14 +31,15 @@ OUTPUT_FILES = ("trajectory_*.tum", "poses.csv", "config.yaml", "summary.json", 
 
 
 def build_tracker(session: Session, config: TrackingConfig) -> Tracker:
-    """The tracker of a session's objects, on the configured device.
+    """The tracker of a session's objects, of the kind that the preset is for, on the configured device.
 
     Raises:
         ConfigError: if the device is not there.
+        ModelError: if the method cannot track one of the objects.
     """
     if config.device.startswith("cuda") and not torch.cuda.is_available():
         raise ConfigError(f"device: '{config.device}' was asked for, but PyTorch sees no CUDA device. Use cpu, or a CUDA build of torch.")
-    tracker = Tracker(list(session.models), session.camera, config.tracker, dtype=getattr(torch, config.dtype))
+    tracker = tracker_class(config.preset)(list(session.models), session.camera, config.tracker, dtype=getattr(torch, config.dtype))
     return tracker.to(config.device)
 
 

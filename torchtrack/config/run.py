@@ -82,7 +82,7 @@ class OverlayConfig(Settings):
 class TrackingConfig(Settings):
     """How objects are tracked: preset, tracker, arithmetic."""
 
-    preset: PresetName = Field("default", description="Tracker settings to start from.")
+    preset: PresetName = Field("default", description="Method, and tracker settings to start from.")
     tracker: TrackerConfig = Field(TrackerConfig(), description="Tracker settings that differ from the preset.")
     device: str = Field("cpu", pattern=r"^(cpu|cuda(:\d+)?)$", description="Where the tracker runs: cpu, cuda or cuda:N.")
     dtype: Literal["float32", "float64"] = Field("float32", description="Floating type of the tracker.")
