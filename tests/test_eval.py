@@ -9,11 +9,13 @@ from tiny_sequence import write_tiny_sequence
 
 from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.errors import ConfigError, MissingFileError
-from torchtrack.eval.evaluate import evaluate, find_sequences
+from torchtrack.eval.evaluate import evaluate
 from torchtrack.eval.metrics import PoseErrors, pose_errors, summarise
+from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table
 from torchtrack.io import Trajectory
 from torchtrack.lie import se3_interpolate, so3_exp
+from torchtrack.sinks.summary import finite
 
 KEYS = (
     *("sequence", "object", "method", "windows", "mean_rotation_deg", "mean_translation_cm", "median_rotation_deg"),
@@ -100,7 +102,7 @@ def test_evaluate_measures_every_sequence_object_and_method(folder, tmp_path):
     rows = list(csv.DictReader((tmp_path / "out" / "errors.csv").read_text().splitlines()))
     assert len(rows) == sum(entry["windows"] for entry in entries)
     assert len(done) == 4
-    assert results_table(evaluation.results).row_count == 6
+    assert results_table(evaluation).row_count == 6
 
 
 def test_a_sequence_that_fails_is_reported_and_the_rest_completes(folder, tmp_path):
@@ -116,7 +118,8 @@ def test_a_sequence_that_fails_is_reported_and_the_rest_completes(folder, tmp_pa
 def test_processes_give_the_same_as_one(folder, tmp_path):
     alone = evaluate(EvaluateConfig(paths=(folder,), jobs=1, output=tmp_path / "alone"))
     shared = evaluate(EvaluateConfig(paths=(folder,), jobs=2, output=tmp_path / "shared"))
-    assert [result.metrics for result in alone.results] == [result.metrics for result in shared.results]
+    # Peaks of a sequence this short are not known, and so not equal to themselves.
+    assert [finite(result.metrics.as_dict()) for result in alone.results] == [finite(result.metrics.as_dict()) for result in shared.results]
 
 
 def test_finding_sequences(folder, tmp_path):

@@ -1,11 +1,11 @@
 """What each command of the command line does, apart from parsing: settings in, work, tables out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from torchtrack.config.demo import DemoConfig
@@ -15,7 +15,8 @@ from torchtrack.config.load import load, read_yaml
 from torchtrack.config.run import RunConfig
 from torchtrack.config.settings import CommandLineText, Settings
 from torchtrack.eval.evaluate import evaluate as evaluate_all
-from torchtrack.eval.evaluate import find_sequences
+from torchtrack.eval.evaluate import plan, report_of
+from torchtrack.eval.grid import markdown
 from torchtrack.eval.tables import results_table, run_headline, run_table
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io import read_calibration
@@ -64,13 +65,33 @@ def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mappi
     if chosen is not None:
         config = config.model_copy(update={"methods": {label: config.methods[label] for label in chosen}})
     with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
-        bar = progress.add_task("sequences", total=len(find_sequences(config.paths)) * len(config.methods))
-        evaluation = evaluate_all(config, lambda job: progress.advance(bar))
-    console.print(results_table(evaluation.results))
+        planned = plan(config, _scene_progress(progress))
+        bar = progress.add_task("sequences", total=len(planned.jobs))
+        evaluation = evaluate_all(config, lambda job: progress.advance(bar), planned)
+    if report := report_of(evaluation, config, planned):
+        for grid in report.grids:
+            # As it is: markup and wrapping would break it.
+            console.print(markdown(grid), markup=False, no_wrap=True, overflow="ignore", crop=False, end="\n\n")
+    else:
+        console.print(results_table(evaluation))
+    for reason in dict.fromkeys(f"{entry.method}: {entry.reason}" for entry in evaluation.not_applicable):
+        console.print(f"- {reason}", markup=False)
     console.print(f"Results are in {config.output}")
     for failure in evaluation.failures:
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {failure.sequence} ({failure.method}): {failure.reason}", markup=False)
     return ExitCode.FAILED if evaluation.failures else ExitCode.DONE
+
+
+def _scene_progress(progress: Progress) -> Callable[[str, float], None]:
+    """Shows how far each scene is simulated."""
+    bars: dict[str, TaskID] = {}
+
+    def show(name: str, share: float) -> None:
+        if name not in bars:
+            bars[name] = progress.add_task(f"simulating {name}", total=1.0)
+        progress.update(bars[name], completed=share)
+
+    return show
 
 
 def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
