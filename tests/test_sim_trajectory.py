@@ -7,12 +7,20 @@ from pydantic import ValidationError
 
 from torchtrack.camera import Camera
 from torchtrack.lie import check_pose, rotation_angle_deg
-from torchtrack.sim.frames import frame_motion, frame_times, outer_points
+from torchtrack.sim.frames import frame_motion, frame_times
 from torchtrack.sim.meshes import make_mesh
 from torchtrack.sim.trajectory import MotionConfig, SinusoidMotion, ground_truth
+from torchtrack.sim.world import longest_way, outer_points
 
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
 CONFIG = MotionConfig(rotation_deg=(20.0, -40.0, 10.0), rotation_amplitude_deg=(30.0, 10.0, 0.0), frequency_hz=1.5)
+
+
+def way(motions, points):
+    """The furthest way of any point, as a function of times."""
+    return lambda t_s: np.maximum.reduce(
+        [longest_way(motion.pose(t_s), of_object, CAMERA).numpy() for motion, of_object in zip(motions, points, strict=True)]
+    )
 
 
 def seconds(*values):
@@ -66,12 +74,12 @@ def test_motion_settings_are_checked():
 def test_frames_adapt_to_motion(speed):
     motions = [SinusoidMotion.from_config(CONFIG, speed, seed) for seed in (0, 1)]
     points = [outer_points(make_mesh("lbracket")), outer_points(make_mesh("satellite"))]
-    t_us, worst_px = frame_times(motions, points, CAMERA, 400_000, 0.5)
+    t_us, worst_px = frame_times(way(motions, points), 400_000, 0.5)
     assert t_us[0] == 0
     assert t_us[-1] == 400_000
     assert np.diff(t_us).min() >= 1
     assert np.diff(t_us).max() <= 10_000
-    motion_px = frame_motion(motions, points, CAMERA, t_us)
+    motion_px = frame_motion(way(motions, points), t_us)
     assert motion_px.max() == worst_px <= 0.5
     # Frames are not wasted: they are evenly spread over the motion.
     assert np.median(motion_px) > 0.4
@@ -82,21 +90,21 @@ def test_frames_grow_in_number_with_speed():
     for speed in (1.0, 2.0):
         motion = SinusoidMotion.from_config(CONFIG, speed)
         duration_us = round(1e6 / speed)
-        counts.append(len(frame_times([motion], [outer_points(make_mesh("cube"))], CAMERA, duration_us, 0.5)[0]))
+        counts.append(len(frame_times(way([motion], [outer_points(make_mesh("cube"))]), duration_us, 0.5)[0]))
     # Twice as fast for half as long is the same way.
     assert counts[1] == pytest.approx(counts[0], rel=0.03)
 
 
 def test_without_motion_there_are_frames_all_the_same():
     motion = SinusoidMotion.from_config(CONFIG, speed=0.0)
-    t_us, worst_px = frame_times([motion], [outer_points(make_mesh("cube"))], CAMERA, 100_000, 0.5)
+    t_us, worst_px = frame_times(way([motion], [outer_points(make_mesh("cube"))]), 100_000, 0.5)
     assert worst_px == 0
     assert 11 <= len(t_us) <= 12
 
 
 def test_points_behind_the_camera_do_not_ask_for_frames():
     config = CONFIG.model_copy(update={"position_m": (0.0, 0.0, -1.0)})
-    t_us, _ = frame_times([SinusoidMotion.from_config(config)], [outer_points(make_mesh("cube"))], CAMERA, 100_000, 0.5)
+    t_us, _ = frame_times(way([SinusoidMotion.from_config(config)], [outer_points(make_mesh("cube"))]), 100_000, 0.5)
     assert 11 <= len(t_us) <= 12
 
 
@@ -104,5 +112,5 @@ def test_motion_is_the_furthest_way_of_a_vertex():
     motion = SinusoidMotion.from_config(MotionConfig(rotation_amplitude_deg=(0, 0, 0), translation_amplitude_m=(0.1, 0, 0)))
     t_us = np.array([0, 1000, 3000])
     x = motion.pose(torch.from_numpy(t_us) * 1e-6)[:, 0, 3]
-    way = frame_motion([motion], [torch.tensor([[0.0, 0, 0], [0, 0, -0.2], [0, 0, 0.2]], dtype=torch.float64)], CAMERA, t_us)
-    assert way == pytest.approx(600 * torch.diff(x).abs().numpy() / 0.5)
+    points = torch.tensor([[0.0, 0, 0], [0, 0, -0.2], [0, 0, 0.2]], dtype=torch.float64)
+    assert frame_motion(way([motion], [points]), t_us) == pytest.approx(600 * torch.diff(x).abs().numpy() / 0.5)

@@ -8,6 +8,9 @@ Layout of ``NAME.npz`` (numpy, no pickle):
 ``labels mesh_files`` one per object; the mesh files lie beside the sequence, in metres
 ``poses pose_t``      ``[P, 4, 4]`` or ``[O, P, 4, 4]`` object to camera, and their times in µs ``[P]`` (optional)
 ``meta``              JSON text (optional)
+``velocity``          ``[O, P, 6]`` rad/s and m/s at ``pose_t``: ``dT/dt = ξ^ T`` (optional; of the simulator)
+``source``            per event: number of its object or occluder, -1 background, -2 noise (optional; of the simulator)
+``occluder_poses``    as ``poses``, with ``occluder_labels``: what moves through and is not tracked (optional)
 ===================== ==================================================================================
 
 A ``NAME_LABEL_textured.glb`` beside it is the same object with its texture.
@@ -18,6 +21,7 @@ import os
 import re
 import tempfile
 import zipfile
+from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -160,6 +164,7 @@ def write_sequence(
     trajectories: ListOf[Trajectory],
     meta: dict[str, Any],
     textured: ListOf[trimesh.Trimesh | trimesh.Scene | None] | None = None,
+    extra: Mapping[str, np.ndarray] | None = None,
 ) -> None:
     """Write a sequence and its meshes (``NAME_LABEL.ply``, ``NAME_LABEL_textured.glb``) as :func:`read_sequence` reads it.
 
@@ -174,6 +179,7 @@ def write_sequence(
         trajectories: the true poses, one per object, all at the same times.
         meta: what JSON can hold.
         textured: one textured mesh (or None) per object, where there are any.
+        extra: further arrays by name; a name of the layout is not replaced.
 
     Raises:
         EventDataError: if events are unsorted or outside the sensor, labels are unfit, or the counts disagree.
@@ -185,6 +191,7 @@ def write_sequence(
     check_events(EventBatch.from_numpy(x, y, t_us, polarity), camera.width, camera.height, str(path))
     mesh_files = [f"{path.stem}_{label}.ply" for label in labels]
     arrays: dict[str, Any] = {
+        **(extra or {}),
         "t": np.asarray(t_us, np.int64),
         "x": np.asarray(x, np.uint16),
         "y": np.asarray(y, np.uint16),

@@ -20,8 +20,9 @@ A sequence in one go::
 ========================= ============================================================================
 """
 
-from torchtrack.sim.event_camera import EventCamera, EventCameraConfig
+from torchtrack.sim.event_camera import EventCamera
 from torchtrack.sim.scenes import BackgroundConfig, CameraConfig, ObjectConfig, SceneConfig
+from torchtrack.sim.sensor_profiles import EventCameraConfig
 from torchtrack.sim.simulation import SimulatedSequence, simulate, write
 from torchtrack.sim.trajectory import MotionConfig, SinusoidMotion, ground_truth
 

@@ -17,6 +17,7 @@ move in steps of ``1/n``, and the events of a slow upright edge would come in bu
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -40,7 +41,7 @@ class RenderConfig(Settings):
     supersampling: int = Field(4, ge=1, le=8, description="Samples per pixel along each axis.")
     lens_blur_px: float = Field(0.4, ge=0, le=5, description="Standard deviation of the lens blur, pixels.")
     near_m: float = Field(0.01, gt=0, description="Surfaces nearer than this are not drawn, m.")
-    light_direction: tuple[float, float, float] = Field((-0.4, -0.7, -0.6), description="Direction towards the light, camera frame.")
+    light_direction: tuple[float, float, float] = Field((-0.4, -0.7, -0.6), description="Direction towards the light, world frame.")
     ambient: float = Field(0.35, ge=0, le=1, description="Share of light that comes from everywhere.")
     diffuse: float = Field(0.65, ge=0, le=1, description="Share of light that comes from the light's direction.")
 
@@ -97,6 +98,21 @@ class Frame:
     regions: tuple[Region, ...]
 
 
+@dataclass(frozen=True)
+class Scenery:
+    """What may differ from image to image beside the poses.
+
+    Args:
+        background: luminance, linear; None for that of the renderer.
+        light_direction: towards the light, camera frame; None for that of the config.
+        brightness: multiplies all light.
+    """
+
+    background: Float[ndarray, "h w"] | None = None
+    light_direction: tuple[float, float, float] | None = None
+    brightness: float = 1.0
+
+
 def plain_background(width: int, height: int, luminance: float) -> Float[ndarray, "h w"]:
     """An even background."""
     return np.full((height, width), luminance, dtype=np.float32)
@@ -124,23 +140,26 @@ class Renderer:
         self.camera, self.config = camera, config or RenderConfig()
         _check_inputs(objects, camera, background)
         self._scene: Scene = merge_objects(objects)
-        self._sharp_background = np.ascontiguousarray(background, dtype=np.float32)
+        self._first_background = np.ascontiguousarray(background, dtype=np.float32)
+        self._sharp_background = self._first_background
         self._background = self._blur(self._sharp_background)
         self._offsets = sample_offsets(self.config.supersampling)
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, self.config.near_m])
-        light = np.array(self.config.light_direction)
-        self._lighting = self._shading.Lighting(
-            self.config.ambient, self.config.diffuse, (light / max(np.linalg.norm(light), 1e-12)).astype(np.float32)
-        )
+        self._lighting = self._light_from(self.config.light_direction)
 
-    def render(self, T_cam_obj: Float[ndarray, "o 4 4"] | Float[Tensor, "o 4 4"]) -> Frame:
+    def render(self, T_cam_obj: Float[ndarray, "o 4 4"] | Float[Tensor, "o 4 4"], scenery: Scenery | None = None) -> Frame:
         """One image of all objects at their poses; parts behind the camera or outside the image are left out.
+
+        Args:
+            T_cam_obj: one pose per object.
+            scenery: what differs from the background and light that the renderer was made with.
 
         Raises:
             PoseError: if there is not one pose per object, or one is not finite.
         """
         T_cam_obj = np.asarray(T_cam_obj, dtype=np.float64)
         _check_poses(T_cam_obj, len(self._scene.object_faces))
+        self._set(scenery or Scenery())
         corners, normals = self._scene.at_poses(T_cam_obj)
         boxes = [self._box(corners[faces]) for faces in self._scene.object_faces]
         regions = merge_regions([box for box in boxes if box is not None])
@@ -151,7 +170,21 @@ class Renderer:
             inside = [faces for faces, box in zip(self._scene.object_faces, boxes, strict=True) if box is not None and box.overlaps(region)]
             ranges = np.array([[faces.start, faces.stop] for faces in inside])
             self._render_region(region, ranges, corners, normals, luminance, depth, object_index)
+        if scenery is not None and scenery.brightness != 1:
+            luminance *= np.float32(scenery.brightness)
         return Frame(luminance, depth, object_index, regions)
+
+    def _light_from(self, direction: tuple[float, float, float]) -> Any:
+        """The light, from a direction in the camera's frame."""
+        light = np.array(direction)
+        return self._shading.Lighting(self.config.ambient, self.config.diffuse, (light / max(np.linalg.norm(light), 1e-12)).astype(np.float32))
+
+    def _set(self, scenery: Scenery) -> None:
+        """Background and light of the next image."""
+        background = self._first_background if scenery.background is None else scenery.background
+        if background is not self._sharp_background:
+            self._sharp_background, self._background = background, self._blur(background)
+        self._lighting = self._light_from(scenery.light_direction or self.config.light_direction)
 
     def _render_region(
         self, region: Region, ranges: ndarray, corners: ndarray, normals: ndarray, luminance: ndarray, depth: ndarray, object_index: ndarray

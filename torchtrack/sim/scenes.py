@@ -1,20 +1,21 @@
-"""Settings of a simulated scene: objects that move before a fixed camera."""
+"""Settings of a simulated scene: objects and a camera that move, what is behind and before them, light, sensor."""
 
 from typing import Literal
 
-import cv2
-import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
+import trimesh
 from pydantic import Field, model_validator
 
 from torchtrack.camera import Camera
 from torchtrack.config.settings import ConfigPath, Settings
-from torchtrack.errors import MissingFileError, UnknownFormatError
-from torchtrack.sim.event_camera import EVENT_CAMERA_PROFILES, EventCameraConfig
-from torchtrack.sim.render import RenderConfig, plain_background
-from torchtrack.sim.surface import grey_reflectance
-from torchtrack.sim.trajectory import MotionConfig
+from torchtrack.object_model.loading import checked_scale, join_parts, load_parts
+from torchtrack.sim.background import BackgroundConfig
+from torchtrack.sim.meshes import make_mesh
+from torchtrack.sim.render import RenderConfig
+from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
+from torchtrack.sim.trajectory import CameraMotionConfig, MotionConfig
+
+SPEEDS_PX_S = {"slow": 250.0, "normal": 750.0, "fast": 2250.0}
+"""Largest speed of any point of an object in the image, by name: what the shared development sequences have."""
 
 
 class CameraConfig(Settings):
@@ -34,62 +35,88 @@ class CameraConfig(Settings):
         return Camera(self.fx, self.fy, cx, cy, self.width, self.height)
 
 
-class BackgroundConfig(Settings):
-    """What is behind the objects; it does not move."""
-
-    luminance: float = Field(0.1, ge=0, le=1, description="Of a plain background, linear in light: 1 is white.")
-    image: ConfigPath | None = Field(None, description="An image instead, stretched to the sensor's size.")
-
-    def build(self, width: int, height: int) -> Float[ndarray, "h w"]:
-        """Luminance of every pixel, linear in light.
-
-        Raises:
-            MissingFileError: if the image is not there.
-            UnknownFormatError: if it cannot be read as an image.
-        """
-        if self.image is None:
-            return plain_background(width, height, self.luminance)
-        if not self.image.is_file():
-            raise MissingFileError(f"the background image '{self.image}' does not exist.")
-        image = cv2.imread(str(self.image), cv2.IMREAD_COLOR)
-        if image is None:
-            raise UnknownFormatError(f"'{self.image}' cannot be read as an image. Use PNG or JPEG.")
-        linear = grey_reflectance(image[..., ::-1]).astype(np.float32)
-        return cv2.resize(linear, (width, height), interpolation=cv2.INTER_AREA)
-
-
 class ObjectConfig(Settings):
     """One object: its shape, its look and its motion."""
 
     label: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$", description="Name, also in file names.")
-    shape: Literal["cube", "lbracket", "satellite", "book"] = Field(description="Which object.")
-    scale: float = Field(1.0, gt=0.05, le=20, description="Enlargement; at 1 the objects measure 10 to 25 cm.")
+    shape: Literal["cube", "lbracket", "satellite", "book", "wedge", "planar", "bar", "torus_knot", "vase", "mug", "animal", "robot"] | None = Field(
+        None, description="A built-in object; or give mesh."
+    )
+    mesh: ConfigPath | None = Field(None, description="PLY, OBJ, STL, GLB, glTF or OFF file, with its texture or colours.")
+    unit: Literal["m", "cm", "mm", "inch"] = Field("m", description="Unit of the mesh file's coordinates.")
+    scale: float = Field(1.0, gt=0.05, le=20, description="Enlargement; at 1 the built-in objects measure 10 to 25 cm.")
     reflectance: float = Field(0.6, gt=0, le=1, description="Share of light that an object without texture gives back.")
     gloss: float = Field(0.08, ge=0, le=2, description="Strength of the highlight.")
     motion: MotionConfig = Field(default_factory=MotionConfig, description="Mean pose and swing.")
+
+    @model_validator(mode="after")
+    def _one_model(self) -> "ObjectConfig":
+        if (self.shape is None) == (self.mesh is None):
+            raise ValueError("give either shape or mesh, exactly one of them")
+        return self
+
+    def build(self) -> trimesh.Trimesh:
+        """The mesh, in metres.
+
+        Raises:
+            MissingFileError, UnknownFormatError, ModelError: if there is something wrong with the mesh file.
+        """
+        if self.mesh is None:
+            return make_mesh(str(self.shape), self.scale)
+        mesh = join_parts(load_parts(self.mesh))
+        mesh.apply_scale(checked_scale(mesh.vertices, self.unit, self.label) * self.scale)
+        return mesh
+
+
+class LightConfig(Settings):
+    """How the light changes over time; its direction and strength at first are settings of ``render``."""
+
+    turn_deg_s: float = Field(0, ge=-36_000, le=36_000, description="How fast the light goes round the scene, degrees per second.")
+    turn_axis: tuple[float, float, float] = Field((0.0, 1.0, 0.0), description="Axis that it goes round, world frame.")
+    flicker_hz: float = Field(0, ge=0, le=2000, description="Frequency of a flicker, Hz; a lamp on 50 Hz mains flickers at 100.")
+    flicker_depth: float = Field(0, ge=0, lt=1, description="Its depth: brightness swings between 1 less and 1 plus this.")
 
 
 class SceneConfig(Settings):
     """A scene to simulate."""
 
     name: str = Field("scene", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$", description="Name, also in file names.")
-    objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="What moves.")
+    objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="What moves, and is tracked.")
+    occluders: tuple[ObjectConfig, ...] = Field((), description="What moves too, and is not tracked.")
     camera: CameraConfig = Field(default_factory=CameraConfig, description="The camera.")
+    camera_motion: CameraMotionConfig | None = Field(None, description="How the camera moves; at rest when not given.")
     duration_s: float = Field(1.0, gt=0, le=600, description="Duration, s.")
-    speed: float = Field(1.0, ge=0, le=20, description="Multiplies the frequency of every motion, and so every velocity.")
-    noise: Literal["ideal", "default"] = Field("default", description="Event camera profile: no imperfection, or those of a good sensor.")
+    speed: float = Field(1.0, ge=0, le=20, description="Multiplies every velocity.")
+    peak_speed: Literal["slow", "normal", "fast"] | float | None = Field(
+        None,
+        description="Largest speed of any point of an object in the image, px/s (slow: 250, normal: 750, fast: 2250); "
+        "objects and camera are sped up or slowed down to reach it, and speed must be 1.",
+    )
+    noise: Literal["ideal", "default", "realistic"] = Field(
+        "default", description="Event camera profile: no imperfection, those of a good sensor, or those of a sensor in poor light."
+    )
     event_camera: EventCameraConfig | None = Field(None, description="Event camera parameters, instead of a profile.")
     background: BackgroundConfig = Field(default_factory=BackgroundConfig, description="What is behind the objects.")
+    light: LightConfig = Field(default_factory=LightConfig, description="How the light changes.")
     render: RenderConfig = Field(default_factory=RenderConfig, description="Light and sampling.")
     seed: int = Field(0, ge=0, le=2**31, description="Of motions, thresholds and noise.")
     max_motion_px: float = Field(0.5, gt=0.01, le=2, description="Furthest way of any vertex between two frames, pixels.")
 
     @model_validator(mode="after")
-    def _labels_differ(self) -> "SceneConfig":
-        labels = [item.label for item in self.objects]
+    def _consistent(self) -> "SceneConfig":
+        labels = [item.label for item in (*self.objects, *self.occluders)]
         if len(set(labels)) != len(labels):
             raise ValueError(f"labels must differ, got {', '.join(labels)}")
+        if isinstance(self.peak_speed, float) and not 1 <= self.peak_speed <= 20_000:
+            raise ValueError(f"peak_speed must be between 1 and 20000 px/s, got {self.peak_speed}")
+        if self.peak_speed is not None and self.speed != 1:
+            raise ValueError("give speed or peak_speed, not both")
         return self
+
+    @property
+    def peak_speed_px_s(self) -> float | None:
+        """The largest speed asked for, px/s."""
+        return SPEEDS_PX_S[self.peak_speed] if isinstance(self.peak_speed, str) else self.peak_speed
 
     @property
     def event_camera_config(self) -> EventCameraConfig:
