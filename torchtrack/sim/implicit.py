@@ -19,6 +19,8 @@ Field = Callable[[Points], Float[ndarray, "*b"]]
 # Corners of a cell in the order of their bits (x: 1, y: 2, z: 4).
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])
 _NEWTON_STEPS = 6
+# Largest way of a vertex along each axis, in cells.
+_WITHIN_CELL = 0.49
 
 
 def sphere(centre: tuple[float, float, float], radius: float) -> Field:
@@ -118,15 +120,14 @@ def _crossed_cells(inside: ndarray) -> Int[ndarray, "n 3"]:
 
 
 def _on_surface(field: Field, points: Float[ndarray, "n 3"], cell_m: float) -> Float[ndarray, "n 3"]:
-    """Points moved along the field's gradient to where it is zero, by no more than a cell's diagonal."""
+    """Points, first in the middle of their cells, moved along the field's gradient to where it is zero."""
     start, step = points, 1e-3 * cell_m
     for _ in range(_NEWTON_STEPS):
         offsets = step * np.eye(3)
         gradient = np.stack([field(points + offset) - field(points - offset) for offset in offsets], -1) / (2 * step)
         points = points - field(points)[:, None] * gradient / np.maximum((gradient**2).sum(-1, keepdims=True), 1e-3)
-        moved = points - start
-        length = np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12)
-        points = start + moved * np.minimum(1, np.sqrt(3) / 2 * cell_m / length)
+        # Every vertex stays in its cell, so that no two meet.
+        points = start + np.clip(points - start, -_WITHIN_CELL * cell_m, _WITHIN_CELL * cell_m)
     return points
 
 

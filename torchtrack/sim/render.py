@@ -140,6 +140,8 @@ class Renderer:
         self.camera, self.config = camera, config or RenderConfig()
         _check_inputs(objects, camera, background)
         self._scene: Scene = merge_objects(objects)
+        self._planes = np.zeros((len(self._scene.corners), 3, 3))
+        self._buffers = np.empty(0, np.float32), np.empty(0, np.int32)
         self._first_background = np.ascontiguousarray(background, dtype=np.float32)
         self._sharp_background = self._first_background
         self._background = self._blur(self._sharp_background)
@@ -160,7 +162,7 @@ class Renderer:
         T_cam_obj = np.asarray(T_cam_obj, dtype=np.float64)
         _check_poses(T_cam_obj, len(self._scene.object_faces))
         self._set(scenery or Scenery())
-        corners, normals = self._scene.at_poses(T_cam_obj)
+        corners, normals, is_seen = self._placed(T_cam_obj)
         boxes = [self._box(corners[faces]) for faces in self._scene.object_faces]
         regions = merge_regions([box for box in boxes if box is not None])
         luminance = self._background.copy()
@@ -169,10 +171,18 @@ class Renderer:
         for region in regions:
             inside = [faces for faces, box in zip(self._scene.object_faces, boxes, strict=True) if box is not None and box.overlaps(region)]
             ranges = np.array([[faces.start, faces.stop] for faces in inside])
-            self._render_region(region, ranges, corners, normals, luminance, depth, object_index)
+            self._render_region(region, ranges, (corners, normals, is_seen), luminance, depth, object_index)
         if scenery is not None and scenery.brightness != 1:
             luminance *= np.float32(scenery.brightness)
         return Frame(luminance, depth, object_index, regions)
+
+    def _placed(self, T_cam_obj: Float[ndarray, "o 4 4"]) -> tuple[ndarray, ndarray, ndarray]:
+        """Corners and normals of all faces in the camera frame, and which faces can be seen."""
+        scene = self._scene
+        corners, normals = np.empty_like(scene.corners), np.empty(scene.normals.shape, np.float32)
+        is_seen = np.empty(len(corners), np.bool_)
+        self._rasterizer.place(scene.corners, scene.normals, scene.look["face_object"], T_cam_obj, scene.is_closed, corners, normals, is_seen)
+        return corners, normals, is_seen
 
     def _light_from(self, direction: tuple[float, float, float]) -> Any:
         """The light, from a direction in the camera's frame."""
@@ -187,21 +197,34 @@ class Renderer:
         self._lighting = self._light_from(scenery.light_direction or self.config.light_direction)
 
     def _render_region(
-        self, region: Region, ranges: ndarray, corners: ndarray, normals: ndarray, luminance: ndarray, depth: ndarray, object_index: ndarray
+        self,
+        region: Region,
+        ranges: ndarray,
+        placed: tuple[ndarray, ndarray, ndarray],
+        luminance: ndarray,
+        depth: ndarray,
+        object_index: ndarray,
     ) -> None:
         """Draw the faces of ``ranges`` (first, end) into one rectangle of the full images."""
+        corners, normals, is_seen = placed
         sharp = self._sharp_background[region.slices].copy()
-        samples = (len(self._offsets), *sharp.shape)
-        inverse_depth, face_index = np.empty(samples, np.float32), np.empty(samples, np.int32)
-        planes = np.zeros((len(corners), 3, 3))
+        inverse_depth, face_index = self._samples(sharp.shape)
         origin = np.array([region.left, region.top], dtype=np.float64)
-        self._rasterizer.draw(corners, ranges, self._intrinsics, origin, self._offsets, planes, inverse_depth, face_index)
+        self._rasterizer.draw(corners, ranges, is_seen, self._intrinsics, origin, self._offsets, self._planes, inverse_depth, face_index)
         surface = self._shading.Surface(normals=normals, **self._scene.look)
         self._shading.shade(
-            face_index, inverse_depth, planes, self._offsets, surface, self._lighting, self._intrinsics, origin,
+            face_index, inverse_depth, self._planes, self._offsets, surface, self._lighting, self._intrinsics, origin,
             sharp, depth[region.slices], object_index[region.slices],
         )  # fmt: skip
         luminance[region.slices] = self._blurred_region(sharp, region)
+
+    def _samples(self, shape: tuple[int, int]) -> tuple[ndarray, ndarray]:
+        """Room for inverse depth and face index ``[h, w, s]``, the same every time: new memory would cost more than the drawing."""
+        count = len(self._offsets) * shape[0] * shape[1]
+        if count > len(self._buffers[0]):
+            self._buffers = np.empty(count, np.float32), np.empty(count, np.int32)
+        inverse_depth, face_index = (buffer[:count].reshape(*shape, len(self._offsets)) for buffer in self._buffers)
+        return inverse_depth, face_index
 
     @property
     def _blur_radius(self) -> int:

@@ -153,15 +153,16 @@ def _events(
 def event_sources(events: EventBatch, is_noise: Bool[Tensor, "n"], before: Frame, after: Frame) -> Int[Tensor, "n"]:
     """What caused each event: who holds its pixel in either frame or, at an outline, a pixel beside it."""
     x, y = events.x.numpy(), events.y.numpy()
-    source = np.full(len(x), BACKGROUND, dtype=np.int16)
+    source = np.where(is_noise.numpy(), NOISE, BACKGROUND).astype(np.int16)
     for reach in range(_OUTLINE_REACH_PX + 1):
         for dy, dx in _ring(reach):
             for frame in (after, before):
                 open_ones = np.flatnonzero(source == BACKGROUND)
-                rows = np.clip(y[open_ones] + dy, 0, frame.object_index.shape[0] - 1)
-                columns = np.clip(x[open_ones] + dx, 0, frame.object_index.shape[1] - 1)
+                if not len(open_ones):
+                    return torch.from_numpy(source)
+                rows = (y[open_ones] + dy).clip(0, frame.object_index.shape[0] - 1)
+                columns = (x[open_ones] + dx).clip(0, frame.object_index.shape[1] - 1)
                 source[open_ones] = frame.object_index[rows, columns]
-    source[is_noise.numpy()] = NOISE
     return torch.from_numpy(source)
 
 

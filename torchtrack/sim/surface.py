@@ -47,6 +47,7 @@ class RenderObject:
         albedo: reflectance of the corners; it multiplies the texture.
         texture: reflectances ``[h, w]``; one texel where there is no texture.
         gloss: strength of the highlight.
+        is_closed: whether it is closed and wound outwards, so that the backs of its faces are never seen.
     """
 
     corners: Float[ndarray, "f 3 3"]
@@ -55,6 +56,7 @@ class RenderObject:
     albedo: Float[ndarray, "f 3"]
     texture: Float[ndarray, "h w"]
     gloss: float = 0.1
+    is_closed: bool = False
 
     @classmethod
     def from_mesh(
@@ -78,7 +80,13 @@ class RenderObject:
             uv = printed[1][faces] * [1, -1] + [0, 1]
         elif isinstance(mesh.visual, trimesh.visual.ColorVisuals) and mesh.visual.defined:
             albedo = grey_reflectance(np.asarray(mesh.visual.vertex_colors))[faces]
-        return cls(corners, corner_normals(corners, crease_angle_deg), uv, albedo, texture, gloss)
+        return cls(corners, corner_normals(corners, crease_angle_deg), uv, albedo, texture, gloss, _is_closed(mesh))
+
+
+def _is_closed(mesh: trimesh.Trimesh) -> bool:
+    """Whether the mesh is closed and wound outwards, once vertices at one place are joined."""
+    welded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    return bool(welded.is_watertight and welded.is_winding_consistent and welded.volume > 0)
 
 
 def _texture(mesh: trimesh.Trimesh) -> tuple[ndarray, ndarray] | None:
@@ -124,23 +132,15 @@ class Scene:
     Args:
         corners, normals: of every face, in the frame of its object.
         object_faces: which faces belong to each object.
+        is_closed: of each object (see :class:`RenderObject`).
         look: the other fields of :class:`torchtrack.sim.shading.Surface`.
     """
 
     corners: Float[ndarray, "f 3 3"]
     normals: Float[ndarray, "f 3 3"]
     object_faces: tuple[slice, ...]
+    is_closed: Bool[ndarray, "o"]
     look: dict[str, Any]
-
-    def at_poses(self, T_cam_obj: Float[ndarray, "o 4 4"]) -> tuple[Float[ndarray, "f 3 3"], Float[ndarray, "f 3 3"]]:
-        """Corners and normals in the camera frame; normals are turned so that both sides of a face are lit."""
-        corners, normals = np.empty_like(self.corners), np.empty_like(self.normals)
-        for faces, T in zip(self.object_faces, T_cam_obj, strict=True):
-            corners[faces] = self.corners[faces] @ T[:3, :3].T + T[:3, 3]
-            normals[faces] = self.normals[faces] @ T[:3, :3].T
-        area_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals *= np.where((area_normals * corners[:, 0]).sum(1) > 0, -1.0, 1.0)[:, None, None]
-        return corners, normals.astype(np.float32)
 
 
 def merge_objects(objects: Sequence[RenderObject]) -> Scene:
@@ -161,7 +161,8 @@ def merge_objects(objects: Sequence[RenderObject]) -> Scene:
         "gloss": np.repeat(np.array([item.gloss for item in objects], dtype=np.float32), counts),
     }
     slices = tuple(slice(int(end - count), int(end)) for end, count in zip(ends, counts, strict=True))
-    return Scene(np.concatenate([item.corners for item in objects]), normals, slices, look)
+    is_closed = np.array([item.is_closed for item in objects])
+    return Scene(np.concatenate([item.corners for item in objects]), normals, slices, is_closed, look)
 
 
 def _is_flat(normals: Float[ndarray, "f 3 3"]) -> Bool[ndarray, "f"]:
