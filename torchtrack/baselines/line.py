@@ -25,7 +25,7 @@ from torchtrack.tracker import StepResult, TrackerState
 # Deviation of the distance between an event and its line (px): much is common to the events of a line, so it is not small.
 _EVENT_PX = 4.0
 # Spectral density of the accelerations that the constant velocity does not foresee, (rad/s²)² s and (m/s²)² s.
-_TURNING, _MOVING = 30.0, 0.5
+_TURNING, _MOVING = 1000.0, 10.0
 # Deviations at the start: pose (rad, m) and velocity (rad/s, m/s).
 _FIRST_DEVIATIONS = (0.01, 0.005, 3.0, 0.5)
 # Events with a second line as near as this are of either (px).

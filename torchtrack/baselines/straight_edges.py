@@ -25,7 +25,7 @@ _PARALLEL_COSINE, _BENT_SHARE = np.cos(np.deg2rad(2.0)), 0.01
 _SAME_VERTEX = 1e-5
 # Points of a straight texture edge lie in a tube around their tangent (radius in diameters, cosine of their own tangents);
 # the least run is cut into pieces, of which so many must hold points: they lie about a hundredth of a diameter apart.
-_TUBE, _TUBE_COSINE, _PIECES, _FILLED_PIECES = 0.0025, np.cos(np.deg2rad(10.0)), 5, 4
+_TUBE, _TUBE_COSINE, _PIECES, _FILLED_PIECES = 0.0025, np.cos(np.deg2rad(10.0)), 8, 6
 # A camera looks from so many sides, from so far (diameters).
 _VIEWS, _VIEW_DISTANCE = 64, 3.0
 LEAST_STRAIGHT_SHARE = 0.5

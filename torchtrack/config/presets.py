@@ -59,10 +59,16 @@ def _ls() -> TrackerConfig:
 
 
 def _nns() -> TrackerConfig:
-    """Our corners alone, each with the nearest point of our contours: nothing is asked of the flow."""
+    """Our corners alone, each with the nearest point of our contours: nothing is asked of the flow.
+
+    There are fewer corners than events, so they lie closer, fewer do, and the gates are wider.
+    """
     return TrackerConfig(
-        corners=CornerConfig(max_corners=200),
-        matching=MatchingConfig(along_flow=False, residual="normal", max_events=0, concentration=False),
+        window=WindowConfig(duration_us=3_000),
+        corners=CornerConfig(max_corners=400, cell_px=5),
+        matching=MatchingConfig(along_flow=False, residual="normal", gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False),
+        solver=SolverConfig(iterations=2),
+        quality=QualityConfig(min_observations=10),
     )
 
 

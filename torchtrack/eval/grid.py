@@ -63,9 +63,10 @@ class Report:
 
 
 def headings(grid: Grid) -> list[str]:
-    """One heading per column: the texts above it, from the widest to its own."""
+    """One heading per column: the texts above it, from the widest to its own; above the names of the rows, the last alone."""
     rows = [[cell.text for cell in row for _ in range(cell.span)] for row in grid.header]
-    return [" ".join(text for text in column if text) for column in zip(*rows, strict=True)]
+    names, *columns = zip(*rows, strict=True)
+    return [names[-1], *(" ".join(text for text in column if text) for column in columns)]
 
 
 def markdown(grid: Grid) -> str:

@@ -19,6 +19,10 @@ from torchtrack.eval.results import Evaluation, ObjectResult
 _NAMES = {"line": "Line-Based", "ls": "LS-Based", "nns": "NNS-Based", "paper": "Ours"}
 _UNITS = "(δR in °, δT in cm)"
 _LOST_MARK, _LOST_SHARE = "†", 0.1
+_NOTES = (
+    "Published figures are the paper's own, on its own data; the others are this package's, on its own sequences.",
+    f"{_LOST_MARK} lost in {100 * _LOST_SHARE:.0f} % of the windows or more. - not made for such objects. Bold: the best of each kind.",
+)
 # Conditions of simulated sequences are part of a cell's name; real ones have one cell, and the condition says its kind.
 _REAL_TABLE = 3
 
@@ -109,12 +113,7 @@ def paper_report(evaluation: Evaluation, cells: Mapping[str, CellConfig], paths:
     tables = paper_tables()
     measured = {method: {name: _measured(evaluation, method, path.stem, cells[name].object) for name, path in paths.items()} for method in methods}
     rows = {table.number: _rows(table, measured) for table in tables}
-    notes = _notes(tables, paths)
-    grids = [
-        _grid(table, block, rows[table.number], notes if number == len(table.blocks) - 1 else ())
-        for table in tables
-        for number, block in enumerate(table.blocks)
-    ]
+    grids = [_grid(table, block, rows[table.number], paths) for table in tables for block in table.blocks]
     every = [cell for table in tables for block in table.blocks for cell in block]
     records = [_record(cell, row, paths) for cell in every for row in rows[cell.table] if _has_figures(row.entries.get(cell.name))]
     return Report((*grids, _means(tables, rows, set(paths))), tuple(records))
@@ -139,13 +138,13 @@ def _rows(table: PaperTable, measured: Mapping[str, Mapping[str, _Entry]]) -> li
         name = _NAMES.get(method)
         if name in table.methods:
             figures = {cell.name: _Entry(*cell.figures[name]) if name in cell.figures else _Entry(text="-") for cell in cells}
-            rows.append(_Row(f"{name} (paper)", name, True, figures))
+            rows.append(_Row(f"{name}, published", name, True, figures))
         if method in measured:
             rows.append(_Row(method, method, False, measured[method]))
     return rows
 
 
-def _grid(table: PaperTable, block: Sequence[PaperCell], rows: Sequence[_Row], notes: tuple[str, ...]) -> Grid:
+def _grid(table: PaperTable, block: Sequence[PaperCell], rows: Sequence[_Row], paths: Mapping[str, Path]) -> Grid:
     sequences = {cell.sequence: 2 * sum(other.sequence == cell.sequence for other in block) for cell in block}
     header = (
         (Cell("Sequence"), *(Cell(sequence, span) for sequence, span in sequences.items())),
@@ -154,7 +153,9 @@ def _grid(table: PaperTable, block: Sequence[PaperCell], rows: Sequence[_Row], n
     )
     first, last = block[0].sequence, block[-1].sequence
     title = f"Table {table.number}. {table.caption} {_UNITS}, sequences {first} to {last}."
-    return Grid(title, header, tuple(_grid_row(row, block, _best(rows, row.from_paper, block)) for row in rows), notes)
+    measured = ", ".join(f"{cell.name}: {paths[cell.name].stem}" for cell in block if cell.name in paths)
+    body = tuple(_grid_row(row, block, _best(rows, row.from_paper, block)) for row in rows)
+    return Grid(title, header, body, (f"Measured on {measured}.",) if measured else ("Nothing was measured for these.",))
 
 
 def _best(rows: Sequence[_Row], from_paper: bool, block: Sequence[PaperCell]) -> dict[str, tuple[float, float]]:
@@ -176,26 +177,17 @@ def _grid_row(row: _Row, block: Sequence[PaperCell], best: Mapping[str, tuple[fl
         if entry.rotation_deg is None or entry.translation_cm is None:
             cells += [Cell(entry.text), Cell(entry.text)]
             continue
+        figure = "{:.2f}".format if row.from_paper else _figure
         mark = _LOST_MARK if (entry.lost_fraction or 0) >= _LOST_SHARE else ""
         rotation, translation = best[cell.name]
-        cells.append(Cell(_figure(entry.rotation_deg) + mark, bold=entry.rotation_deg == rotation))
-        cells.append(Cell(_figure(entry.translation_cm) + mark, bold=entry.translation_cm == translation))
+        cells.append(Cell(figure(entry.rotation_deg) + mark, bold=entry.rotation_deg == rotation))
+        cells.append(Cell(figure(entry.translation_cm) + mark, bold=entry.translation_cm == translation))
     return tuple(cells)
 
 
 def _figure(value: float) -> str:
-    """Two decimals as in the paper, three where these would say little."""
+    """Two decimals as in the paper; three where these would say little."""
     return f"{value:.2f}" if value >= 1 else f"{value:.3f}"
-
-
-def _notes(tables: Sequence[PaperTable], paths: Mapping[str, Path]) -> tuple[str, ...]:
-    """What the marks mean, and what stands in each of our cells."""
-    known = ", ".join(f"{cell.name}: {paths[cell.name].stem}" for table in tables for block in table.blocks for cell in block if cell.name in paths)
-    return (
-        "Rows marked (paper) are the paper's own figures, on its own data; the others are this package's, on its own sequences.",
-        f"Measured: {known}.",
-        f"{_LOST_MARK} lost in {100 * _LOST_SHARE:.0f} % of the windows or more. - not made for such objects. Bold: the best, of the paper's and of ours.",
-    )
 
 
 def _means(tables: Sequence[PaperTable], rows: Mapping[int, Sequence[_Row]], measured: set[str]) -> Grid:
@@ -206,7 +198,7 @@ def _means(tables: Sequence[PaperTable], rows: Mapping[int, Sequence[_Row]], mea
         (Cell("Method"), *(Cell(name) for _ in tables for name in ("δR", "δT", "cells"))),
     )
     body = [(Cell(label), *(cell for table in tables for cell in _mean_cells(table, rows[table.number], label, measured))) for label in labels]
-    return Grid(f"Means over the cells that were measured {_UNITS}.", header, tuple(body))
+    return Grid(f"Means over the cells that were measured {_UNITS}.", header, tuple(body), _NOTES)
 
 
 def _mean_cells(table: PaperTable, rows: Sequence[_Row], label: str, measured: set[str]) -> list[Cell]:
