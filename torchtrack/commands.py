@@ -14,6 +14,7 @@ from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.config.load import load, read_yaml
 from torchtrack.config.run import RunConfig
 from torchtrack.config.settings import CommandLineText, Settings
+from torchtrack.errors import ConfigError
 from torchtrack.eval.evaluate import evaluate as evaluate_all
 from torchtrack.eval.evaluate import plan, report_of
 from torchtrack.eval.grid import markdown
@@ -23,8 +24,9 @@ from torchtrack.io import read_calibration
 from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines
 from torchtrack.runner import run
 from torchtrack.session import open_session
-from torchtrack.sim import SceneConfig, write
-from torchtrack.sim import simulate as simulate_scene
+from torchtrack.sim import SceneConfig
+from torchtrack.sim.suite import is_suite, run_suite, scenes_of, simulate_to_file
+from torchtrack.sim.video import VideoConfig, write_video_events
 from torchtrack.sinks.progress import ProgressBar
 
 # Tables need this much where the output is no terminal, which says how wide it is.
@@ -94,17 +96,38 @@ def _scene_progress(progress: Progress) -> Callable[[str, float], None]:
     return show
 
 
-def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
-    """Simulate a scene into a sequence; returns the exit code."""
-    path = _simulated(load(SceneConfig, Path(config_file), overrides), Path(output), quiet)
-    output_console().print(f"The sequence is in {path}")
+def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, jobs: int, preview: bool, quiet: bool) -> int:
+    """Simulate a scene into a sequence, or a suite into a folder; returns the exit code, which is not 0 where a scene failed."""
+    file, target = Path(config_file), Path(output)
+    if not is_suite(file) or (not file.is_dir() and "variant" in overrides):
+        scene = load(SceneConfig, file, overrides)
+        path = _simulated(scene, target if target.suffix else target / f"{scene.name}.npz", quiet, preview)
+        output_console().print(f"The sequence is in {path}")
+        return ExitCode.DONE
+    if target.suffix:
+        raise ConfigError(f"'{file}' holds several scenes: give a folder in place of '{target}', or choose one with --variant.")
+    scenes = scenes_of(file, overrides)
+    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
+        bars = {scene.name: progress.add_task(scene.name, total=1.0) for scene in scenes}
+        failures = run_suite(scenes, target, jobs, preview=preview, told=lambda name, share: progress.update(bars[name], completed=share))
+    output_console().print(f"{len(scenes) - len(failures)} of {len(scenes)} sequences are in {target}")
+    for failure in failures:
+        Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {failure.name}: {failure.reason}", markup=False)
+    return ExitCode.FAILED if failures else ExitCode.DONE
+
+
+def simulate_video(given: Mapping[str, Any], output: str, overrides: Mapping[str, Any]) -> int:
+    """Turn a video, or a folder of images, into events; returns the exit code."""
+    config = load(VideoConfig, None, {**given, **overrides})
+    count = write_video_events(config, Path(output))
+    output_console().print(f"{count} events are in {output}")
     return ExitCode.DONE
 
 
-def _simulated(scene: SceneConfig, path: Path, quiet: bool) -> Path:
+def _simulated(scene: SceneConfig, path: Path, quiet: bool, preview: bool = False) -> Path:
     with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
         bar = progress.add_task(f"simulating {scene.name}", total=1.0)
-        return write(simulate_scene(scene, lambda share: progress.update(bar, completed=share)), path)
+        return simulate_to_file(scene, path, lambda share: progress.update(bar, completed=share), preview=preview)
 
 
 def demo(config_file: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:

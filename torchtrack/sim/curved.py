@@ -70,6 +70,20 @@ def animal(cell_m: float = 0.0026) -> trimesh.Trimesh:
     return _centred(implicit.surface(implicit.union(*parts, blend=0.02), (-0.1, -0.09, -0.05), (0.115, 0.085, 0.05), cell_m))
 
 
+def duck(cell_m: float = 0.0028) -> trimesh.Trimesh:
+    """A bath duck: body, head, beak, wings and tail."""
+    parts = [
+        implicit.ellipsoid((0.0, 0.0, 0.0), (0.065, 0.040, 0.045)),
+        implicit.sphere((0.038, -0.058, 0.0), 0.031),
+        implicit.ellipsoid((-0.062, -0.028, 0.0), (0.022, 0.014, 0.018)),
+        implicit.ellipsoid((-0.008, -0.006, 0.042), (0.034, 0.020, 0.012)),
+        implicit.ellipsoid((-0.008, -0.006, -0.042), (0.034, 0.020, 0.012)),
+    ]
+    beak = implicit.ellipsoid((0.074, -0.052, 0.0), (0.018, 0.007, 0.016))
+    field = implicit.union(implicit.union(*parts, blend=0.015), beak, blend=0.004)
+    return _centred(implicit.surface(field, (-0.09, -0.095, -0.06), (0.1, 0.045, 0.06), cell_m))
+
+
 def robot(cell_m: float = 0.0025) -> trimesh.Trimesh:
     """A figure of capsules: body, head, arms and legs in a pose without symmetry."""
     limbs = [

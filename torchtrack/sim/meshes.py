@@ -190,6 +190,7 @@ SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
     "mug": curved.mug,
     "animal": curved.animal,
     "robot": curved.robot,
+    "duck": curved.duck,
 }
 
 

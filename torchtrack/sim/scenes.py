@@ -1,11 +1,12 @@
 """Settings of a simulated scene: objects and a camera that move, what is behind and before them, light, sensor."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import trimesh
 from pydantic import Field, model_validator
 
 from torchtrack.camera import Camera
+from torchtrack.config.merge import merged
 from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.object_model.loading import checked_scale, join_parts, load_parts
 from torchtrack.sim.background import BackgroundConfig
@@ -39,9 +40,9 @@ class ObjectConfig(Settings):
     """One object: its shape, its look and its motion."""
 
     label: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$", description="Name, also in file names.")
-    shape: Literal["cube", "lbracket", "satellite", "book", "wedge", "planar", "bar", "torus_knot", "vase", "mug", "animal", "robot"] | None = Field(
-        None, description="A built-in object; or give mesh."
-    )
+    shape: (
+        Literal["cube", "lbracket", "satellite", "book", "wedge", "planar", "bar", "torus_knot", "vase", "mug", "animal", "robot", "duck"] | None
+    ) = Field(None, description="A built-in object; or give mesh.")
     mesh: ConfigPath | None = Field(None, description="PLY, OBJ, STL, GLB, glTF or OFF file, with its texture or colours.")
     unit: Literal["m", "cm", "mm", "inch"] = Field("m", description="Unit of the mesh file's coordinates.")
     scale: float = Field(1.0, gt=0.05, le=20, description="Enlargement; at 1 the built-in objects measure 10 to 25 cm.")
@@ -101,6 +102,21 @@ class SceneConfig(Settings):
     render: RenderConfig = Field(default_factory=RenderConfig, description="Light and sampling.")
     seed: int = Field(0, ge=0, le=2**31, description="Of motions, thresholds and noise.")
     max_motion_px: float = Field(0.5, gt=0.01, le=2, description="Furthest way of any vertex between two frames, pixels.")
+    variants: dict[str, dict[str, Any]] = Field({}, description="By name: settings that differ; each variant is a scene NAME_VARIANT.")
+    variant: str | None = Field(None, description="The variant to take; by default what is given outside of all.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_variant(cls, values: Any) -> Any:
+        """Lay the chosen variant over the rest; what remains is a scene without variants."""
+        if not isinstance(values, dict) or not isinstance(variants := values.get("variants") or {}, dict):
+            return values
+        name, rest = values.get("variant"), {key: value for key, value in values.items() if key not in ("variant", "variants")}
+        if name is None:
+            return rest
+        if not isinstance(variants.get(name), dict):
+            raise ValueError(f"variant: there is none called '{name}' ({', '.join(variants) or 'the scene has none'})")
+        return {**merged(rest, variants[name]), "name": f"{rest.get('name', 'scene')}_{name}"}
 
     @model_validator(mode="after")
     def _consistent(self) -> "SceneConfig":
