@@ -18,10 +18,11 @@ from torchtrack.eval.grid import Report
 from torchtrack.eval.metrics import summarise
 from torchtrack.eval.paper import check_cells, paper_report
 from torchtrack.eval.results import Evaluation, Failure, NotApplicable, ObjectResult, write_results
-from torchtrack.eval.sources import Simulating, cell_sequence, find_sequences
+from torchtrack.eval.sources import cell_sequences, find_sequences
 from torchtrack.quality import Status
 from torchtrack.runner import build_tracker, session_steps, threads
 from torchtrack.session import Session, open_session
+from torchtrack.sim.suite import Told
 from torchtrack.sinks.record import Record
 
 
@@ -36,17 +37,18 @@ class Job:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done: the jobs, and the sequence of each cell of the paper's tables."""
+    """What is to be done: the jobs, the sequence of each cell of the paper's tables, and scenes that could not be simulated."""
 
     jobs: tuple[Job, ...]
     cells: Mapping[str, Path]
+    failures: tuple[Failure, ...] = ()
 
 
 # What became of one job: what was measured and what the method is not made for, or why it failed.
 Outcome = Sequence[ObjectResult | NotApplicable] | Failure
 
 
-def plan(config: EvaluateConfig, simulating: Simulating = lambda name, share: None) -> Plan:
+def plan(config: EvaluateConfig, simulating: Told = lambda name, share: None) -> Plan:
     """Find the sequences; scenes that are not simulated yet are, and ``simulating`` is told how far.
 
     Raises:
@@ -54,10 +56,12 @@ def plan(config: EvaluateConfig, simulating: Simulating = lambda name, share: No
         MissingFileError: if a path that is named is not there.
     """
     check_cells(config.cells)
-    cells = {name: cell_sequence(cell, config.cache, simulating) for name, cell in config.cells.items()}
-    found = find_sequences(config.paths) if config.paths or not cells else []
-    paths = dict.fromkeys([*found, *cells.values()])
-    return Plan(tuple(Job(path, label, _run_config(path, method, config)) for path in paths for label, method in config.methods.items()), cells)
+    found = find_sequences(config.paths) if config.paths or not config.cells else []
+    cells, failures = cell_sequences(config.cells, config.cache, config.jobs, simulating)
+    failed = {failure.sequence for failure in failures}
+    paths = dict.fromkeys([*found, *(path for path in cells.values() if path.stem not in failed)])
+    jobs = [Job(path, label, _run_config(path, method, config)) for path in paths for label, method in config.methods.items()]
+    return Plan(tuple(jobs), cells, failures)
 
 
 def evaluate(config: EvaluateConfig, on_done: Callable[[Job], None] = lambda job: None, planned: Plan | None = None) -> Evaluation:
@@ -85,7 +89,7 @@ def evaluate(config: EvaluateConfig, on_done: Callable[[Job], None] = lambda job
     evaluation = Evaluation(
         tuple(entry for entry in entries if isinstance(entry, ObjectResult)),
         tuple(entry for entry in entries if isinstance(entry, NotApplicable)),
-        tuple(outcome for outcome in ordered if isinstance(outcome, Failure)),
+        (*planned.failures, *(outcome for outcome in ordered if isinstance(outcome, Failure))),
     )
     write_results(evaluation, config.output)
     if report := report_of(evaluation, config, planned):
@@ -108,7 +112,7 @@ def _run_config(path: Path, method: MethodConfig, config: EvaluateConfig) -> Run
 
 def _outcomes(jobs: Sequence[Job], limits: tuple[float, float], processes: int) -> Iterator[tuple[int, Outcome]]:
     """The outcome of each job as it comes, with its place."""
-    with _executor(min(processes, len(jobs))) as pool:
+    with _executor(max(1, min(processes, len(jobs)))) as pool:
         futures = {pool.submit(measure, job, limits): index for index, job in enumerate(jobs)}
         for future in as_completed(futures):
             index = futures[future]

@@ -1,17 +1,14 @@
 """Where the sequences of an evaluation come from: files, folders, and scenes that are simulated once and kept."""
 
-import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from torchtrack import __version__
 from torchtrack.config.evaluate import CellConfig
-from torchtrack.config.load import as_yaml, load
+from torchtrack.config.load import load
 from torchtrack.errors import ConfigError, MissingFileError
-from torchtrack.sim import SceneConfig, simulate, write
-
-# Called with the name of a scene and how far it is simulated, 0 to 1.
-Simulating = Callable[[str, float], None]
+from torchtrack.eval.results import Failure
+from torchtrack.sim import SceneConfig
+from torchtrack.sim.suite import Told, run_suite
 
 
 def find_sequences(paths: Sequence[Path]) -> list[Path]:
@@ -34,23 +31,34 @@ def find_sequences(paths: Sequence[Path]) -> list[Path]:
     return list(found)
 
 
-def cell_sequence(cell: CellConfig, cache: Path, simulating: Simulating = lambda name, share: None) -> Path:
-    """The sequence of one cell of the paper's tables; a scene is simulated where ``cache`` does not hold it yet.
+def cell_sequences(
+    cells: Mapping[str, CellConfig], cache: Path, jobs: int, simulating: Told = lambda name, share: None
+) -> tuple[dict[str, Path], tuple[Failure, ...]]:
+    """The sequence of each cell of the paper's tables, and which scenes failed; scenes that ``cache`` does not hold are simulated.
 
-    What was simulated is kept under the scene's name and a digest of all its settings, whole or not at all: an
-    evaluation that was interrupted goes on where it was.
+    What was simulated is kept with its settings, whole or not at all: an evaluation that was interrupted goes on where
+    it was, and a scene whose settings have changed is simulated anew.
+
+    Args:
+        cells: by name.
+        cache: folder of simulated sequences.
+        jobs: processes that simulate.
+        simulating: called with the name of a scene and how far it is simulated, 0 to 1.
 
     Raises:
-        MissingFileError: if the sequence or the scene's file is not there.
-        ConfigError: if the scene's settings are wrong.
+        MissingFileError: if a sequence or a scene's file is not there.
+        ConfigError: if a scene's settings are wrong, or two different scenes have one name.
     """
-    if cell.scene is None:
-        return find_sequences([cell.source] if cell.source else [])[0]
-    scene = load(SceneConfig, cell.scene, cell.overrides)
-    digest = hashlib.sha256(f"{__version__}\n{as_yaml(scene)}".encode()).hexdigest()[:10]
-    path = cache / f"{scene.name}-{digest}.npz"
-    if not path.exists():
-        simulating(scene.name, 0.0)
-        cache.mkdir(parents=True, exist_ok=True)
-        write(simulate(scene, lambda share: simulating(scene.name, share)), path)
-    return path
+    paths = {name: find_sequences([cell.source])[0] for name, cell in cells.items() if cell.source is not None}
+    scenes: dict[str, SceneConfig] = {}
+    for name, cell in cells.items():
+        if cell.scene is None:
+            continue
+        scene = load(SceneConfig, cell.scene, cell.overrides)
+        if scenes.setdefault(scene.name, scene) != scene:
+            raise ConfigError(f"cells: two different scenes are called '{scene.name}'; each becomes a file of its name. Name one otherwise.")
+        paths[name] = cache / f"{scene.name}.npz"
+    if not scenes:
+        return paths, ()
+    failures = run_suite(list(scenes.values()), cache, jobs, simulating)
+    return {name: paths[name] for name in cells}, tuple(Failure(failure.name, "simulation", failure.reason) for failure in failures)

@@ -1,0 +1,147 @@
+"""How late a camera's time stamps are against the clock of the ground truth.
+
+Events lie on the contours that caused them, where these were when they did. Against the contours at the time of the stamp
+they lag behind by (normal velocity) x (latency), so the latency is the slope of a line: offset normal to the contour over
+normal velocity of the contour, found by iteratively reweighted least squares. It starts at the best of a coarse grid.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import cKDTree
+
+from torchtrack.camera import project, undistortion_table
+from torchtrack.config.tracker import ContourConfig
+from torchtrack.contours import ContourModel, group_by_model, mesh_contours
+from torchtrack.errors import EventDataError
+from torchtrack.lie import transform_points
+from torchtrack.session import Session
+
+# Latencies that are tried first, µs.
+_GRID_US = np.arange(-10_000, 50_001, 1000)
+# The stream is looked at this often, for so long (µs), and at no more than so many events each time.
+_LOOKS, _LOOK_US, _EVENTS_PER_LOOK = 120, 1000, 300
+# An event further from every contour than this (px) was not caused by one.
+_GATE_PX = 4.0
+_ROUNDS = 8
+# Velocities are differences over this time, µs.
+_STEP_US = 500
+# Offsets are weighted down beyond about this (px): Tukey's biweight.
+_TUKEY_PX = 2.0
+_LEAST_EVENTS = 200
+_LEAST_SPEED_PX_S = 20.0
+
+
+@dataclass(frozen=True)
+class LatencyEstimate:
+    """What was found.
+
+    Args:
+        latency_us: how much later events are stamped than they happened; ``sensor_latency_us`` takes it off.
+        deviation_us: its standard deviation, from the scatter of the events.
+        before_px, after_px: median distance of the events from the contours, without and with the latency taken off.
+        events: how many took part.
+    """
+
+    latency_us: float
+    deviation_us: float
+    before_px: float
+    after_px: float
+    events: int
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Some events of one short time: ideal pixels, and times."""
+
+    pixels: Float[ndarray, "e 2"]
+    t_us: Float[ndarray, "e"]
+
+
+def estimate_latency(session: Session) -> LatencyEstimate:
+    """The latency of a sequence with ground truth.
+
+    Raises:
+        EventDataError: if no object has ground truth, or too few events lie near moving contours.
+    """
+    known = [number for number, truth in enumerate(session.ground_truth) if truth is not None]
+    if not known:
+        raise EventDataError(f"'{session.name}' has no ground truth to find the latency by.")
+    models = group_by_model([session.models[number] for number in known], ContourConfig())
+    looks = list(_looks(session))
+    grid = [(_near_share(session, known, models, looks[::6], float(latency_us)), float(latency_us)) for latency_us in _GRID_US]
+    latency_us, deviation_us, count = max(grid)[1], float("nan"), 0
+    for _ in range(_ROUNDS):
+        offset, speed = _offsets(session, known, models, looks, latency_us)
+        moving = np.abs(speed) > _LEAST_SPEED_PX_S
+        offset, speed = offset[moving], speed[moving]
+        if len(offset) < _LEAST_EVENTS:
+            raise EventDataError(f"'{session.name}': only {len(offset)} events lie near moving contours; {_LEAST_EVENTS} are needed.")
+        weight = np.clip(1 - (offset / (2 * _TUKEY_PX)) ** 2, 0, None) ** 2
+        information = float((weight * speed**2).sum())
+        change_s = -float((weight * offset * speed).sum()) / information
+        residual = offset + change_s * speed
+        latency_us, count = latency_us + 1e6 * change_s, len(offset)
+        deviation_us = 1e6 * float(np.sqrt((weight**2 * residual**2 * speed**2).sum())) / information
+    before, after = (float(np.median(np.abs(_offsets(session, known, models, looks, at)[0]))) for at in (0.0, latency_us))
+    return LatencyEstimate(latency_us, deviation_us, before, after, count)
+
+
+def _looks(session: Session) -> Iterator[_Look]:
+    """Short pieces of the stream, spread evenly over the time that has ground truth, with room for every latency at both ends."""
+    table = undistortion_table(session.camera).double().numpy()
+    spans = [(int(truth.t_us[0]), int(truth.t_us[-1])) for truth in session.ground_truth if truth is not None]
+    room_us = min(20_000, (spans[0][1] - spans[0][0]) // 10)
+    starts = np.linspace(max(a for a, _ in spans) + room_us, min(b for _, b in spans) - room_us, _LOOKS).astype(np.int64)
+    held = [np.zeros((0, 3)) for _ in starts]
+    for chunk in session.chunks():
+        t_us = chunk.t_us.numpy()
+        for number, start in enumerate(starts):
+            first, end = np.searchsorted(t_us, [start, start + _LOOK_US])
+            chosen = np.unique(np.linspace(first, end - 1, min(_EVENTS_PER_LOOK, end - first)).astype(int)) if end > first else np.zeros(0, int)
+            new = np.column_stack([chunk.x.numpy()[chosen], chunk.y.numpy()[chosen], t_us[chosen]])
+            held[number] = np.concatenate([held[number], new])[:_EVENTS_PER_LOOK]
+    for of_look in held:
+        if len(of_look):
+            x, y = of_look[:, 0].astype(int), of_look[:, 1].astype(int)
+            yield _Look(table[y, x], of_look[:, 2])
+
+
+def _near_share(session: Session, known: list[int], models: list[ContourModel], looks: list[_Look], latency_us: float) -> float:
+    """Sum over events of how near they lie to a contour, 1 on it and 0 beyond the gate, with a latency taken off."""
+    offset, _ = _offsets(session, known, models, looks, latency_us)
+    return float((1 - (offset / (2 * _GATE_PX)) ** 2).clip(0).sum())
+
+
+def _offsets(
+    session: Session, known: list[int], models: list[ContourModel], looks: list[_Look], latency_us: float
+) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
+    """Of all events near a contour: distance along its normal (px), and the contour's velocity along its normal (px/s)."""
+    parts = [_offsets_of_look(session, known, models, look, latency_us) for look in looks]
+    return np.concatenate([offset for offset, _ in parts]), np.concatenate([speed for _, speed in parts])
+
+
+def _offsets_of_look(
+    session: Session, known: list[int], models: list[ContourModel], look: _Look, latency_us: float
+) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
+    """:func:`_offsets` of one look; each event is carried to the middle of the look by the velocity of its contour."""
+    middle_us = round(float(look.t_us.mean()) - latency_us)
+    times = torch.tensor([middle_us, middle_us - _STEP_US, middle_us + _STEP_US])
+    poses = torch.stack([session.ground_truth[number].at(times) for number in known], 1)  # type: ignore[union-attr]
+    intrinsics = session.camera.intrinsics(torch.float64).expand(len(known), -1)
+    # Models are float32; their points are carried on in float64.
+    contours = mesh_contours(models, poses[0].float(), intrinsics.float(), ContourConfig())
+    pixels, before, after = (project(transform_points(T, contours.points_obj.double()), intrinsics)[contours.mask].numpy() for T in poses)
+    normals = contours.normals[contours.mask].double().numpy()
+    if not len(pixels):
+        return np.zeros(0), np.zeros(0)
+    distance, nearest = cKDTree(pixels).query(look.pixels, distance_upper_bound=_GATE_PX)
+    near = np.isfinite(distance)
+    nearest = nearest[near]
+    speed = ((after - before)[nearest] * normals[nearest]).sum(1) / (2e-6 * _STEP_US)
+    offset = ((look.pixels[near] - pixels[nearest]) * normals[nearest]).sum(1)
+    return offset - speed * 1e-6 * (look.t_us[near] - latency_us - middle_us), speed
