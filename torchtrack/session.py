@@ -12,8 +12,7 @@ from torchtrack.camera import Camera
 from torchtrack.config.run import CameraConfig, ObjectConfig, PoseConfig, RunConfig
 from torchtrack.errors import ConfigError, EventDataError
 from torchtrack.events import EventBatch
-from torchtrack.io import EventSource, SequenceObject, Trajectory, open_events, read_calibration, read_sequence, read_tum
-from torchtrack.io.npz import ZIP_MAGIC, keys_of, open_archive
+from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence, read_tum
 from torchtrack.lie import check_pose, rotation_from_quaternion
 from torchtrack.object_model import ObjectModel
 from torchtrack.stepping import clipped
@@ -85,7 +84,7 @@ def open_session(config: RunConfig) -> Session:
 
 def _open_source(config: RunConfig) -> tuple[str, EventSource, Camera, dict[str, SequenceObject]]:
     """Name, events and camera of the source, and the objects it knows by label."""
-    if _is_sequence(config.source):
+    if is_sequence(config.source):
         sequence = read_sequence(config.source)
         camera = _camera(config.camera) if config.camera else sequence.camera
         return sequence.name, sequence.events, camera, {obj.label: obj for obj in sequence.objects}
@@ -95,17 +94,6 @@ def _open_source(config: RunConfig) -> tuple[str, EventSource, Camera, dict[str,
         raise ConfigError(f"camera: '{config.source}' holds events alone. Give a calibration file, or fx, fy, cx, cy, width and height.")
     camera = _camera(config.camera)
     return config.source.stem, open_events(config.source, camera.width, camera.height), camera, {}
-
-
-def _is_sequence(path: Path) -> bool:
-    """Whether a file is an archive of arrays that holds a camera too."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        if not stream.read(4).startswith(ZIP_MAGIC):
-            return False
-    with open_archive(path) as archive:
-        return "K" in keys_of(archive)
 
 
 def _camera(config: CameraConfig) -> Camera:

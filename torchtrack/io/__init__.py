@@ -8,7 +8,7 @@ from torchtrack.io.event_stream import EventStream
 from torchtrack.io.formats import open_events
 from torchtrack.io.info import EventInfo
 from torchtrack.io.npz import NpzEvents
-from torchtrack.io.sequence import Sequence, SequenceObject, read_sequence, write_sequence
+from torchtrack.io.sequence import Sequence, SequenceObject, is_sequence, read_sequence, write_sequence
 from torchtrack.io.trajectory import Trajectory, read_tum, write_tum
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "Sequence",
     "SequenceObject",
     "Trajectory",
+    "is_sequence",
     "open_events",
     "read_calibration",
     "read_sequence",

@@ -96,7 +96,7 @@ class Aedat4File(EventFile):
 
     def _packets(self, stream: BinaryIO) -> Iterator[bytes]:
         """The packets of the stream of events."""
-        last = self.end if self.end > self.offset else self.path.stat().st_size
+        last = self.end if self.end >= self.offset else self.path.stat().st_size
         while stream.tell() < last:
             head = stream.read(8)
             stream_id, size = int.from_bytes(head[:4], "little", signed=True), int.from_bytes(head[4:], "little", signed=True)

@@ -5,9 +5,7 @@ there are two customs: ``x,y,p,t`` (Prophesee) and ``t,x,y,p``; the third column
 ``# width=640 height=480`` says the sensor size, as our own files do.
 """
 
-import io
 import re
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -15,6 +13,7 @@ import numpy as np
 
 from torchtrack.errors import EventDataError
 from torchtrack.io.columns import Columns
+from torchtrack.io.digits import whole_numbers
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.problems import Problem
 from torchtrack.io.seconds import parse_seconds
@@ -67,16 +66,21 @@ class CsvFile(EventFile):
 
     def _parse(self, block: bytes, line_number: int) -> Columns:
         """Events of whole lines: at once if all are whole numbers, else line by line."""
-        table = _whole_numbers(block, len(self.order))
+        head = b""
+        # What says the size and the names stands before the numbers.
+        while line_number == 1 and (block[:1].isalpha() or block[:1] in (b"#", b'"')):
+            line, newline, block = block.partition(b"\n")
+            head += line + newline
+        table = whole_numbers(block, len(self.order)) if block else []
         if table is None:
-            table = self._lines(block, line_number)
-        return Columns(*table[:, list(self.order)].T)
+            table = self._lines(head + block, line_number)
+        return Columns(*(table[column] for column in self.order)) if len(table) else Columns.empty()
 
-    def _lines(self, block: bytes, line_number: int) -> np.ndarray:
+    def _lines(self, block: bytes, line_number: int) -> list[np.ndarray]:
         rows: list[list[int]] = []
         for number, line in enumerate(block.decode("utf-8", errors="replace").splitlines(), start=line_number):
             words = line.partition("#")[0].replace(";", ",").split(",")
-            if not "".join(words).strip() or (number == 1 and _named(words) is not None):
+            if not "".join(words).strip() or _named(words) is not None:
                 continue
             try:
                 rows.append(_row([word.strip() for word in words], self.order))
@@ -84,7 +88,7 @@ class CsvFile(EventFile):
                 self.problems.found(Problem.MALFORMED, 1, f"line {number}: expected t, x, y and polarity, got '{line[:80]}': {error}.")
         table = np.array(rows, dtype=np.int64).reshape(-1, 4)
         # The rows are in the order t, x, y, p; the caller expects that of the file.
-        return table[:, np.argsort(self.order)]
+        return list(table[:, np.argsort(self.order)].T)
 
 
 def column_order(head: bytes) -> tuple[int, ...] | None:
@@ -109,19 +113,6 @@ def _named(words: list[str]) -> tuple[int, ...] | None:
     names = [word.strip().lower().strip('"') for word in words]
     found = [next((names.index(name) for name in _NAMES[key] if name in names), None) for key in "txyp"]
     return tuple(column for column in found if column is not None) if None not in found and len(names) == 4 else None
-
-
-def _whole_numbers(block: bytes, columns: int) -> np.ndarray | None:
-    """A table of whole numbers, or None if there is anything else in the text."""
-    if block.translate(None, b"0123456789,-\r\n"):
-        return None
-    with warnings.catch_warnings():
-        # Empty lines alone are no reason to warn.
-        warnings.simplefilter("ignore")
-        try:
-            return np.loadtxt(io.BytesIO(block), np.int64, delimiter=",", ndmin=2, encoding="ascii").reshape(-1, columns)
-        except (ValueError, OverflowError):
-            return None
 
 
 def _row(words: list[str], order: tuple[int, ...]) -> list[int]:

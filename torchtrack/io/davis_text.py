@@ -14,11 +14,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from torchtrack.errors import EventDataError
 from torchtrack.io.columns import Columns, join
+from torchtrack.io.digits import digits
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.seconds import parse_seconds
@@ -70,8 +72,8 @@ class DavisTextEvents(EventFile):
             member = text_member(archive)
             if member is None:
                 raise EventDataError(f"'{self.path}' is a zip archive without a text file of events.")
-            with damage_reported(self.path), archive.open(member) as stream:
-                yield stream
+            with damage_reported(self.path), cast(BufferedIOBase, archive.open(member)) as text:
+                yield text
 
     def _read(self, max_events: int) -> Iterator[Columns]:
         line_number = 1
@@ -162,8 +164,8 @@ def _parse_plain(block: bytes) -> Columns | None:
     polarity = data[starts[3]] - ord("0")
     if (polarity > 1).any():
         return None
-    t_us = 1_000_000 * _digits(data, starts[0], dots) + _microseconds(data, dots + 1, ends[0])
-    return Columns(t_us, _digits(data, starts[1], ends[1]), _digits(data, starts[2], ends[2]), polarity)
+    t_us = 1_000_000 * digits(data, starts[0], dots) + _microseconds(data, dots + 1, ends[0])
+    return Columns(t_us, digits(data, starts[1], ends[1]), digits(data, starts[2], ends[2]), polarity)
 
 
 def _is_regular(starts: np.ndarray, ends: np.ndarray, newlines: np.ndarray, dots: np.ndarray) -> bool:
@@ -178,16 +180,6 @@ def _is_regular(starts: np.ndarray, ends: np.ndarray, newlines: np.ndarray, dots
         and (dots - starts[0]).max() <= _MOST_DIGITS["seconds"]
         and (ends[1:3] - starts[1:3]).max() <= _MOST_DIGITS["pixel"]
     )
-
-
-def _digits(data: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Integers written in ``data[starts:ends]``."""
-    lengths = ends - starts
-    value = np.zeros(len(starts), dtype=np.int64)
-    for place in range(int(lengths.max(initial=0))):
-        digit = data[starts + place] - np.uint8(ord("0"))
-        value = np.where(place < lengths, 10 * value + digit, value)
-    return value
 
 
 def _microseconds(data: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:

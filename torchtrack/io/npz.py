@@ -93,6 +93,20 @@ def read_array(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray:
     return native.reshape(member.shape, order="F" if member.fortran_order else "C")
 
 
+def stream_array(archive: zipfile.ZipFile, key: str, path: Path, size: int) -> Iterator[np.ndarray]:
+    """A flat array of an archive, in parts of ``size``.
+
+    Raises:
+        EventDataError: if it is not there, damaged, or holds objects; ``path`` is for the message.
+    """
+    member = _open_member(archive, key, path)
+    with member.stream:
+        count = int(np.prod(member.shape))
+        for start in range(0, count, size):
+            yield member.read(min(size, count - start))
+        member.finish()
+
+
 @dataclass(frozen=True)
 class NpzEvents(EventFile):
     """Events of an ``.npz`` file: integer arrays ``t`` (µs), ``x``, ``y`` and polarity ``p`` of one length.

@@ -1,6 +1,6 @@
 """Sequences: events, camera, object models and ground truth, in one ``.npz`` file with its meshes beside it.
 
-Layout of ``NAME.npz`` (numpy, no pickle):
+:func:`read_sequence` reads the HDF5 form too, see :mod:`torchtrack.io.container`. Layout of ``NAME.npz`` (numpy, no pickle):
 
 ===================== ==================================================================================
 ``t x y p``           events: µs (int64, sorted), pixels (uint16), polarity (uint8, 1 = brighter)
@@ -23,9 +23,8 @@ import tempfile
 import zipfile
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,36 +33,15 @@ import trimesh
 from torchtrack.camera import Camera
 from torchtrack.errors import CalibrationError, EventDataError, MissingFileError, PoseError
 from torchtrack.events import EventBatch, check_events
-from torchtrack.io.event_source import EventSource
+from torchtrack.io.container import is_container, read_container
 from torchtrack.io.npz import NpzEvents, keys_of, open_archive, read_array
+from torchtrack.io.sequence_arrays import distortion_arrays, pose_arrays
+from torchtrack.io.sequence_types import Sequence, SequenceObject
 from torchtrack.io.trajectory import Trajectory
+from torchtrack.io.zip_archive import is_zip
 
+_EXTRA = ("velocity", "occluder_poses", "occluder_labels")
 _LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
-
-
-@dataclass(frozen=True)
-class SequenceObject:
-    """One object of a sequence: its label, its model files, and its true poses where they are known."""
-
-    label: str
-    mesh_path: Path
-    textured_path: Path | None = None
-    ground_truth: Trajectory | None = None
-
-    def model_path(self, models: Literal["textured", "geometry"] = "textured") -> Path:
-        """The model file to use: the textured one where it is asked for and there, else the geometry."""
-        return self.textured_path if models == "textured" and self.textured_path is not None else self.mesh_path
-
-
-@dataclass(frozen=True)
-class Sequence:
-    """A recorded or simulated sequence; its events are streamed, not held."""
-
-    name: str
-    events: EventSource
-    camera: Camera
-    objects: tuple[SequenceObject, ...]
-    meta: dict[str, Any] = field(default_factory=dict)
 
 
 def read_sequence(path: str | os.PathLike[str]) -> Sequence:
@@ -71,12 +49,14 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
 
     Raises:
         MissingFileError: if the file, or a mesh that it names, is not there.
-        UnknownFormatError: if it is not an ``.npz`` file.
+        UnknownFormatError: if it is neither an ``.npz`` file nor a sequence in HDF5.
         EventDataError: if an array is missing, damaged or of the wrong shape.
         CalibrationError: if the camera makes no sense.
         PoseError: if the ground truth is not rigid, or its times do not increase.
     """
     path = Path(path)
+    if is_container(path):
+        return read_container(path)
     events = NpzEvents(path)
     with open_archive(path) as archive:
         camera = _read_camera(archive, events, path)
@@ -85,8 +65,20 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
             raise EventDataError(f"'{path}': labels and mesh_files must name one or more objects each, got {len(labels)} and {len(mesh_files)}.")
         ground_truth = _read_ground_truth(archive, labels, path)
         meta = _read_meta(archive, path)
+        extra = {name: read_array(archive, name, path) for name in _EXTRA if name in keys_of(archive)}
     objects = tuple(_sequence_object(path, *row) for row in zip(labels, mesh_files, ground_truth, strict=True))
-    return Sequence(path.stem, events, camera, objects, meta)
+    return Sequence(path.stem, events, camera, objects, meta, extra)
+
+
+def is_sequence(path: str | os.PathLike[str]) -> bool:
+    """Whether a file holds a sequence: events with a camera, in either form."""
+    path = Path(path)
+    if not path.is_file():
+        return False
+    if not is_zip(path):
+        return is_container(path)
+    with open_archive(path) as archive:
+        return "K" in keys_of(archive)
 
 
 def _read_numbers(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray:
@@ -199,8 +191,8 @@ def write_sequence(
         "K": camera.matrix,
         "width": np.int64(camera.width),
         "height": np.int64(camera.height),
-        **_distortion_arrays(camera),
-        **_pose_arrays(trajectories),
+        **distortion_arrays(camera),
+        **pose_arrays(trajectories),
         "labels": np.array(labels),
         "mesh_files": np.array(mesh_files),
         "meta": np.array(json.dumps(meta)),
@@ -231,20 +223,6 @@ def _check_objects(path: Path, labels: ListOf[str], meshes: int, trajectories: i
     unfit = [label for label in labels if not _LABEL.fullmatch(label)]
     if unfit or len(set(labels)) != len(labels):
         raise EventDataError(f"labels go into file names: each must differ and hold letters, digits and _.+- alone, got {list(labels)}.")
-
-
-def _distortion_arrays(camera: Camera) -> dict[str, np.ndarray]:
-    if camera.distortion_model == "none":
-        return {}
-    return {"distortion_model": np.array(camera.distortion_model), "distortion": np.array(camera.distortion, dtype=np.float64)}
-
-
-def _pose_arrays(trajectories: ListOf[Trajectory]) -> dict[str, np.ndarray]:
-    t_us = trajectories[0].t_us
-    if any(not torch.equal(trajectory.t_us, t_us) for trajectory in trajectories):
-        raise PoseError("the trajectories of a sequence must share their times. Resample them with Trajectory.at().")
-    poses = np.stack([trajectory.T_cam_obj.cpu().numpy() for trajectory in trajectories])
-    return {"poses": poses[0] if len(poses) == 1 else poses, "pose_t": t_us.cpu().numpy()}
 
 
 def _geometry(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
