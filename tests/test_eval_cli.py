@@ -14,10 +14,11 @@ def write_ball(folder):
 
 def test_methods_by_name_and_a_curved_object(tmp_path, capsys):
     arguments = ["evaluate", str(write_ball(tmp_path)), "--methods", "line,ls", "--jobs", "1", "--quiet", "-o", str(tmp_path / "out")]
-    assert main(arguments) == 0
+    assert main([*arguments, "--report", "compact"]) == 0
     output = capsys.readouterr().out
     assert "- line: 'ball' is curved: 0 % of its contour is on straight edges, 50 % are needed" in output
     assert "- ls: 'ball' is curved" in output
+    assert "| method | tiny |" in output and (tmp_path / "out" / "tables.md").is_file()
 
 
 def test_the_papers_tables_are_printed_and_written(tmp_path, capsys):

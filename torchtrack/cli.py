@@ -69,15 +69,17 @@ class Evaluate:
     paths: Positional[Annotated[tuple[str, ...], arg(metavar="[PATH ...]", help_behavior_hint="")]] = ()
     """Sequences (.npz), or folders of them."""
     output: _Output = None
-    """Folder for metrics.json and errors.csv."""
+    """Folder for metrics.json, errors.csv and the report's tables."""
     methods: Annotated[str | None, _option("A,B,...")] = None
-    """Comma-separated: labels of methods in the config file, or names of presets."""
+    """Comma-separated: labels of methods in the config file, or presets: default, paper, line, ls, nns."""
     config: Annotated[str | None, _option("FILE")] = None
     """A YAML config file with paths and methods."""
     models: _Models = None
     """Use a sequence's textured models where it has them, or geometry alone."""
     jobs: Annotated[int | None, _option("N", "-j")] = None
     """Processes, of one thread each."""
+    report: Annotated[Literal["sequences", "compact"] | None, _option("sequences|compact")] = None
+    """A row per sequence, object and method; or one per method, also as Markdown, LaTeX, CSV and JSON."""
     quiet: bool = False
     """No progress bar."""
 
