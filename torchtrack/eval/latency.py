@@ -2,7 +2,8 @@
 
 Events lie on the contours that caused them, where these were when they did. Against the contours at the time of the stamp
 they lag behind by (normal velocity) x (latency), so the latency is the slope of a line: offset normal to the contour over
-normal velocity of the contour, found by iteratively reweighted least squares. It starts at the best of a coarse grid.
+normal velocity of the contour, found by iteratively reweighted least squares. It starts at the best of a coarse grid. It can
+be told from a lag in pixels only where speeds differ.
 """
 
 from collections.abc import Iterator
@@ -32,6 +33,8 @@ _ROUNDS = 8
 _STEP_US = 500
 # Offsets are weighted down beyond about this (px): Tukey's biweight.
 _TUKEY_PX = 2.0
+# How far events lie behind their contours at any speed, and how much that differs from scene to scene, px.
+_USUAL_LAG_PX, _LAG_DEVIATION_PX = 0.1, 0.1
 _LEAST_EVENTS = 200
 _LEAST_SPEED_PX_S = 20.0
 
@@ -42,13 +45,15 @@ class LatencyEstimate:
 
     Args:
         latency_us: how much later events are stamped than they happened; ``sensor_latency_us`` takes it off.
-        deviation_us: its standard deviation, from the scatter of the events.
+        deviation_us: its standard deviation, by the scatter of the events and by what is not known of their lag in pixels.
+        lag_px: how far events lie behind their contours at any speed: half a threshold's worth of blurred edge.
         before_px, after_px: median distance of the events from the contours, without and with the latency taken off.
         events: how many took part.
     """
 
     latency_us: float
     deviation_us: float
+    lag_px: float
     before_px: float
     after_px: float
     events: int
@@ -74,21 +79,27 @@ def estimate_latency(session: Session) -> LatencyEstimate:
     models = group_by_model([session.models[number] for number in known], ContourConfig())
     looks = list(_looks(session))
     grid = [(_near_share(session, known, models, looks[::6], float(latency_us)), float(latency_us)) for latency_us in _GRID_US]
-    latency_us, deviation_us, count = max(grid)[1], float("nan"), 0
+    latency_us, deviation_us, lag_px, count = max(grid)[1], float("nan"), 0.0, 0
     for _ in range(_ROUNDS):
         offset, speed = _offsets(session, known, models, looks, latency_us)
         moving = np.abs(speed) > _LEAST_SPEED_PX_S
         offset, speed = offset[moving], speed[moving]
         if len(offset) < _LEAST_EVENTS:
             raise EventDataError(f"'{session.name}': only {len(offset)} events lie near moving contours; {_LEAST_EVENTS} are needed.")
-        weight = np.clip(1 - (offset / (2 * _TUKEY_PX)) ** 2, 0, None) ** 2
-        information = float((weight * speed**2).sum())
-        change_s = -float((weight * offset * speed).sum()) / information
-        residual = offset + change_s * speed
-        latency_us, count = latency_us + 1e6 * change_s, len(offset)
-        deviation_us = 1e6 * float(np.sqrt((weight**2 * residual**2 * speed**2).sum())) / information
+        # Beside the latency there is a lag in pixels: the light must pass a threshold before a pixel fires, at any speed.
+        design = -np.column_stack([1e-6 * speed, np.sign(speed)])
+        weight = np.clip(1 - (offset - lag_px * design[:, 1]) ** 2 / (2 * _TUKEY_PX) ** 2, 0, None) ** 2
+        # Where speeds hardly differ the two cannot be told apart: then the lag is the usual one.
+        information = design.T @ (weight[:, None] * design) + np.diag([0.0, weight.sum()])
+        target = design.T @ (weight * offset) + [0.0, weight.sum() * _USUAL_LAG_PX]
+        (change_us, lag_px), count = np.linalg.solve(information, target), len(offset)
+        scatter = weight * (offset - design @ [change_us, lag_px])
+        of_scatter = np.linalg.norm((np.linalg.inv(information) @ (design * scatter[:, None]).T)[0])
+        of_lag = 1e6 * _LAG_DEVIATION_PX / np.sqrt((weight * speed**2).sum() / weight.sum())
+        deviation_us = float(np.hypot(of_scatter, of_lag))
+        latency_us += float(change_us)
     before, after = (float(np.median(np.abs(_offsets(session, known, models, looks, at)[0]))) for at in (0.0, latency_us))
-    return LatencyEstimate(latency_us, deviation_us, before, after, count)
+    return LatencyEstimate(latency_us, deviation_us, float(lag_px), before, after, count)
 
 
 def _looks(session: Session) -> Iterator[_Look]:
