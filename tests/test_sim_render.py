@@ -8,8 +8,9 @@ import trimesh
 import torchtrack.sim
 from torchtrack.camera import Camera
 from torchtrack.errors import CalibrationError, ConfigError, MissingExtraError, ModelError, PoseError
+from torchtrack.sim.drawing import Region, merge_regions, sample_offsets
 from torchtrack.sim.meshes import SHAPES, make_mesh
-from torchtrack.sim.render import Region, RenderConfig, Renderer, merge_regions, plain_background, sample_offsets
+from torchtrack.sim.render import RenderConfig, Renderer, plain_background
 from torchtrack.sim.surface import RenderObject, corner_normals, grey_reflectance, linear_to_srgb, srgb_to_linear
 from torchtrack.sim.textures import letter
 
@@ -265,7 +266,7 @@ def test_unknown_shapes_and_bad_inputs_are_errors():
 
 
 def test_without_numba_the_error_names_the_extra(monkeypatch):
-    for name in ("rasterizer", "shading"):
+    for name in ("rasterizer", "shading", "raster_drawer"):
         monkeypatch.delitem(sys.modules, f"torchtrack.sim.{name}", raising=False)
         monkeypatch.delattr(torchtrack.sim, name, raising=False)
     monkeypatch.setitem(sys.modules, "numba", None)

@@ -17,9 +17,10 @@ from torchtrack.camera import Camera
 from torchtrack.events import EventBatch, concatenate
 from torchtrack.io.sequence import write_sequence
 from torchtrack.io.trajectory import Trajectory
+from torchtrack.sim.drawing import merge_regions
 from torchtrack.sim.event_camera import EventCamera
 from torchtrack.sim.frames import MAX_INTERVAL_US, frame_times
-from torchtrack.sim.render import Frame, Renderer, merge_regions
+from torchtrack.sim.render import Frame, Renderer
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.surface import RenderObject
 from torchtrack.sim.trajectory import truth_times, velocity
