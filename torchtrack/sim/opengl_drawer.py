@@ -98,7 +98,7 @@ class OpenGLDrawer:
         self._whole = self._gl.vertex_array(self._gather, [(corners, "2f", "corner")])
         self._meshes = [self._upload(faces) for faces in scene.object_faces]
         self._prints = [self._texture(faces.start) for faces in scene.object_faces]
-        self._targets: tuple[tuple[int, int], moderngl.Framebuffer, moderngl.Framebuffer] | None = None
+        self._targets: tuple[tuple[int, int], moderngl.Framebuffer, moderngl.Texture, moderngl.Framebuffer] | None = None
 
     def _upload(self, faces: slice) -> moderngl.VertexArray:
         """The triangles of one object."""
@@ -141,12 +141,12 @@ class OpenGLDrawer:
     ) -> None:
         """Draw some of the objects into one region, over the background that ``luminance`` holds."""
         height, width = luminance.shape
-        tiles, pixels = self._room((width, height))
+        tiles, samples, pixels = self._room((width, height))
         self._draw_tiles(tiles, region, numbers, (width, height))
         pixels.use()
         pixels.viewport = (0, 0, width, height)
         self._gl.disable(moderngl.DEPTH_TEST)
-        tiles.color_attachments[0].use(0)
+        samples.use(0)
         self._gather["tiles"], self._gather["size"], self._gather["n"] = 0, (width, height), self._n
         self._whole.render()
         result = np.frombuffer(pixels.read((0, 0, width, height), 4, dtype="f4"), dtype=np.float32).reshape(height, width, 4)
@@ -174,15 +174,16 @@ class OpenGLDrawer:
                 program["intrinsics"] = (fx, fy, cx - region.left - dx + 0.5, cy - region.top - dy + 0.5)
                 self._meshes[number].render()
 
-    def _room(self, size: tuple[int, int]) -> tuple[moderngl.Framebuffer, moderngl.Framebuffer]:
-        """Images for the tiles and for the pixels, kept as long as they are large enough."""
+    def _room(self, size: tuple[int, int]) -> tuple[moderngl.Framebuffer, moderngl.Texture, moderngl.Framebuffer]:
+        """Images for the tiles (with what holds their colours) and for the pixels, kept as long as they are large enough."""
         if self._targets is None or self._targets[0][0] < size[0] or self._targets[0][1] < size[1]:
             old = self._targets[0] if self._targets else (0, 0)
             width, height = max(old[0], size[0]), max(old[1], size[1])
             large = (self._n * width, self._n * height)
-            tiles = self._gl.framebuffer([self._gl.texture(large, 4, dtype="f4")], self._gl.depth_texture(large))
-            self._targets = (width, height), tiles, self._gl.framebuffer([self._gl.texture((width, height), 4, dtype="f4")])
-        return self._targets[1], self._targets[2]
+            samples = self._gl.texture(large, 4, dtype="f4")
+            tiles = self._gl.framebuffer([samples], self._gl.depth_texture(large))
+            self._targets = (width, height), tiles, samples, self._gl.framebuffer([self._gl.texture((width, height), 4, dtype="f4")])
+        return self._targets[1:]
 
 
 def open_context() -> moderngl.Context:
@@ -192,7 +193,7 @@ def open_context() -> moderngl.Context:
         MissingExtraError: if EGL offers none.
     """
     try:
-        return moderngl.create_standalone_context(backend="egl")
+        return moderngl.create_context(standalone=True, backend="egl")
     except Exception as error:  # moderngl raises plain Exception
         raise MissingExtraError(
             "libEGL", "gl", f"Rendering simulated scenes with OpenGL found no EGL here ({error}); use render.backend rasterizer, or"

@@ -79,6 +79,16 @@ class Scenery:
     brightness: float = 1.0
 
 
+def blurred(image: Float[ndarray, "h w"], sigma_px: float) -> Float[ndarray, "h w"]:
+    """The image as a lens that is not quite sharp shows it."""
+    size = 2 * _blur_radius(sigma_px) + 1
+    return cv2.GaussianBlur(image, (size, size), sigma_px, borderType=cv2.BORDER_REPLICATE) if sigma_px > 0 else image
+
+
+def _blur_radius(sigma_px: float) -> int:
+    return int(np.ceil(_BLUR_REACH * sigma_px))
+
+
 def plain_background(width: int, height: int, luminance: float) -> Float[ndarray, "h w"]:
     """An even background."""
     return np.full((height, width), luminance, dtype=np.float32)
@@ -144,11 +154,10 @@ class Renderer:
 
     @property
     def _blur_radius(self) -> int:
-        return int(np.ceil(_BLUR_REACH * self.config.lens_blur_px))
+        return _blur_radius(self.config.lens_blur_px)
 
     def _blur(self, image: Float[ndarray, "h w"]) -> Float[ndarray, "h w"]:
-        size, sigma = 2 * self._blur_radius + 1, self.config.lens_blur_px
-        return cv2.GaussianBlur(image, (size, size), sigma, borderType=cv2.BORDER_REPLICATE) if sigma > 0 else image
+        return blurred(image, self.config.lens_blur_px)
 
     def _blurred_region(self, sharp: Float[ndarray, "h w"], region: Region) -> Float[ndarray, "h w"]:
         """The rectangle as it looks in the blurred whole: near its inner borders there is background alone."""

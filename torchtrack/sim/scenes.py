@@ -5,9 +5,10 @@ from typing import Any, Literal
 import trimesh
 from pydantic import Field, model_validator
 
-from torchtrack.camera import Camera
+from torchtrack.camera import Camera, DistortionModel
 from torchtrack.config.merge import merged
 from torchtrack.config.settings import ConfigPath, Settings
+from torchtrack.io.calibration import read_calibration
 from torchtrack.object_model.loading import checked_scale, join_parts, load_parts
 from torchtrack.sim.background import BackgroundConfig
 from torchtrack.sim.meshes import make_mesh
@@ -20,20 +21,30 @@ SPEEDS_PX_S = {"slow": 250.0, "normal": 750.0, "fast": 2250.0}
 
 
 class CameraConfig(Settings):
-    """A pinhole camera without distortion."""
+    """The camera: a sensor, a focal length, and a lens that may distort; or all of it from a calibration file."""
 
+    calibration: ConfigPath | None = Field(None, description="Calibration file, in place of all else here but a size that it does not say.")
     width: int = Field(640, ge=8, le=4096, description="Sensor width, pixels.")
     height: int = Field(480, ge=8, le=4096, description="Sensor height, pixels.")
     fx: float = Field(600.0, gt=0, description="Focal length along x, pixels.")
     fy: float = Field(600.0, gt=0, description="Focal length along y, pixels.")
     cx: float | None = Field(None, description="Principal point, x; the middle of the sensor when not given.")
     cy: float | None = Field(None, description="Principal point, y; the middle of the sensor when not given.")
+    distortion_model: DistortionModel = Field("none", description="Lens model, as in OpenCV.")
+    distortion: tuple[float, ...] = Field((), description="Its coefficients.")
 
     def build(self) -> Camera:
-        """The camera."""
+        """The camera.
+
+        Raises:
+            MissingFileError, CalibrationError: if there is something wrong with the calibration file, or the distortion.
+        """
+        if self.calibration is not None:
+            given = self.model_fields_set
+            return read_calibration(self.calibration, self.width if "width" in given else None, self.height if "height" in given else None)
         cx = self.cx if self.cx is not None else (self.width - 1) / 2
         cy = self.cy if self.cy is not None else (self.height - 1) / 2
-        return Camera(self.fx, self.fy, cx, cy, self.width, self.height)
+        return Camera(self.fx, self.fy, cx, cy, self.width, self.height, self.distortion_model, self.distortion)
 
 
 class ObjectConfig(Settings):

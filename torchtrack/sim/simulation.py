@@ -20,6 +20,7 @@ from torchtrack.io.trajectory import Trajectory
 from torchtrack.sim.drawing import merge_regions
 from torchtrack.sim.event_camera import EventCamera
 from torchtrack.sim.frames import MAX_INTERVAL_US, frame_times
+from torchtrack.sim.lens import LensRenderer
 from torchtrack.sim.render import Frame, Renderer
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.surface import RenderObject
@@ -79,7 +80,8 @@ def render_frames(
     meshes = meshes or [item.build() for item in items]
     world = world or make_world(config, meshes)
     objects = [RenderObject.from_mesh(mesh, item.reflectance, item.gloss) for mesh, item in zip(meshes, items, strict=True)]
-    renderer = Renderer(objects, world.camera, world.still_background(), config.render)
+    make = Renderer if world.camera.distortion_model == "none" else LensRenderer
+    renderer = make(objects, world.camera, world.still_background(), config.render)
     for first in range(0, len(t_us), _POSES_PER_ROUND):
         t_s = torch.from_numpy(t_us[first : first + _POSES_PER_ROUND]).double() * 1e-6
         T_cam_obj, T_world_cam = world.all_poses(t_s).numpy(), world.camera_poses(t_s).numpy()

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchtrack import lie
 from torchtrack.camera import MIN_DEPTH_M, Camera, project
 from torchtrack.errors import ConfigError
+from torchtrack.sim.lens import ideal_camera
 from torchtrack.sim.render import Scenery
 from torchtrack.sim.scenes import ObjectConfig, SceneConfig
 from torchtrack.sim.trajectory import Motion, make_motion
@@ -40,7 +41,8 @@ class World:
 
     def __init__(self, config: SceneConfig, points: Sequence[Float[Tensor, "_ 3"]]) -> None:
         self.config, self.points, self.camera = config, points, config.camera.build()
-        self.backdrop = config.background.build(self.camera)
+        self.ideal = ideal_camera(self.camera)
+        self.backdrop = config.background.build(self.ideal)
         self.background_moves = config.background.moves(config.camera_motion is not None)
         self._move(config.speed)
         if config.peak_speed_px_s is not None:
@@ -106,7 +108,7 @@ class World:
 
     def object_way_px(self, number: int, t_s: Float[Tensor, "q"]) -> Float[ndarray, "q-1"]:
         """:meth:`way_px` of one object alone."""
-        return longest_way(self.object_poses(number, t_s), self.points[number], self.camera).numpy()
+        return longest_way(self.object_poses(number, t_s), self.points[number], self.ideal).numpy()
 
     def _speed_for(self, target_px_s: float) -> float:
         """The factor of time at which the fastest point of all objects has the speed asked for.
