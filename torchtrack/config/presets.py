@@ -42,7 +42,6 @@ def _lines(loss: Literal["tukey", "none"]) -> TrackerConfig:
     return TrackerConfig(
         window=WindowConfig(duration_us=3_000),
         corners=CornerConfig(max_corners=0),
-        contours=ContourConfig(max_texture_points=2000),
         matching=MatchingConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500),
         solver=SolverConfig(iterations=3, loss=loss, damping=1e-4, prior=False),
     )

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from rich.table import Table
 
-from torchtrack.eval.results import Evaluation
+from torchtrack.eval.results import Evaluation, NotApplicable, ObjectResult
 from torchtrack.sinks.summary import RunSummary
 
 
@@ -19,23 +19,24 @@ def results_table(evaluation: Evaluation) -> Table:
     for name in ("mean", "median", "max", "peak", "lost", "step"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("windows by status")
-    for result in evaluation.results:
-        metrics = result.metrics
-        table.add_row(
-            result.sequence,
-            result.object,
-            result.method,
-            _error(metrics.mean_rotation_deg, metrics.mean_translation_cm),
-            _error(metrics.median_rotation_deg, metrics.median_translation_cm),
-            _error(metrics.max_rotation_deg, metrics.max_translation_cm),
-            f"{metrics.peak_rotation:.1f} {metrics.peak_translation:.1f}",
-            f"{100 * metrics.lost_fraction:.1f}%",
-            f"{result.median_step_ms:.1f} ms",
-            _statuses(result.status),
-        )
-    for entry in evaluation.not_applicable:
-        table.add_row(entry.sequence, entry.object, entry.method, *["-"] * 7)
+    entries: list[ObjectResult | NotApplicable] = [*evaluation.results, *evaluation.not_applicable]
+    order = list(dict.fromkeys(entry.sequence for entry in entries))
+    for entry in sorted(entries, key=lambda entry: order.index(entry.sequence)):
+        table.add_row(entry.sequence, entry.object, entry.method, *(_figures(entry) if isinstance(entry, ObjectResult) else ["-"] * 7))
     return table
+
+
+def _figures(result: ObjectResult) -> tuple[str, ...]:
+    metrics = result.metrics
+    return (
+        _error(metrics.mean_rotation_deg, metrics.mean_translation_cm),
+        _error(metrics.median_rotation_deg, metrics.median_translation_cm),
+        _error(metrics.max_rotation_deg, metrics.max_translation_cm),
+        f"{metrics.peak_rotation:.1f} {metrics.peak_translation:.1f}",
+        f"{100 * metrics.lost_fraction:.1f}%",
+        f"{result.median_step_ms:.1f} ms",
+        _statuses(result.status),
+    )
 
 
 def _statuses(counts: Mapping[str, int]) -> str:
