@@ -6,6 +6,7 @@ samples are those of the rasteriser. A second pass gathers the tiles into pixels
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -192,8 +193,9 @@ def open_context() -> moderngl.Context:
     Raises:
         MissingExtraError: if EGL offers none.
     """
+    settings: dict[str, Any] = {"backend": "egl"}
     try:
-        return moderngl.create_context(standalone=True, backend="egl")
+        return moderngl.create_context(standalone=True, **settings)
     except Exception as error:  # moderngl raises plain Exception
         raise MissingExtraError(
             "libEGL", "gl", f"Rendering simulated scenes with OpenGL found no EGL here ({error}); use render.backend rasterizer, or"
