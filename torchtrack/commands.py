@@ -18,6 +18,8 @@ from torchtrack.errors import ConfigError
 from torchtrack.eval.evaluate import evaluate as evaluate_all
 from torchtrack.eval.evaluate import plan, report_of
 from torchtrack.eval.grid import markdown
+from torchtrack.eval.latency import estimate_latency
+from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table, run_headline, run_table
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io import read_calibration
@@ -55,6 +57,8 @@ def _run(config: RunConfig, quiet: bool) -> int:
     summary = run(config, progress, session)
     console.print(run_headline(summary))
     console.print(run_table(summary))
+    if summary.dropped_windows:
+        console.print(f"{summary.dropped_windows} windows ({summary.dropped_events} events) came too fast and were dropped")
     console.print(f"Results are in {config.output}")
     return ExitCode.INTERRUPTED if summary.interrupted else ExitCode.DONE
 
@@ -82,6 +86,19 @@ def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mappi
     for failure in evaluation.failures:
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {failure.sequence} ({failure.method}): {failure.reason}", markup=False)
     return ExitCode.FAILED if evaluation.failures else ExitCode.DONE
+
+
+def show_latency(paths: Sequence[str]) -> int:
+    """Show how late the events of sequences are against their ground truth; returns the exit code."""
+    table = Table("sequence", "latency (µs)", "± (µs)", "lag (px)", "distance before → after (px)", header_style="bold")
+    for path in find_sequences([Path(text) for text in paths]):
+        found = estimate_latency(open_session(RunConfig(source=path)))
+        row = (f"{found.latency_us:.0f}", f"{found.deviation_us:.0f}", f"{found.lag_px:.2f}", f"{found.before_px:.2f} → {found.after_px:.2f}")
+        table.add_row(path.stem, *row)
+    console = output_console()
+    console.print(table)
+    console.print("The setting sensor_latency_us of a run takes a latency off.")
+    return ExitCode.DONE
 
 
 def _scene_progress(progress: Progress) -> Callable[[str, float], None]:

@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from torchtrack.baselines import tracker_class
 from torchtrack.config.load import as_yaml
 from torchtrack.config.run import RunConfig, TrackingConfig
 from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
+from torchtrack.events import EventWindow
 from torchtrack.interrupt import Interrupt
 from torchtrack.session import Session, open_session
 from torchtrack.sinks import Sink
@@ -43,10 +45,10 @@ def build_tracker(session: Session, config: TrackingConfig) -> Tracker:
     return tracker.to(config.device)
 
 
-def session_steps(session: Session, tracker: Tracker, config: TrackingConfig) -> Iterator[Step]:
-    """Track a session from its initial poses on, one step per window."""
+def session_steps(session: Session, tracker: Tracker, config: TrackingConfig, windows: Iterator[EventWindow] | None = None) -> Iterator[Step]:
+    """Track a session from its initial poses on, one step per window; ``windows``: where they do not come from the session."""
     state = tracker.init(session.T_cam_obj.to(config.device), session.start_us)
-    return steps(cut_windows(session.chunks(), config.tracker.window, session.start_us), tracker, state)
+    return steps(windows or cut_windows(session.chunks(), config.tracker.window, session.start_us), tracker, state)
 
 
 def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None = None) -> RunSummary:
@@ -70,7 +72,9 @@ def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None =
         with ExitStack() as stack:
             own: list[Sink] = [record, PoseFiles(folder, session.labels, record), *_optional_sinks(folder, session, config)]
             every = [stack.enter_context(closing(sink)) for sink in (*own, *sinks)]
-            for step in session_steps(session, tracker, config):
+            keep_up = session.keep_up(config.tracker.window)
+            windows = keep_up.until(lambda: interrupt.requested) if keep_up else None
+            for step in session_steps(session, tracker, config, windows):
                 for sink in every:
                     sink.add(step)
                 if interrupt.requested:
@@ -84,6 +88,8 @@ def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None =
             interrupted=interrupt.requested,
             more=_further_facts(config, session.labels, own),
         )
+        if keep_up:
+            summary = replace(summary, dropped_windows=keep_up.dropped_windows, dropped_events=keep_up.dropped_events)
         (folder / "config.yaml").write_text(as_yaml(config), encoding="utf-8")
         write_json(folder / "summary.json", summary.as_json())
     return summary

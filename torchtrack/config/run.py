@@ -6,6 +6,7 @@ from typing import Any, Literal, get_args
 from pydantic import Field, model_validator
 
 from torchtrack.camera import DistortionModel
+from torchtrack.config.events import EventsConfig, EventSourcePath
 from torchtrack.config.merge import merged
 from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.settings import ConfigPath, Settings
@@ -103,11 +104,15 @@ class TrackingConfig(Settings):
 class RunConfig(TrackingConfig):
     """Settings of ``torchtrack track``."""
 
-    source: ConfigPath = Field(description="Event file or simulated sequence (.npz).")
+    source: EventSourcePath = Field(description="Event file or sequence; or live: dv://HOST:PORT, evk4://, davis://, or stdin:// (EVT3).")
+    events: EventsConfig = EventsConfig()
     objects: tuple[ObjectConfig, ...] = Field((), description="Objects to track; none given: all objects of the sequence.")
     camera: CameraConfig | None = Field(None, description="The camera; a sequence brings its own.")
     start_us: int | None = Field(None, description="Time of the initial pose, in stream time (µs); by default the start of the stream.")
     end_us: int | None = Field(None, description="Tracking ends here, in stream time (µs); by default with the stream.")
+    sensor_latency_us: int = Field(
+        0, ge=-1_000_000, le=1_000_000, description="How late the events' time stamps are against the poses' clock (µs); taken off."
+    )
     models: Models = Field("textured", description="Use a sequence's textured models where it has them, or geometry alone.")
     threads: int = Field(1, ge=1, le=256, description="Threads of the tracker on the CPU.")
     output: ConfigPath = Field(

@@ -48,7 +48,7 @@ class EventStream(ABC):
 class LaterStream(EventStream):
     """Another stream without the events before ``start_us``."""
 
-    inner: EventStream
+    inner: EventSource
     start_us: int
 
     @property

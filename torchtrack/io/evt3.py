@@ -126,7 +126,7 @@ class Evt3Decoder:
         packed[ends[singles] - 1] = (single & 0x7FF) | (single & 0x800).astype(np.int32) << _TO_BRIGHTER
         vector = words[vectors]
         masks = np.where(kinds[vectors] == _VECTOR_12, vector & 0xFFF, vector & 0xFF)
-        hits = np.flatnonzero(np.unpackbits(masks.view(np.uint8), bitorder="little"))
+        hits = np.flatnonzero(np.unpackbits(masks.view(np.uint8), bitorder="little").view(bool))
         of_vector = hits >> 4
         # Place of a vector's first event, less the number of events of all vectors before it.
         shift = ends[vectors] - np.cumsum(_EVENTS_OF[vector], dtype=np.int32)
