@@ -23,11 +23,12 @@ uniform mat3 rotation; uniform vec3 translation;
 uniform vec4 intrinsics;   // fx, fy, and the principal point from the tile's corner
 uniform vec2 size; uniform float near;
 in vec3 position; in vec3 normal; in vec3 face_normal; in vec2 uv; in float albedo; in float gloss;
-out vec3 at; out vec3 towards; out vec2 texel; out float reflectance; flat out float shine;
+out vec3 at; out vec3 towards; out vec2 texel; out float reflectance; flat out float shine; flat out float back;
 void main() {
     at = rotation * position + translation;
     vec3 facing = rotation * face_normal;
-    towards = (rotation * normal) * (dot(facing, at) > 0.0 ? -1.0 : 1.0);
+    back = dot(facing, at) > 0.0 ? 1.0 : 0.0;
+    towards = (rotation * normal) * (1.0 - 2.0 * back);
     texel = uv; reflectance = albedo; shine = gloss;
     vec2 pixel = intrinsics.xy * at.xy + intrinsics.zw * at.z;
     gl_Position = vec4(2.0 * pixel / size - at.z, 2.0 * near - at.z, at.z);
@@ -35,10 +36,12 @@ void main() {
 """
 _FRAGMENT = """
 #version 330
-uniform sampler2D print; uniform vec3 light; uniform float ambient; uniform float diffuse; uniform float number;
-in vec3 at; in vec3 towards; in vec2 texel; in float reflectance; flat in float shine;
+uniform sampler2D print; uniform vec3 light; uniform float ambient; uniform float diffuse; uniform float number; uniform float closed;
+in vec3 at; in vec3 towards; in vec2 texel; in float reflectance; flat in float shine; flat in float back;
 out vec4 result;
 void main() {
+    // The back of a closed surface is never seen.
+    if (closed * back > 0.5) discard;
     vec3 n = normalize(towards);
     float highlight = pow(max(dot(n, normalize(normalize(-at) + light)), 0.0), 32.0);
     float lit = ambient + diffuse * max(dot(n, light), 0.0);
@@ -168,7 +171,7 @@ class OpenGLDrawer:
         for number in numbers:
             T = self._T[number]
             program["rotation"], program["translation"] = tuple(T[:3, :3].T.ravel().tolist()), tuple(T[:3, 3].tolist())
-            program["number"] = float(number)
+            program["number"], program["closed"] = float(number), float(self._scene.is_closed[number])
             self._prints[number].use(0)
             for s, (dx, dy) in enumerate(self._offsets.tolist()):
                 tiles.viewport = (s % self._n * width, s // self._n * height, width, height)

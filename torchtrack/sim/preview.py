@@ -14,8 +14,8 @@ from torchtrack.sim.simulation import SimulatedSequence, render_frames
 from torchtrack.sim.surface import linear_to_srgb
 from torchtrack.viz.video import OverlayWriter
 
-_FRAMES_PER_SECOND = 30
-_SLOW_MOTION = 4
+_FRAMES_PER_SECOND = 30.0
+_SLOW_MOTION = 4.0
 # Events are shown for this long, µs.
 _SHOWN_US = 5000
 _ON, _OFF, _CONTOUR, _OCCLUDER = (255, 160, 60), (60, 60, 255), (80, 255, 80), (0, 200, 255)
