@@ -17,6 +17,7 @@ from torchtrack.baselines.straight_edges import (
     too_curved,
 )
 from torchtrack.object_model import ObjectModel
+from torchtrack.sim.meshes import make_mesh
 
 ANGLE = np.linspace(0, 2 * np.pi, 81)
 
@@ -72,6 +73,11 @@ def test_a_curved_object_says_how_curved_it_is():
     assert too_curved(box_model()) is None
     reason = too_curved(model_of(trimesh.creation.icosphere(subdivisions=3, radius=0.05)))
     assert reason == "'thing' is curved: 0 % of its contour is on straight edges, 50 % are needed"
+
+
+@pytest.mark.parametrize(("shape", "straight"), [("wedge", True), ("satellite", True), ("planar", True), ("mug", False), ("robot", False)])
+def test_simulated_objects_are_of_the_kind_that_they_stand_for(shape, straight):
+    assert (too_curved(model_of(make_mesh(shape))) is None) == straight
 
 
 def test_polylines_are_straight_or_not():
