@@ -14,7 +14,7 @@ from torchtrack.config.run import CameraConfig, ObjectConfig, PoseConfig, RunCon
 from torchtrack.config.tracker import WindowConfig
 from torchtrack.errors import ConfigError, EventDataError
 from torchtrack.events import EventBatch
-from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence, read_tum
+from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence, read_trajectory
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS
 from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, Region, downscaled_camera, find_hot_pixels, region_camera
 from torchtrack.io.keep_up import KeepUp
@@ -223,7 +223,7 @@ def _initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) ->
 
 def _configured_pose(pose: PoseConfig, start_us: int) -> Float[Tensor, "4 4"]:
     if pose.trajectory is not None:
-        return read_tum(pose.trajectory).at(torch.tensor([start_us]))[0]
+        return read_trajectory(pose.trajectory).at(torch.tensor([start_us]))[0]
     if pose.matrix is not None:
         return torch.tensor(pose.matrix, dtype=torch.float64)
     T = torch.eye(4, dtype=torch.float64)

@@ -22,7 +22,7 @@ class PoseConfig(Settings):
     matrix: tuple[Row, Row, Row, Row] | None = Field(None, description="The 4x4 matrix, row by row.")
     translation_m: tuple[float, float, float] | None = Field(None, description="Position of the object's origin in the camera frame (m).")
     quaternion_xyzw: Row = Field((0, 0, 0, 1), description="Rotation beside translation_m, as a quaternion x, y, z, w.")
-    trajectory: ConfigPath | None = Field(None, description="A TUM file; the pose is taken at the start time.")
+    trajectory: ConfigPath | None = Field(None, description="A file of poses (TUM, CSV, or a CSV of OptiTrack); the pose is taken at the start time.")
 
     @model_validator(mode="after")
     def _one_way(self) -> "PoseConfig":

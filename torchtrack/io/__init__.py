@@ -8,6 +8,7 @@ from torchtrack.io.event_stream import EventStream
 from torchtrack.io.formats import open_events
 from torchtrack.io.info import EventInfo
 from torchtrack.io.npz import NpzEvents
+from torchtrack.io.pose_files import read_trajectory
 from torchtrack.io.sequence import Sequence, SequenceObject, is_sequence, read_sequence, write_sequence
 from torchtrack.io.trajectory import Trajectory, read_tum, write_tum
 
@@ -25,6 +26,7 @@ __all__ = [
     "open_events",
     "read_calibration",
     "read_sequence",
+    "read_trajectory",
     "read_tum",
     "write_sequence",
     "write_tum",
