@@ -52,8 +52,7 @@ def coloured():
         (("mug", "cube"), 0.6),
         (("planar",), 0.4),
         (("sphere",), 0.4),
-        (("lbracket",), 0.05),
-        (("planar",), 0.03),
+        (("planar",), 0.07),
     ],
 )
 def test_both_give_the_same_image(shapes, z, supersampling):

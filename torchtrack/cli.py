@@ -80,15 +80,20 @@ class Evaluate:
     """Processes, of one thread each."""
     report: Annotated[Literal["sequences", "compact"] | None, _option("sequences|compact")] = None
     """A row per sequence, object and method; or one per method, also as Markdown, LaTeX, CSV and JSON."""
+    estimate_latency: bool = False
+    """Track nothing; find how late the events of each sequence are against its ground truth."""
     quiet: bool = False
     """No progress bar."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands import evaluate
+        from torchtrack.commands import evaluate, show_latency
 
+        if self.estimate_latency:
+            _refuse(overrides)
+            return show_latency(self.paths)
         chosen = self.methods.split(",") if self.methods else None
-        given = _given(self, ("config", "methods", "quiet", "paths"))
+        given = _given(self, ("config", "methods", "quiet", "paths", "estimate_latency"))
         if self.paths:
             given["paths"] = [CommandLineText(path) for path in self.paths]
         return evaluate(self.config, given, overrides, chosen, quiet=self.quiet)
