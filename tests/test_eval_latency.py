@@ -28,17 +28,20 @@ def late(tmp_path_factory):
     return write(simulate(scene), tmp_path_factory.mktemp("late") / "late.npz")
 
 
-def test_the_latency_of_the_sensor_is_found(late):
-    found = estimate_latency(open_session(RunConfig(source=late)))
+@pytest.fixture(scope="module")
+def found(late):
+    return estimate_latency(open_session(RunConfig(source=late)))
+
+
+def test_the_latency_of_the_sensor_is_found(found):
     assert found.latency_us == pytest.approx(LATENCY_US, abs=min(1500, 2 * found.deviation_us))
     assert found.after_px < 0.6 * found.before_px
     assert found.events > 1000
 
 
-def test_a_latency_that_is_taken_off_is_gone(late):
-    first = estimate_latency(open_session(RunConfig(source=late)))
+def test_a_latency_that_is_taken_off_is_gone(late, found):
     rest = estimate_latency(open_session(RunConfig(source=late, sensor_latency_us=LATENCY_US)))
-    assert first.latency_us - rest.latency_us == pytest.approx(LATENCY_US, abs=150)
+    assert found.latency_us - rest.latency_us == pytest.approx(LATENCY_US, abs=150)
 
 
 def test_a_latency_shifts_the_stream_and_nothing_else(late):

@@ -14,21 +14,24 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from torchtrack.camera import project, undistortion_table
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import ContourModel, group_by_model, mesh_contours
+from torchtrack.contours import Contours, group_by_model, mesh_contours
 from torchtrack.errors import EventDataError
 from torchtrack.lie import transform_points
 from torchtrack.session import Session
 
 # Latencies that are tried first, µs.
-_GRID_US = np.arange(-10_000, 50_001, 1000)
+_GRID_US = np.arange(-10_000, 50_001, 1500)
 # The stream is looked at this often, for so long (µs), and at no more than so many events each time.
-_LOOKS, _LOOK_US, _EVENTS_PER_LOOK = 120, 1000, 300
+_LOOKS, _LOOK_US, _EVENTS_PER_LOOK = 100, 1000, 300
+# One look in so many is enough to find where to start.
+_EVERY_COARSE = 8
 # An event further from every contour than this (px) was not caused by one.
 _GATE_PX = 4.0
-_ROUNDS = 8
+_ROUNDS = 6
 # Velocities are differences over this time, µs.
 _STEP_US = 500
 # Offsets are weighted down beyond about this (px): Tukey's biweight.
@@ -67,21 +70,41 @@ class _Look:
     t_us: Float[ndarray, "e"]
 
 
+class _Truth:
+    """The objects whose poses are known, and their contours."""
+
+    def __init__(self, session: Session) -> None:
+        known = [number for number, truth in enumerate(session.ground_truth) if truth is not None]
+        self.trajectories = [truth for truth in session.ground_truth if truth is not None]
+        self._models = group_by_model([session.models[number] for number in known], ContourConfig())
+        self._intrinsics = session.camera.intrinsics(torch.float64).expand(len(known), -1)
+
+    def poses(self, t_us: list[int]) -> Float[Tensor, "q o 4 4"]:
+        """Poses of all objects at some times."""
+        return torch.stack([truth.at(torch.tensor(t_us)) for truth in self.trajectories], 1)
+
+    def contours(self, t_us: int) -> Contours:
+        """Contours of all objects at one time; models are float32."""
+        return mesh_contours(self._models, self.poses([t_us])[0].float(), self._intrinsics.float(), ContourConfig())
+
+    def seen(self, contours: Contours, T_cam_obj: Float[Tensor, "o 4 4"]) -> Float[ndarray, "m 2"]:
+        """The contours' pixels at other poses nearby."""
+        return project(transform_points(T_cam_obj, contours.points_obj.double()), self._intrinsics)[contours.mask].numpy()
+
+
 def estimate_latency(session: Session) -> LatencyEstimate:
     """The latency of a sequence with ground truth.
 
     Raises:
         EventDataError: if no object has ground truth, or too few events lie near moving contours.
     """
-    known = [number for number, truth in enumerate(session.ground_truth) if truth is not None]
-    if not known:
+    if all(truth is None for truth in session.ground_truth):
         raise EventDataError(f"'{session.name}' has no ground truth to find the latency by.")
-    models = group_by_model([session.models[number] for number in known], ContourConfig())
-    looks = list(_looks(session))
-    grid = [(_near_share(session, known, models, looks[::6], float(latency_us)), float(latency_us)) for latency_us in _GRID_US]
-    latency_us, deviation_us, lag_px, count = max(grid)[1], float("nan"), 0.0, 0
+    truth, looks = _Truth(session), list(_looks(session))
+    latency_us, deviation_us, lag_px, count = _coarse_latency_us(truth, looks[::_EVERY_COARSE]), float("nan"), 0.0, 0
+    contours = [truth.contours(round(float(look.t_us.mean()) - latency_us)) for look in looks]
     for _ in range(_ROUNDS):
-        offset, speed = _offsets(session, known, models, looks, latency_us)
+        offset, speed = _offsets(truth, looks, contours, latency_us)
         moving = np.abs(speed) > _LEAST_SPEED_PX_S
         offset, speed = offset[moving], speed[moving]
         if len(offset) < _LEAST_EVENTS:
@@ -98,7 +121,7 @@ def estimate_latency(session: Session) -> LatencyEstimate:
         of_lag = 1e6 * _LAG_DEVIATION_PX / np.sqrt((weight * speed**2).sum() / weight.sum())
         deviation_us = float(np.hypot(of_scatter, of_lag))
         latency_us += float(change_us)
-    before, after = (float(np.median(np.abs(_offsets(session, known, models, looks, at)[0]))) for at in (0.0, latency_us))
+    before, after = (float(np.median(np.abs(_offsets(truth, looks, contours, at)[0]))) for at in (0.0, latency_us))
     return LatencyEstimate(latency_us, deviation_us, float(lag_px), before, after, count)
 
 
@@ -122,31 +145,27 @@ def _looks(session: Session) -> Iterator[_Look]:
             yield _Look(table[y, x], of_look[:, 2])
 
 
-def _near_share(session: Session, known: list[int], models: list[ContourModel], looks: list[_Look], latency_us: float) -> float:
-    """Sum over events of how near they lie to a contour, 1 on it and 0 beyond the gate, with a latency taken off."""
-    offset, _ = _offsets(session, known, models, looks, latency_us)
-    return float((1 - (offset / (2 * _GATE_PX)) ** 2).clip(0).sum())
+def _coarse_latency_us(truth: _Truth, looks: list[_Look]) -> float:
+    """The latency of the grid with which most events lie near contours, the nearer the better."""
+    contours = [truth.contours(round(float(look.t_us.mean()))) for look in looks]
+
+    def score(latency_us: float) -> float:
+        offset, _ = _offsets(truth, looks, contours, latency_us)
+        return float((1 - (offset / (2 * _GATE_PX)) ** 2).clip(0).sum())
+
+    return max(_GRID_US.astype(float).tolist(), key=score)
 
 
-def _offsets(
-    session: Session, known: list[int], models: list[ContourModel], looks: list[_Look], latency_us: float
-) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
+def _offsets(truth: _Truth, looks: list[_Look], contours: list[Contours], latency_us: float) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
     """Of all events near a contour: distance along its normal (px), and the contour's velocity along its normal (px/s)."""
-    parts = [_offsets_of_look(session, known, models, look, latency_us) for look in looks]
+    parts = [_offsets_of_look(truth, look, of_look, latency_us) for look, of_look in zip(looks, contours, strict=True)]
     return np.concatenate([offset for offset, _ in parts]), np.concatenate([speed for _, speed in parts])
 
 
-def _offsets_of_look(
-    session: Session, known: list[int], models: list[ContourModel], look: _Look, latency_us: float
-) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
+def _offsets_of_look(truth: _Truth, look: _Look, contours: Contours, latency_us: float) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
     """:func:`_offsets` of one look; each event is carried to the middle of the look by the velocity of its contour."""
     middle_us = round(float(look.t_us.mean()) - latency_us)
-    times = torch.tensor([middle_us, middle_us - _STEP_US, middle_us + _STEP_US])
-    poses = torch.stack([session.ground_truth[number].at(times) for number in known], 1)  # type: ignore[union-attr]
-    intrinsics = session.camera.intrinsics(torch.float64).expand(len(known), -1)
-    # Models are float32; their points are carried on in float64.
-    contours = mesh_contours(models, poses[0].float(), intrinsics.float(), ContourConfig())
-    pixels, before, after = (project(transform_points(T, contours.points_obj.double()), intrinsics)[contours.mask].numpy() for T in poses)
+    pixels, before, after = (truth.seen(contours, T) for T in truth.poses([middle_us, middle_us - _STEP_US, middle_us + _STEP_US]))
     normals = contours.normals[contours.mask].double().numpy()
     if not len(pixels):
         return np.zeros(0), np.zeros(0)
