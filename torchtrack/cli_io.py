@@ -65,8 +65,8 @@ class Convert:
 class Bench:
     """Measure the speed of a part; write JSON and Markdown, with medians and quartiles."""
 
-    part: Positional[Literal["io"]]
-    """io: reading events, per format."""
+    part: Positional[Literal["io", "sim"]]
+    """io: reading events, per format. sim: rendering and making events."""
     output: Annotated[str, arg(aliases=["-o"], metavar="DIR")]
     """Folder for the results."""
     repeats: Annotated[int, arg(metavar="N")] = 7
