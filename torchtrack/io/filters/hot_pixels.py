@@ -13,6 +13,8 @@ from torchtrack.events import EventBatch
 from torchtrack.io.event_source import EventSource
 from torchtrack.io.filters.stage import Stage
 
+_PARTS, _ENOUGH_PARTS = 10, 8
+
 
 @dataclass(frozen=True)
 class HotPixelFilter(Stage):
@@ -41,8 +43,8 @@ class HotPixelFilter(Stage):
 def find_hot_pixels(source: EventSource, duration_us: int = 500_000, min_rate: float = 50.0, ratio: float = 10.0) -> Bool[Tensor, "h w"]:
     """Pixels that fire much more than their neighbours do, over the beginning of a stream.
 
-    An edge that passes makes neighbours fire as well; a hot pixel fires alone. Where two of them touch, the second largest
-    of a pixel's eight neighbours is what counts.
+    An edge that passes makes neighbours fire as well, and passes; a hot pixel fires alone, and in at least eight of ten equal
+    parts of the time. Where two of them touch, the second busiest of a pixel's eight neighbours is what counts.
 
     Args:
         source: the stream.
@@ -55,6 +57,7 @@ def find_hot_pixels(source: EventSource, duration_us: int = 500_000, min_rate: f
     """
     width, height = source.width, source.height
     counts = np.zeros(height * width, np.int64)
+    fired = np.zeros((_PARTS, height * width), bool)
     first_us: int | None = None
     last_us = 0
     for chunk in source.chunks():
@@ -63,10 +66,15 @@ def find_hot_pixels(source: EventSource, duration_us: int = 500_000, min_rate: f
         if len(chunk) == 0:
             break
         last_us = int(chunk.t_us[-1])
-        counts += np.bincount((chunk.y.long() * width + chunk.x).numpy(), minlength=len(counts))
+        pixels = (chunk.y.long() * width + chunk.x).numpy()
+        counts += np.bincount(pixels, minlength=len(counts))
+        fired[np.minimum((chunk.t_us.numpy() - first_us) * _PARTS // duration_us, _PARTS - 1), pixels] = True
     image = np.pad(counts.reshape(height, width), 1)
     places = [(dy, dx) for dy in range(3) for dx in range(3) if (dy, dx) != (1, 1)]
     neighbours = np.sort(np.stack([image[dy : dy + height, dx : dx + width] for dy, dx in places]), axis=0)[-2]
-    seconds = 1e-6 * max(last_us - (first_us or 0), 1)
+    span_us = max(last_us - (first_us or 0), 1)
     centre = image[1:-1, 1:-1]
-    return torch.from_numpy((centre >= min_rate * seconds) & (centre > ratio * (neighbours + 1)))
+    # A stream may be shorter than what was to be looked at.
+    enough = _ENOUGH_PARTS * min(span_us / duration_us, 1.0)
+    lasting = fired.sum(0).reshape(height, width) >= enough
+    return torch.from_numpy(lasting & (centre >= min_rate * 1e-6 * span_us) & (centre > ratio * (neighbours + 1)))
