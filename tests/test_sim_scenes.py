@@ -15,6 +15,7 @@ from torchtrack.sim import BackgroundConfig, CameraConfig, MotionConfig, ObjectC
 from torchtrack.sim.meshes import make_mesh
 from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
 from torchtrack.sim.simulation import render_frames
+from torchtrack.sim.suite import scenes_of
 from torchtrack.sim.world import make_world, motions_of
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "simulate"
@@ -169,25 +170,47 @@ def test_written_geometry_has_each_vertex_once(cube, tmp_path):
     assert np.array_equal(drawn[..., :3], made)
 
 
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+SHIPPED = [path for path in sorted(CONFIGS.rglob("*.yaml")) if path.name not in ("paper.yaml", "validation.yaml")]
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_scenes_stay_in_view_and_apart(path):
-    config = load(SceneConfig, path)
-    assert config.name == path.stem
-    world, boxes = make_world(config), []
-    t_s = torch.arange(0, config.duration_s, 0.005, dtype=torch.float64)
-    for number in range(len(config.objects)):
-        T = world.object_poses(number, t_s)
-        pixels = project(
-            transform_points(T, world.points[number].expand(len(t_s), -1, -1)), world.camera.intrinsics(torch.float64).expand(len(t_s), -1)
-        )
-        low, high = pixels.amin(1), pixels.amax(1)
-        assert float(low.min()) > 5
-        assert bool((high < torch.tensor([world.camera.width - 6.0, world.camera.height - 6.0])).all())
-        boxes.append((low, high))
-    for i, (low, high) in enumerate(boxes):
-        for other_low, other_high in boxes[:i]:
-            apart = ((low > other_high) | (other_low > high)).any(-1)
-            assert float(apart.double().mean()) > 0.9
+    for config in scenes_of(path):
+        assert config.name.startswith(path.stem)
+        world, boxes = make_world(config), []
+        t_s = torch.arange(0, config.duration_s, 0.02, dtype=torch.float64)
+        for number in range(len(config.objects)):
+            points = transform_points(world.object_poses(number, t_s), world.points[number].expand(len(t_s), -1, -1))
+            pixels = project(points, world.camera.intrinsics(torch.float64).expand(len(t_s), -1))
+            low, high = pixels.amin(1), pixels.amax(1)
+            assert float(low.min()) > 5
+            assert bool((high < torch.tensor([world.camera.width - 6.0, world.camera.height - 6.0])).all())
+            boxes.append((low, high))
+        for i, (low, high) in enumerate(boxes):
+            for other_low, other_high in boxes[:i]:
+                apart = ((low > other_high) | (other_low > high)).any(-1)
+                assert float(apart.double().mean()) > 0.9
+
+
+def test_the_suite_of_the_paper_has_all_its_sequences():
+    names = [scene.name for scene in scenes_of(CONFIGS / "paper.yaml")]
+    straight = [f"{number:02d}_{speed}" for number in range(1, 7) for speed in ("slow", "normal", "fast")]
+    curved = [f"{number:02d}_{kind}" for number in range(7, 13) for kind in ("original", "messy", "occlusion")]
+    assert names == straight + curved + [str(number) for number in range(13, 18)]
+
+
+@pytest.mark.parametrize("number", range(7, 13))
+def test_occluders_of_the_paper_hide_much_of_the_object_but_not_at_first(number):
+    needs_numba()
+    (config,) = scenes_of(CONFIGS / "paper" / f"{number:02d}.yaml", {"variant": "occlusion", "render.supersampling": 1, "render.lens_blur_px": 0.0})
+    alone = config.model_copy(update={"occluders": ()})
+    t_us = np.linspace(0, 2_000_000, 7).astype(np.int64)
+    share = [
+        (hidden.object_index == 0).sum() / (whole.object_index == 0).sum()
+        for hidden, whole in zip(render_frames(config, t_us), render_frames(alone, t_us), strict=True)
+    ]
+    assert share[0] > 0.99
+    assert min(share) < 0.7
 
 
 def test_settings_are_checked(tmp_path):

@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import trimesh
@@ -194,6 +195,12 @@ SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
 }
 
 
+@cache
+def _made(name: str) -> trimesh.Trimesh:
+    """Made once: fields of distances take a while."""
+    return SHAPES[name]()
+
+
 def make_mesh(name: str, scale: float = 1.0) -> trimesh.Trimesh:
     """A mesh of :data:`SHAPES`, enlarged by ``scale``.
 
@@ -202,6 +209,6 @@ def make_mesh(name: str, scale: float = 1.0) -> trimesh.Trimesh:
     """
     if name not in SHAPES:
         raise ConfigError(f"unknown shape '{name}': use one of {', '.join(SHAPES)}.")
-    mesh = SHAPES[name]()
+    mesh = _made(name).copy()
     mesh.apply_scale(scale)
     return mesh

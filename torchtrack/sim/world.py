@@ -18,11 +18,10 @@ from torchtrack.sim.render import Scenery
 from torchtrack.sim.scenes import ObjectConfig, SceneConfig
 from torchtrack.sim.trajectory import Motion, make_motion
 
-# Speeds are looked up this often when the largest one is sought, s.
-_SPEED_GRID_S = 0.001
-# A motion is not sped up or slowed down by more than this to reach the speed asked for.
-_MOST_SPEED_UP = 64.0
-_BISECTIONS = 26
+# Speeds are looked up this often in a scene when the largest one is sought.
+_SPEED_SAMPLES = 1000
+# A motion is not sped up by more than this to reach the speed asked for.
+_MOST_SPEED_UP = 32
 # As many directions are looked into for the points of a mesh that lie furthest out.
 _MOST_POINTS = 200
 
@@ -113,25 +112,26 @@ class World:
     def _speed_for(self, target_px_s: float) -> float:
         """The factor of time at which the fastest point of all objects has the speed asked for.
 
-        Motions are the same in shape at any factor: the faster, the more of them falls into the scene.
+        Motions are the same in shape at any factor ``s``: what happens up to ``s`` times the duration falls into the scene,
+        ``s`` times as fast.
         """
-        low, high = 1 / _MOST_SPEED_UP, _MOST_SPEED_UP
-        if not self._peak_px_s(low) <= target_px_s <= self._peak_px_s(high):
-            raise ConfigError(
-                f"peak_speed: no point of the objects of '{self.config.name}' can be brought to {target_px_s:g} px/s: at a {high:g}th of their "
-                f"pace they reach {self._peak_px_s(low):.3g} px/s, at {high:g} times {self._peak_px_s(high):.3g}. Change their motions."
-            )
-        for _ in range(_BISECTIONS):
-            middle = math.sqrt(low * high)
-            low, high = (middle, high) if self._peak_px_s(middle) < target_px_s else (low, middle)
-        return math.sqrt(low * high)
-
-    def _peak_px_s(self, speed: float) -> float:
-        """Largest speed of any point of any object, with all motions at ``speed``."""
-        self._move(speed)
-        t_s = torch.linspace(0, self.config.duration_s, max(2, int(self.config.duration_s / _SPEED_GRID_S)) + 1, dtype=torch.float64)
-        step_s = float(t_s[1] - t_s[0])
-        return max(float(self.object_way_px(number, t_s).max()) for number in range(len(self.objects))) / step_s
+        self._move(1.0)
+        step_s = self.config.duration_s / _SPEED_SAMPLES
+        start, so_far = 0, 0.0
+        while start < _MOST_SPEED_UP * _SPEED_SAMPLES:
+            sample = torch.arange(start, start + _SPEED_SAMPLES + 1, dtype=torch.float64)
+            ways = [self.object_way_px(number, sample * step_s) for number in range(len(self.objects))]
+            fastest = np.maximum.accumulate(np.maximum(np.max(ways, axis=0) / step_s, so_far))
+            factor = sample[1:].numpy() / _SPEED_SAMPLES
+            reached = np.flatnonzero(factor * fastest >= target_px_s)
+            if len(reached):
+                first = int(reached[0])
+                return float(np.clip(target_px_s / fastest[first], factor[first] - 1 / _SPEED_SAMPLES, factor[first]))
+            start, so_far = start + _SPEED_SAMPLES, float(fastest[-1])
+        raise ConfigError(
+            f"peak_speed: no point of the objects of '{self.config.name}' can be brought to {target_px_s:g} px/s: at {_MOST_SPEED_UP} times "
+            f"their pace they reach {_MOST_SPEED_UP * so_far:.3g} px/s. Change their motions."
+        )
 
 
 def longest_way(T_cam_obj: Float[Tensor, "p 4 4"], points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "q"]:
