@@ -6,6 +6,8 @@ import torch
 import trimesh
 
 from torchtrack.camera import distort
+from torchtrack.events import concatenate
+from torchtrack.io.container import read_source
 from torchtrack.io.sequence import read_sequence
 from torchtrack.lie import se3_exp
 from torchtrack.sim import BackgroundConfig, CameraConfig, MotionConfig, ObjectConfig, SceneConfig, simulate, write
@@ -141,3 +143,34 @@ def test_flicker_makes_events_everywhere(ball):
     per_pixel = torch.bincount(events.y * 160 + events.x, minlength=160 * 120).double()
     assert float(per_pixel.median()) == pytest.approx(2 * 10 * 2, rel=0.1)
     assert float((per_pixel > 0).double().mean()) > 0.99
+
+
+def test_a_sequence_fits_into_one_file(tmp_path):
+    item = ObjectConfig(label="cube", shape="cube", motion=MotionConfig(position_m=(0, 0, 0.4)))
+    sequence = simulate(SceneConfig(name="one", objects=(item,), camera=CameraConfig(**SMALL), duration_s=0.03))
+    path = write(sequence, tmp_path / "one.h5")
+    assert [file.name for file in tmp_path.iterdir()] == ["one.h5"]
+    read = read_sequence(path)
+    assert read.meta == sequence.meta
+    assert read.extra["velocity"].shape == (1, 31, 6)
+    (of_cube,) = read.objects
+    assert of_cube.label == "cube"
+    assert torch.equal(of_cube.ground_truth.T_cam_obj, sequence.trajectories[0].T_cam_obj)
+    assert trimesh.load_mesh(of_cube.mesh_path).is_watertight
+    assert of_cube.textured_path is not None
+    events = concatenate(list(read.events.chunks()))
+    assert torch.equal(events.t_us, sequence.events.t_us)
+    assert np.array_equal(np.concatenate(list(read_source(path, 1000))), sequence.source.numpy())
+
+
+def test_a_container_that_breaks_off_leaves_nothing(tmp_path, monkeypatch):
+    item = ObjectConfig(label="bar", shape="bar", motion=MotionConfig(position_m=(0, 0, 0.4)))
+    sequence = simulate(SceneConfig(objects=(item,), camera=CameraConfig(**SMALL), duration_s=0.01))
+
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchtrack.sim.output.ContainerWriter.annotate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write(sequence, tmp_path / "one.h5")
+    assert not list(tmp_path.iterdir())

@@ -106,7 +106,7 @@ class Simulate:
     config: Positional[Annotated[str, arg(metavar="[CONFIG]", help_behavior_hint="")]] = ""
     """A YAML file of a scene or a suite, or a folder of them."""
     output: Annotated[str, arg(aliases=["-o"], metavar="FILE|DIR", help_behavior_hint="")] = ""
-    """The sequence to write (.npz), its meshes beside it; of a suite, the folder."""
+    """The sequence to write (.npz with its meshes beside it, or .h5 with all in one); of a suite, the folder."""
     variant: Annotated[str | None, _option("NAME")] = None
     """One variant of a scene that has several; all of them when not given."""
     jobs: Annotated[int, arg(aliases=["-j"], metavar="N")] = 2

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from torch import Tensor
 
 from torchtrack.camera import Camera
 from torchtrack.events import EventBatch, concatenate
-from torchtrack.io.sequence import write_sequence
 from torchtrack.io.trajectory import Trajectory
 from torchtrack.sim.drawing import merge_regions
 from torchtrack.sim.event_camera import EventCamera
@@ -195,44 +193,3 @@ def _meta(config: SceneConfig, world: World, frames: int, worst_px: float) -> di
         "convention": "OpenCV camera, object->camera, metres, pixel centre at integer",
         "scene": config.model_dump(mode="json"),
     }
-
-
-def write(sequence: SimulatedSequence, path: str | Path) -> Path:
-    """Write a sequence to the ``.npz`` file ``path``, with its meshes beside it; see :mod:`torchtrack.io.sequence`.
-
-    Raises:
-        EventDataError: if ``path`` is not a ``.npz`` file.
-    """
-    events, objects = sequence.events, len(sequence.labels)
-    meshes = sequence.meshes[:objects]
-    write_sequence(
-        path,
-        x=events.x.numpy(),
-        y=events.y.numpy(),
-        t_us=events.t_us.numpy(),
-        polarity=events.polarity.numpy().astype(np.uint8),
-        camera=sequence.camera,
-        labels=sequence.labels,
-        meshes=[_bare(mesh) for mesh in meshes],
-        trajectories=sequence.trajectories[:objects],
-        meta=sequence.meta,
-        textured=[mesh if isinstance(mesh.visual, trimesh.visual.TextureVisuals) else None for mesh in meshes],
-        extra=_extra_arrays(sequence),
-    )
-    return Path(path)
-
-
-def _bare(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Geometry with colours, without a texture: that doubles vertices along its seams, and geometry needs each of them once."""
-    colours = mesh.visual.vertex_colors if isinstance(mesh.visual, trimesh.visual.ColorVisuals) and mesh.visual.defined else None
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=colours is None)
-
-
-def _extra_arrays(sequence: SimulatedSequence) -> dict[str, np.ndarray]:
-    """What a simulated sequence holds beside the common arrays."""
-    objects = len(sequence.labels)
-    arrays = {"velocity": sequence.velocities[:objects].numpy(), "source": sequence.source.numpy().astype(np.int16)}
-    if sequence.occluder_labels:
-        poses = np.stack([trajectory.T_cam_obj.numpy() for trajectory in sequence.trajectories[objects:]])
-        arrays |= {"occluder_poses": poses[0] if len(poses) == 1 else poses, "occluder_labels": np.array(sequence.occluder_labels)}
-    return arrays

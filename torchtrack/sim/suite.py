@@ -22,10 +22,11 @@ from pydantic import Field
 
 from torchtrack.config.load import load, read_yaml
 from torchtrack.config.settings import Settings
-from torchtrack.errors import ConfigError, EventDataError, MissingFileError, TorchtrackError
+from torchtrack.errors import ConfigError, MissingFileError, TorchtrackError
 from torchtrack.io.sequence import read_sequence
+from torchtrack.sim.output import check_output, write
 from torchtrack.sim.scenes import SceneConfig
-from torchtrack.sim.simulation import Progress, simulate, write
+from torchtrack.sim.simulation import Progress, simulate
 
 # Progress of a scene is told in steps of this share.
 _PROGRESS_STEP = 0.02
@@ -108,11 +109,10 @@ def simulate_to_file(scene: SceneConfig, path: Path, progress: Progress | None =
     """Simulate a scene and write it; with a preview, ``NAME.mp4`` beside it.
 
     Raises:
-        EventDataError: if ``path`` is not a ``.npz`` file.
+        EventDataError: if ``path`` is neither a ``.npz`` nor a ``.h5`` file.
         TorchtrackError: as :func:`torchtrack.sim.simulation.simulate`.
     """
-    if path.suffix != ".npz":
-        raise EventDataError(f"a sequence is written to a .npz file, got '{path}'.")
+    check_output(path)
     sequence = simulate(scene, progress)
     if preview:
         # What draws pictures loads the whole tracker; those who want none need not wait for it.
