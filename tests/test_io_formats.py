@@ -290,7 +290,7 @@ def test_dvs_messages(ros2, count):
     events = random_events(count, **SIZE) if count else EventBatch.empty()
     message = event_array(events, ros2)
     assert decoder.size(message) == (64, 48)
-    assert_same(decoder.events(message).batch(), events)
+    assert_same(decoder.events([message]).batch(), events)
 
 
 def mono(events: EventBatch, base_us: int) -> bytes:
@@ -316,12 +316,12 @@ def test_packets_count_from_their_own_time(encode, ros2):
     events = random_events(200, **SIZE, duration_us=50_000)
     base_us = int(events.t_us[0]) - 3
     message = event_packet(encode.__name__, encode(events, base_us), base_us * 1000, ros2)
-    assert_same(MessageDecoder("EventPacket", ros2, Problems("bag", strict=True)).events(message).batch(), events)
+    assert_same(MessageDecoder("EventPacket", ros2, Problems("bag", strict=True)).events([message]).batch(), events)
 
 
 def test_vectors_of_libcaer_stand_upright():
     words = np.array([0, 1 << 12 | 5, 2 << 12 | 9, 4 << 12 | 1 << 11 | 20, 5 << 12 | 0b101], "<u2")
-    found = MessageDecoder("EventPacket", True, Problems("bag", strict=True)).events(event_packet("libcaer_cmp", words.tobytes(), 0, True))
+    found = MessageDecoder("EventPacket", True, Problems("bag", strict=True)).events([event_packet("libcaer_cmp", words.tobytes(), 0, True)])
     assert (found.x.tolist(), found.y.tolist(), found.t_us.tolist(), found.polarity.tolist()) == ([9, 9], [20, 22], [5, 5], [True, True])
 
 
@@ -330,10 +330,10 @@ def test_messages_that_cannot_be_read_are_counted(encoding, content, reason):
     message = event_packet(encoding, content, 0, True)
     for broken, why in ((message, reason), (message[:30], "ends early")):
         problems = Problems("bag", strict=False)
-        assert len(MessageDecoder("EventPacket", True, problems).events(broken)) == 0
+        assert len(MessageDecoder("EventPacket", True, problems).events([broken])) == 0
         assert problems.counts == {Problem.DAMAGED: 1}
         with pytest.raises(EventDataError, match=why):
-            MessageDecoder("EventPacket", True, Problems("bag", strict=True)).events(broken)
+            MessageDecoder("EventPacket", True, Problems("bag", strict=True)).events([broken])
 
 
 def test_a_bag_without_events(tmp_path):

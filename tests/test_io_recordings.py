@@ -70,3 +70,22 @@ def test_zipped_davis_text(data_dir, tmp_path):
         archive.write(path, "shapes_rotation/events.txt")
         archive.writestr("shapes_rotation/calib.txt", "1 2 3 4")
     assert_same(everything(open_events(tmp_path / "shapes_rotation.zip")), everything(open_events(path)))
+
+
+def test_mcap(data_dir, tmp_path):
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    typesys = pytest.importorskip("rosbags.typesys")
+    source = data_dir / "recordings" / "event_camera_msgs_evt3_ros2"
+    with rosbag2.Reader(source) as reader, rosbag2.Writer(tmp_path / "bag", version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        known = reader.connections[0]
+        store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        definition = (
+            "std_msgs/Header header\nuint32 height\nuint32 width\nuint64 seq\nuint64 time_base\nstring encoding\nbool is_bigendian\nuint8[] events"
+        )
+        store.register(typesys.get_types_from_msg(definition, known.msgtype))
+        connection = writer.add_connection(known.topic, known.msgtype, typestore=store)
+        for _, t_ns, message in reader.messages():
+            writer.write(connection, t_ns, message)
+    expected = everything(open_events(source))
+    assert_same(everything(open_events(tmp_path / "bag", strict=True)), expected)
+    assert_same(everything(open_events(next((tmp_path / "bag").glob("*.mcap")), strict=True)), expected)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtrack.errors import EventDataError, UnknownFormatError
-from torchtrack.io.columns import Columns, join
+from torchtrack.io.columns import Columns
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.extras import optional
 from torchtrack.io.problems import Problems
@@ -38,7 +38,7 @@ _DAMAGED = (
     sqlite3.Error,
 )
 # Small messages are decoded together.
-_FEWEST_EVENTS = 100_000
+_FEWEST_BYTES = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -64,15 +64,17 @@ class RosBag(EventFile):
         self._settle_size(width if 0 < width <= 1 << 16 else None, height if 0 < height <= 1 << 16 else None)
 
     def _read(self, max_events: int) -> Iterator[Columns]:
-        waiting: list[Columns] = []
+        waiting: list[bytes] = []
+        size = 0
         with self._messages() as (connection, messages):
             decoder = self._decoder(connection, self.problems)
             for message in messages:
-                waiting.append(decoder.events(message))
-                if sum(map(len, waiting)) >= _FEWEST_EVENTS:
-                    yield join(waiting)
-                    waiting = []
-        yield join(waiting)
+                waiting.append(message)
+                size += len(message)
+                if size >= _FEWEST_BYTES:
+                    yield decoder.events(waiting)
+                    waiting, size = [], 0
+            yield decoder.events(waiting)
 
     def _decoder(self, connection: Any, problems: Problems) -> MessageDecoder:
         return MessageDecoder(_KINDS[connection.msgtype], not _is_ros1(self.path), problems)

@@ -6,12 +6,13 @@
 Reference: github.com/ros-event-camera/event_camera_msgs, github.com/uzh-rpg/rpg_dvs_ros.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from torchtrack.errors import EventDataError
-from torchtrack.io.columns import Columns
+from torchtrack.io.columns import Columns, join
 from torchtrack.io.evt3 import Evt3Decoder
 from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.time_high import unwrap
@@ -80,8 +81,25 @@ class MessageDecoder:
         height, width = cursor.number(4), cursor.number(4)
         return width, height
 
-    def events(self, message: bytes) -> Columns:
-        """The events of a message; a damaged one counts as a fault."""
+    def events(self, messages: Iterable[bytes]) -> Columns:
+        """The events of messages; a damaged one counts as a fault."""
+        parts: list[Columns] = []
+        words: list[np.ndarray] = []
+        for message in messages:
+            content = self._content(message)
+            if isinstance(content, np.ndarray):
+                words.append(content)
+            else:
+                parts += [self._decoded(words), content]
+                words = []
+        return join([*parts, self._decoded(words)])
+
+    def _decoded(self, words: list[np.ndarray]) -> Columns:
+        """The events of EVT3 words, at once: messages are small."""
+        return self._evt3.feed(np.concatenate(words)) if words else Columns.empty()
+
+    def _content(self, message: bytes) -> Columns | np.ndarray:
+        """The events of a message, or the words of EVT3 that it carries."""
         try:
             cursor = _Cursor(message, self.ros2)
             cursor.header()
@@ -92,14 +110,14 @@ class MessageDecoder:
             self.problems.found(Problem.DAMAGED, 1, f"a message cannot be read ({error}). Record it again.")
             return Columns.empty()
 
-    def _packet(self, cursor: _Cursor) -> Columns:
+    def _packet(self, cursor: _Cursor) -> Columns | np.ndarray:
         cursor.number(8)
         base_ns, encoding, big_endian = cursor.number(8), cursor.text(), cursor.number(1)
         data = bytes(cursor.take(cursor.number(4)))
         if big_endian:
             raise EventDataError("its numbers are big-endian, which is not known of any camera")
         if encoding == "evt3":
-            return self._evt3.feed(_words(data, "<u2"))
+            return _words(data, "<u2")
         if encoding == "libcaer_cmp":
             return self._compressed(_words(data, "<u2"), base_ns)
         if encoding in ("mono", "libcaer"):
