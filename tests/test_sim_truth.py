@@ -136,6 +136,24 @@ def test_a_textured_file_looks_like_its_shape(tmp_path):
     assert np.abs(frames[0].luminance - frames[1].luminance).max() < 0.02
 
 
+def test_parts_of_a_file_keep_their_textures(tmp_path):
+    from torchtrack.sim.meshes import make_mesh
+
+    book = make_mesh("book")
+    book.apply_translation([0.2, 0, 0])
+    trimesh.Scene([make_mesh("cube"), book]).export(tmp_path / "both.glb")
+    still = {"translation_amplitude_m": (0, 0, 0), "rotation_amplitude_deg": (0, 0, 0)}
+    left, right = (MotionConfig(position_m=(x, 0, 0.9), **still) for x in (-0.1, 0.1))
+    apart = (ObjectConfig(label="cube", shape="cube", motion=left), ObjectConfig(label="book", shape="book", motion=right))
+    joined = (ObjectConfig(label="both", mesh=tmp_path / "both.glb", motion=left),)
+    scenes = [SceneConfig(objects=objects, camera=CameraConfig(**SMALL), duration_s=0.01) for objects in (apart, joined)]
+    frames = [next(render_frames(scene, np.array([0]))) for scene in scenes]
+    assert np.abs(frames[0].luminance - frames[1].luminance).max() < 0.02
+    write(simulate(scenes[1]), tmp_path / "joined.npz")
+    written = trimesh.load_scene(tmp_path / "joined_both_textured.glb")
+    assert len(written.geometry) == 2
+
+
 def test_flicker_makes_events_everywhere(ball):
     light = LightConfig(flicker_hz=100, flicker_depth=0.3)
     events = simulate(ball_scene(ball, speed=0.0, light=light, duration_s=0.1)).events

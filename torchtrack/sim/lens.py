@@ -15,7 +15,7 @@ from torch import Tensor
 from torchtrack.camera import Camera, distort, undistortion_table
 from torchtrack.sim.drawing import Region, merge_regions
 from torchtrack.sim.render import Frame, RenderConfig, Renderer, Scenery, blurred
-from torchtrack.sim.surface import RenderObject
+from torchtrack.sim.surface import Parts
 
 # Ideal pixels beyond the sensor's view, for interpolation at its border.
 _MARGIN_PX = 4
@@ -38,13 +38,13 @@ class LensRenderer:
     """A :class:`Renderer` behind a lens.
 
     Args:
-        objects: what to draw.
+        objects: what to draw; one may have parts with a texture each.
         camera: with distortion.
         background: luminance as the :func:`ideal_camera` sees it.
         config: light and sampling.
     """
 
-    def __init__(self, objects: Sequence[RenderObject], camera: Camera, background: Float[ndarray, "h w"], config: RenderConfig) -> None:
+    def __init__(self, objects: Sequence[Parts], camera: Camera, background: Float[ndarray, "h w"], config: RenderConfig) -> None:
         self.camera, self.config, self._ideal = camera, config, ideal_camera(camera)
         self._renderer = Renderer(objects, self._ideal, background, config.model_copy(update={"lens_blur_px": 0.0}))
         shift = np.array([self._ideal.cx - camera.cx, self._ideal.cy - camera.cy])

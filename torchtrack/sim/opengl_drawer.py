@@ -100,12 +100,11 @@ class OpenGLDrawer:
         self._gather = self._gl.program(vertex_shader=_WHOLE, fragment_shader=_GATHER)
         corners = self._gl.buffer(np.array([-1, -1, 3, -1, -1, 3], dtype=np.float32).tobytes())
         self._whole = self._gl.vertex_array(self._gather, [(corners, "2f", "corner")])
-        self._meshes = [self._upload(faces) for faces in scene.object_faces]
-        self._prints = [self._texture(faces.start) for faces in scene.object_faces]
+        self._parts = [[(self._upload(faces), self._texture(faces.start)) for faces in of_object] for of_object in scene.part_faces]
         self._targets: tuple[tuple[int, int], moderngl.Framebuffer, moderngl.Texture, moderngl.Framebuffer] | None = None
 
     def _upload(self, faces: slice) -> moderngl.VertexArray:
-        """The triangles of one object."""
+        """The triangles of one part."""
         scene, look = self._scene, self._scene.look
         corners = scene.corners[faces]
         face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -123,7 +122,7 @@ class OpenGLDrawer:
         return self._gl.vertex_array(self._program, [(self._gl.buffer(data.tobytes()), "3f 3f 3f 2f 1f 1f", *names)])
 
     def _texture(self, face: int) -> moderngl.Texture:
-        """The print of the object that a face belongs to."""
+        """The print of the part that a face belongs to."""
         start, width, height = self._scene.look["texture"][face].tolist()
         texture = self._gl.texture((width, height), 1, self._scene.look["texels"][start : start + width * height].tobytes(), dtype="f4", alignment=4)
         texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
@@ -172,11 +171,12 @@ class OpenGLDrawer:
             T = self._T[number]
             program["rotation"], program["translation"] = tuple(T[:3, :3].T.ravel().tolist()), tuple(T[:3, 3].tolist())
             program["number"], program["closed"] = float(number), float(self._scene.is_closed[number])
-            self._prints[number].use(0)
             for s, (dx, dy) in enumerate(self._offsets.tolist()):
                 tiles.viewport = (s % self._n * width, s // self._n * height, width, height)
                 program["intrinsics"] = (fx, fy, cx - region.left - dx + 0.5, cy - region.top - dy + 0.5)
-                self._meshes[number].render()
+                for triangles, texture in self._parts[number]:
+                    texture.use(0)
+                    triangles.render()
 
     def _room(self, size: tuple[int, int]) -> tuple[moderngl.Framebuffer, moderngl.Texture, moderngl.Framebuffer]:
         """Images for the tiles (with what holds their colours) and for the pixels, kept as long as they are large enough."""

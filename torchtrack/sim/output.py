@@ -11,6 +11,8 @@ from torchtrack.io.atomic import atomic_path
 from torchtrack.io.container import ContainerWriter
 from torchtrack.io.sequence import write_sequence
 from torchtrack.io.sequence_types import SequenceObject
+from torchtrack.object_model.loading import join_parts
+from torchtrack.sim.scenes import Model
 from torchtrack.sim.simulation import SimulatedSequence
 
 _HDF5 = (".h5", ".hdf5")
@@ -44,10 +46,10 @@ def write(sequence: SimulatedSequence, path: str | Path) -> Path:
         polarity=events.polarity.numpy().astype(np.uint8),
         camera=sequence.camera,
         labels=sequence.labels,
-        meshes=[_bare(mesh) for mesh in sequence.meshes[:objects]],
+        meshes=[_bare(model) for model in sequence.models[:objects]],
         trajectories=sequence.trajectories[:objects],
         meta=sequence.meta,
-        textured=[_printed(mesh) for mesh in sequence.meshes[:objects]],
+        textured=[_printed(model) for model in sequence.models[:objects]],
         extra=_extra_arrays(sequence) | {"source": sequence.source.numpy().astype(np.int16)},
     )
     return path
@@ -68,24 +70,38 @@ def _write_container(sequence: SimulatedSequence, path: Path) -> None:
 
 def _exported(sequence: SimulatedSequence, number: int, folder: Path) -> SequenceObject:
     """An object with its model files in a folder."""
-    label, mesh, printed_path = sequence.labels[number], sequence.meshes[number], None
+    label, model, printed_path = sequence.labels[number], sequence.models[number], None
     mesh_path = folder / f"{label}.ply"
-    _bare(mesh).export(mesh_path)
-    if (printed := _printed(mesh)) is not None:
+    _bare(model).export(mesh_path)
+    if (printed := _printed(model)) is not None:
         printed_path = folder / f"{label}.glb"
         printed.export(printed_path)
     return SequenceObject(label, mesh_path, printed_path, sequence.trajectories[number])
 
 
-def _printed(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
-    """The mesh, if it has a texture."""
-    return mesh if isinstance(mesh.visual, trimesh.visual.TextureVisuals) else None
+def _printed(model: Model) -> trimesh.Trimesh | trimesh.Scene | None:
+    """The model, if any of its parts has a texture."""
+    if not any(isinstance(part.visual, trimesh.visual.TextureVisuals) for part in model):
+        return None
+    return model[0] if len(model) == 1 else trimesh.Scene(list(model))
 
 
-def _bare(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def _bare(model: Model) -> trimesh.Trimesh:
     """Geometry with colours, without a texture: that doubles vertices along its seams, and geometry needs each of them once."""
-    colours = mesh.visual.vertex_colors if isinstance(mesh.visual, trimesh.visual.ColorVisuals) and mesh.visual.defined else None
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=colours is None)
+    colours = [_colours(part) for part in model]
+    known = all(of_part is not None for of_part in colours)
+    parts = [
+        trimesh.Trimesh(part.vertices, part.faces, vertex_colors=of_part if known else None, process=False)
+        for part, of_part in zip(model, colours, strict=True)
+    ]
+    mesh = join_parts(parts)
+    return mesh if known else trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+
+
+def _colours(mesh: trimesh.Trimesh) -> np.ndarray | None:
+    """Colours of the vertices, where there are any."""
+    visual = mesh.visual
+    return np.asarray(visual.vertex_colors) if isinstance(visual, trimesh.visual.ColorVisuals) and visual.defined else None
 
 
 def _extra_arrays(sequence: SimulatedSequence) -> dict[str, np.ndarray]:

@@ -30,7 +30,7 @@ def write_preview(sequence: SimulatedSequence, config: SceneConfig, path: Path) 
     end_us = int(sequence.trajectories[0].t_us[-1])
     t_us = np.arange(_SHOWN_US, end_us + 1, round(1e6 / (_FRAMES_PER_SECOND * _SLOW_MOTION)))
     with OverlayWriter(path, frames_per_second=_FRAMES_PER_SECOND, slow_motion=_SLOW_MOTION, stills=0) as writer:
-        for at, frame in zip(t_us.tolist(), render_frames(config, t_us, sequence.meshes), strict=True):
+        for at, frame in zip(t_us.tolist(), render_frames(config, t_us, sequence.models), strict=True):
             writer.add(at, _picture(frame, sequence, at))
 
 

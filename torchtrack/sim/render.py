@@ -29,7 +29,7 @@ from torchtrack.camera import Camera
 from torchtrack.config.settings import Settings
 from torchtrack.errors import CalibrationError, MissingExtraError, ModelError, PoseError
 from torchtrack.sim.drawing import Drawer, Light, Region, merge_regions
-from torchtrack.sim.surface import RenderObject, merge_objects
+from torchtrack.sim.surface import Parts, merge_objects
 
 # The blur's weights beyond this many standard deviations are below 1e-4.
 _BLUR_REACH = 4.0
@@ -98,7 +98,7 @@ class Renderer:
     """Draws a fixed set of objects before a fixed background.
 
     Args:
-        objects: what to draw.
+        objects: what to draw; one may have parts with a texture each.
         camera: pinhole camera without distortion.
         background: luminance ``[H, W]``, linear, finite and not negative.
         config: light and sampling.
@@ -110,7 +110,11 @@ class Renderer:
     """
 
     def __init__(
-        self, objects: Sequence[RenderObject], camera: Camera, background: Float[ndarray, "h w"], config: RenderConfig | None = None
+        self,
+        objects: Sequence[Parts],
+        camera: Camera,
+        background: Float[ndarray, "h w"],
+        config: RenderConfig | None = None,
     ) -> None:
         self.camera, self.config = camera, config or RenderConfig()
         _check_inputs(objects, camera, background)
@@ -186,7 +190,7 @@ class Renderer:
         return Region(top, bottom, left, right) if top < bottom and left < right else None
 
 
-def _check_inputs(objects: Sequence[RenderObject], camera: Camera, background: ndarray) -> None:
+def _check_inputs(objects: Sequence[Parts], camera: Camera, background: ndarray) -> None:
     if not objects:
         raise ModelError("a renderer needs at least one object, got none.")
     if camera.distortion_model != "none":
@@ -204,7 +208,7 @@ def _check_poses(T_cam_obj: ndarray, objects: int) -> None:
         raise PoseError(f"the renderer needs one finite pose per object, [{objects}, 4, 4]; got shape {list(T_cam_obj.shape)}.")
 
 
-def make_drawer(objects: Sequence[RenderObject], camera: Camera, config: RenderConfig) -> Drawer:
+def make_drawer(objects: Sequence[Parts], camera: Camera, config: RenderConfig) -> Drawer:
     """The one that the config asks for; each loads its library only when asked for.
 
     Raises:

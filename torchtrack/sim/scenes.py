@@ -2,6 +2,7 @@
 
 from typing import Any, Literal
 
+import numpy as np
 import trimesh
 from pydantic import Field, model_validator
 
@@ -9,7 +10,7 @@ from torchtrack.camera import Camera, DistortionModel
 from torchtrack.config.merge import merged
 from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.io.calibration import read_calibration
-from torchtrack.object_model.loading import checked_scale, join_parts, load_parts
+from torchtrack.object_model.loading import checked_scale, load_parts
 from torchtrack.sim.background import BackgroundConfig
 from torchtrack.sim.meshes import make_mesh
 from torchtrack.sim.render import RenderConfig
@@ -18,6 +19,10 @@ from torchtrack.sim.trajectory import CameraMotionConfig, MotionConfig
 
 SPEEDS_PX_S = {"slow": 250.0, "normal": 750.0, "fast": 2250.0}
 """Largest speed of any point of an object in the image, by name: what the shared development sequences have."""
+
+
+Model = tuple[trimesh.Trimesh, ...]
+"""The parts of an object."""
 
 
 class CameraConfig(Settings):
@@ -67,17 +72,17 @@ class ObjectConfig(Settings):
             raise ValueError("give either shape or mesh, exactly one of them")
         return self
 
-    def build(self) -> trimesh.Trimesh:
-        """The mesh, in metres.
+    def build(self) -> Model:
+        """The parts of its mesh, in metres, each with a texture of its own.
 
         Raises:
             MissingFileError, UnknownFormatError, ModelError: if there is something wrong with the mesh file.
         """
         if self.mesh is None:
-            return make_mesh(str(self.shape), self.scale)
-        mesh = join_parts(load_parts(self.mesh))
-        mesh.apply_scale(checked_scale(mesh.vertices, self.unit, self.label) * self.scale)
-        return mesh
+            return (make_mesh(str(self.shape), self.scale),)
+        parts = load_parts(self.mesh)
+        scale = checked_scale(np.concatenate([part.vertices for part in parts]), self.unit, self.label) * self.scale
+        return tuple(part.apply_scale(scale) for part in parts)
 
 
 class LightConfig(Settings):

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
@@ -20,7 +19,7 @@ from torchtrack.sim.event_camera import EventCamera
 from torchtrack.sim.frames import MAX_INTERVAL_US, frame_times
 from torchtrack.sim.lens import LensRenderer
 from torchtrack.sim.render import Frame, Renderer
-from torchtrack.sim.scenes import SceneConfig
+from torchtrack.sim.scenes import Model, SceneConfig
 from torchtrack.sim.surface import RenderObject
 from torchtrack.sim.trajectory import truth_times, velocity
 from torchtrack.sim.world import World, make_world
@@ -53,7 +52,7 @@ class SimulatedSequence:
             :data:`BACKGROUND` or :data:`NOISE`.
         camera: the camera.
         labels, occluder_labels: of the objects, and of what passes before them.
-        meshes, trajectories: one per object, then one per occluder; meshes in metres with their textures, true poses at 1 kHz.
+        models, trajectories: one per object, then one per occluder; meshes in metres with their textures, true poses at 1 kHz.
         velocities: twists ``[rotation (rad/s), translation (m/s)]`` with ``dT_cam_obj/dt = ξ^ T_cam_obj``, at the same times.
         meta: settings and facts of the simulation, as JSON can hold them.
     """
@@ -64,20 +63,18 @@ class SimulatedSequence:
     camera: Camera
     labels: tuple[str, ...]
     occluder_labels: tuple[str, ...]
-    meshes: tuple[trimesh.Trimesh, ...]
+    models: tuple[Model, ...]
     trajectories: tuple[Trajectory, ...]
     velocities: Float[Tensor, "o p 6"]
     meta: dict[str, Any]
 
 
-def render_frames(
-    config: SceneConfig, t_us: Int[ndarray, "p"], meshes: Sequence[trimesh.Trimesh] | None = None, world: World | None = None
-) -> Iterator[Frame]:
-    """The images of a scene at the given times; meshes (of objects, then occluders) and world are made where they are not given."""
+def render_frames(config: SceneConfig, t_us: Int[ndarray, "p"], models: Sequence[Model] | None = None, world: World | None = None) -> Iterator[Frame]:
+    """The images of a scene at the given times; models (of objects, then occluders) and world are made where they are not given."""
     items = (*config.objects, *config.occluders)
-    meshes = meshes or [item.build() for item in items]
-    world = world or make_world(config, meshes)
-    objects = [RenderObject.from_mesh(mesh, item.reflectance, item.gloss) for mesh, item in zip(meshes, items, strict=True)]
+    models = models or [item.build() for item in items]
+    world = world or make_world(config, models)
+    objects = [tuple(RenderObject.from_mesh(part, item.reflectance, item.gloss) for part in model) for model, item in zip(models, items, strict=True)]
     make = Renderer if world.camera.distortion_model == "none" else LensRenderer
     renderer = make(objects, world.camera, world.still_background(), config.render)
     for first in range(0, len(t_us), _POSES_PER_ROUND):
@@ -100,11 +97,11 @@ def simulate(config: SceneConfig, progress: Progress | None = None) -> Simulated
         MissingFileError, UnknownFormatError, ModelError, PoseError: if there is something wrong with a file that the scene names.
     """
     items = (*config.objects, *config.occluders)
-    meshes = tuple(item.build() for item in items)
-    world = make_world(config, meshes)
+    models = tuple(item.build() for item in items)
+    world = make_world(config, models)
     duration_us = max(1, round(config.duration_s * 1e6))
     t_us, worst_px = frame_times(world.way_px, duration_us, config.max_motion_px, _max_interval_us(config))
-    events, source = _events(config, world, render_frames(config, t_us, meshes, world), t_us, progress)
+    events, source = _events(config, world, render_frames(config, t_us, models, world), t_us, progress)
     truth_us = truth_times(duration_us)
     truth_s = truth_us.double() * 1e-6
     return SimulatedSequence(
@@ -114,7 +111,7 @@ def simulate(config: SceneConfig, progress: Progress | None = None) -> Simulated
         world.camera,
         tuple(item.label for item in config.objects),
         tuple(item.label for item in config.occluders),
-        meshes,
+        models,
         tuple(Trajectory(truth_us, world.object_poses(number, truth_s)) for number in range(len(items))),
         torch.stack([velocity(partial(world.object_poses, number), truth_s) for number in range(len(items))]),
         _meta(config, world, len(t_us), worst_px),

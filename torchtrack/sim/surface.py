@@ -125,6 +125,10 @@ def _corner_pairs(vertex: Int[ndarray, "c"]) -> tuple[Int[ndarray, "p"], Int[nda
     return first, order[np.repeat(starts[vertex[order]], per_corner) + step]
 
 
+Parts = RenderObject | tuple[RenderObject, ...]
+"""An object, or its parts."""
+
+
 @dataclass(frozen=True)
 class Scene:
     """All objects of a scene as one list of triangles.
@@ -132,6 +136,7 @@ class Scene:
     Args:
         corners, normals: of every face, in the frame of its object.
         object_faces: which faces belong to each object.
+        part_faces: the same for the parts of each object, which have a texture each.
         is_closed: of each object (see :class:`RenderObject`).
         look: the other fields of :class:`torchtrack.sim.shading.Surface`.
     """
@@ -139,30 +144,41 @@ class Scene:
     corners: Float[ndarray, "f 3 3"]
     normals: Float[ndarray, "f 3 3"]
     object_faces: tuple[slice, ...]
+    part_faces: tuple[tuple[slice, ...], ...]
     is_closed: Bool[ndarray, "o"]
     look: dict[str, Any]
 
 
-def merge_objects(objects: Sequence[RenderObject]) -> Scene:
-    """One list of triangles, with all textures in one array of texels."""
-    counts = [len(item.corners) for item in objects]
+def merge_objects(objects: Sequence[Parts]) -> Scene:
+    """One list of triangles, with all textures in one array of texels; an object may have parts with a texture each."""
+    groups = [item if isinstance(item, tuple) else (item,) for item in objects]
+    parts = [part for group in groups for part in group]
+    owner = [number for number, group in enumerate(groups) for _ in group]
+    counts = [len(part.corners) for part in parts]
     ends = np.cumsum(counts)
-    sizes = [item.texture.size for item in objects]
+    sizes = [part.texture.size for part in parts]
     starts = np.cumsum(sizes) - sizes
-    textures = [(start, item.texture.shape[1], item.texture.shape[0]) for start, item in zip(starts, objects, strict=True)]
-    normals = np.concatenate([item.normals for item in objects])
+    textures = [(start, part.texture.shape[1], part.texture.shape[0]) for start, part in zip(starts, parts, strict=True)]
+    normals = np.concatenate([part.normals for part in parts])
     look = {
-        "uv": np.concatenate([item.uv for item in objects]).astype(np.float32),
-        "albedo": np.concatenate([item.albedo for item in objects]).astype(np.float32),
+        "uv": np.concatenate([part.uv for part in parts]).astype(np.float32),
+        "albedo": np.concatenate([part.albedo for part in parts]).astype(np.float32),
         "is_flat": _is_flat(normals),
         "texture": np.repeat(np.array(textures, dtype=np.int64), counts, axis=0),
-        "texels": np.concatenate([item.texture.ravel() for item in objects]).astype(np.float32),
-        "face_object": np.repeat(np.arange(len(objects)), counts),
-        "gloss": np.repeat(np.array([item.gloss for item in objects], dtype=np.float32), counts),
+        "texels": np.concatenate([part.texture.ravel() for part in parts]).astype(np.float32),
+        "face_object": np.repeat(np.array(owner), counts),
+        "gloss": np.repeat(np.array([part.gloss for part in parts], dtype=np.float32), counts),
     }
-    slices = tuple(slice(int(end - count), int(end)) for end, count in zip(ends, counts, strict=True))
-    is_closed = np.array([item.is_closed for item in objects])
-    return Scene(np.concatenate([item.corners for item in objects]), normals, slices, is_closed, look)
+    of_parts = [slice(int(end - count), int(end)) for end, count in zip(ends, counts, strict=True)]
+    by_object = [[faces for faces, number in zip(of_parts, owner, strict=True) if number == wanted] for wanted in range(len(groups))]
+    return Scene(
+        np.concatenate([part.corners for part in parts]),
+        normals,
+        tuple(slice(of_object[0].start, of_object[-1].stop) for of_object in by_object),
+        tuple(tuple(of_object) for of_object in by_object),
+        np.array([all(part.is_closed for part in group) for group in groups]),
+        look,
+    )
 
 
 def _is_flat(normals: Float[ndarray, "f 3 3"]) -> Bool[ndarray, "f"]:

@@ -8,6 +8,7 @@ import torch
 import trimesh
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.spatial import QhullError
 from torch import Tensor
 
 from torchtrack import lie
@@ -15,7 +16,7 @@ from torchtrack.camera import MIN_DEPTH_M, Camera, project
 from torchtrack.errors import ConfigError
 from torchtrack.sim.lens import ideal_camera
 from torchtrack.sim.render import Scenery
-from torchtrack.sim.scenes import ObjectConfig, SceneConfig
+from torchtrack.sim.scenes import Model, ObjectConfig, SceneConfig
 from torchtrack.sim.trajectory import Motion, make_motion
 
 # Speeds are looked up this often in a scene when the largest one is sought.
@@ -148,7 +149,10 @@ def outer_points(mesh: trimesh.Trimesh) -> Float[Tensor, "n 3"]:
 
     Of a smooth hull, those that lie furthest out in some direction.
     """
-    hull = np.array(mesh.convex_hull.vertices, dtype=np.float64)
+    try:
+        hull = np.array(mesh.convex_hull.vertices, dtype=np.float64)
+    except QhullError:  # all in one plane
+        hull = np.array(mesh.vertices, dtype=np.float64)
     if len(hull) > _MOST_POINTS:
         height, turn = np.linspace(-1, 1, _MOST_POINTS), np.pi * (1 + np.sqrt(5)) * np.arange(_MOST_POINTS)
         level = np.sqrt(1 - height**2)
@@ -157,10 +161,11 @@ def outer_points(mesh: trimesh.Trimesh) -> Float[Tensor, "n 3"]:
     return torch.from_numpy(hull)
 
 
-def make_world(config: SceneConfig, meshes: Sequence[trimesh.Trimesh] | None = None) -> World:
-    """The world of a scene; its meshes are made where they are not given."""
+def make_world(config: SceneConfig, models: Sequence[Model] | None = None) -> World:
+    """The world of a scene; its models are made where they are not given."""
     items: tuple[ObjectConfig, ...] = (*config.objects, *config.occluders)
-    return World(config, [outer_points(mesh) for mesh in meshes or [item.build() for item in items]])
+    models = models or [item.build() for item in items]
+    return World(config, [torch.cat([outer_points(part) for part in model]) for model in models])
 
 
 def motions_of(config: SceneConfig) -> list[Motion]:
