@@ -69,8 +69,10 @@ def test_without_truth_or_motion_there_is_nothing_to_find(late, tmp_path):
         estimate_latency(open_session(RunConfig(source=write(simulate(scene), tmp_path / "still.npz"))))
 
 
-def test_the_command_shows_a_row_per_sequence(late, capsys):
+def test_the_command_shows_a_row_per_sequence(late, found, capsys, monkeypatch):
+    monkeypatch.setattr("torchtrack.commands.estimate_latency", lambda session: found)
     assert main(["evaluate", str(late), "--estimate-latency"]) == ExitCode.DONE
     shown = capsys.readouterr().out
     assert "late" in shown
+    assert f"{found.latency_us:.0f}" in shown
     assert "sensor_latency_us" in shown
