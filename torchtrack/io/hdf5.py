@@ -24,12 +24,15 @@ import numpy as np
 from torchtrack.errors import EventDataError, MissingExtraError, UnknownFormatError
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_file import EventFile
+from torchtrack.io.event_source import PART_EVENTS
 from torchtrack.io.extras import optional
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _LAYOUTS = (("x", "y", "t", "p"), ("xs", "ys", "ts", "ps"))
 _ECF_FILTER = 0x8ECF
 _DSEC_SIZE, _PROPHESEE_SIZE = (640, 480), (1280, 720)
+# Per array; events are read in order, and no part of a file twice.
+_CACHE_BYTES = 1 << 20
 # What h5py is known to raise over damaged files.
 _DAMAGED = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError, AttributeError)
 _ECF_HELP = (
@@ -42,7 +45,7 @@ _ECF_HELP = (
 def open_hdf5(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading; what h5py raises over damage becomes an :class:`EventDataError`."""
     try:
-        with h5py.File(path, "r") as file:
+        with h5py.File(path, "r", rdcc_nbytes=_CACHE_BYTES) as file:
             yield file
     except (EventDataError, UnknownFormatError, MissingExtraError):
         raise
@@ -91,8 +94,9 @@ class Hdf5Events(EventFile):
         with open_hdf5(self.path) as file:
             offset_us = _time_offset(file, self.group)
             arrays = _arrays(file, self.group)
-            for start in range(self._first(file, offset_us), self.count, max_events):
-                part = slice(start, min(start + max_events, self.count))
+            size = min(max_events, PART_EVENTS)
+            for start in range(self._first(file, offset_us), self.count, size):
+                part = slice(start, min(start + size, self.count))
                 yield self._part(arrays, part, offset_us)
 
     def _part(self, arrays: list[h5py.Dataset], part: slice, offset_us: int) -> Columns:

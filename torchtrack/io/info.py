@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 
+from torchtrack.events import EventBatch
 from torchtrack.io.event_source import EventSource
 
 _PEAK_SPAN_US = 10_000
@@ -57,46 +58,62 @@ class EventInfo:
 
 def summarise(source: EventSource, max_events: int | None = None) -> EventInfo:
     """Read a stream, or its first ``max_events`` events, and say what is in it."""
-    first_us: int | None = None
-    last_us: int | None = None
-    count = brighter = gap_count = 0
-    gaps: list[Gap] = []
-    peak = _Peak()
+    tally = _Tally()
     complete = True
     for chunk in source.chunks():
-        if max_events is not None and count + len(chunk) > max_events:
-            chunk, complete = chunk[: max_events - count], False
-            if len(chunk) == 0:
-                break
-        t_us = chunk.t_us
-        before = t_us[:1] if last_us is None else torch.tensor([last_us])
-        steps = torch.diff(t_us, prepend=before)
-        at = torch.nonzero(steps > _GAP_US)[:, 0]
-        gap_count += len(at)
-        gaps = sorted([*gaps, *_longest(t_us, steps, at)], key=lambda gap: -gap.duration_us)[:_MOST_GAPS]
-        peak.add(t_us)
-        first_us = int(t_us[0]) if first_us is None else first_us
-        last_us = int(t_us[-1])
-        count += len(chunk)
-        brighter += int(chunk.polarity.sum())
+        if max_events is not None and tally.count + len(chunk) > max_events:
+            chunk, complete = chunk[: max_events - tally.count], False
+        if len(chunk):
+            tally.add(chunk)
         if not complete:
             break
     problems = getattr(source, "problems", None)
-    duration_s = 1e-6 * max((last_us or 0) - (first_us or 0), 1)
     return EventInfo(
         width=source.width,
         height=source.height,
-        count=count if complete else getattr(source, "known_count", None),
+        count=tally.count if complete else getattr(source, "known_count", None),
         complete=complete,
-        first_us=first_us,
-        last_us=last_us,
-        mean_rate=count / duration_s if count > 1 else 0.0,
-        peak_rate=peak.count / (1e-6 * _PEAK_SPAN_US),
-        brighter_share=brighter / count if count else 0.0,
-        gaps=tuple(sorted(gaps, key=lambda gap: gap.start_us)),
-        gap_count=gap_count,
+        first_us=tally.first_us,
+        last_us=tally.last_us,
+        mean_rate=tally.mean_rate,
+        peak_rate=tally.peak.count / (1e-6 * _PEAK_SPAN_US),
+        brighter_share=tally.brighter / max(tally.count, 1),
+        gaps=tuple(sorted(tally.gaps, key=lambda gap: gap.start_us)),
+        gap_count=tally.gap_count,
         problems={problem.value: number for problem, number in problems.counts.items()} if problems is not None else {},
     )
+
+
+@dataclass
+class _Tally:
+    """What was seen so far."""
+
+    count: int = 0
+    brighter: int = 0
+    first_us: int | None = None
+    last_us: int | None = None
+    gap_count: int = 0
+    gaps: list[Gap] = field(default_factory=list)
+    peak: "_Peak" = field(default_factory=lambda: _Peak())
+
+    def add(self, chunk: EventBatch) -> None:
+        t_us = chunk.t_us
+        self.first_us = int(t_us[0]) if self.first_us is None else self.first_us
+        before = self.first_us if self.last_us is None else self.last_us
+        steps = torch.diff(t_us, prepend=torch.tensor([before]))
+        at = torch.nonzero(steps > _GAP_US)[:, 0]
+        self.gap_count += len(at)
+        self.gaps = sorted([*self.gaps, *_longest(t_us, steps, at)], key=lambda gap: -gap.duration_us)[:_MOST_GAPS]
+        self.peak.add(t_us)
+        self.last_us = int(t_us[-1])
+        self.count += len(chunk)
+        self.brighter += int(chunk.polarity.sum())
+
+    @property
+    def mean_rate(self) -> float:
+        if self.first_us is None or self.last_us is None or self.count < 2:
+            return 0.0
+        return self.count / (1e-6 * max(self.last_us - self.first_us, 1))
 
 
 def _longest(t_us: torch.Tensor, steps: torch.Tensor, at: torch.Tensor) -> list[Gap]:

@@ -17,6 +17,7 @@ import numpy as np
 from torchtrack.errors import EventDataError, UnknownFormatError
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_file import EventFile
+from torchtrack.io.event_source import PART_EVENTS
 from torchtrack.io.zip_archive import ZIP_MAGIC, damage_reported, open_archive
 
 __all__ = ["ZIP_MAGIC", "NpzEvents", "keys_of", "open_archive", "read_array"]
@@ -144,8 +145,9 @@ class NpzEvents(EventFile):
             members = [_open_member(archive, key, self.path) for key in _EVENT_KEYS]
             for member in members:
                 stack.enter_context(member.stream)
-            for start in range(0, self.count, max_events):
-                size = min(max_events, self.count - start)
+            part = min(max_events, PART_EVENTS)
+            for start in range(0, self.count, part):
+                size = min(part, self.count - start)
                 yield Columns(*(member.read(size) for member in members))
             for member in members:
                 member.finish()
