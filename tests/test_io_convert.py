@@ -89,6 +89,15 @@ def test_vectors_make_evt3_smaller(tmp_path):
     assert_same(everything(open_events(path)), events)
 
 
+def test_another_decoder_reads_what_is_written(tmp_path):
+    evt3 = pytest.importorskip("evt3")
+    events = random_events(5000, width=64, height=48, duration_us=200_000)
+    known = evt3.decode_file(str(written(tmp_path, "evt3", events, 64, 48)))
+    assert (known.sensor_width, known.sensor_height) == (64, 48)
+    for name, values in (("timestamp", events.t_us), ("x", events.x), ("y", events.y), ("polarity", events.polarity)):
+        assert getattr(known, name).tolist() == values.int().tolist(), name
+
+
 def test_writers_refuse_what_is_wrong(tmp_path, kind):
     writer = WRITERS[kind](tmp_path / f"e{SUFFIX[kind]}", 64, 48)
     one = np.array([1])
