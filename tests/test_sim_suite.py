@@ -1,5 +1,6 @@
 """Many scenes at once: variants, lists, folders; what is there is kept, what fails is told."""
 
+import numpy as np
 import pytest
 
 from torchtrack.cli import main
@@ -7,6 +8,7 @@ from torchtrack.errors import ConfigError, EventDataError, MissingFileError
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io.sequence import read_sequence
 from torchtrack.sim import SceneConfig
+from torchtrack.sim.render import Frame
 from torchtrack.sim.suite import is_done, is_suite, run_suite, scenes_of, simulate_to_file
 
 TINY = "camera: {width: 60, height: 40, fx: 60, fy: 60}\nduration_s: 0.02\nobjects: [{label: cube, shape: cube}]\n"
@@ -126,3 +128,12 @@ def test_the_command_makes_one_variant_with_a_preview(suite, tmp_path, capsys):
 def test_commands_that_make_no_sense_are_errors(arguments, message, capsys):
     assert main(["simulate", *arguments]) == ExitCode.WRONG_SETTINGS
     assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_contours_of_a_preview_are_where_something_else_begins():
+    from torchtrack.sim.preview import _contours
+
+    owner, depth = np.full((5, 8), -1, dtype=np.int16), np.full((5, 8), np.inf, dtype=np.float32)
+    owner[:, 2:7], depth[:, 2:4], depth[:, 4:7] = 0, 0.5, 0.6
+    edge = _contours(Frame(np.zeros((5, 8), np.float32), depth, owner, ()))
+    assert np.flatnonzero(edge[2]).tolist() == [1, 2, 3, 4, 6, 7]

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from numpy import ndarray
 
 from torchtrack.sim.render import Frame
@@ -16,6 +16,8 @@ from torchtrack.viz.video import OverlayWriter
 
 _FRAMES_PER_SECOND = 30.0
 _SLOW_MOTION = 4.0
+# A step in depth of this share is a contour.
+_JUMP = 0.03
 # Events are shown for this long, µs.
 _SHOWN_US = 5000
 _ON, _OFF, _CONTOUR, _OCCLUDER = (255, 160, 60), (60, 60, 255), (80, 255, 80), (0, 200, 255)
@@ -39,14 +41,21 @@ def _picture(frame: Frame, sequence: SimulatedSequence, t_us: int) -> UInt8[ndar
     first, end = torch.searchsorted(sequence.events.t_us, torch.tensor([t_us - _SHOWN_US, t_us]), right=True).tolist()
     events = sequence.events[first:end]
     image[events.y.numpy(), events.x.numpy()] = np.where(events.polarity.numpy()[:, None], _ON, _OFF)
-    owner = frame.object_index.astype(np.int32)
-    # Where what is nearer begins: a pixel whose neighbour belongs to something else.
-    edge = np.zeros(owner.shape, dtype=bool)
-    edge[:, 1:] |= owner[:, 1:] != owner[:, :-1]
-    edge[:, :-1] |= owner[:, 1:] != owner[:, :-1]
-    edge[1:] |= owner[1:] != owner[:-1]
-    edge[:-1] |= owner[1:] != owner[:-1]
+    owner = frame.object_index
+    edge = _contours(frame)
     objects = len(sequence.labels)
     image[edge & (owner >= 0) & (owner < objects)] = _CONTOUR
     image[edge & (owner >= objects)] = _OCCLUDER
     return image
+
+
+def _contours(frame: Frame) -> Bool[ndarray, "h w"]:
+    """Pixels beside a pixel of something else, or of the same object much nearer or further."""
+    owner, nearness = frame.object_index, 1 / frame.depth
+    edge = np.zeros(owner.shape, dtype=np.bool_)
+    for first, second in (((slice(None), slice(1, None)), (slice(None), slice(None, -1))), ((slice(1, None),), (slice(None, -1),))):
+        jump = np.abs(nearness[first] - nearness[second]) > _JUMP * np.maximum(nearness[first], nearness[second])
+        differs = (owner[first] != owner[second]) | jump
+        edge[first] |= differs
+        edge[second] |= differs
+    return edge
