@@ -182,6 +182,15 @@ def test_lenient_reading_keeps_what_is_good(tmp_path):
     assert str(source.problems) == "1 events outside the sensor, 2 events that go back in time"
 
 
+@pytest.mark.parametrize("size", [1, 2, 4, 5, 100])
+def test_a_wild_time_at_the_end_of_a_part_costs_one_event(tmp_path, size):
+    t = np.array([1, 2, 3, 1000, 4, 5, 6, 7, 8])
+    ones = np.ones(9, np.int64)
+    source = open_events(save_npz(tmp_path / "e.npz", EventBatch.from_numpy(ones, ones, t, ones)))
+    with pytest.warns(TorchtrackWarning, match="1 events that go back in time: time goes back from 1000 to 4 µs at event 4"):
+        assert everything(source, size).t_us.tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
+
+
 def test_columns_of_a_batch():
     events = random_events(10, **SIZE)
     assert_same(Columns.of(events).batch(), events)

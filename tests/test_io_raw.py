@@ -163,7 +163,7 @@ def raw_file(folder, words: list[int], header: str = "% evt 3.0\n% geometry 64x4
     return path
 
 
-GOOD = [HIGH, LOW | 5, ROW | 1, EVENT | 2, LOW | 9, EVENT | 3]
+GOOD = [HIGH, LOW | 5, ROW | 1, EVENT | 2, LOW | 9, EVENT | 3, EVENT | 4]
 
 
 @pytest.mark.parametrize(
@@ -171,8 +171,8 @@ GOOD = [HIGH, LOW | 5, ROW | 1, EVENT | 2, LOW | 9, EVENT | 3]
     [
         ([*GOOD, 1 << 12], b"", Problem.UNKNOWN, r"1 words are of no kind of this encoding \(first: 1\)"),
         (GOOD, b"\0", Problem.DAMAGED, "ends within a word: 1 bytes are left over"),
-        ([*GOOD, EVENT | 64], b"", Problem.OUTSIDE, r"event 2 is at \(64, 1\), outside the sensor of 64x48 pixels \(1 such events\)"),
-        ([*GOOD, LOW | 6, EVENT | 3], b"", Problem.BACK, "time goes back from 9 to 6 µs at event 2"),
+        ([*GOOD, EVENT | 64], b"", Problem.OUTSIDE, r"event 3 is at \(64, 1\), outside the sensor of 64x48 pixels \(1 such events\)"),
+        ([*GOOD, LOW | 6, EVENT | 3], b"", Problem.BACK, "time goes back from 9 to 6 µs at event 3"),
     ],
 )
 def test_what_is_wrong_is_an_error_or_left_out(tmp_path, words, rest, problem, reason):
@@ -182,7 +182,7 @@ def test_what_is_wrong_is_an_error_or_left_out(tmp_path, words, rest, problem, r
     source = open_events(path)
     with pytest.warns(TorchtrackWarning, match=f"some of it was left out. First of 1 {problem.value}: .*{reason}"):
         events = everything(source)
-    assert events.t_us.tolist() == [5, 9]
+    assert events.t_us.tolist() == [5, 9, 9]
     assert source.problems.counts == {problem: 1}
     with pytest.warns(TorchtrackWarning):
         assert source.info().problems == {problem.value: 1}

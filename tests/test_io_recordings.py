@@ -64,6 +64,13 @@ def test_info_says_what_is_in_it(recording):
     assert 0.2 < info.brighter_share < 0.8
 
 
+def test_counts_are_estimated_where_not_all_is_read(recording):
+    path, (_, count, *_) = recording
+    info = open_events(path).info(max_events=100)
+    assert not info.complete
+    assert info.count is None or 0.9 * count <= info.count <= 1.1 * count
+
+
 def test_zipped_davis_text(data_dir, tmp_path):
     path = data_dir / "recordings" / "shapes_rotation" / "events.txt"
     with zipfile.ZipFile(tmp_path / "shapes_rotation.zip", "w", zipfile.ZIP_DEFLATED) as archive:

@@ -11,7 +11,7 @@ from torchtrack.io.columns import Columns
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
 from torchtrack.io.event_stream import EventStream
 from torchtrack.io.problems import Problem, Problems
-from torchtrack.io.soundness import sound
+from torchtrack.io.soundness import mended, sound
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,8 @@ class EventFile(EventStream):
     def _checked(self, max_events: int) -> Iterator[EventBatch]:
         self.problems.clear()
         last_us, count = None, 0
-        for part in self._readable(max_events):
+        parts = self._readable(max_events)
+        for part in parts if self.strict else mended(parts):
             events = self._started(part)
             usable = sound(events, self.width, self.height, self.problems, last_us, count)
             count += len(events)

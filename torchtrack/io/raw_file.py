@@ -19,6 +19,7 @@ from torchtrack.io.prophesee_header import PropheseeHeader, read_header
 
 # Small enough that a block and what is made of it stay in the processor's cache.
 _BLOCK_BYTES = 1 << 18
+_ESTIMATE_BYTES = 1 << 20
 _HD, _VGA = (1280, 720), (640, 480)
 
 
@@ -43,9 +44,16 @@ class RawFile(EventFile):
 
     @property
     def known_count(self) -> int | None:
-        """An estimate from the size of the file: EVT2 has about one event a word, the others vary."""
-        words = (self.path.stat().st_size - self.offset) // 4
-        return words if self.encoding == "evt2" else None
+        """An estimate: as many events per byte as at the beginning."""
+        decoder = self.decoder(Problems(str(self.path), strict=False))
+        with self.path.open("rb") as stream:
+            stream.seek(self.offset)
+            data = stream.read(_ESTIMATE_BYTES)
+        whole = len(data) // decoder.dtype.itemsize
+        if whole == 0:
+            return 0
+        count = len(decoder.feed(np.frombuffer(data, decoder.dtype, count=whole)))
+        return round(count * (self.path.stat().st_size - self.offset) / len(data))
 
     def decoder(self, problems: Problems) -> WordDecoder:
         """A decoder for this file's words."""

@@ -1,8 +1,10 @@
 """Which events of a stream can be used: inside the sensor, and in order of time."""
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 
-from torchtrack.io.columns import Columns
+from torchtrack.io.columns import Columns, join
 from torchtrack.io.problems import Problem, Problems
 
 
@@ -44,6 +46,23 @@ def sound(events: Columns, width: int, height: int, problems: Problems, last_us:
     return events[keep]
 
 
+def mended(parts: Iterable[Columns], most: int = 4) -> Iterator[Columns]:
+    """Parts of a stream, joined with the next one (and up to ``most`` in all) where time goes back between them.
+
+    Which side of such a step is wrong can be told from both together only.
+    """
+    waiting: list[Columns] = []
+    for part in parts:
+        if len(part) == 0:
+            continue
+        if waiting and (part.t_us[0] >= waiting[-1].t_us[-1] or len(waiting) == most):
+            yield join(waiting)
+            waiting = []
+        waiting.append(part)
+    if waiting:
+        yield join(waiting)
+
+
 def _all_inside(events: Columns, width: int, height: int) -> bool:
     for pixels, size in ((events.x, width), (events.y, height)):
         if pixels.max() >= size or (pixels.dtype.kind == "i" and pixels.min() < 0):
@@ -72,4 +91,5 @@ def _in_order(t_us: np.ndarray, last_us: int | None) -> np.ndarray:
     if last_us is not None:
         late &= t_us >= last_us
         early &= t_us >= last_us
-    return early if early.sum() > late.sum() else late
+    # In doubt the later ones stay: what follows goes on from them.
+    return early if early.sum() >= late.sum() else late
