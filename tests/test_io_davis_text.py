@@ -73,8 +73,8 @@ def test_the_last_line_needs_no_newline(tmp_path):
 def test_malformed_lines_are_named_with_number_and_content(tmp_path, line, reason):
     plain = "".join(f"0.{i:06d} 1 2 1\n" for i in range(300))
     path = save_text(tmp_path / "e.txt", f"# comment\n\n{plain}{line}\n{plain}")
-    with pytest.raises(EventDataError, match=rf"e\.txt, line 303: expected 't x y p' .*, got '{line}': .*{reason}"):
-        list(open_events(path).chunks())
+    with pytest.raises(EventDataError, match=rf"e\.txt: line 303: expected 't x y p' .*, got '{line}': .*{reason}"):
+        list(open_events(path, strict=True).chunks())
 
 
 def test_a_malformed_first_line_is_reported_when_the_file_is_opened(tmp_path):
@@ -93,7 +93,7 @@ def test_endless_lines_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(davis_text, "_BLOCK_BYTES", 100)
     path = save_text(tmp_path / "e.txt", "0.1 1 2 1\n" + "0.1 1 2 1 " * 50)
     with pytest.raises(EventDataError, match="a line is longer than 100 bytes"):
-        list(open_events(path).chunks())
+        list(open_events(path, strict=True).chunks())
 
 
 def test_text_is_streamed_in_constant_memory(tmp_path, monkeypatch):

@@ -47,10 +47,9 @@ def test_sequences_as_events(data_dir, name, count):
     assert sum(len(chunk) for chunk in source.chunks()) == count
 
 
-@pytest.mark.parametrize("name", ["evt3_sample.raw", "ncars_sample.dat", "dvs_sample.es", "planar_square_flip.mat"])
-def test_formats_that_are_not_read_yet(data_dir, name):
+def test_formats_that_are_not_read(data_dir):
     with pytest.raises(UnknownFormatError, match=r"Supported: .*npz.*DAVIS text"):
-        open_events(data_dir / "recordings" / name)
+        open_events(data_dir / "recordings" / "planar_square_flip.mat")
 
 
 # ---- the common interface
@@ -101,10 +100,10 @@ def test_time_that_goes_back_is_found_within_and_across_chunks(tmp_path, kind, m
     t_us = [10, 20, 30, 25, 40]
     monkeypatch.setattr(davis_text, "_BLOCK_BYTES", max_events * len("0.000010 1 2 1\n"))
     if kind == "text":
-        source = open_events(save_text(tmp_path / "e.txt", "".join(f"0.0000{t} 1 2 1\n" for t in t_us)))
+        source = open_events(save_text(tmp_path / "e.txt", "".join(f"0.0000{t} 1 2 1\n" for t in t_us)), strict=True)
     else:
         ones = np.ones(5, dtype=np.uint16)
-        source = open_events(save_npz(tmp_path / "e.npz", EventBatch.from_numpy(ones, ones, np.array(t_us), ones)))
+        source = open_events(save_npz(tmp_path / "e.npz", EventBatch.from_numpy(ones, ones, np.array(t_us), ones)), strict=True)
     with pytest.raises(EventDataError, match=r"e\.(txt|npz): time goes back from 30 to 25 µs at event 3"):
         list(source.chunks(max_events))
 
@@ -112,11 +111,11 @@ def test_time_that_goes_back_is_found_within_and_across_chunks(tmp_path, kind, m
 @pytest.mark.parametrize("kind", ["text", "npz"])
 def test_events_outside_the_sensor_are_found(tmp_path, kind):
     if kind == "text":
-        source = open_events(save_text(tmp_path / "e.txt", "0.1 10 10 1\n0.2 240 10 0\n"))
+        source = open_events(save_text(tmp_path / "e.txt", "0.1 10 10 1\n0.2 240 10 0\n"), strict=True)
     else:
         x, y = np.array([10, 240]), np.array([10, 10])
         path = save_npz(tmp_path / "e.npz", EventBatch.from_numpy(x, y, x, y), width=None, height=None)
-        source = open_events(path, width=240, height=180)
+        source = open_events(path, width=240, height=180, strict=True)
     with pytest.raises(EventDataError, match=r"event 1 is at \(240, 10\), outside the sensor of 240x180"):
         list(source.chunks())
 
@@ -144,7 +143,7 @@ def test_a_folder_is_no_event_file(tmp_path):
         open_events(tmp_path)
 
 
-@pytest.mark.parametrize("content", [b"% Date 2020\n% evt 3.0\n\x01\x02", b"\x89HDF\r\n", b"t,x,y,p\n1,2,3,1\n", b"0.1 2 3 1\n\x00\x00"])
+@pytest.mark.parametrize("content", [b"% Date 2020\n\x01\x02", b"\x89HDF\r\n", b"a,b,c,d\n1,2,3,1\n", b"0.1 2 3 1\n\x00\x00"])
 def test_unknown_formats_list_the_known_ones(tmp_path, content):
     (tmp_path / "events.bin").write_bytes(content)
     with pytest.raises(UnknownFormatError, match=r"events\.bin' is in no known event format .*Supported: numpy \.npz .*, DAVIS text"):

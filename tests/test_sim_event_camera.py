@@ -5,7 +5,8 @@ import torch
 
 from torchtrack.errors import EventDataError
 from torchtrack.events import concatenate
-from torchtrack.sim.event_camera import EVENT_CAMERA_PROFILES, NEVER_US, EventCamera, EventCameraConfig
+from torchtrack.sim.event_camera import NEVER_US, EventCamera
+from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
 
 IDEAL = EVENT_CAMERA_PROFILES["ideal"]
 # Dark current out of the way: log levels are then those of the luminance.

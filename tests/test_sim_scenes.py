@@ -12,10 +12,11 @@ from torchtrack.errors import ConfigError, EventDataError, MissingFileError, Unk
 from torchtrack.io.sequence import read_sequence
 from torchtrack.lie import transform_points
 from torchtrack.sim import BackgroundConfig, CameraConfig, MotionConfig, ObjectConfig, SceneConfig, simulate, write
-from torchtrack.sim.event_camera import EVENT_CAMERA_PROFILES, EventCameraConfig
-from torchtrack.sim.frames import outer_points
 from torchtrack.sim.meshes import make_mesh
-from torchtrack.sim.simulation import motions_of, render_frames
+from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
+from torchtrack.sim.simulation import render_frames
+from torchtrack.sim.suite import scenes_of
+from torchtrack.sim.world import make_world, motions_of
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "simulate"
 SMALL = CameraConfig(width=120, height=90, fx=130.0, fy=130.0)
@@ -169,23 +170,47 @@ def test_written_geometry_has_each_vertex_once(cube, tmp_path):
     assert np.array_equal(drawn[..., :3], made)
 
 
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+SHIPPED = [path for path in sorted(CONFIGS.rglob("*.yaml")) if path.name not in ("paper.yaml", "validation.yaml")]
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_scenes_stay_in_view_and_apart(path):
-    config = load(SceneConfig, path)
-    assert config.name == path.stem
-    camera, boxes = config.camera.build(), []
-    t_s = torch.arange(0, config.duration_s, 0.005, dtype=torch.float64)
-    for item, motion in zip(config.objects, motions_of(config), strict=True):
-        points = transform_points(motion.pose(t_s), outer_points(make_mesh(item.shape, item.scale)).expand(len(t_s), -1, -1))
-        pixels = project(points, camera.intrinsics(torch.float64).expand(len(t_s), -1))
-        low, high = pixels.amin(1), pixels.amax(1)
-        assert float(low.min()) > 5
-        assert bool((high < torch.tensor([camera.width - 6.0, camera.height - 6.0])).all())
-        boxes.append((low, high))
-    for i, (low, high) in enumerate(boxes):
-        for other_low, other_high in boxes[:i]:
-            apart = ((low > other_high) | (other_low > high)).any(-1)
-            assert float(apart.double().mean()) > 0.9
+    for config in scenes_of(path):
+        assert config.name.startswith(path.stem)
+        world, boxes = make_world(config), []
+        t_s = torch.arange(0, config.duration_s, 0.02, dtype=torch.float64)
+        for number in range(len(config.objects)):
+            points = transform_points(world.object_poses(number, t_s), world.points[number].expand(len(t_s), -1, -1))
+            pixels = project(points, world.camera.intrinsics(torch.float64).expand(len(t_s), -1))
+            low, high = pixels.amin(1), pixels.amax(1)
+            assert float(low.min()) > 5
+            assert bool((high < torch.tensor([world.camera.width - 6.0, world.camera.height - 6.0])).all())
+            boxes.append((low, high))
+        for i, (low, high) in enumerate(boxes):
+            for other_low, other_high in boxes[:i]:
+                apart = ((low > other_high) | (other_low > high)).any(-1)
+                assert float(apart.double().mean()) > 0.9
+
+
+def test_the_suite_of_the_paper_has_all_its_sequences():
+    names = [scene.name for scene in scenes_of(CONFIGS / "paper.yaml")]
+    straight = [f"{number:02d}_{speed}" for number in range(1, 7) for speed in ("slow", "normal", "fast")]
+    curved = [f"{number:02d}_{kind}" for number in range(7, 13) for kind in ("original", "messy", "occlusion")]
+    assert names == straight + curved + [str(number) for number in range(13, 18)]
+
+
+@pytest.mark.parametrize("number", range(7, 13))
+def test_occluders_of_the_paper_hide_much_of_the_object_but_not_at_first(number):
+    needs_numba()
+    (config,) = scenes_of(CONFIGS / "paper" / f"{number:02d}.yaml", {"variant": "occlusion", "render.supersampling": 1, "render.lens_blur_px": 0.0})
+    alone = config.model_copy(update={"occluders": ()})
+    t_us = np.linspace(0, 2_000_000, 7).astype(np.int64)
+    share = [
+        (hidden.object_index == 0).sum() / (whole.object_index == 0).sum()
+        for hidden, whole in zip(render_frames(config, t_us), render_frames(alone, t_us), strict=True)
+    ]
+    assert share[0] > 0.99
+    assert min(share) < 0.7
 
 
 def test_settings_are_checked(tmp_path):
@@ -214,16 +239,16 @@ def test_background_image_is_linear_in_light(tmp_path):
     image = np.zeros((20, 40, 3), dtype=np.uint8)
     image[:, 20:] = 188
     cv2.imwrite(str(tmp_path / "wall.png"), image)
-    built = BackgroundConfig(image=tmp_path / "wall.png").build(80, 40)
+    built = BackgroundConfig(image=tmp_path / "wall.png").picture(80, 40)
     assert built.shape == (40, 80)
     assert built[20, 10] == 0
     assert built[20, 70] == pytest.approx(0.503, abs=0.002)
-    assert BackgroundConfig(luminance=0.3).build(8, 9).mean() == pytest.approx(0.3)
+    assert BackgroundConfig(luminance=0.3).picture(8, 9).mean() == pytest.approx(0.3)
     with pytest.raises(MissingFileError, match=r"nowhere\.png"):
-        BackgroundConfig(image=tmp_path / "nowhere.png").build(8, 8)
+        BackgroundConfig(image=tmp_path / "nowhere.png").picture(8, 8)
     (tmp_path / "text.png").write_text("not an image")
     with pytest.raises(UnknownFormatError, match="cannot be read as an image"):
-        BackgroundConfig(image=tmp_path / "text.png").build(8, 8)
+        BackgroundConfig(image=tmp_path / "text.png").picture(8, 8)
 
 
 def test_camera_is_centred_unless_told_otherwise():

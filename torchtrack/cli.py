@@ -13,6 +13,7 @@ import tyro
 from rich.console import Console
 from tyro.conf import Positional, arg, subcommand
 
+from torchtrack.cli_io import Bench, Convert, Info
 from torchtrack.config.load import typed
 from torchtrack.config.settings import CommandLineText
 from torchtrack.errors import ConfigError, TorchtrackError
@@ -40,7 +41,7 @@ class Track:
     output: _Output = None
     """Folder for the results."""
     preset: _Preset = None
-    """Tracker settings to start from: default or paper."""
+    """Method to track with: default, paper, line, ls or nns."""
     models: _Models = None
     """Use a sequence's textured models where it has them, or geometry alone."""
     start_us: _Number = None
@@ -68,24 +69,31 @@ class Evaluate:
     paths: Positional[Annotated[tuple[str, ...], arg(metavar="[PATH ...]", help_behavior_hint="")]] = ()
     """Sequences (.npz), or folders of them."""
     output: _Output = None
-    """Folder for metrics.json and errors.csv."""
+    """Folder for metrics.json, errors.csv and the report's tables."""
     methods: Annotated[str | None, _option("A,B,...")] = None
-    """Comma-separated: labels of methods in the config file, or names of presets."""
+    """Comma-separated: labels of methods in the config file, or presets: default, paper, line, ls, nns."""
     config: Annotated[str | None, _option("FILE")] = None
     """A YAML config file with paths and methods."""
     models: _Models = None
     """Use a sequence's textured models where it has them, or geometry alone."""
     jobs: Annotated[int | None, _option("N", "-j")] = None
     """Processes, of one thread each."""
+    report: Annotated[Literal["sequences", "compact"] | None, _option("sequences|compact")] = None
+    """A row per sequence, object and method; or one per method, also as Markdown, LaTeX, CSV and JSON."""
+    estimate_latency: bool = False
+    """Track nothing; find how late the events of each sequence are against its ground truth."""
     quiet: bool = False
     """No progress bar."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands import evaluate
+        from torchtrack.commands import evaluate, show_latency
 
+        if self.estimate_latency:
+            _refuse(overrides)
+            return show_latency(self.paths)
         chosen = self.methods.split(",") if self.methods else None
-        given = _given(self, ("config", "methods", "quiet", "paths"))
+        given = _given(self, ("config", "methods", "quiet", "paths", "estimate_latency"))
         if self.paths:
             given["paths"] = [CommandLineText(path) for path in self.paths]
         return evaluate(self.config, given, overrides, chosen, quiet=self.quiet)
@@ -93,20 +101,44 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Simulate:
-    """Simulate an event camera before moving objects; write a sequence with its ground truth."""
+    """Simulate an event camera before moving objects, or make events of a video; write sequences with their ground truth."""
 
-    config: Positional[Annotated[str, arg(metavar="CONFIG")]]
-    """A YAML file of the scene."""
-    output: Annotated[str, arg(aliases=["-o"], metavar="FILE")]
-    """The sequence to write (.npz); its meshes are put beside it."""
+    config: Positional[Annotated[str, arg(metavar="[CONFIG]", help_behavior_hint="")]] = ""
+    """A YAML file of a scene or a suite, or a folder of them."""
+    output: Annotated[str, arg(aliases=["-o"], metavar="FILE|DIR", help_behavior_hint="")] = ""
+    """The sequence to write (.npz with its meshes beside it, or .h5 with all in one); of a suite, the folder."""
+    variant: Annotated[str | None, _option("NAME")] = None
+    """One variant of a scene that has several; all of them when not given."""
+    jobs: Annotated[int, arg(aliases=["-j"], metavar="N")] = 2
+    """Processes of a suite, of one thread each."""
+    preview: bool = False
+    """Also write a video of each scene, with events and true contours."""
+    video: Annotated[str | None, _option("FILE|DIR")] = None
+    """In place of a scene: a video, or a folder of images."""
+    frames_per_second: Annotated[float | None, _option("N", "--fps")] = None
+    """Of the video, where it does not say it."""
+    timestamps: Annotated[str | None, _option("FILE")] = None
+    """Times of the video's frames (s), one a line."""
+    noise: Annotated[Literal["ideal", "default", "realistic"] | None, _option("NAME")] = None
+    """Event camera profile."""
     quiet: bool = False
     """No progress bar."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands import simulate
+        from torchtrack.commands import simulate, simulate_video
 
-        return simulate(self.config, self.output, overrides, quiet=self.quiet)
+        if not self.output:
+            raise ConfigError("command line: simulate needs an output, as in -o sequence.npz.")
+        if bool(self.config) == bool(self.video):
+            raise ConfigError("command line: simulate needs either the file of a scene or --video, and not both.")
+        given = _given(self, ("config", "output", "jobs", "preview", "quiet"))
+        if self.video:
+            return simulate_video(given, self.output, overrides)
+        scene_only = {name: value for name, value in given.items() if name in ("variant", "noise")}
+        if len(scene_only) != len(given):
+            raise ConfigError("command line: frames_per_second and timestamps are for --video.")
+        return simulate(self.config, self.output, scene_only | overrides, jobs=self.jobs, preview=self.preview, quiet=self.quiet)
 
 
 @dataclass(frozen=True)
@@ -173,6 +205,9 @@ _Command = (
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Demo, subcommand("demo")]
     | Annotated[Outline, subcommand("outline")]
+    | Annotated[Info, subcommand("info")]
+    | Annotated[Convert, subcommand("convert")]
+    | Annotated[Bench, subcommand("bench")]
     | Annotated[Settings, subcommand("settings")]
 )
 

@@ -1,11 +1,11 @@
 """What each command of the command line does, apart from parsing: settings in, work, tables out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from torchtrack.config.demo import DemoConfig
@@ -14,20 +14,25 @@ from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.config.load import load, read_yaml
 from torchtrack.config.run import RunConfig
 from torchtrack.config.settings import CommandLineText, Settings
+from torchtrack.errors import ConfigError
 from torchtrack.eval.evaluate import evaluate as evaluate_all
-from torchtrack.eval.evaluate import find_sequences
+from torchtrack.eval.evaluate import plan, report_of
+from torchtrack.eval.grid import markdown
+from torchtrack.eval.latency import estimate_latency
+from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table, run_headline, run_table
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io import read_calibration
 from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines
 from torchtrack.runner import run
 from torchtrack.session import open_session
-from torchtrack.sim import SceneConfig, write
-from torchtrack.sim import simulate as simulate_scene
+from torchtrack.sim import SceneConfig
+from torchtrack.sim.suite import is_suite, run_suite, scenes_of, simulate_to_file
+from torchtrack.sim.video import VideoConfig, write_video_events
 from torchtrack.sinks.progress import ProgressBar
 
 # Tables need this much where the output is no terminal, which says how wide it is.
-_FILE_WIDTH = 160
+_FILE_WIDTH = 200
 
 
 def output_console() -> Console:
@@ -52,6 +57,8 @@ def _run(config: RunConfig, quiet: bool) -> int:
     summary = run(config, progress, session)
     console.print(run_headline(summary))
     console.print(run_table(summary))
+    if summary.dropped_windows:
+        console.print(f"{summary.dropped_windows} windows ({summary.dropped_events} events) came too fast and were dropped")
     console.print(f"Results are in {config.output}")
     return ExitCode.INTERRUPTED if summary.interrupted else ExitCode.DONE
 
@@ -64,26 +71,80 @@ def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mappi
     if chosen is not None:
         config = config.model_copy(update={"methods": {label: config.methods[label] for label in chosen}})
     with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
-        bar = progress.add_task("sequences", total=len(find_sequences(config.paths)) * len(config.methods))
-        evaluation = evaluate_all(config, lambda job: progress.advance(bar))
-    console.print(results_table(evaluation.results))
+        planned = plan(config, _scene_progress(progress))
+        bar = progress.add_task("sequences", total=len(planned.jobs))
+        evaluation = evaluate_all(config, lambda job: progress.advance(bar), planned)
+    if report := report_of(evaluation, config, planned):
+        for grid in report.grids:
+            # As it is: markup and wrapping would break it.
+            console.print(markdown(grid), markup=False, no_wrap=True, overflow="ignore", crop=False, end="\n\n")
+    else:
+        console.print(results_table(evaluation))
+    for reason in dict.fromkeys(f"{entry.method}: {entry.reason}" for entry in evaluation.not_applicable):
+        console.print(f"- {reason}", markup=False)
     console.print(f"Results are in {config.output}")
     for failure in evaluation.failures:
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {failure.sequence} ({failure.method}): {failure.reason}", markup=False)
     return ExitCode.FAILED if evaluation.failures else ExitCode.DONE
 
 
-def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
-    """Simulate a scene into a sequence; returns the exit code."""
-    path = _simulated(load(SceneConfig, Path(config_file), overrides), Path(output), quiet)
-    output_console().print(f"The sequence is in {path}")
+def show_latency(paths: Sequence[str]) -> int:
+    """Show how late the events of sequences are against their ground truth; returns the exit code."""
+    table = Table("sequence", "latency (µs)", "± (µs)", "lag (px)", "distance before → after (px)", header_style="bold")
+    for path in find_sequences([Path(text) for text in paths]):
+        found = estimate_latency(open_session(RunConfig(source=path)))
+        row = (f"{found.latency_us:.0f}", f"{found.deviation_us:.0f}", f"{found.lag_px:.2f}", f"{found.before_px:.2f} → {found.after_px:.2f}")
+        table.add_row(path.stem, *row)
+    console = output_console()
+    console.print(table)
+    console.print("The setting sensor_latency_us of a run takes a latency off.")
     return ExitCode.DONE
 
 
-def _simulated(scene: SceneConfig, path: Path, quiet: bool) -> Path:
+def _scene_progress(progress: Progress) -> Callable[[str, float], None]:
+    """Shows how far each scene is simulated."""
+    bars: dict[str, TaskID] = {}
+
+    def show(name: str, share: float) -> None:
+        if name not in bars:
+            bars[name] = progress.add_task(f"simulating {name}", total=1.0)
+        progress.update(bars[name], completed=share)
+
+    return show
+
+
+def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, jobs: int, preview: bool, quiet: bool) -> int:
+    """Simulate a scene into a sequence, or a suite into a folder; returns the exit code, which is not 0 where a scene failed."""
+    file, target = Path(config_file), Path(output)
+    if not is_suite(file) or (not file.is_dir() and "variant" in overrides):
+        scene = load(SceneConfig, file, overrides)
+        path = _simulated(scene, target if target.suffix else target / f"{scene.name}.npz", quiet, preview)
+        output_console().print(f"The sequence is in {path}")
+        return ExitCode.DONE
+    if target.suffix:
+        raise ConfigError(f"'{file}' holds several scenes: give a folder in place of '{target}', or choose one with --variant.")
+    scenes = scenes_of(file, overrides)
+    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
+        bars = {scene.name: progress.add_task(scene.name, total=1.0) for scene in scenes}
+        failures = run_suite(scenes, target, jobs, preview=preview, told=lambda name, share: progress.update(bars[name], completed=share))
+    output_console().print(f"{len(scenes) - len(failures)} of {len(scenes)} sequences are in {target}")
+    for failure in failures:
+        Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {failure.name}: {failure.reason}", markup=False)
+    return ExitCode.FAILED if failures else ExitCode.DONE
+
+
+def simulate_video(given: Mapping[str, Any], output: str, overrides: Mapping[str, Any]) -> int:
+    """Turn a video, or a folder of images, into events; returns the exit code."""
+    config = load(VideoConfig, None, {**given, **overrides})
+    count = write_video_events(config, Path(output))
+    output_console().print(f"{count} events are in {output}")
+    return ExitCode.DONE
+
+
+def _simulated(scene: SceneConfig, path: Path, quiet: bool, preview: bool = False) -> Path:
     with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
         bar = progress.add_task(f"simulating {scene.name}", total=1.0)
-        return write(simulate_scene(scene, lambda share: progress.update(bar, completed=share)), path)
+        return simulate_to_file(scene, path, lambda share: progress.update(bar, completed=share), preview=preview)
 
 
 def demo(config_file: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:

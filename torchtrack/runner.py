@@ -4,14 +4,17 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from torchtrack.baselines import tracker_class
 from torchtrack.config.load import as_yaml
 from torchtrack.config.run import RunConfig, TrackingConfig
 from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
+from torchtrack.events import EventWindow
 from torchtrack.interrupt import Interrupt
 from torchtrack.session import Session, open_session
 from torchtrack.sinks import Sink
@@ -30,21 +33,22 @@ OUTPUT_FILES = ("trajectory_*.tum", "poses.csv", "config.yaml", "summary.json", 
 
 
 def build_tracker(session: Session, config: TrackingConfig) -> Tracker:
-    """The tracker of a session's objects, on the configured device.
+    """The tracker of a session's objects, of the kind that the preset is for, on the configured device.
 
     Raises:
         ConfigError: if the device is not there.
+        ModelError: if the method cannot track one of the objects.
     """
     if config.device.startswith("cuda") and not torch.cuda.is_available():
         raise ConfigError(f"device: '{config.device}' was asked for, but PyTorch sees no CUDA device. Use cpu, or a CUDA build of torch.")
-    tracker = Tracker(list(session.models), session.camera, config.tracker, dtype=getattr(torch, config.dtype))
+    tracker = tracker_class(config.preset)(list(session.models), session.camera, config.tracker, dtype=getattr(torch, config.dtype))
     return tracker.to(config.device)
 
 
-def session_steps(session: Session, tracker: Tracker, config: TrackingConfig) -> Iterator[Step]:
-    """Track a session from its initial poses on, one step per window."""
+def session_steps(session: Session, tracker: Tracker, config: TrackingConfig, windows: Iterator[EventWindow] | None = None) -> Iterator[Step]:
+    """Track a session from its initial poses on, one step per window; ``windows``: where they do not come from the session."""
     state = tracker.init(session.T_cam_obj.to(config.device), session.start_us)
-    return steps(cut_windows(session.chunks(), config.tracker.window, session.start_us), tracker, state)
+    return steps(windows or cut_windows(session.chunks(), config.tracker.window, session.start_us), tracker, state)
 
 
 def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None = None) -> RunSummary:
@@ -68,7 +72,9 @@ def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None =
         with ExitStack() as stack:
             own: list[Sink] = [record, PoseFiles(folder, session.labels, record), *_optional_sinks(folder, session, config)]
             every = [stack.enter_context(closing(sink)) for sink in (*own, *sinks)]
-            for step in session_steps(session, tracker, config):
+            keep_up = session.keep_up(config.tracker.window)
+            windows = keep_up.until(lambda: interrupt.requested) if keep_up else None
+            for step in session_steps(session, tracker, config, windows):
                 for sink in every:
                     sink.add(step)
                 if interrupt.requested:
@@ -82,6 +88,8 @@ def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None =
             interrupted=interrupt.requested,
             more=_further_facts(config, session.labels, own),
         )
+        if keep_up:
+            summary = replace(summary, dropped_windows=keep_up.dropped_windows, dropped_events=keep_up.dropped_events)
         (folder / "config.yaml").write_text(as_yaml(config), encoding="utf-8")
         write_json(folder / "summary.json", summary.as_json())
     return summary

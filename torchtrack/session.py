@@ -1,7 +1,7 @@
 """What a run tracks: events, camera, object models, the initial poses, and the truth where it is known."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -9,14 +9,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.camera import Camera
+from torchtrack.config.events import EventsConfig
 from torchtrack.config.run import CameraConfig, ObjectConfig, PoseConfig, RunConfig
+from torchtrack.config.tracker import WindowConfig
 from torchtrack.errors import ConfigError, EventDataError
 from torchtrack.events import EventBatch
-from torchtrack.io import EventSource, SequenceObject, Trajectory, open_events, read_calibration, read_sequence, read_tum
-from torchtrack.io.npz import ZIP_MAGIC, keys_of, open_archive
+from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence, read_trajectory
+from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS
+from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, Region, downscaled_camera, find_hot_pixels, region_camera
+from torchtrack.io.keep_up import KeepUp
+from torchtrack.io.live import LiveSource, open_live
 from torchtrack.lie import check_pose, rotation_from_quaternion
 from torchtrack.object_model import ObjectModel
-from torchtrack.stepping import clipped
+from torchtrack.stepping import clipped, cut_windows
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,8 @@ class Session:
         T_cam_obj: ``[B, 4, 4]`` float64, the initial poses.
         start_us: time of the initial poses.
         end_us: where tracking ends, or None for the end of the stream.
+        live: the live source that the events are from, or None for a file.
+        live_windows: how many windows of a live source may wait.
     """
 
     name: str
@@ -42,10 +49,18 @@ class Session:
     T_cam_obj: Float[Tensor, "b 4 4"]
     start_us: int
     end_us: int | None
+    live: LiveSource | None = None
+    live_windows: int = 64
 
     def chunks(self) -> Iterator[EventBatch]:
         """The events after the start and up to the end."""
         return clipped(self.events.chunks(), self.start_us, self.end_us)
+
+    def keep_up(self, config: WindowConfig) -> KeepUp | None:
+        """The windows of a live source, which drops those that come too fast; None for a file."""
+        if self.live is None:
+            return None
+        return KeepUp(cut_windows(self.chunks(), config, self.start_us), self.live_windows, self.live.stop)
 
     @property
     def known_duration_s(self) -> float | None:
@@ -55,6 +70,34 @@ class Session:
         return 1e-6 * (end_us - self.start_us) if end_us is not None else None
 
 
+@dataclass(frozen=True)
+class EarlierEvents:
+    """A stream with the latency of its sensor taken off all time stamps.
+
+    Args:
+        source: the stream.
+        latency_us: how late its time stamps are.
+    """
+
+    source: EventSource
+    latency_us: int
+
+    @property
+    def width(self) -> int:
+        """Sensor width in pixels."""
+        return self.source.width
+
+    @property
+    def height(self) -> int:
+        """Sensor height in pixels."""
+        return self.source.height
+
+    def chunks(self, max_events: int = DEFAULT_CHUNK_EVENTS) -> Iterator[EventBatch]:
+        """The events in time order, at the times when they happened."""
+        for batch in self.source.chunks(max_events):
+            yield replace(batch, t_us=batch.t_us - self.latency_us)
+
+
 def open_session(config: RunConfig) -> Session:
     """Open everything that a run needs.
 
@@ -62,7 +105,10 @@ def open_session(config: RunConfig) -> Session:
         TorchtrackError: of the kind that fits, if a file, model, camera or pose is missing or wrong.
         EventDataError: if the stream has no events in the time asked for.
     """
-    name, events, camera, of_sequence = _open_source(config)
+    name, source, camera, of_sequence = _open_source(config)
+    events, camera = prepared(source, camera, config.events)
+    if config.sensor_latency_us:
+        events = EarlierEvents(events, config.sensor_latency_us)
     chosen = config.objects or tuple(ObjectConfig(label=label) for label in of_sequence)
     if not chosen:
         raise ConfigError(f"objects: '{config.source}' brings no objects of its own. List those to track, each with a mesh and an initial_pose.")
@@ -80,12 +126,31 @@ def open_session(config: RunConfig) -> Session:
         T_cam_obj=torch.stack(poses),
         start_us=start_us,
         end_us=config.end_us,
+        live=source if isinstance(source, LiveSource) else None,
+        live_windows=config.events.live_windows,
     )
+
+
+def prepared(events: EventSource, camera: Camera, config: EventsConfig) -> tuple[EventSource, Camera]:
+    """Events after the configured stages, and the camera as it sees them."""
+    if config.hot_pixels:
+        if isinstance(events, LiveSource):
+            raise ConfigError("events.hot_pixels: hot pixels are found in a file, not in a live source. Leave it out.")
+        events = HotPixelFilter(events, find_hot_pixels(events))
+    if config.region is not None:
+        events, camera = Region(events, *config.region), region_camera(camera, *config.region)
+    if config.downscale > 1:
+        events, camera = Downscaled(events, config.downscale), downscaled_camera(camera, config.downscale)
+    if config.background_us is not None:
+        events = BackgroundFilter(events, config.background_us)
+    return events, camera
 
 
 def _open_source(config: RunConfig) -> tuple[str, EventSource, Camera, dict[str, SequenceObject]]:
     """Name, events and camera of the source, and the objects it knows by label."""
-    if _is_sequence(config.source):
+    if isinstance(config.source, str):
+        return _open_live(config.source, config.camera)
+    if is_sequence(config.source):
         sequence = read_sequence(config.source)
         camera = _camera(config.camera) if config.camera else sequence.camera
         return sequence.name, sequence.events, camera, {obj.label: obj for obj in sequence.objects}
@@ -94,18 +159,18 @@ def _open_source(config: RunConfig) -> tuple[str, EventSource, Camera, dict[str,
         open_events(config.source)
         raise ConfigError(f"camera: '{config.source}' holds events alone. Give a calibration file, or fx, fy, cx, cy, width and height.")
     camera = _camera(config.camera)
-    return config.source.stem, open_events(config.source, camera.width, camera.height), camera, {}
+    return config.source.stem, open_events(config.source, camera.width, camera.height, config.events.strict), camera, {}
 
 
-def _is_sequence(path: Path) -> bool:
-    """Whether a file is an archive of arrays that holds a camera too."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        if not stream.read(4).startswith(ZIP_MAGIC):
-            return False
-    with open_archive(path) as archive:
-        return "K" in keys_of(archive)
+def _open_live(source: str, config: CameraConfig | None) -> tuple[str, EventSource, Camera, dict[str, SequenceObject]]:
+    if config is None:
+        raise ConfigError(f"camera: '{source}' sends events alone. Give a calibration file, or fx, fy, cx, cy, width and height.")
+    camera = _camera(config)
+    live = open_live(source, camera.width, camera.height)
+    if (live.width, live.height) != (camera.width, camera.height):
+        sizes = f"{live.width}x{live.height} pixels, but the camera {camera.width}x{camera.height}"
+        raise ConfigError(f"camera: '{source}' has {sizes}. Correct the calibration.")
+    return "live", live, camera, {}
 
 
 def _camera(config: CameraConfig) -> Camera:
@@ -114,7 +179,7 @@ def _camera(config: CameraConfig) -> Camera:
     return Camera(**config.model_dump(exclude={"calibration"}))
 
 
-def _matching(obj: ObjectConfig, of_sequence: dict[str, SequenceObject], source: Path) -> SequenceObject | None:
+def _matching(obj: ObjectConfig, of_sequence: dict[str, SequenceObject], source: Path | str) -> SequenceObject | None:
     """The object of the sequence that a configured one names, or None where it brings its own model."""
     found = of_sequence.get(obj.label)
     if found is None and obj.mesh is None and obj.polylines is None:
@@ -158,7 +223,7 @@ def _initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) ->
 
 def _configured_pose(pose: PoseConfig, start_us: int) -> Float[Tensor, "4 4"]:
     if pose.trajectory is not None:
-        return read_tum(pose.trajectory).at(torch.tensor([start_us]))[0]
+        return read_trajectory(pose.trajectory).at(torch.tensor([start_us]))[0]
     if pose.matrix is not None:
         return torch.tensor(pose.matrix, dtype=torch.float64)
     T = torch.eye(4, dtype=torch.float64)

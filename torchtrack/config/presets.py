@@ -1,5 +1,6 @@
-"""The two presets of one pipeline: ``default`` (ours) and ``paper`` (the paper's letter, for comparison)."""
+"""Presets: ``default`` (ours), ``paper`` (the paper's letter), and the paper's comparison methods ``line``, ``ls`` and ``nns``."""
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 from torchtrack.config.tracker import (
@@ -16,7 +17,7 @@ from torchtrack.config.tracker import (
 )
 from torchtrack.errors import ConfigError
 
-PresetName = Literal["default", "paper"]
+PresetName = Literal["default", "paper", "line", "ls", "nns"]
 
 
 def _paper() -> TrackerConfig:
@@ -36,14 +37,47 @@ def _paper() -> TrackerConfig:
     )
 
 
+def _lines(loss: Literal["tukey", "none"]) -> TrackerConfig:
+    """Events against the straight edges of the model, in short windows (:mod:`torchtrack.baselines`)."""
+    return TrackerConfig(
+        window=WindowConfig(duration_us=3_000),
+        corners=CornerConfig(max_corners=0),
+        matching=MatchingConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500),
+        solver=SolverConfig(iterations=3, loss=loss, damping=1e-4, prior=False),
+    )
+
+
+def _line() -> TrackerConfig:
+    """Chamorro et al.: a Kalman filter on robust distances."""
+    return _lines(loss="tukey")
+
+
+def _ls() -> TrackerConfig:
+    """Plain least squares."""
+    return _lines(loss="none")
+
+
+def _nns() -> TrackerConfig:
+    """Our corners alone, each with the nearest point of our contours: nothing is asked of the flow.
+
+    There are fewer corners than events, so they lie closer, fewer do, and the gates are wider.
+    """
+    return TrackerConfig(
+        window=WindowConfig(duration_us=3_000),
+        corners=CornerConfig(max_corners=400, cell_px=5),
+        matching=MatchingConfig(along_flow=False, residual="normal", gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False),
+        solver=SolverConfig(iterations=2),
+        quality=QualityConfig(min_observations=10),
+    )
+
+
 def preset(name: PresetName | str) -> TrackerConfig:
     """The tracker settings of a preset.
 
     Raises:
         ConfigError: if there is no such preset.
     """
-    if name == "default":
-        return TrackerConfig()
-    if name == "paper":
-        return _paper()
+    makers: dict[str, Callable[[], TrackerConfig]] = {"default": TrackerConfig, "paper": _paper, "line": _line, "ls": _ls, "nns": _nns}
+    if name in makers:
+        return makers[name]()
     raise ConfigError(f"unknown preset '{name}': use one of {', '.join(get_args(PresetName))}.")

@@ -6,6 +6,7 @@ from typing import Any, Literal, get_args
 from pydantic import Field, model_validator
 
 from torchtrack.camera import DistortionModel
+from torchtrack.config.events import EventsConfig, EventSourcePath
 from torchtrack.config.merge import merged
 from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.settings import ConfigPath, Settings
@@ -21,7 +22,7 @@ class PoseConfig(Settings):
     matrix: tuple[Row, Row, Row, Row] | None = Field(None, description="The 4x4 matrix, row by row.")
     translation_m: tuple[float, float, float] | None = Field(None, description="Position of the object's origin in the camera frame (m).")
     quaternion_xyzw: Row = Field((0, 0, 0, 1), description="Rotation beside translation_m, as a quaternion x, y, z, w.")
-    trajectory: ConfigPath | None = Field(None, description="A TUM file; the pose is taken at the start time.")
+    trajectory: ConfigPath | None = Field(None, description="A file of poses (TUM, CSV, or a CSV of OptiTrack); the pose is taken at the start time.")
 
     @model_validator(mode="after")
     def _one_way(self) -> "PoseConfig":
@@ -82,7 +83,7 @@ class OverlayConfig(Settings):
 class TrackingConfig(Settings):
     """How objects are tracked: preset, tracker, arithmetic."""
 
-    preset: PresetName = Field("default", description="Tracker settings to start from.")
+    preset: PresetName = Field("default", description="Method, and tracker settings to start from.")
     tracker: TrackerConfig = Field(TrackerConfig(), description="Tracker settings that differ from the preset.")
     device: str = Field("cpu", pattern=r"^(cpu|cuda(:\d+)?)$", description="Where the tracker runs: cpu, cuda or cuda:N.")
     dtype: Literal["float32", "float64"] = Field("float32", description="Floating type of the tracker.")
@@ -103,11 +104,15 @@ class TrackingConfig(Settings):
 class RunConfig(TrackingConfig):
     """Settings of ``torchtrack track``."""
 
-    source: ConfigPath = Field(description="Event file or simulated sequence (.npz).")
+    source: EventSourcePath = Field(description="Event file or sequence; or live: dv://HOST:PORT, evk4://, davis://, or stdin:// (EVT3).")
+    events: EventsConfig = EventsConfig()
     objects: tuple[ObjectConfig, ...] = Field((), description="Objects to track; none given: all objects of the sequence.")
     camera: CameraConfig | None = Field(None, description="The camera; a sequence brings its own.")
     start_us: int | None = Field(None, description="Time of the initial pose, in stream time (µs); by default the start of the stream.")
     end_us: int | None = Field(None, description="Tracking ends here, in stream time (µs); by default with the stream.")
+    sensor_latency_us: int = Field(
+        0, ge=-1_000_000, le=1_000_000, description="How late the events' time stamps are against the poses' clock (µs); taken off."
+    )
     models: Models = Field("textured", description="Use a sequence's textured models where it has them, or geometry alone.")
     threads: int = Field(1, ge=1, le=256, description="Threads of the tracker on the CPU.")
     output: ConfigPath = Field(

@@ -20,7 +20,7 @@ class CommandLineText(str):
     __slots__ = ()
 
 
-def _absolute(value: Any, info: Any) -> Any:
+def absolute_path(value: Any, info: Any) -> Any:
     """An absolute path: ``~`` and ``$VARIABLES`` expanded, relative to ``context["folder"]``, else to the working folder.
 
     ``info`` is pydantic's ValidationInfo, a protocol that cannot be checked at run time.
@@ -35,4 +35,4 @@ def _absolute(value: Any, info: Any) -> Any:
     return Path(os.path.normpath(base / expanded))
 
 
-ConfigPath = Annotated[Path, BeforeValidator(_absolute)]
+ConfigPath = Annotated[Path, BeforeValidator(absolute_path)]

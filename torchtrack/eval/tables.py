@@ -1,34 +1,46 @@
 """Errors and speed as tables for the terminal."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 from rich.table import Table
 
-from torchtrack.eval.evaluate import ObjectResult
+from torchtrack.eval.results import Evaluation, NotApplicable, ObjectResult
 from torchtrack.sinks.summary import RunSummary
 
 
-def results_table(results: Sequence[ObjectResult]) -> Table:
-    """One row per sequence, object and method; each error is a rotation and a translation."""
+def results_table(evaluation: Evaluation) -> Table:
+    """One row per sequence, object and method; each error is a rotation and a translation.
+
+    ``peak`` is the largest error after the first 50 ms, by the mean. A method that is not made for an object has ``-``.
+    """
     table = Table(header_style="bold")
     for name in ("sequence", "object", "method"):
         table.add_column(name, no_wrap=True)
-    for name in ("windows", "mean", "median", "max", "lost", "step"):
+    for name in ("mean", "median", "max", "peak", "lost", "step"):
         table.add_column(name, justify="right", no_wrap=True)
-    for result in results:
-        metrics = result.metrics
-        table.add_row(
-            result.sequence,
-            result.object,
-            result.method,
-            str(metrics.windows),
-            _error(metrics.mean_rotation_deg, metrics.mean_translation_cm),
-            _error(metrics.median_rotation_deg, metrics.median_translation_cm),
-            _error(metrics.max_rotation_deg, metrics.max_translation_cm),
-            f"{100 * metrics.lost_fraction:.1f}%",
-            f"{result.median_step_ms:.1f} ms",
-        )
+    table.add_column("windows by status")
+    entries: list[ObjectResult | NotApplicable] = [*evaluation.results, *evaluation.not_applicable]
+    order = list(dict.fromkeys(entry.sequence for entry in entries))
+    for entry in sorted(entries, key=lambda entry: order.index(entry.sequence)):
+        table.add_row(entry.sequence, entry.object, entry.method, *(_figures(entry) if isinstance(entry, ObjectResult) else ["-"] * 7))
     return table
+
+
+def _figures(result: ObjectResult) -> tuple[str, ...]:
+    metrics = result.metrics
+    return (
+        _error(metrics.mean_rotation_deg, metrics.mean_translation_cm),
+        _error(metrics.median_rotation_deg, metrics.median_translation_cm),
+        _error(metrics.max_rotation_deg, metrics.max_translation_cm),
+        f"{metrics.peak_rotation:.1f} {metrics.peak_translation:.1f}",
+        f"{100 * metrics.lost_fraction:.1f}%",
+        f"{result.median_step_ms:.1f} ms",
+        _statuses(result.status),
+    )
+
+
+def _statuses(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items())
 
 
 def _error(rotation_deg: float, translation_cm: float) -> str:
@@ -49,8 +61,7 @@ def run_table(summary: RunSummary) -> Table:
         if errors is not None:
             mean, worst = _error(errors.mean_rotation_deg, errors.mean_translation_cm), _error(errors.max_rotation_deg, errors.max_translation_cm)
             cells = (mean, worst, f"{100 * errors.lost_fraction:.1f}%")
-        statuses = ", ".join(f"{name} {count}" for name, count in of_object.status.items())
-        table.add_row(label, *cells, f"{of_object.mean_quality:.2f}", statuses)
+        table.add_row(label, *cells, f"{of_object.mean_quality:.2f}", _statuses(of_object.status))
     return table
 
 

@@ -1,4 +1,6 @@
-"""Camera calibration files: the DAVIS ``calib.txt``, and a YAML form of our own.
+"""Camera calibration files: the DAVIS ``calib.txt``, a YAML form of our own, and those of other tools.
+
+OpenCV, ROS, Metavision and Kalibr are read too, see :mod:`torchtrack.io.foreign_calibration`.
 
 ``calib.txt`` holds one line of numbers, ``fx fy cx cy`` and then distortion coefficients (plumb bob:
 ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``); it does not say the sensor size. The YAML form says everything:
@@ -24,6 +26,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from torchtrack.camera import Camera, DistortionModel
 from torchtrack.errors import CalibrationError, MissingFileError
+from torchtrack.io.foreign_calibration import foreign_camera, load_yaml
 
 
 class _CalibrationFile(BaseModel):
@@ -86,11 +89,14 @@ def _from_numbers(numbers: list[float], width: int | None, height: int | None) -
 
 def _from_yaml(text: str, width: int | None, height: int | None) -> Camera:
     try:
-        content: Any = yaml.safe_load(text)
+        content: Any = load_yaml(text)
     except yaml.YAMLError as error:
         raise CalibrationError(f"neither numbers nor YAML ({' '.join(str(error).split())}).") from error
     if not isinstance(content, dict):
         raise CalibrationError("expected 'fx fy cx cy k1 k2 p1 p2 k3', or YAML with fx, fy, cx, cy, width, height and distortion.")
+    foreign = foreign_camera(content, width, height)
+    if foreign is not None:
+        return foreign
     try:
         read = _CalibrationFile.model_validate(content)
     except ValidationError as error:

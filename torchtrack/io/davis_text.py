@@ -1,24 +1,30 @@
 """Events in the text format of the DAVIS data sets: a line ``t x y p`` each, ``t`` in seconds, polarity 1 = brighter.
 
-Lines that begin with ``#`` and blank lines are skipped. Times are parsed as decimals, never through binary floats, and
-rounded to the nearest microsecond, halves up: ``2.097134001`` is 2097134 µs.
+The file may lie in a zip archive. Lines that begin with ``#`` and blank lines are skipped. Times are parsed as decimals,
+never through binary floats, and rounded to the nearest microsecond, halves up: ``2.097134001`` is 2097134 µs.
 
 The file is read in blocks of a few MB. A block of plain lines is parsed with whole-array operations on its bytes; one
 that holds anything else (a comment, an exponent, a sign) is halved until the odd lines stand alone, and those are read
 one by one.
 """
 
+import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BufferedIOBase
 from pathlib import Path
-from typing import NamedTuple
+from typing import cast
 
 import numpy as np
 
-from torchtrack.errors import EventDataError, MissingFileError
-from torchtrack.events import EventBatch
-from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size, checked
+from torchtrack.errors import EventDataError
+from torchtrack.io.columns import Columns, join
+from torchtrack.io.digits import digits
+from torchtrack.io.event_file import EventFile
+from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.seconds import parse_seconds
+from torchtrack.io.zip_archive import damage_reported, is_zip, open_archive
 
 DAVIS240C_SIZE = (240, 180)
 _BLOCK_BYTES = 2 << 20
@@ -36,53 +42,52 @@ _MOST_DIGITS = {"seconds": 12, "pixel": 9}
 _FRACTION_DIGITS = 6
 
 
-class _Columns(NamedTuple):
-    t_us: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    polarity: np.ndarray
-
-
 @dataclass(frozen=True)
-class DavisTextEvents:
-    """Events of a DAVIS text file.
+class DavisTextEvents(EventFile):
+    """Events of a DAVIS text file; see :class:`torchtrack.io.event_file.EventFile`.
 
-    Args:
-        path: the file.
-        width, height: sensor size in pixels; that of the DAVIS240C, 240x180, when neither is given.
+    The sensor size is that of the DAVIS240C, 240x180, when neither width nor height is given.
 
     Raises:
-        MissingFileError: if there is no such file.
         EventDataError: if the first event cannot be read, times are not in seconds, or only one of width and height is
             given.
     """
 
-    path: Path
-    width: int = 0
-    height: int = 0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "path", Path(self.path))
-        if not self.path.is_file():
-            raise MissingFileError(f"event file '{self.path}' does not exist.")
+    def _open(self) -> None:
         if not self.width and not self.height:
             for name, value in zip(("width", "height"), DAVIS240C_SIZE, strict=True):
                 object.__setattr__(self, name, value)
-        check_sensor_size(self.width, self.height, str(self.path))
-        _check_head(self.path)
+        with self._stream() as stream, damage_reported(self.path):
+            head = stream.read(_HEAD_BYTES)
+        _check_head(head, self.path, Problems(str(self.path), strict=True))
 
-    def chunks(self, max_events: int = DEFAULT_CHUNK_EVENTS) -> Iterator[EventBatch]:
-        """The events in time order; see :class:`torchtrack.io.event_source.EventSource`."""
-        check_max_events(max_events)
-        return checked(self._read(), self.width, self.height, str(self.path), max_events)
+    @contextmanager
+    def _stream(self) -> Iterator[BufferedIOBase]:
+        """The text, out of its archive where it lies in one."""
+        if not is_zip(self.path):
+            with self.path.open("rb") as stream:
+                yield stream
+            return
+        with open_archive(self.path) as archive:
+            member = text_member(archive)
+            if member is None:
+                raise EventDataError(f"'{self.path}' is a zip archive without a text file of events.")
+            with damage_reported(self.path), cast(BufferedIOBase, archive.open(member)) as text:
+                yield text
 
-    def _read(self) -> Iterator[EventBatch]:
+    def _read(self, max_events: int) -> Iterator[Columns]:
         line_number = 1
-        for block in _blocks(self.path):
-            # One batch a block, however small the pieces were: those who cut windows pay for every batch.
-            t_us, x, y, polarity = (np.concatenate(parts) for parts in zip(*_parse(block, line_number, self.path), strict=True))
-            yield EventBatch.from_numpy(x, y, t_us, polarity)
-            line_number += block.count(b"\n")
+        with self._stream() as stream:
+            for block in _blocks(stream, self.path):
+                # One batch a block, however small the pieces were: those who cut windows pay for every batch.
+                yield join(_parse(block, line_number, self.problems))
+                line_number += block.count(b"\n")
+
+
+def text_member(archive: zipfile.ZipFile) -> str | None:
+    """The text file of an archive that holds the events: ``events.txt``, or the largest."""
+    texts = [entry for entry in archive.infolist() if entry.filename.lower().endswith(".txt")]
+    return max(texts, key=lambda entry: (Path(entry.filename).name == "events.txt", entry.file_size)).filename if texts else None
 
 
 def looks_like_davis_text(head: bytes) -> bool:
@@ -96,15 +101,13 @@ def looks_like_davis_text(head: bytes) -> bool:
     return True
 
 
-def _check_head(path: Path) -> None:
-    """Report a first line that is no event, and times that must be microseconds, without reading on."""
-    with path.open("rb") as stream:
-        lines = stream.read(_HEAD_BYTES).split(b"\n")
+def _check_head(head: bytes, path: Path, problems: Problems) -> None:
+    """Raise over a first line that is no event, and times that must be microseconds, without reading on."""
     times: list[bytes] = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(head.split(b"\n"), start=1):
         if line.partition(b"#")[0].strip():
             if not times:
-                _parse_line_of(line, number, path)
+                _parse_line_of(line, number, problems)
             times.append(line.split()[0])
     whole = times[:-1]
     if len(set(whole)) > 1 and all(time.isdigit() for time in whole):
@@ -113,36 +116,35 @@ def _check_head(path: Path) -> None:
         )
 
 
-def _blocks(path: Path) -> Iterator[bytes]:
-    """The file in blocks of whole lines, each ending with a newline."""
+def _blocks(stream: BufferedIOBase, path: Path) -> Iterator[bytes]:
+    """The text in blocks of whole lines, each ending with a newline."""
     rest = b""
-    with path.open("rb") as stream:
-        while data := stream.read(_BLOCK_BYTES):
-            cut = data.rfind(b"\n") + 1
-            if cut:
-                yield rest + data[:cut]
-                rest = data[cut:]
-            else:
-                rest += data
-            if len(rest) > _BLOCK_BYTES:
-                raise EventDataError(f"{path}: a line is longer than {_BLOCK_BYTES} bytes; this is not a text file of events.")
+    while data := stream.read(_BLOCK_BYTES):
+        cut = data.rfind(b"\n") + 1
+        if cut:
+            yield rest + data[:cut]
+            rest = data[cut:]
+        else:
+            rest += data
+        if len(rest) > _BLOCK_BYTES:
+            raise EventDataError(f"{path}: a line is longer than {_BLOCK_BYTES} bytes; this is not a text file of events.")
     if rest:
         yield rest + b"\n"
 
 
-def _parse(block: bytes, line_number: int, path: Path) -> Iterator[_Columns]:
+def _parse(block: bytes, line_number: int, problems: Problems) -> Iterator[Columns]:
     """Events of whole lines: at once if all are plain, else by halves, and line by line in the end."""
     columns = _parse_plain(block)
     if columns is not None:
         yield columns
     elif len(block) <= _FEW_BYTES or (middle := block.find(b"\n", len(block) // 2) + 1) in (0, len(block)):
-        yield _parse_lines(block, line_number, path)
+        yield _parse_lines(block, line_number, problems)
     else:
-        yield from _parse(block[:middle], line_number, path)
-        yield from _parse(block[middle:], line_number + block.count(b"\n", 0, middle), path)
+        yield from _parse(block[:middle], line_number, problems)
+        yield from _parse(block[middle:], line_number + block.count(b"\n", 0, middle), problems)
 
 
-def _parse_plain(block: bytes) -> _Columns | None:
+def _parse_plain(block: bytes) -> Columns | None:
     """Events of a block where every line is ``digits.digits digits digits 0|1``, or None if any is not."""
     # Padding: digits are looked up at fixed places, which may lie past the last line.
     data = np.frombuffer(block + b" " * (_FRACTION_DIGITS + 2), np.uint8)
@@ -162,8 +164,8 @@ def _parse_plain(block: bytes) -> _Columns | None:
     polarity = data[starts[3]] - ord("0")
     if (polarity > 1).any():
         return None
-    t_us = 1_000_000 * _digits(data, starts[0], dots) + _microseconds(data, dots + 1, ends[0])
-    return _Columns(t_us, _digits(data, starts[1], ends[1]), _digits(data, starts[2], ends[2]), polarity)
+    t_us = 1_000_000 * digits(data, starts[0], dots) + _microseconds(data, dots + 1, ends[0])
+    return Columns(t_us, digits(data, starts[1], ends[1]), digits(data, starts[2], ends[2]), polarity)
 
 
 def _is_regular(starts: np.ndarray, ends: np.ndarray, newlines: np.ndarray, dots: np.ndarray) -> bool:
@@ -180,16 +182,6 @@ def _is_regular(starts: np.ndarray, ends: np.ndarray, newlines: np.ndarray, dots
     )
 
 
-def _digits(data: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Integers written in ``data[starts:ends]``."""
-    lengths = ends - starts
-    value = np.zeros(len(starts), dtype=np.int64)
-    for place in range(int(lengths.max(initial=0))):
-        digit = data[starts + place] - np.uint8(ord("0"))
-        value = np.where(place < lengths, 10 * value + digit, value)
-    return value
-
-
 def _microseconds(data: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Decimals of a second in µs, rounded by their seventh digit: whatever follows cannot change where it falls."""
     lengths = ends - starts
@@ -200,18 +192,19 @@ def _microseconds(data: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.
     return value + ((lengths > _FRACTION_DIGITS) & (data[starts + _FRACTION_DIGITS] >= ord("5")))
 
 
-def _parse_lines(block: bytes, line_number: int, path: Path) -> _Columns:
-    events = (_parse_line_of(line, number, path) for number, line in enumerate(block.split(b"\n"), start=line_number))
+def _parse_lines(block: bytes, line_number: int, problems: Problems) -> Columns:
+    events = (_parse_line_of(line, number, problems) for number, line in enumerate(block.split(b"\n"), start=line_number))
     table = np.array([event for event in events if event is not None], dtype=np.int64).reshape(-1, 4)
-    return _Columns(*table.T)
+    return Columns(*table.T)
 
 
-def _parse_line_of(line: bytes, number: int, path: Path) -> tuple[int, int, int, int] | None:
+def _parse_line_of(line: bytes, number: int, problems: Problems) -> tuple[int, int, int, int] | None:
     try:
         return _parse_line(line)
     except ValueError as error:
         shown = line[:80].decode("utf-8", errors="replace").strip()
-        raise EventDataError(f"{path}, line {number}: {_EXPECTED}, got '{shown}': {error}.") from error
+        problems.found(Problem.MALFORMED, 1, f"line {number}: {_EXPECTED}, got '{shown}': {error}.")
+        return None
 
 
 def _parse_line(line: bytes) -> tuple[int, int, int, int] | None:

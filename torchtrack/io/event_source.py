@@ -1,12 +1,14 @@
 """What every reader of events gives: one stream, in time order, checked, in constant memory."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch, check_events
+from torchtrack.events import EventBatch
 
 DEFAULT_CHUNK_EVENTS = 500_000
+# Readers that may choose read about so many events at a time: what is made of them stays in the processor's cache.
+PART_EVENTS = 1 << 16
 
 
 @runtime_checkable
@@ -35,21 +37,6 @@ class EventSource(Protocol):
                 the sensor.
         """
         ...
-
-
-def checked(batches: Iterable[EventBatch], width: int, height: int, source: str, max_events: int) -> Iterator[EventBatch]:
-    """Cut batches to at most ``max_events`` and check them, each against the one before it too; empty ones are dropped.
-
-    ``source`` names the stream in error messages.
-    """
-    last_t_us, count = None, 0
-    for batch in batches:
-        if len(batch) == 0:
-            continue
-        check_events(batch, width, height, source, last_t_us, first_index=count)
-        last_t_us, count = int(batch.t_us[-1]), count + len(batch)
-        for start in range(0, len(batch), max_events):
-            yield batch[start : start + max_events]
 
 
 def check_max_events(max_events: int) -> None:

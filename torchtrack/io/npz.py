@@ -4,56 +4,28 @@
 does not grow with the file. Pickled objects are never loaded.
 """
 
-import os
 import tokenize
 import zipfile
-import zlib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 
-from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
-from torchtrack.events import EventBatch
-from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size, checked
+from torchtrack.errors import EventDataError, UnknownFormatError
+from torchtrack.io.columns import Columns
+from torchtrack.io.event_file import EventFile
+from torchtrack.io.event_source import PART_EVENTS
+from torchtrack.io.zip_archive import ZIP_MAGIC, damage_reported, open_archive
 
-ZIP_MAGIC = b"PK\x03\x04"
+__all__ = ["ZIP_MAGIC", "NpzEvents", "keys_of", "open_archive", "read_array"]
+
 _EVENT_KEYS = ("t", "x", "y", "p")
-# What zipfile is known to raise over damaged bytes.
-_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, UnicodeDecodeError, OSError)
 # What numpy is known to raise over headers: it parses them as Python literals.
 _BAD_HEADER = (ValueError, KeyError, TypeError, SyntaxError, tokenize.TokenError)
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-
-
-@contextmanager
-def _damage_reported(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except _DAMAGED as error:
-        raise EventDataError(f"'{path}' is truncated or damaged ({error}). Copy or make it again.") from error
-
-
-def open_archive(path: str | os.PathLike[str]) -> zipfile.ZipFile:
-    """Open an ``.npz`` file for reading; the caller closes it.
-
-    Raises:
-        MissingFileError: if there is no such file.
-        UnknownFormatError: if it is not an ``.npz`` file.
-        EventDataError: if it is one, but truncated or damaged.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise MissingFileError(f"file '{path}' does not exist.")
-    with path.open("rb") as stream:
-        magic = stream.read(len(ZIP_MAGIC))
-    if magic != ZIP_MAGIC:
-        raise UnknownFormatError(f"'{path}' is not an .npz file (a zip archive of numpy arrays): it starts with {magic!r}.")
-    with _damage_reported(path):
-        return zipfile.ZipFile(path)
 
 
 def keys_of(archive: zipfile.ZipFile) -> set[str]:
@@ -73,7 +45,7 @@ class _Member:
 
     def read(self, count: int) -> np.ndarray:
         """The next ``count`` elements, flat."""
-        with _damage_reported(self.path):
+        with damage_reported(self.path):
             data = self.stream.read(count * self.dtype.itemsize)
         if len(data) != count * self.dtype.itemsize:
             raise EventDataError(f"'{self.path}' is truncated or damaged: an array ends early. Copy or make it again.")
@@ -81,7 +53,7 @@ class _Member:
 
     def finish(self) -> None:
         """Read past the end, which makes :mod:`zipfile` compare the checksum."""
-        with _damage_reported(self.path):
+        with damage_reported(self.path):
             self.stream.read(1)
 
 
@@ -89,10 +61,10 @@ def _open_member(archive: zipfile.ZipFile, key: str, path: Path) -> _Member:
     """Open an array and check its header against the size of its data, before anything of that size is allocated."""
     if key not in keys_of(archive):
         raise EventDataError(f"'{path}' has no array '{key}'; it holds: {', '.join(sorted(keys_of(archive))) or 'none'}.")
-    with _damage_reported(path):
+    with damage_reported(path):
         stream = cast(zipfile.ZipExtFile, archive.open(f"{key}.npy"))
     try:
-        with _damage_reported(path):
+        with damage_reported(path):
             version = np.lib.format.read_magic(stream)
             shape, fortran_order, dtype = _HEADER_READERS[version](stream)
     except _BAD_HEADER as error:
@@ -122,13 +94,26 @@ def read_array(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray:
     return native.reshape(member.shape, order="F" if member.fortran_order else "C")
 
 
+def stream_array(archive: zipfile.ZipFile, key: str, path: Path, size: int) -> Iterator[np.ndarray]:
+    """A flat array of an archive, in parts of ``size``.
+
+    Raises:
+        EventDataError: if it is not there, damaged, or holds objects; ``path`` is for the message.
+    """
+    member = _open_member(archive, key, path)
+    with member.stream:
+        count = int(np.prod(member.shape))
+        for start in range(0, count, size):
+            yield member.read(min(size, count - start))
+        member.finish()
+
+
 @dataclass(frozen=True)
-class NpzEvents:
+class NpzEvents(EventFile):
     """Events of an ``.npz`` file: integer arrays ``t`` (µs), ``x``, ``y`` and polarity ``p`` of one length.
 
-    Args:
-        path: the file.
-        width, height: sensor size in pixels; taken from the arrays ``width`` and ``height`` where the file has them.
+    The sensor size is taken from the arrays ``width`` and ``height`` where the file has them; see
+    :class:`torchtrack.io.event_file.EventFile`.
 
     Raises:
         MissingFileError, UnknownFormatError: if there is no such file, or it is not an ``.npz`` file.
@@ -136,13 +121,14 @@ class NpzEvents:
             or differs from the one in the file.
     """
 
-    path: Path
-    width: int = 0
-    height: int = 0
     count: int = field(init=False, default=0)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "path", Path(self.path))
+    @property
+    def known_count(self) -> int | None:
+        """How many events there are."""
+        return self.count
+
+    def _open(self) -> None:
         with open_archive(self.path) as archive:
             if not keys_of(archive):
                 raise UnknownFormatError(f"'{self.path}' is a zip archive, but holds no numpy arrays (.npy).")
@@ -151,24 +137,18 @@ class NpzEvents:
             members = [_open_member(archive, key, self.path) for key in _EVENT_KEYS]
         for member, key in zip(members, _EVENT_KEYS, strict=True):
             _check_event_member(member, key, members[0].shape)
-        check_sensor_size(self.width, self.height, str(self.path))
         object.__setattr__(self, "count", members[0].shape[0])
 
-    def chunks(self, max_events: int = DEFAULT_CHUNK_EVENTS) -> Iterator[EventBatch]:
-        """The events in time order; see :class:`torchtrack.io.event_source.EventSource`."""
-        check_max_events(max_events)
-        return checked(self._read(max_events), self.width, self.height, str(self.path), max_events)
-
-    def _read(self, max_events: int) -> Iterator[EventBatch]:
+    def _read(self, max_events: int) -> Iterator[Columns]:
         with ExitStack() as stack:
             archive = stack.enter_context(open_archive(self.path))
             members = [_open_member(archive, key, self.path) for key in _EVENT_KEYS]
             for member in members:
                 stack.enter_context(member.stream)
-            for start in range(0, self.count, max_events):
-                size = min(max_events, self.count - start)
-                t_us, x, y, polarity = (member.read(size) for member in members)
-                yield EventBatch.from_numpy(x, y, t_us, polarity)
+            part = min(max_events, PART_EVENTS)
+            for start in range(0, self.count, part):
+                size = min(part, self.count - start)
+                yield Columns(*(member.read(size) for member in members))
             for member in members:
                 member.finish()
 

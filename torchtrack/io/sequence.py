@@ -1,6 +1,6 @@
 """Sequences: events, camera, object models and ground truth, in one ``.npz`` file with its meshes beside it.
 
-Layout of ``NAME.npz`` (numpy, no pickle):
+:func:`read_sequence` reads the HDF5 form too, see :mod:`torchtrack.io.container`. Layout of ``NAME.npz`` (numpy, no pickle):
 
 ===================== ==================================================================================
 ``t x y p``           events: µs (int64, sorted), pixels (uint16), polarity (uint8, 1 = brighter)
@@ -8,6 +8,9 @@ Layout of ``NAME.npz`` (numpy, no pickle):
 ``labels mesh_files`` one per object; the mesh files lie beside the sequence, in metres
 ``poses pose_t``      ``[P, 4, 4]`` or ``[O, P, 4, 4]`` object to camera, and their times in µs ``[P]`` (optional)
 ``meta``              JSON text (optional)
+``velocity``          ``[O, P, 6]`` rad/s and m/s at ``pose_t``: ``dT/dt = ξ^ T`` (optional; of the simulator)
+``source``            per event: number of its object or occluder, -1 background, -2 noise (optional; of the simulator)
+``occluder_poses``    as ``poses``, with ``occluder_labels``: what moves through and is not tracked (optional)
 ===================== ==================================================================================
 
 A ``NAME_LABEL_textured.glb`` beside it is the same object with its texture.
@@ -15,51 +18,26 @@ A ``NAME_LABEL_textured.glb`` beside it is the same object with its texture.
 
 import json
 import os
-import re
-import tempfile
 import zipfile
-from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import trimesh
 
 from torchtrack.camera import Camera
 from torchtrack.errors import CalibrationError, EventDataError, MissingFileError, PoseError
-from torchtrack.events import EventBatch, check_events
-from torchtrack.io.event_source import EventSource
+from torchtrack.io.container import is_container, read_container
 from torchtrack.io.npz import NpzEvents, keys_of, open_archive, read_array
+from torchtrack.io.sequence_types import Sequence, SequenceObject
 from torchtrack.io.trajectory import Trajectory
+from torchtrack.io.zip_archive import is_zip
 
-_LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
+if TYPE_CHECKING:
+    from torchtrack.io.sequence_writer import write_sequence as write_sequence
 
-
-@dataclass(frozen=True)
-class SequenceObject:
-    """One object of a sequence: its label, its model files, and its true poses where they are known."""
-
-    label: str
-    mesh_path: Path
-    textured_path: Path | None = None
-    ground_truth: Trajectory | None = None
-
-    def model_path(self, models: Literal["textured", "geometry"] = "textured") -> Path:
-        """The model file to use: the textured one where it is asked for and there, else the geometry."""
-        return self.textured_path if models == "textured" and self.textured_path is not None else self.mesh_path
-
-
-@dataclass(frozen=True)
-class Sequence:
-    """A recorded or simulated sequence; its events are streamed, not held."""
-
-    name: str
-    events: EventSource
-    camera: Camera
-    objects: tuple[SequenceObject, ...]
-    meta: dict[str, Any] = field(default_factory=dict)
+_EXTRA = ("velocity", "occluder_poses", "occluder_labels")
 
 
 def read_sequence(path: str | os.PathLike[str]) -> Sequence:
@@ -67,12 +45,14 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
 
     Raises:
         MissingFileError: if the file, or a mesh that it names, is not there.
-        UnknownFormatError: if it is not an ``.npz`` file.
+        UnknownFormatError: if it is neither an ``.npz`` file nor a sequence in HDF5.
         EventDataError: if an array is missing, damaged or of the wrong shape.
         CalibrationError: if the camera makes no sense.
         PoseError: if the ground truth is not rigid, or its times do not increase.
     """
     path = Path(path)
+    if is_container(path):
+        return read_container(path)
     events = NpzEvents(path)
     with open_archive(path) as archive:
         camera = _read_camera(archive, events, path)
@@ -81,8 +61,20 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
             raise EventDataError(f"'{path}': labels and mesh_files must name one or more objects each, got {len(labels)} and {len(mesh_files)}.")
         ground_truth = _read_ground_truth(archive, labels, path)
         meta = _read_meta(archive, path)
+        extra = {name: read_array(archive, name, path) for name in _EXTRA if name in keys_of(archive)}
     objects = tuple(_sequence_object(path, *row) for row in zip(labels, mesh_files, ground_truth, strict=True))
-    return Sequence(path.stem, events, camera, objects, meta)
+    return Sequence(path.stem, events, camera, objects, meta, extra)
+
+
+def is_sequence(path: str | os.PathLike[str]) -> bool:
+    """Whether a file holds a sequence: events with a camera, in either form."""
+    path = Path(path)
+    if not path.is_file():
+        return False
+    if not is_zip(path):
+        return is_container(path)
+    with open_archive(path) as archive:
+        return "K" in keys_of(archive)
 
 
 def _read_numbers(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray:
@@ -147,101 +139,8 @@ def _sequence_object(path: Path, label: str, mesh_file: str, ground_truth: Traje
     return SequenceObject(label, mesh_path, textured if textured.is_file() else None, ground_truth)
 
 
-def write_sequence(
-    path: str | os.PathLike[str],
-    *,
-    x: np.ndarray,
-    y: np.ndarray,
-    t_us: np.ndarray,
-    polarity: np.ndarray,
-    camera: Camera,
-    labels: ListOf[str],
-    meshes: ListOf[trimesh.Trimesh],
-    trajectories: ListOf[Trajectory],
-    meta: dict[str, Any],
-    textured: ListOf[trimesh.Trimesh | trimesh.Scene | None] | None = None,
-) -> None:
-    """Write a sequence and its meshes (``NAME_LABEL.ply``, ``NAME_LABEL_textured.glb``) as :func:`read_sequence` reads it.
-
-    Everything is written to temporary files first and put in place at the end, the ``.npz`` last, so that nothing
-    half-written is left behind. Events are stored uncompressed.
-
-    Args:
-        path: the ``.npz`` file to write.
-        x, y, t_us, polarity: events, sorted by time (µs), one length.
-        camera: the camera.
-        labels, meshes: one per object; labels are used in file names; meshes in metres.
-        trajectories: the true poses, one per object, all at the same times.
-        meta: what JSON can hold.
-        textured: one textured mesh (or None) per object, where there are any.
-
-    Raises:
-        EventDataError: if events are unsorted or outside the sensor, labels are unfit, or the counts disagree.
-        PoseError: if the trajectories do not share their times.
-    """
-    path = Path(path)
-    textured = textured if textured is not None else [None] * len(labels)
-    _check_objects(path, labels, len(meshes), len(trajectories), len(textured))
-    check_events(EventBatch.from_numpy(x, y, t_us, polarity), camera.width, camera.height, str(path))
-    mesh_files = [f"{path.stem}_{label}.ply" for label in labels]
-    arrays: dict[str, Any] = {
-        "t": np.asarray(t_us, np.int64),
-        "x": np.asarray(x, np.uint16),
-        "y": np.asarray(y, np.uint16),
-        "p": (np.asarray(polarity) > 0).astype(np.uint8),
-        "K": camera.matrix,
-        "width": np.int64(camera.width),
-        "height": np.int64(camera.height),
-        **_distortion_arrays(camera),
-        **_pose_arrays(trajectories),
-        "labels": np.array(labels),
-        "mesh_files": np.array(mesh_files),
-        "meta": np.array(json.dumps(meta)),
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-        written = Path(folder)
-        for mesh, mesh_file in zip(meshes, mesh_files, strict=True):
-            _geometry(mesh).export(written / mesh_file)
-        for label, model in zip(labels, textured, strict=True):
-            if model is not None:
-                model.export(written / f"{path.stem}_{label}_textured.glb")
-        with (written / path.name).open("wb") as stream:
-            np.savez(stream, **arrays)
-        # The file that names the others comes last: whoever sees it finds them.
-        for file in sorted(written.iterdir(), key=lambda file: file.name == path.name):
-            file.replace(path.parent / file.name)
-
-
-def _check_objects(path: Path, labels: ListOf[str], meshes: int, trajectories: int, textured: int) -> None:
-    if path.suffix != ".npz":
-        raise EventDataError(f"a sequence is written to a .npz file, got '{path}'.")
-    if not labels or {len(labels)} != {meshes, trajectories, textured}:
-        raise EventDataError(
-            f"every object needs a label, a mesh and a trajectory: got {len(labels)} labels, {meshes} meshes, "
-            f"{trajectories} trajectories and {textured} textured meshes (or None)."
-        )
-    unfit = [label for label in labels if not _LABEL.fullmatch(label)]
-    if unfit or len(set(labels)) != len(labels):
-        raise EventDataError(f"labels go into file names: each must differ and hold letters, digits and _.+- alone, got {list(labels)}.")
-
-
-def _distortion_arrays(camera: Camera) -> dict[str, np.ndarray]:
-    if camera.distortion_model == "none":
-        return {}
-    return {"distortion_model": np.array(camera.distortion_model), "distortion": np.array(camera.distortion, dtype=np.float64)}
-
-
-def _pose_arrays(trajectories: ListOf[Trajectory]) -> dict[str, np.ndarray]:
-    t_us = trajectories[0].t_us
-    if any(not torch.equal(trajectory.t_us, t_us) for trajectory in trajectories):
-        raise PoseError("the trajectories of a sequence must share their times. Resample them with Trajectory.at().")
-    poses = np.stack([trajectory.T_cam_obj.cpu().numpy() for trajectory in trajectories])
-    return {"poses": poses[0] if len(poses) == 1 else poses, "pose_t": t_us.cpu().numpy()}
-
-
-def _geometry(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh without a texture, which a ``.ply`` cannot carry; colours stay."""
-    if not isinstance(mesh.visual, trimesh.visual.TextureVisuals):
-        return mesh
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+def __getattr__(name: str) -> Any:
+    """Load the writer on first use: it needs the library of meshes, which takes more memory than reading does."""
+    if name == "write_sequence":
+        return getattr(import_module("torchtrack.io.sequence_writer"), name)
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -9,20 +9,28 @@ A sequence in one go::
     print(len(sequence.events), 'events,', write(sequence, 'hello.npz'))
     "
 
-========================= ============================================================================
-``trajectory.py``         smooth motions, known at any time
-``textures.py meshes.py`` procedural objects
-``surface.py render.py``  images; ``rasterizer.py shading.py`` hold the numba kernels
-``event_camera.py``       images -> events
-``frames.py``             when to render, so that nothing moves more than half a pixel
-``scenes.py``             settings of a scene
-``simulation.py``         ``simulate`` and ``write``
-========================= ============================================================================
+=============================== ============================================================================
+``scenes.py background.py``     settings of a scene
+``trajectory.py world.py``      smooth motions, and where everything is at any time
+``meshes.py curved.py``         procedural objects; ``implicit.py`` surfaces of distance fields, ``textures.py`` prints
+``surface.py render.py``        images, by what draws: ``raster_drawer.py`` (numba; kernels in ``rasterizer.py shading.py``)
+                                or ``opengl_drawer.py``, both behind ``drawing.py``
+``backdrop.py lens.py``         what is behind the objects, and a lens that distorts
+``event_camera.py``             images -> events; ``photoreceptor.py noise.py fired.py`` are its parts,
+                                ``sensor_profiles.py`` its parameters
+``frames.py``                   when to render, so that nothing moves more than half a pixel
+``simulation.py output.py``     ``simulate`` and ``write``
+``suite.py``                    many scenes in parallel
+``video.py``                    events of a given video
+``preview.py``                  a video of a sequence
+=============================== ============================================================================
 """
 
-from torchtrack.sim.event_camera import EventCamera, EventCameraConfig
+from torchtrack.sim.event_camera import EventCamera
+from torchtrack.sim.output import write
 from torchtrack.sim.scenes import BackgroundConfig, CameraConfig, ObjectConfig, SceneConfig
-from torchtrack.sim.simulation import SimulatedSequence, simulate, write
+from torchtrack.sim.sensor_profiles import EventCameraConfig
+from torchtrack.sim.simulation import SimulatedSequence, simulate
 from torchtrack.sim.trajectory import MotionConfig, SinusoidMotion, ground_truth
 
 __all__ = [

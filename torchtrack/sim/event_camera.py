@@ -22,6 +22,12 @@ What a pixel does, and where it is described:
 - The memorised level leaks downwards, so a pixel at rest fires ON events at a steady rate: Nozaki & Delbruck 2017. Every
   pixel starts at a random phase of it; else all would wait a whole period, and then fire together.
 - Shot noise fires ON and OFF events as a Poisson process, less often in bright light: v2e, with its factor of 0.25 at white.
+- The photoreceptor is a first-order low pass of the log luminance, whose cutoff is proportional to the light (Lichtsteiner
+  2008); as in v2e it does not fall below 20/275 of that at white. Its answer to a straight line is taken exactly.
+- Hot pixels fire ON events as a Poisson process at rates that are exponentially distributed: Hu 2021 has noise rates that
+  differ between pixels; the few that stand out in real sensors are modelled here alone.
+- Time stamps are late by a constant latency and an exponentially distributed wait for the readout (Lichtsteiner
+  2008: its arbiter). What is read out after the last frame is never seen.
 """
 
 from collections.abc import Sequence
@@ -29,37 +35,19 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
-from pydantic import Field
 from torch import Tensor
 
-from torchtrack.config.settings import Settings
 from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch
+from torchtrack.sim.fired import Fired, concatenate_fired, read_out
+from torchtrack.sim.noise import HotPixels, rested, shot_noise
+from torchtrack.sim.photoreceptor import cutoff_hz, response
+from torchtrack.sim.sensor_profiles import EventCameraConfig
 
 # No pixel is more sensitive than this, whatever the mismatch says (v2e has the same floor).
 _MIN_THRESHOLD = 0.01
-# Shot noise at white, as a share of that in the dark (v2e).
-_BRIGHT_NOISE_SHARE = 0.25
 # Time of the last event of a pixel that has not fired: long before any time of a recording.
 NEVER_US = -(2**62)
-
-
-class EventCameraConfig(Settings):
-    """Physical parameters of an event camera; the defaults are those of a good sensor in good light."""
-
-    threshold_on: float = Field(0.2, gt=0, le=2, description="Mean ON contrast threshold, log units (0.2: 22 % brighter).")
-    threshold_off: float = Field(0.2, gt=0, le=2, description="Mean OFF contrast threshold, log units.")
-    threshold_mismatch: float = Field(0.03, ge=0, le=0.5, description="Standard deviation of the thresholds between pixels, log units.")
-    refractory_us: int = Field(100, ge=0, le=1_000_000, description="Time in reset after an event, µs.")
-    leak_rate_hz: float = Field(0.1, ge=0, le=100, description="Rate of leak events (ON) of a pixel at rest, Hz.")
-    shot_noise_rate_hz: float = Field(0.2, ge=0, le=1000, description="Rate of shot noise events (ON and OFF) of a pixel in the dark, Hz.")
-    dark_level: float = Field(0.005, gt=0, le=1, description="Dark current as a luminance, where 1 is white.")
-
-
-EVENT_CAMERA_PROFILES = {
-    "ideal": EventCameraConfig(threshold_mismatch=0, refractory_us=0, leak_rate_hz=0, shot_noise_rate_hz=0),
-    "default": EventCameraConfig(),
-}
 
 
 @dataclass(frozen=True)
@@ -67,14 +55,17 @@ class EventCameraState:
     """All that changes in an event camera; levels are log luminances.
 
     Args:
-        log_level: at the last frame.
+        light_level: log luminance at the last frame.
+        log_level: what the photoreceptor makes of it; the same where its bandwidth has no limit.
         reference: memorised at the last event, less the leak since the start (see :class:`EventCamera`).
         last_event_us: :data:`NEVER_US` before the first event.
         in_reset: flat indices of the pixels that were still in reset at the last frame.
         start_us, frame_us: times of the first and the last frame.
         generator_state: of the random generator.
+        pending: events that have fired but are not yet read out, at the times (µs) when they will be.
     """
 
+    light_level: Float[Tensor, "h w"]
     log_level: Float[Tensor, "h w"]
     reference: Float[Tensor, "h w"]
     last_event_us: Int[Tensor, "h w"]
@@ -82,6 +73,7 @@ class EventCameraState:
     start_us: int
     frame_us: int
     generator_state: UInt8[Tensor, "g"]
+    pending: Fired
 
 
 @dataclass(frozen=True)
@@ -106,15 +98,6 @@ class _Pixels:
         return _Pixels(self.index[chosen], self.level[chosen], self.slope[chosen], self.reference[chosen], self.release_us[chosen])
 
 
-@dataclass(frozen=True)
-class _Fired:
-    """Events by flat pixel index; times are µs since the start of the frame interval."""
-
-    index: Int[Tensor, "n"]
-    t_us: Int[Tensor, "n"]
-    polarity: Bool[Tensor, "n"]
-
-
 class EventCamera:
     """An event camera with its fixed pattern of thresholds.
 
@@ -132,6 +115,7 @@ class EventCamera:
         self.threshold_off = self._thresholds(config.threshold_off, generator)
         # Log units per µs; a pixel at rest then fires at the leak rate whatever its threshold.
         self._leak = self.threshold_on * (config.leak_rate_hz * 1e-6)
+        self._hot_pixels = HotPixels(config, width * height, generator, self.device)
         self._first_generator_state = generator.get_state()
 
     def _thresholds(self, mean: float, generator: torch.Generator) -> Float[Tensor, "h w"]:
@@ -150,7 +134,7 @@ class EventCamera:
         reference = log_level - self.threshold_on * phase if self.config.leak_rate_hz > 0 else log_level.clone()
         last_event_us = torch.full(log_level.shape, NEVER_US, dtype=torch.int64, device=self.device)
         in_reset = torch.zeros(0, dtype=torch.int64, device=self.device)
-        return EventCameraState(log_level, reference, last_event_us, in_reset, t_us, t_us, generator.get_state())
+        return EventCameraState(log_level, log_level, reference, last_event_us, in_reset, t_us, t_us, generator.get_state(), Fired.none(self.device))
 
     def step(
         self, state: EventCameraState, luminance: Float[Tensor, "h w"], t_us: int, regions: Sequence[tuple[slice, slice]] | None = None
@@ -166,21 +150,55 @@ class EventCamera:
         Raises:
             EventDataError: if the frame has another size, holds values that are not finite or negative, or is not later.
         """
+        state, events, _ = self.step_with_causes(state, luminance, t_us, regions)
+        return state, events
+
+    def step_with_causes(
+        self, state: EventCameraState, luminance: Float[Tensor, "h w"], t_us: int, regions: Sequence[tuple[slice, slice]] | None = None
+    ) -> tuple[EventCameraState, EventBatch, Bool[Tensor, "n"]]:
+        """:meth:`step`, which also tells for every event whether it is noise: shot noise, a hot pixel, or leak alone."""
         if t_us <= state.frame_us:
             raise EventDataError(f"frames must come in time order: got one at {t_us} µs after one at {state.frame_us} µs.")
-        log_level = self._updated_level(state.log_level, luminance, regions)
-        pixels, fired = self._fire(self._candidates(state, log_level, t_us), t_us - state.frame_us)
+        duration_us = t_us - state.frame_us
+        light_level = self._updated_level(state.light_level, luminance, regions)
+        log_level = self._photoreceptor(state, light_level, duration_us)
+        pixels, fired = self._fire(self._candidates(state, log_level, t_us), duration_us)
         last_event_us = _latest(state.last_event_us, fired, state.frame_us)
         generator = _generator(state.generator_state)
-        noise = self._shot_noise(log_level, last_event_us, state.frame_us, t_us, generator)
+        noise = self._noise(log_level, last_event_us, state.frame_us, duration_us, generator)
+        fired = replace(fired, is_noise=self._by_leak_alone(fired, state, log_level, duration_us))
+        both = concatenate_fired([fired, noise], self.device).later(state.frame_us)
+        ready, pending = read_out(state.pending, both, t_us, self.config, generator)
         last_event_us = _latest(last_event_us, noise, state.frame_us)
         reference = state.reference.clone()
         reference.view(-1)[pixels.index] = pixels.reference
-        after = EventCameraState(log_level, reference, last_event_us, state.in_reset, state.start_us, t_us, generator.get_state())
+        after = EventCameraState(
+            light_level, log_level, reference, last_event_us, state.in_reset, state.start_us, t_us, generator.get_state(), pending
+        )
         self._memorise(after, state, noise.index)
         touched = torch.cat([pixels.index, noise.index]).unique()
         in_reset = touched[last_event_us.view(-1)[touched] + self.config.refractory_us > t_us]
-        return replace(after, in_reset=in_reset), self._batch(fired, noise, state.frame_us)
+        return replace(after, in_reset=in_reset), *self._batch(ready)
+
+    def _photoreceptor(self, state: EventCameraState, light_level: Float[Tensor, "h w"], duration_us: int) -> Float[Tensor, "h w"]:
+        """What the photoreceptor makes of the new frame."""
+        if not self.config.bandwidth_hz:
+            return light_level
+        cutoff = cutoff_hz(light_level.exp() - self.config.dark_level, self.config.bandwidth_hz)
+        return response(state.log_level, state.light_level, light_level, cutoff, 1e-6 * duration_us)
+
+    def _noise(
+        self, log_level: Float[Tensor, "h w"], last_event_us: Int[Tensor, "h w"], start_us: int, duration_us: int, generator: torch.Generator
+    ) -> Fired:
+        """Shot noise and hot pixels of one interval, on pixels that are not in reset."""
+        sources = [shot_noise(log_level, self.config, duration_us, generator), self._hot_pixels.fire(duration_us, generator)]
+        noise = concatenate_fired(sources, self.device)
+        return noise[rested(noise, last_event_us, start_us, self.config.refractory_us)]
+
+    def _by_leak_alone(self, fired: Fired, state: EventCameraState, log_level: Float[Tensor, "h w"], duration_us: int) -> Bool[Tensor, "n"]:
+        """Which events had more leak than change of light in their interval."""
+        change = (log_level.view(-1)[fired.index] - state.log_level.view(-1)[fired.index]).abs()
+        return change <= self._leak.view(-1)[fired.index] * duration_us
 
     def _updated_level(
         self, log_level: Float[Tensor, "h w"], luminance: Float[Tensor, "rows columns"], regions: Sequence[tuple[slice, slice]] | None
@@ -215,7 +233,7 @@ class EventCamera:
         at_release = pixels.signal(release_us.clamp(max=duration))
         return replace(pixels, reference=torch.where(release_us > 0, at_release, pixels.reference))
 
-    def _fire(self, pixels: _Pixels, duration_us: int) -> tuple[_Pixels, _Fired]:
+    def _fire(self, pixels: _Pixels, duration_us: int) -> tuple[_Pixels, Fired]:
         """Follow the pixels through one interval, event by event; also returns what they memorise at its end."""
         reference, rounds = pixels.reference.clone(), []
         rising = pixels.slope > 0
@@ -228,27 +246,13 @@ class EventCamera:
             fires = (crossing_us <= duration_us) & (active.slope != 0)
             active, row, target = active[fires], row[fires], target[fires]
             event_us = crossing_us[fires].ceil().clamp(1, duration_us)
-            rounds.append(_Fired(active.index, event_us.long(), rising[row]))
+            rounds.append(Fired(active.index, event_us.long(), rising[row], torch.zeros_like(row, dtype=torch.bool)))
             release_us = event_us + self.config.refractory_us
             # Without a reset the pixel memorises the very level that it reached.
             memorised = active.signal(release_us.clamp(max=duration_us)) if self.config.refractory_us else target
             reference[row] = memorised
             active = replace(active, reference=memorised, release_us=release_us)
-        return replace(pixels, reference=reference), _concatenate(rounds, self.device)
-
-    def _shot_noise(
-        self, log_level: Float[Tensor, "h w"], last_event_us: Int[Tensor, "h w"], start_us: int, end_us: int, generator: torch.Generator
-    ) -> _Fired:
-        """Noise events of one interval, on pixels that are not in reset."""
-        duration_us, pixels = end_us - start_us, self.width * self.height
-        expected = self.config.shot_noise_rate_hz * 1e-6 * duration_us * pixels
-        count = int(torch.poisson(torch.tensor(expected, dtype=torch.float64), generator=generator))
-        where, when, sign, luck = torch.rand((4, count), generator=generator, dtype=torch.float64).to(self.device)
-        index, t_us = (where * pixels).long(), 1 + (when * duration_us).long()
-        brightness = (log_level.view(-1)[index].exp() - self.config.dark_level).clamp(0, 1)
-        ready = start_us + t_us >= last_event_us.view(-1)[index] + self.config.refractory_us
-        kept = ready & (luck < 1 - (1 - _BRIGHT_NOISE_SHARE) * brightness)
-        return _Fired(index[kept], t_us[kept], (sign < 0.5)[kept])
+        return replace(pixels, reference=reference), concatenate_fired(rounds, self.device)
 
     def _memorise(self, after: EventCameraState, before: EventCameraState, index: Int[Tensor, "n"]) -> None:
         """Let pixels memorise their level at the end of the reset that follows their last event, in ``after.reference``."""
@@ -256,13 +260,14 @@ class EventCamera:
         fraction = (release_us.clamp(max=after.frame_us) - before.frame_us).double() / (after.frame_us - before.frame_us)
         after.reference.view(-1)[index] = torch.lerp(self._signal(before, index), self._signal(after, index), fraction.to(after.reference))
 
-    def _batch(self, fired: _Fired, noise: _Fired, start_us: int) -> EventBatch:
-        """Events sorted by time, then pixel."""
-        both = _concatenate([fired, noise], self.device)
-        order = torch.argsort(both.t_us * (self.width * self.height) + both.index, stable=True)
-        index = both.index[order]
+    def _batch(self, fired: Fired) -> tuple[EventBatch, Bool[Tensor, "n"]]:
+        """Events sorted by time, then pixel, and which of them are noise."""
+        # Times since the first: an absolute one times the number of pixels could overflow.
+        first_us = fired.t_us.min() if len(fired) else 0
+        order = torch.argsort((fired.t_us - first_us) * (self.width * self.height) + fired.index, stable=True)
+        index = fired.index[order]
         x, y = (index % self.width).int(), torch.div(index, self.width, rounding_mode="floor").int()
-        return EventBatch(x, y, both.t_us[order] + start_us, both.polarity[order], torch.zeros_like(index))
+        return EventBatch(x, y, fired.t_us[order], fired.polarity[order], torch.zeros_like(index)), fired.is_noise[order]
 
 
 def _generator(state: UInt8[Tensor, "g"]) -> torch.Generator:
@@ -271,14 +276,7 @@ def _generator(state: UInt8[Tensor, "g"]) -> torch.Generator:
     return generator
 
 
-def _latest(last_event_us: Int[Tensor, "h w"], fired: _Fired, start_us: int) -> Int[Tensor, "h w"]:
+def _latest(last_event_us: Int[Tensor, "h w"], fired: Fired, start_us: int) -> Int[Tensor, "h w"]:
     """Times of the last events with new ones added; a pixel may have fired several times."""
     flat = last_event_us.view(-1).scatter_reduce(0, fired.index, fired.t_us + start_us, "amax")
     return flat.view_as(last_event_us)
-
-
-def _concatenate(parts: Sequence[_Fired], device: torch.device) -> _Fired:
-    if not parts:
-        none = torch.zeros(0, dtype=torch.int64, device=device)
-        return _Fired(none, none, none.bool())
-    return _Fired(*(torch.cat([getattr(part, name) for part in parts]) for name in ("index", "t_us", "polarity")))

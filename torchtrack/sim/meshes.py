@@ -5,15 +5,17 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from PIL import Image as PillowImage
+from scipy.spatial import Delaunay
 
 from torchtrack.errors import ConfigError
-from torchtrack.sim import textures
+from torchtrack.sim import curved, textures
 from torchtrack.sim.textures import Image
 
 # Faces of a box in the order -x +x -y +y -z +z: their corners (outwards, counterclockwise) as signs.
@@ -115,7 +117,88 @@ def l_bracket(width_m: float = 0.14, height_m: float = 0.10, depth_m: float = 0.
     return trimesh.Trimesh(vertices, np.concatenate([cap[:, ::-1], cap + count, walls]), process=False)
 
 
-SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {"cube": cube, "lbracket": l_bracket, "satellite": satellite, "book": book}
+def planar_pattern(size_m: float = 0.18, thickness_m: float = 0.003) -> trimesh.Trimesh:
+    """A printed card."""
+    patches = [textures.planar_pattern(900), np.full((16, 16), textures.PAPER, dtype=np.uint8)]
+    # The camera sees the side of -z, where the box's patches run the other way round.
+    return _boxes([_Box((size_m, size_m, thickness_m), (0.0, 0.0, 0.0), (1, 1, 1, 1, 0, 1))], patches)
+
+
+def wedge(length_m: float = 0.16, height_m: float = 0.1, depth_m: float = 0.06) -> trimesh.Trimesh:
+    """A wedge with a square and a triangular hole through it."""
+    outline = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, -0.2], [-0.5, 0.5]]) * [length_m, height_m]
+    square = np.array([[-0.4, -0.35], [-0.2, -0.35], [-0.2, 0.02], [-0.4, 0.02]]) * [length_m, height_m]
+    triangle = np.array([[-0.08, -0.36], [0.3, -0.36], [-0.08, -0.02]]) * [length_m, height_m]
+    return _prism([outline, square, triangle], depth_m)
+
+
+def bar(length_m: float = 0.5, width_m: float = 0.05, thickness_m: float = 0.02) -> trimesh.Trimesh:
+    """A plain bar along y, such as one that passes before the objects."""
+    return trimesh.creation.box((width_m, length_m, thickness_m))
+
+
+def _prism(loops: Sequence[Float[ndarray, "_ 2"]], depth_m: float, spacing: float = 0.012) -> trimesh.Trimesh:
+    """A prism over an outline with holes; each loop counterclockwise, the first around all others."""
+    loops = [_subdivided(loop, spacing) for loop in loops]
+    flat = np.concatenate(loops)
+    # On loops as dense as these the triangulation keeps to them; what lies outside or in a hole is dropped.
+    triangles = Delaunay(flat).simplices
+    centres = flat[triangles].mean(1)
+    inside = _contains(loops[0], centres) & ~np.any([_contains(hole, centres) for hole in loops[1:]], axis=0)
+    a, b, c = flat[triangles].transpose(1, 0, 2)
+    area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    cap = np.where(area[:, None] > 0, triangles, triangles[:, ::-1])[inside & (np.abs(area) > 1e-12)]
+    count, walls, start = len(flat), [], 0
+    for number, loop in enumerate(loops):
+        side = start + np.arange(len(loop))
+        after = start + (np.arange(len(loop)) + 1) % len(loop)
+        side, after = (side, after) if number == 0 else (after, side)
+        walls += [np.column_stack([side, after, after + count]), np.column_stack([side, after + count, side + count])]
+        start += len(loop)
+    vertices = np.concatenate([np.column_stack([flat, np.full(count, z)]) for z in (-depth_m / 2, depth_m / 2)])
+    return trimesh.Trimesh(vertices, np.concatenate([cap[:, ::-1], cap + count, *walls]), process=False)
+
+
+def _subdivided(loop: Float[ndarray, "_ 2"], spacing: float) -> Float[ndarray, "_ 2"]:
+    """A closed loop with its edges cut into pieces no longer than ``spacing`` (m)."""
+    pieces = []
+    for start, end in zip(loop, np.roll(loop, -1, axis=0), strict=True):
+        count = int(np.ceil(np.linalg.norm(end - start) / spacing))
+        pieces.append(start + np.arange(count)[:, None] / count * (end - start))
+    return np.concatenate(pieces)
+
+
+def _contains(loop: Float[ndarray, "_ 2"], points: Float[ndarray, "n 2"]) -> Bool[ndarray, "n"]:
+    """Which points a closed loop goes around (even-odd rule)."""
+    start, end = loop, np.roll(loop, -1, axis=0)
+    x, y = points[:, :1], points[:, 1:]
+    crosses = (start[:, 1] > y) != (end[:, 1] > y)
+    rise = np.where(end[:, 1] == start[:, 1], 1.0, end[:, 1] - start[:, 1])
+    left = x < (end[:, 0] - start[:, 0]) * (y - start[:, 1]) / rise + start[:, 0]
+    return (crosses & left).sum(1) % 2 == 1
+
+
+SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
+    "cube": cube,
+    "lbracket": l_bracket,
+    "satellite": satellite,
+    "book": book,
+    "wedge": wedge,
+    "planar": planar_pattern,
+    "bar": bar,
+    "torus_knot": curved.torus_knot,
+    "vase": curved.vase,
+    "mug": curved.mug,
+    "animal": curved.animal,
+    "robot": curved.robot,
+    "duck": curved.duck,
+}
+
+
+@cache
+def _made(name: str) -> trimesh.Trimesh:
+    """Made once: fields of distances take a while."""
+    return SHAPES[name]()
 
 
 def make_mesh(name: str, scale: float = 1.0) -> trimesh.Trimesh:
@@ -126,6 +209,6 @@ def make_mesh(name: str, scale: float = 1.0) -> trimesh.Trimesh:
     """
     if name not in SHAPES:
         raise ConfigError(f"unknown shape '{name}': use one of {', '.join(SHAPES)}.")
-    mesh = SHAPES[name]()
+    mesh = _made(name).copy()
     mesh.apply_scale(scale)
     return mesh

@@ -5,7 +5,8 @@ coordinates*): with the corners ``A B C`` of a triangle in the camera frame and 
 ``[a b c] = [A B C]⁻¹ d`` are affine in the pixel, their sum is the inverse depth, and divided by it they are the
 perspective-correct barycentric coordinates. Triangles that cross the camera plane need no clipping.
 
-Samples: phase ``s`` holds one sample of every pixel of the region, ``offsets[s]`` from the pixel's centre.
+Samples of a pixel lie beside one another in memory, sample ``s`` at ``offsets[s]`` from the pixel's centre: a small face touches
+few cache lines, and a pixel's samples are tested in one go. Coordinates are float64 up to the pixel's centre, float32 from there.
 """
 
 import inspect
@@ -35,11 +36,45 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 @kernel()
+def place(
+    corners_obj: Array, normals_obj: Array, face_object: Array, pose: Array, is_closed: Array, corners: Array, normals: Array, is_seen: Array
+) -> None:
+    """Move all faces to the camera frame; normals are turned towards the camera, and backs of closed surfaces marked as unseen.
+
+    Args:
+        corners_obj, normals_obj: ``[f, 3, 3]``, each in the frame of its object.
+        face_object: ``[f]`` number of the object.
+        pose: ``[o, 4, 4]``.
+        is_closed: ``[o]``.
+        corners, normals, is_seen: filled.
+    """
+    for f in range(len(corners_obj)):
+        T = pose[face_object[f]]
+        for k in range(3):
+            x, y, z = corners_obj[f, k, 0], corners_obj[f, k, 1], corners_obj[f, k, 2]
+            for i in range(3):
+                corners[f, k, i] = T[i, 0] * x + T[i, 1] * y + T[i, 2] * z + T[i, 3]
+        faces_camera = _determinant(corners[f, 0], corners[f, 1], corners[f, 2]) < 0
+        is_seen[f] = faces_camera or not is_closed[face_object[f]]
+        sign = 1.0 if faces_camera else -1.0
+        for k in range(3):
+            x, y, z = sign * normals_obj[f, k, 0], sign * normals_obj[f, k, 1], sign * normals_obj[f, k, 2]
+            for i in range(3):
+                normals[f, k, i] = T[i, 0] * x + T[i, 1] * y + T[i, 2] * z
+
+
+@kernel()
+def _determinant(a: Array, b: Array, c: Array) -> float:
+    """Six times the volume between three points and the camera; negative where they go round counterclockwise, seen from there."""
+    return a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+
+
+@kernel()
 def _setup(corners: Array, intrinsics: Array, origin: Array, plane: Array) -> bool:
     """Affine coefficients ``plane [3, 3]`` of each barycentric coordinate over the inverse depth; whether the face can be drawn."""
     fx, fy, cx, cy, near = intrinsics
     a, b, c = corners[0], corners[1], corners[2]
-    det = a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+    det = _determinant(a, b, c)
     scale = np.sqrt((a * a).sum() * (b * b).sum() * (c * c).sum())
     # Written so that a corner that is not a number fails it too.
     if not (abs(det) > _SLIVER * scale and max(a[2], b[2], c[2]) > near):
@@ -70,12 +105,12 @@ def _row_range(corners: Array, intrinsics: Array, origin: Array, height: int) ->
 
 
 @kernel()
-def _span(plane: Array, dx: float, row: float, width: int) -> tuple[int, int]:
-    """First and last column of a row where all three barycentric coordinates are non-negative."""
+def _span(plane: Array, reach: Array, row: float, width: int) -> tuple[int, int]:
+    """First and last column of a row where a pixel may have a sample inside the face."""
     low, high = 0.0, width - 1.0
     for k in range(3):
         slope = plane[k, 0]
-        value = plane[k, 1] * row + plane[k, 2] + slope * dx
+        value = plane[k, 1] * row + plane[k, 2] + reach[k]
         if slope > 0:
             low = max(low, np.ceil(-value / slope))
         elif slope < 0:
@@ -88,45 +123,76 @@ def _span(plane: Array, dx: float, row: float, width: int) -> tuple[int, int]:
 
 
 @kernel()
+def _steps(plane: Array, offsets: Array, steps: Array, reach: Array) -> None:
+    """How the three coordinates and their sum differ from the pixel's centre at each sample, and by how much at the most."""
+    for k in range(3):
+        reach[k] = 0.0
+        for s in range(len(offsets)):
+            step = plane[k, 0] * offsets[s, 0] + plane[k, 1] * offsets[s, 1]
+            steps[k, s] = step
+            reach[k] = max(reach[k], step)
+    for s in range(len(offsets)):
+        steps[3, s] = steps[0, s] + steps[1, s] + steps[2, s]
+
+
+@kernel()
+def _test(f: int, centre: tuple[float, float, float], limits: tuple[float, float, float], steps: Array, nearest: Array, faces: Array) -> None:
+    """Put a face on those samples of one pixel that it covers and where it is nearer than what was drawn before."""
+    a, b, c = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2])
+    total = np.float32(centre[0] + centre[1] + centre[2])
+    lowest, highest, cut = np.float32(limits[0]), np.float32(limits[1]), np.float32(limits[2])
+    for s in range(len(nearest)):
+        value = total + steps[3, s]
+        inside = (a + steps[0, s] >= 0) & (b + steps[1, s] >= 0) & (c + steps[2, s] >= 0) & (value <= cut)
+        # A sliver's inverse depth is badly conditioned, but it lies between those of its corners.
+        value = min(max(value, lowest), highest)
+        hit = inside & (value > nearest[s])
+        nearest[s] = value if hit else nearest[s]
+        faces[s] = f if hit else faces[s]
+
+
+@kernel()
 def _draw_face(
-    f: int, corners: Array, intrinsics: Array, origin: Array, offsets: Array, planes: Array, inverse_depth: Array, face_index: Array
+    f: int, corners: Array, intrinsics: Array, origin: Array, offsets: Array, plane: Array, work: Array, inverse_depth: Array, face_index: Array
 ) -> None:
-    """Put one face wherever it is nearer than what was drawn before."""
-    samples, height, width = inverse_depth.shape
+    """Put one face wherever it is nearer than what was drawn before; ``work [4, s]`` is room for the steps."""
+    height, width, _ = inverse_depth.shape
     farthest, nearest = corners[f, :, 2].max(), corners[f, :, 2].min()
-    lowest, highest = 1.0 / farthest, 1.0 / max(nearest, intrinsics[4])
-    plane = planes[f]
-    slope_x = plane[0, 0] + plane[1, 0] + plane[2, 0]
-    slope_y = plane[0, 1] + plane[1, 1] + plane[2, 1]
-    constant = plane[0, 2] + plane[1, 2] + plane[2, 2]
+    highest = 1.0 / max(nearest, intrinsics[4])
+    # What lies before the near plane is cut off.
+    limits = (1.0 / farthest, highest, highest if nearest < intrinsics[4] else np.inf)
+    reach = np.empty(3)
+    _steps(plane, offsets, work, reach)
     first_row, end_row = _row_range(corners[f], intrinsics, origin, height)
-    for s in range(samples):
-        dx, dy = offsets[s, 0], offsets[s, 1]
-        for row in range(first_row, end_row):
-            first, last = _span(plane, dx, row + dy, width)
-            start = slope_y * (row + dy) + constant + slope_x * dx
-            for col in range(first, last + 1):
-                value = start + slope_x * col
-                if nearest < intrinsics[4] and value > highest:
-                    continue
-                # A sliver's inverse depth is badly conditioned, but it lies between those of its corners.
-                value = min(max(value, lowest), highest)
-                if value > inverse_depth[s, row, col]:
-                    inverse_depth[s, row, col] = value
-                    face_index[s, row, col] = f
+    for row in range(first_row, end_row):
+        first, last = _span(plane, reach, row, width)
+        for col in range(first, last + 1):
+            a = plane[0, 0] * col + plane[0, 1] * row + plane[0, 2]
+            b = plane[1, 0] * col + plane[1, 1] * row + plane[1, 2]
+            c = plane[2, 0] * col + plane[2, 1] * row + plane[2, 2]
+            _test(f, (a, b, c), limits, work, inverse_depth[row, col], face_index[row, col])
 
 
 @kernel()
 def draw(
-    corners: Array, ranges: Array, intrinsics: Array, origin: Array, offsets: Array, planes: Array, inverse_depth: Array, face_index: Array
+    corners: Array,
+    ranges: Array,
+    is_seen: Array,
+    intrinsics: Array,
+    origin: Array,
+    offsets: Array,
+    planes: Array,
+    inverse_depth: Array,
+    face_index: Array,
 ) -> None:
-    """Find the nearest face at every sample, among the faces in ``ranges [r, 2]`` (first, end).
+    """Find the nearest face at every sample, among those faces in ``ranges [r, 2]`` (first, end) that are ``is_seen [f]``.
 
-    Fills ``planes [f, 3, 3]`` for those faces, ``inverse_depth`` and ``face_index [s, h, w]`` (-1 where there is none).
+    Fills ``planes [f, 3, 3]`` for those faces, ``inverse_depth`` and ``face_index [h, w, s]`` (-1 where there is none).
     """
     inverse_depth[:] = 0
     face_index[:] = -1
+    work = np.empty((4, len(offsets)), dtype=np.float32)
     for r in range(len(ranges)):
         for f in range(ranges[r, 0], ranges[r, 1]):
-            if _setup(corners[f], intrinsics, origin, planes[f]):
-                _draw_face(f, corners, intrinsics, origin, offsets, planes, inverse_depth, face_index)
+            if is_seen[f] and _setup(corners[f], intrinsics, origin, planes[f]):
+                _draw_face(f, corners, intrinsics, origin, offsets, planes[f], work, inverse_depth, face_index)

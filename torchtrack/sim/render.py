@@ -16,7 +16,7 @@ move in steps of ``1/n``, and the events of a slow upright edge would come in bu
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import ModuleType
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -28,7 +28,8 @@ from torch import Tensor
 from torchtrack.camera import Camera
 from torchtrack.config.settings import Settings
 from torchtrack.errors import CalibrationError, MissingExtraError, ModelError, PoseError
-from torchtrack.sim.surface import RenderObject, Scene, merge_objects
+from torchtrack.sim.drawing import Drawer, Light, Region, merge_regions
+from torchtrack.sim.surface import Parts, merge_objects
 
 # The blur's weights beyond this many standard deviations are below 1e-4.
 _BLUR_REACH = 4.0
@@ -37,47 +38,13 @@ _BLUR_REACH = 4.0
 class RenderConfig(Settings):
     """How a scene is lit and sampled."""
 
+    backend: Literal["rasterizer", "opengl"] = Field("rasterizer", description="What draws: numba (extra sim), or OpenGL through EGL (extra gl).")
     supersampling: int = Field(4, ge=1, le=8, description="Samples per pixel along each axis.")
     lens_blur_px: float = Field(0.4, ge=0, le=5, description="Standard deviation of the lens blur, pixels.")
     near_m: float = Field(0.01, gt=0, description="Surfaces nearer than this are not drawn, m.")
-    light_direction: tuple[float, float, float] = Field((-0.4, -0.7, -0.6), description="Direction towards the light, camera frame.")
+    light_direction: tuple[float, float, float] = Field((-0.4, -0.7, -0.6), description="Direction towards the light, world frame.")
     ambient: float = Field(0.35, ge=0, le=1, description="Share of light that comes from everywhere.")
     diffuse: float = Field(0.65, ge=0, le=1, description="Share of light that comes from the light's direction.")
-
-
-@dataclass(frozen=True)
-class Region:
-    """A rectangle of pixels, ends excluded."""
-
-    top: int
-    bottom: int
-    left: int
-    right: int
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        """Index of the rectangle in an image ``[H, W]``."""
-        return slice(self.top, self.bottom), slice(self.left, self.right)
-
-    def overlaps(self, other: "Region") -> bool:
-        """Whether the two share a pixel."""
-        return self.top < other.bottom and other.top < self.bottom and self.left < other.right and other.left < self.right
-
-    def union(self, other: "Region") -> "Region":
-        """The smallest rectangle around both."""
-        return Region(min(self.top, other.top), max(self.bottom, other.bottom), min(self.left, other.left), max(self.right, other.right))
-
-
-def merge_regions(regions: Sequence[Region]) -> tuple[Region, ...]:
-    """Rectangles that overlap, joined until none do."""
-    merged: list[Region] = []
-    for region in regions:
-        while overlapping := [other for other in merged if other.overlaps(region)]:
-            for other in overlapping:
-                merged.remove(other)
-                region = region.union(other)
-        merged.append(region)
-    return tuple(merged)
 
 
 @dataclass(frozen=True)
@@ -97,6 +64,31 @@ class Frame:
     regions: tuple[Region, ...]
 
 
+@dataclass(frozen=True)
+class Scenery:
+    """What may differ from image to image beside the poses.
+
+    Args:
+        background: luminance, linear; None for that of the renderer.
+        light_direction: towards the light, camera frame; None for that of the config.
+        brightness: multiplies all light.
+    """
+
+    background: Float[ndarray, "h w"] | None = None
+    light_direction: tuple[float, float, float] | None = None
+    brightness: float = 1.0
+
+
+def blurred(image: Float[ndarray, "h w"], sigma_px: float) -> Float[ndarray, "h w"]:
+    """The image as a lens that is not quite sharp shows it."""
+    size = 2 * _blur_radius(sigma_px) + 1
+    return cv2.GaussianBlur(image, (size, size), sigma_px, borderType=cv2.BORDER_REPLICATE) if sigma_px > 0 else image
+
+
+def _blur_radius(sigma_px: float) -> int:
+    return int(np.ceil(_BLUR_REACH * sigma_px))
+
+
 def plain_background(width: int, height: int, luminance: float) -> Float[ndarray, "h w"]:
     """An even background."""
     return np.full((height, width), luminance, dtype=np.float32)
@@ -106,77 +98,70 @@ class Renderer:
     """Draws a fixed set of objects before a fixed background.
 
     Args:
-        objects: what to draw.
+        objects: what to draw; one may have parts with a texture each.
         camera: pinhole camera without distortion.
         background: luminance ``[H, W]``, linear, finite and not negative.
         config: light and sampling.
 
     Raises:
-        MissingExtraError: if numba is not installed.
+        MissingExtraError: if what should draw is not installed.
         CalibrationError: if the camera has distortion, or the background's size is not the sensor's.
         ModelError: if there is no object.
     """
 
     def __init__(
-        self, objects: Sequence[RenderObject], camera: Camera, background: Float[ndarray, "h w"], config: RenderConfig | None = None
+        self,
+        objects: Sequence[Parts],
+        camera: Camera,
+        background: Float[ndarray, "h w"],
+        config: RenderConfig | None = None,
     ) -> None:
-        self._rasterizer, self._shading = _load_kernels()
         self.camera, self.config = camera, config or RenderConfig()
         _check_inputs(objects, camera, background)
-        self._scene: Scene = merge_objects(objects)
-        self._sharp_background = np.ascontiguousarray(background, dtype=np.float32)
+        self._drawer, self._objects = make_drawer(objects, camera, self.config), len(objects)
+        self._first_background = np.ascontiguousarray(background, dtype=np.float32)
+        self._sharp_background = self._first_background
         self._background = self._blur(self._sharp_background)
-        self._offsets = sample_offsets(self.config.supersampling)
-        self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, self.config.near_m])
-        light = np.array(self.config.light_direction)
-        self._lighting = self._shading.Lighting(
-            self.config.ambient, self.config.diffuse, (light / max(np.linalg.norm(light), 1e-12)).astype(np.float32)
-        )
 
-    def render(self, T_cam_obj: Float[ndarray, "o 4 4"] | Float[Tensor, "o 4 4"]) -> Frame:
+    def render(self, T_cam_obj: Float[ndarray, "o 4 4"] | Float[Tensor, "o 4 4"], scenery: Scenery | None = None) -> Frame:
         """One image of all objects at their poses; parts behind the camera or outside the image are left out.
+
+        Args:
+            T_cam_obj: one pose per object.
+            scenery: what differs from the background and light that the renderer was made with.
 
         Raises:
             PoseError: if there is not one pose per object, or one is not finite.
         """
-        T_cam_obj = np.asarray(T_cam_obj, dtype=np.float64)
-        _check_poses(T_cam_obj, len(self._scene.object_faces))
-        corners, normals = self._scene.at_poses(T_cam_obj)
-        boxes = [self._box(corners[faces]) for faces in self._scene.object_faces]
+        T_cam_obj, scenery = np.asarray(T_cam_obj, dtype=np.float64), scenery or Scenery()
+        _check_poses(T_cam_obj, self._objects)
+        self._set_background(self._first_background if scenery.background is None else scenery.background)
+        light = Light(self.config.ambient, self.config.diffuse, scenery.light_direction or self.config.light_direction)
+        boxes = [self._box(corners) for corners in self._drawer.place(T_cam_obj, light)]
         regions = merge_regions([box for box in boxes if box is not None])
         luminance = self._background.copy()
         depth = np.full(luminance.shape, np.inf, dtype=np.float32)
         object_index = np.full(luminance.shape, -1, dtype=np.int16)
         for region in regions:
-            inside = [faces for faces, box in zip(self._scene.object_faces, boxes, strict=True) if box is not None and box.overlaps(region)]
-            ranges = np.array([[faces.start, faces.stop] for faces in inside])
-            self._render_region(region, ranges, corners, normals, luminance, depth, object_index)
+            inside = [number for number, box in enumerate(boxes) if box is not None and box.overlaps(region)]
+            sharp = self._sharp_background[region.slices].copy()
+            self._drawer.draw(region, inside, sharp, depth[region.slices], object_index[region.slices])
+            luminance[region.slices] = self._blurred_region(sharp, region)
+        if scenery.brightness != 1:
+            luminance *= np.float32(scenery.brightness)
         return Frame(luminance, depth, object_index, regions)
 
-    def _render_region(
-        self, region: Region, ranges: ndarray, corners: ndarray, normals: ndarray, luminance: ndarray, depth: ndarray, object_index: ndarray
-    ) -> None:
-        """Draw the faces of ``ranges`` (first, end) into one rectangle of the full images."""
-        sharp = self._sharp_background[region.slices].copy()
-        samples = (len(self._offsets), *sharp.shape)
-        inverse_depth, face_index = np.empty(samples, np.float32), np.empty(samples, np.int32)
-        planes = np.zeros((len(corners), 3, 3))
-        origin = np.array([region.left, region.top], dtype=np.float64)
-        self._rasterizer.draw(corners, ranges, self._intrinsics, origin, self._offsets, planes, inverse_depth, face_index)
-        surface = self._shading.Surface(normals=normals, **self._scene.look)
-        self._shading.shade(
-            face_index, inverse_depth, planes, self._offsets, surface, self._lighting, self._intrinsics, origin,
-            sharp, depth[region.slices], object_index[region.slices],
-        )  # fmt: skip
-        luminance[region.slices] = self._blurred_region(sharp, region)
+    def _set_background(self, background: Float[ndarray, "h w"]) -> None:
+        """The background of the next image."""
+        if background is not self._sharp_background:
+            self._sharp_background, self._background = background, self._blur(background)
 
     @property
     def _blur_radius(self) -> int:
-        return int(np.ceil(_BLUR_REACH * self.config.lens_blur_px))
+        return _blur_radius(self.config.lens_blur_px)
 
     def _blur(self, image: Float[ndarray, "h w"]) -> Float[ndarray, "h w"]:
-        size, sigma = 2 * self._blur_radius + 1, self.config.lens_blur_px
-        return cv2.GaussianBlur(image, (size, size), sigma, borderType=cv2.BORDER_REPLICATE) if sigma > 0 else image
+        return blurred(image, self.config.lens_blur_px)
 
     def _blurred_region(self, sharp: Float[ndarray, "h w"], region: Region) -> Float[ndarray, "h w"]:
         """The rectangle as it looks in the blurred whole: near its inner borders there is background alone."""
@@ -188,7 +173,7 @@ class Renderer:
         result[top:bottom, left:right] = blurred[top:bottom, left:right]
         return result
 
-    def _box(self, corners: Float[ndarray, "f 3 3"]) -> Region | None:
+    def _box(self, corners: Float[ndarray, "n 3"]) -> Region | None:
         """Pixels that an object can touch, blur included; the whole image where it reaches through the camera plane."""
         width, height = self.camera.width, self.camera.height
         depth = corners[..., 2]
@@ -196,8 +181,8 @@ class Renderer:
             return None
         if (depth < self.config.near_m).any():
             return Region(0, height, 0, width)
-        fx, fy, cx, cy = self._intrinsics[:4]
-        u, v = corners[..., 0] / depth * fx + cx, corners[..., 1] / depth * fy + cy
+        camera = self.camera
+        u, v = corners[..., 0] / depth * camera.fx + camera.cx, corners[..., 1] / depth * camera.fy + camera.cy
         # The pixel that a point falls into, then the blur of its light, then what that blur sees.
         margin = 2 * self._blur_radius + 1
         top, left = np.clip(np.floor([v.min(), u.min()]) - margin, 0, [height, width]).astype(int).tolist()
@@ -205,14 +190,7 @@ class Renderer:
         return Region(top, bottom, left, right) if top < bottom and left < right else None
 
 
-def sample_offsets(n: int) -> Float[ndarray, "s 2"]:
-    """Offsets (u, v) of ``n x n`` samples from the centre of a pixel, pixels: no two share a column or a row."""
-    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
-    u, v = (i + (j + 0.5) / n) / n - 0.5, (j + (i + 0.5) / n) / n - 0.5
-    return np.stack([u.ravel(), v.ravel()], 1)
-
-
-def _check_inputs(objects: Sequence[RenderObject], camera: Camera, background: ndarray) -> None:
+def _check_inputs(objects: Sequence[Parts], camera: Camera, background: ndarray) -> None:
     if not objects:
         raise ModelError("a renderer needs at least one object, got none.")
     if camera.distortion_model != "none":
@@ -230,10 +208,21 @@ def _check_poses(T_cam_obj: ndarray, objects: int) -> None:
         raise PoseError(f"the renderer needs one finite pose per object, [{objects}, 4, 4]; got shape {list(T_cam_obj.shape)}.")
 
 
-def _load_kernels() -> tuple[ModuleType, ModuleType]:
-    """The compiled kernels; numba takes a second to import, so only those who render pay for it."""
+def make_drawer(objects: Sequence[Parts], camera: Camera, config: RenderConfig) -> Drawer:
+    """The one that the config asks for; each loads its library only when asked for.
+
+    Raises:
+        MissingExtraError: if that is not installed, or finds no OpenGL.
+    """
+    scene, intrinsics = merge_objects(objects), (camera.fx, camera.fy, camera.cx, camera.cy)
+    if config.backend == "opengl":
+        try:
+            from torchtrack.sim.opengl_drawer import OpenGLDrawer
+        except ImportError as error:
+            raise MissingExtraError("moderngl", "gl", "Rendering simulated scenes with OpenGL") from error
+        return OpenGLDrawer(scene, intrinsics, config.near_m, config.supersampling)
     try:
-        from torchtrack.sim import rasterizer, shading
+        from torchtrack.sim.raster_drawer import RasterDrawer
     except ImportError as error:
         raise MissingExtraError("numba", "sim", "Rendering simulated scenes") from error
-    return rasterizer, shading
+    return RasterDrawer(scene, intrinsics, config.near_m, config.supersampling)

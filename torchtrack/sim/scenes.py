@@ -1,95 +1,154 @@
-"""Settings of a simulated scene: objects that move before a fixed camera."""
+"""Settings of a simulated scene: objects and a camera that move, what is behind and before them, light, sensor."""
 
-from typing import Literal
+from typing import Any, Literal
 
-import cv2
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
+import trimesh
 from pydantic import Field, model_validator
 
-from torchtrack.camera import Camera
+from torchtrack.camera import Camera, DistortionModel
+from torchtrack.config.merge import merged
 from torchtrack.config.settings import ConfigPath, Settings
-from torchtrack.errors import MissingFileError, UnknownFormatError
-from torchtrack.sim.event_camera import EVENT_CAMERA_PROFILES, EventCameraConfig
-from torchtrack.sim.render import RenderConfig, plain_background
-from torchtrack.sim.surface import grey_reflectance
-from torchtrack.sim.trajectory import MotionConfig
+from torchtrack.io.calibration import read_calibration
+from torchtrack.object_model.loading import checked_scale, load_parts
+from torchtrack.sim.background import BackgroundConfig
+from torchtrack.sim.meshes import make_mesh
+from torchtrack.sim.render import RenderConfig
+from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
+from torchtrack.sim.trajectory import CameraMotionConfig, MotionConfig
+
+SPEEDS_PX_S = {"slow": 250.0, "normal": 750.0, "fast": 2250.0}
+"""Largest speed of any point of an object in the image, by name: what the shared development sequences have."""
+
+
+Model = tuple[trimesh.Trimesh, ...]
+"""The parts of an object."""
 
 
 class CameraConfig(Settings):
-    """A pinhole camera without distortion."""
+    """The camera: a sensor, a focal length, and a lens that may distort; or all of it from a calibration file."""
 
+    calibration: ConfigPath | None = Field(None, description="Calibration file, in place of all else here but a size that it does not say.")
     width: int = Field(640, ge=8, le=4096, description="Sensor width, pixels.")
     height: int = Field(480, ge=8, le=4096, description="Sensor height, pixels.")
     fx: float = Field(600.0, gt=0, description="Focal length along x, pixels.")
     fy: float = Field(600.0, gt=0, description="Focal length along y, pixels.")
     cx: float | None = Field(None, description="Principal point, x; the middle of the sensor when not given.")
     cy: float | None = Field(None, description="Principal point, y; the middle of the sensor when not given.")
+    distortion_model: DistortionModel = Field("none", description="Lens model, as in OpenCV.")
+    distortion: tuple[float, ...] = Field((), description="Its coefficients.")
 
     def build(self) -> Camera:
-        """The camera."""
-        cx = self.cx if self.cx is not None else (self.width - 1) / 2
-        cy = self.cy if self.cy is not None else (self.height - 1) / 2
-        return Camera(self.fx, self.fy, cx, cy, self.width, self.height)
-
-
-class BackgroundConfig(Settings):
-    """What is behind the objects; it does not move."""
-
-    luminance: float = Field(0.1, ge=0, le=1, description="Of a plain background, linear in light: 1 is white.")
-    image: ConfigPath | None = Field(None, description="An image instead, stretched to the sensor's size.")
-
-    def build(self, width: int, height: int) -> Float[ndarray, "h w"]:
-        """Luminance of every pixel, linear in light.
+        """The camera.
 
         Raises:
-            MissingFileError: if the image is not there.
-            UnknownFormatError: if it cannot be read as an image.
+            MissingFileError, CalibrationError: if there is something wrong with the calibration file, or the distortion.
         """
-        if self.image is None:
-            return plain_background(width, height, self.luminance)
-        if not self.image.is_file():
-            raise MissingFileError(f"the background image '{self.image}' does not exist.")
-        image = cv2.imread(str(self.image), cv2.IMREAD_COLOR)
-        if image is None:
-            raise UnknownFormatError(f"'{self.image}' cannot be read as an image. Use PNG or JPEG.")
-        linear = grey_reflectance(image[..., ::-1]).astype(np.float32)
-        return cv2.resize(linear, (width, height), interpolation=cv2.INTER_AREA)
+        if self.calibration is not None:
+            given = self.model_fields_set
+            return read_calibration(self.calibration, self.width if "width" in given else None, self.height if "height" in given else None)
+        cx = self.cx if self.cx is not None else (self.width - 1) / 2
+        cy = self.cy if self.cy is not None else (self.height - 1) / 2
+        return Camera(self.fx, self.fy, cx, cy, self.width, self.height, self.distortion_model, self.distortion)
 
 
 class ObjectConfig(Settings):
     """One object: its shape, its look and its motion."""
 
     label: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$", description="Name, also in file names.")
-    shape: Literal["cube", "lbracket", "satellite", "book"] = Field(description="Which object.")
-    scale: float = Field(1.0, gt=0.05, le=20, description="Enlargement; at 1 the objects measure 10 to 25 cm.")
+    shape: (
+        Literal["cube", "lbracket", "satellite", "book", "wedge", "planar", "bar", "torus_knot", "vase", "mug", "animal", "robot", "duck"] | None
+    ) = Field(None, description="A built-in object; or give mesh.")
+    mesh: ConfigPath | None = Field(None, description="PLY, OBJ, STL, GLB, glTF or OFF file, with its texture or colours.")
+    unit: Literal["m", "cm", "mm", "inch"] = Field("m", description="Unit of the mesh file's coordinates.")
+    scale: float = Field(1.0, gt=0.05, le=20, description="Enlargement; at 1 the built-in objects measure 10 to 25 cm.")
     reflectance: float = Field(0.6, gt=0, le=1, description="Share of light that an object without texture gives back.")
     gloss: float = Field(0.08, ge=0, le=2, description="Strength of the highlight.")
     motion: MotionConfig = Field(default_factory=MotionConfig, description="Mean pose and swing.")
+
+    @model_validator(mode="after")
+    def _one_model(self) -> "ObjectConfig":
+        if (self.shape is None) == (self.mesh is None):
+            raise ValueError("give either shape or mesh, exactly one of them")
+        return self
+
+    def build(self) -> Model:
+        """The parts of its mesh, in metres, each with a texture of its own.
+
+        Raises:
+            MissingFileError, UnknownFormatError, ModelError: if there is something wrong with the mesh file.
+        """
+        if self.mesh is None:
+            return (make_mesh(str(self.shape), self.scale),)
+        parts = load_parts(self.mesh)
+        scale = checked_scale(np.concatenate([part.vertices for part in parts]), self.unit, self.label) * self.scale
+        return tuple(part.apply_scale(scale) for part in parts)
+
+
+class LightConfig(Settings):
+    """How the light changes over time; its direction and strength at first are settings of ``render``."""
+
+    turn_deg_s: float = Field(0, ge=-36_000, le=36_000, description="How fast the light goes round the scene, degrees per second.")
+    turn_axis: tuple[float, float, float] = Field((0.0, 1.0, 0.0), description="Axis that it goes round, world frame.")
+    flicker_hz: float = Field(0, ge=0, le=2000, description="Frequency of a flicker, Hz; a lamp on 50 Hz mains flickers at 100.")
+    flicker_depth: float = Field(0, ge=0, lt=1, description="Its depth: brightness swings between 1 less and 1 plus this.")
 
 
 class SceneConfig(Settings):
     """A scene to simulate."""
 
     name: str = Field("scene", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$", description="Name, also in file names.")
-    objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="What moves.")
+    objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="What moves, and is tracked.")
+    occluders: tuple[ObjectConfig, ...] = Field((), description="What moves too, and is not tracked.")
     camera: CameraConfig = Field(default_factory=CameraConfig, description="The camera.")
+    camera_motion: CameraMotionConfig | None = Field(None, description="How the camera moves; at rest when not given.")
     duration_s: float = Field(1.0, gt=0, le=600, description="Duration, s.")
-    speed: float = Field(1.0, ge=0, le=20, description="Multiplies the frequency of every motion, and so every velocity.")
-    noise: Literal["ideal", "default"] = Field("default", description="Event camera profile: no imperfection, or those of a good sensor.")
+    speed: float = Field(1.0, ge=0, le=20, description="Multiplies every velocity.")
+    peak_speed: Literal["slow", "normal", "fast"] | float | None = Field(
+        None,
+        description="Largest speed of any point of an object in the image, px/s (slow: 250, normal: 750, fast: 2250); "
+        "objects and camera are sped up or slowed down to reach it, and speed must be 1.",
+    )
+    noise: Literal["ideal", "default", "realistic"] = Field(
+        "default", description="Event camera profile: no imperfection, those of a good sensor, or those of a sensor in poor light."
+    )
     event_camera: EventCameraConfig | None = Field(None, description="Event camera parameters, instead of a profile.")
     background: BackgroundConfig = Field(default_factory=BackgroundConfig, description="What is behind the objects.")
+    light: LightConfig = Field(default_factory=LightConfig, description="How the light changes.")
     render: RenderConfig = Field(default_factory=RenderConfig, description="Light and sampling.")
     seed: int = Field(0, ge=0, le=2**31, description="Of motions, thresholds and noise.")
     max_motion_px: float = Field(0.5, gt=0.01, le=2, description="Furthest way of any vertex between two frames, pixels.")
+    variants: dict[str, dict[str, Any]] = Field({}, description="By name: settings that differ; each variant is a scene NAME_VARIANT.")
+    variant: str | None = Field(None, description="The variant to take; by default what is given outside of all.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_variant(cls, values: Any) -> Any:
+        """Lay the chosen variant over the rest; what remains is a scene without variants."""
+        if not isinstance(values, dict) or not isinstance(variants := values.get("variants") or {}, dict):
+            return values
+        name, rest = values.get("variant"), {key: value for key, value in values.items() if key not in ("variant", "variants")}
+        if name is None:
+            return rest
+        if not isinstance(variants.get(name), dict):
+            raise ValueError(f"variant: there is none called '{name}' ({', '.join(variants) or 'the scene has none'})")
+        return {**merged(rest, variants[name]), "name": f"{rest.get('name', 'scene')}_{name}"}
 
     @model_validator(mode="after")
-    def _labels_differ(self) -> "SceneConfig":
-        labels = [item.label for item in self.objects]
+    def _consistent(self) -> "SceneConfig":
+        labels = [item.label for item in (*self.objects, *self.occluders)]
         if len(set(labels)) != len(labels):
             raise ValueError(f"labels must differ, got {', '.join(labels)}")
+        if isinstance(self.peak_speed, float) and not 1 <= self.peak_speed <= 20_000:
+            raise ValueError(f"peak_speed must be between 1 and 20000 px/s, got {self.peak_speed}")
+        if self.peak_speed is not None and self.speed != 1:
+            raise ValueError("give speed or peak_speed, not both")
         return self
+
+    @property
+    def peak_speed_px_s(self) -> float | None:
+        """The largest speed asked for, px/s."""
+        return SPEEDS_PX_S[self.peak_speed] if isinstance(self.peak_speed, str) else self.peak_speed
 
     @property
     def event_camera_config(self) -> EventCameraConfig:

@@ -113,15 +113,24 @@ def _half_vector(u: float, v: float, intrinsics: Array, light: Array) -> Triple:
 
 
 @kernel()
-def _vote(votes: Array, background: int, depth: Array, object_index: Array, row: int, col: int) -> None:
+def _vote(faces: Array, inverse_depth: Array, face_object: Array, depth: Array, object_index: Array, row: int, col: int) -> None:
     """Give the pixel to whoever holds most of its samples; inverse depth is affine, so its mean is that of the centre."""
-    best, count = -1, float(background)
-    for k in range(len(votes)):
-        if votes[k, 0] > count:
-            best, count = k, votes[k, 0]
+    best, most, inverse = -1, 0, 0.0
+    for s in range(len(faces)):
+        # Who comes after this many others cannot hold more.
+        if len(faces) - s <= most:
+            break
+        owner = face_object[faces[s]] if faces[s] >= 0 else -1
+        count, total = 0, 0.0
+        for q in range(len(faces)):
+            if (face_object[faces[q]] if faces[q] >= 0 else -1) == owner:
+                count += 1
+                total += inverse_depth[q]
+        if count > most:
+            best, most, inverse = owner, count, total
     if best >= 0:
         object_index[row, col] = best
-        depth[row, col] = count / votes[best, 1]
+        depth[row, col] = most / inverse
 
 
 @kernel(fastmath=_FAST)
@@ -158,13 +167,47 @@ def _one_face(f: int, row: int, col: int, planes: Array, offsets: Array, half: T
 
 
 @kernel()
-def _common_face(face_index: Array, row: int, col: int) -> int:
+def _common_face(faces: Array) -> int:
     """The face that all samples of a pixel show; -1 where all show background, -2 where they differ."""
-    face = face_index[0, row, col]
-    for s in range(1, len(face_index)):
-        if face_index[s, row, col] != face:
+    face = faces[0]
+    for s in range(1, len(faces)):
+        if faces[s] != face:
             return -2
     return face
+
+
+@kernel(fastmath=_FAST)
+def _some_faces(
+    faces: Array, row: int, col: int, planes: Array, offsets: Array, half: Triple, surface: Surface, lighting: Lighting
+) -> tuple[float, int]:
+    """Sum of the luminances of the samples that show a face, and how many there are.
+
+    Light is taken once per face, in the middle of its samples; texture at every sample.
+    """
+    total, covered = 0.0, 0
+    done = np.uint64(0)
+    for s in range(len(faces)):
+        f = faces[s]
+        if f < 0 or (done >> np.uint64(s)) & np.uint64(1):
+            continue
+        count, x, y = 0, 0.0, 0.0
+        for q in range(s, len(faces)):
+            if faces[q] == f:
+                done |= np.uint64(1) << np.uint64(q)
+                count += 1
+                x += offsets[q, 0]
+                y += offsets[q, 1]
+        weights = _weights(planes, f, col + x / count, row + y / count)
+        diffuse, highlight = _light(f, weights, half, surface, lighting)
+        covered += count
+        total += count * highlight
+        if surface.texture[f, 1] * surface.texture[f, 2] == 1:
+            total += count * diffuse * _reflectance(f, weights, surface)
+            continue
+        for q in range(s, len(faces)):
+            if faces[q] == f:
+                total += diffuse * _reflectance(f, _weights(planes, f, col + offsets[q, 0], row + offsets[q, 1]), surface)
+    return total, covered
 
 
 @kernel(fastmath=_FAST)
@@ -182,28 +225,19 @@ def shade(
     object_index: Array,
 ) -> None:
     """Average the samples of every pixel into ``luminance`` (which holds the background), ``depth`` and ``object_index [h, w]``."""
-    samples, height, width = face_index.shape
-    votes = np.zeros((surface.face_object.max() + 1, 2))
+    height, width, samples = face_index.shape
     for row in range(height):
         for col in range(width):
-            common = _common_face(face_index, row, col)
+            faces = face_index[row, col]
+            common = _common_face(faces)
             if common == -1:
                 continue
             half = _half_vector(origin[0] + col, origin[1] + row, intrinsics, lighting.direction)
-            votes[:] = 0
-            covered, total = 0, 0.0
-            for s in range(samples):
-                f = face_index[s, row, col]
-                if f < 0:
-                    continue
-                covered += 1
-                votes[surface.face_object[f], 0] += 1
-                votes[surface.face_object[f], 1] += inverse_depth[s, row, col]
-                if common == -2:
-                    weights = _weights(planes, f, col + offsets[s, 0], row + offsets[s, 1])
-                    diffuse, highlight = _light(f, weights, half, surface, lighting)
-                    total += _reflectance(f, weights, surface) * diffuse + highlight
             if common >= 0:
-                total = samples * _one_face(common, row, col, planes, offsets, half, surface, lighting)
+                luminance[row, col] = _one_face(common, row, col, planes, offsets, half, surface, lighting)
+                object_index[row, col] = surface.face_object[common]
+                depth[row, col] = samples / inverse_depth[row, col].sum()
+                continue
+            total, covered = _some_faces(faces, row, col, planes, offsets, half, surface, lighting)
             luminance[row, col] = (total + (samples - covered) * luminance[row, col]) / samples
-            _vote(votes, samples - covered, depth, object_index, row, col)
+            _vote(faces, inverse_depth[row, col], surface.face_object, depth, object_index, row, col)

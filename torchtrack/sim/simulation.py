@@ -2,28 +2,43 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-import trimesh
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from torch import Tensor
 
 from torchtrack.camera import Camera
 from torchtrack.events import EventBatch, concatenate
-from torchtrack.io.sequence import write_sequence
 from torchtrack.io.trajectory import Trajectory
+from torchtrack.sim.drawing import merge_regions
 from torchtrack.sim.event_camera import EventCamera
-from torchtrack.sim.frames import frame_times, outer_points
-from torchtrack.sim.meshes import make_mesh
-from torchtrack.sim.render import Frame, Renderer, merge_regions
-from torchtrack.sim.scenes import SceneConfig
+from torchtrack.sim.frames import MAX_INTERVAL_US, frame_times
+from torchtrack.sim.lens import LensRenderer
+from torchtrack.sim.render import Frame, Renderer
+from torchtrack.sim.scenes import Model, SceneConfig
 from torchtrack.sim.surface import RenderObject
-from torchtrack.sim.trajectory import SinusoidMotion, ground_truth
+from torchtrack.sim.trajectory import truth_times, velocity
+from torchtrack.sim.world import World, make_world
 
 Progress = Callable[[float], None]
+
+BACKGROUND, NOISE = -1, -2
+"""Sources of events beside the objects."""
+
+# Lens blur and the motion between frames carry an outline's events about this far from its object.
+_OUTLINE_REACH_PX = 2
+# Poses per round, to bound memory.
+_POSES_PER_ROUND = 2048
+# Straight lines between this many frames follow a sine to a percent of its amplitude.
+_FRAMES_PER_FLICKER = 24
+# The light turns no further than this between two frames.
+_LARGEST_LIGHT_TURN_DEG = 0.5
+# The photoreceptor's answer is taken as a straight line between frames.
+_PHOTORECEPTOR_INTERVAL_US = 1000.0
 
 
 @dataclass(frozen=True)
@@ -33,35 +48,40 @@ class SimulatedSequence:
     Args:
         name: of the scene.
         events: sorted by time, from 1 µs to the end of the scene.
+        source: of every event: the number of an object, or of an occluder (they count on after the objects), or
+            :data:`BACKGROUND` or :data:`NOISE`.
         camera: the camera.
-        labels, meshes, trajectories: one per object; meshes in metres with their textures, true poses at 1 kHz.
+        labels, occluder_labels: of the objects, and of what passes before them.
+        models, trajectories: one per object, then one per occluder; meshes in metres with their textures, true poses at 1 kHz.
+        velocities: twists ``[rotation (rad/s), translation (m/s)]`` with ``dT_cam_obj/dt = ξ^ T_cam_obj``, at the same times.
         meta: settings and facts of the simulation, as JSON can hold them.
     """
 
     name: str
     events: EventBatch
+    source: Int[Tensor, "n"]
     camera: Camera
     labels: tuple[str, ...]
-    meshes: tuple[trimesh.Trimesh, ...]
+    occluder_labels: tuple[str, ...]
+    models: tuple[Model, ...]
     trajectories: tuple[Trajectory, ...]
+    velocities: Float[Tensor, "o p 6"]
     meta: dict[str, Any]
 
 
-def motions_of(config: SceneConfig) -> list[SinusoidMotion]:
-    """The motion of every object."""
-    return [SinusoidMotion.from_config(item.motion, config.speed, seed=1000 * config.seed + i) for i, item in enumerate(config.objects)]
-
-
-def render_frames(config: SceneConfig, t_us: Int[ndarray, "p"], meshes: Sequence[trimesh.Trimesh] | None = None) -> Iterator[Frame]:
-    """The images of a scene at the given times."""
-    camera = config.camera.build()
-    meshes = meshes or [make_mesh(item.shape, item.scale) for item in config.objects]
-    objects = [RenderObject.from_mesh(mesh, item.reflectance, item.gloss) for mesh, item in zip(meshes, config.objects, strict=True)]
-    renderer = Renderer(objects, camera, config.background.build(camera.width, camera.height), config.render)
-    t_s = torch.from_numpy(t_us).double() * 1e-6
-    poses = torch.stack([motion.pose(t_s) for motion in motions_of(config)], 1).numpy()
-    for T_cam_obj in poses:
-        yield renderer.render(T_cam_obj)
+def render_frames(config: SceneConfig, t_us: Int[ndarray, "p"], models: Sequence[Model] | None = None, world: World | None = None) -> Iterator[Frame]:
+    """The images of a scene at the given times; models (of objects, then occluders) and world are made where they are not given."""
+    items = (*config.objects, *config.occluders)
+    models = models or [item.build() for item in items]
+    world = world or make_world(config, models)
+    objects = [tuple(RenderObject.from_mesh(part, item.reflectance, item.gloss) for part in model) for model, item in zip(models, items, strict=True)]
+    make = Renderer if world.camera.distortion_model == "none" else LensRenderer
+    renderer = make(objects, world.camera, world.still_background(), config.render)
+    for first in range(0, len(t_us), _POSES_PER_ROUND):
+        t_s = torch.from_numpy(t_us[first : first + _POSES_PER_ROUND]).double() * 1e-6
+        T_cam_obj, T_world_cam = world.all_poses(t_s).numpy(), world.camera_poses(t_s).numpy()
+        for poses, of_camera, at in zip(T_cam_obj, T_world_cam, t_s.tolist(), strict=True):
+            yield renderer.render(poses, world.scenery(of_camera, at))
 
 
 def simulate(config: SceneConfig, progress: Progress | None = None) -> SimulatedSequence:
@@ -73,45 +93,92 @@ def simulate(config: SceneConfig, progress: Progress | None = None) -> Simulated
 
     Raises:
         MissingExtraError: if numba is not installed.
-        MissingFileError, UnknownFormatError: if there is something wrong with the background image.
+        ConfigError: if the speed asked for cannot be reached.
+        MissingFileError, UnknownFormatError, ModelError, PoseError: if there is something wrong with a file that the scene names.
     """
-    camera, motions = config.camera.build(), motions_of(config)
-    meshes = tuple(make_mesh(item.shape, item.scale) for item in config.objects)
+    items = (*config.objects, *config.occluders)
+    models = tuple(item.build() for item in items)
+    world = make_world(config, models)
     duration_us = max(1, round(config.duration_s * 1e6))
-    t_us, worst_px = frame_times(motions, [outer_points(mesh) for mesh in meshes], camera, duration_us, config.max_motion_px)
-    events = _events(config, camera, render_frames(config, t_us, meshes), t_us, progress)
+    t_us, worst_px = frame_times(world.way_px, duration_us, config.max_motion_px, _max_interval_us(config))
+    events, source = _events(config, world, render_frames(config, t_us, models, world), t_us, progress)
+    truth_us = truth_times(duration_us)
+    truth_s = truth_us.double() * 1e-6
     return SimulatedSequence(
         config.name,
         events,
-        camera,
+        source,
+        world.camera,
         tuple(item.label for item in config.objects),
-        meshes,
-        tuple(ground_truth(motion, duration_us) for motion in motions),
-        _meta(config, len(t_us), worst_px),
+        tuple(item.label for item in config.occluders),
+        models,
+        tuple(Trajectory(truth_us, world.object_poses(number, truth_s)) for number in range(len(items))),
+        torch.stack([velocity(partial(world.object_poses, number), truth_s) for number in range(len(items))]),
+        _meta(config, world, len(t_us), worst_px),
     )
 
 
-def _events(config: SceneConfig, camera: Camera, frames: Iterator[Frame], t_us: Int[ndarray, "p"], progress: Progress | None) -> EventBatch:
-    """Events that the frames cause."""
-    sensor = EventCamera(config.event_camera_config, camera.width, camera.height, config.seed)
+def _max_interval_us(config: SceneConfig) -> float:
+    """Longest time between two frames, so that what changes without moving is followed too."""
+    longest = float(MAX_INTERVAL_US)
+    if config.light.flicker_hz and config.light.flicker_depth:
+        longest = min(longest, 1e6 / (_FRAMES_PER_FLICKER * config.light.flicker_hz))
+    if config.light.turn_deg_s:
+        longest = min(longest, 1e6 * _LARGEST_LIGHT_TURN_DEG / abs(config.light.turn_deg_s))
+    if config.event_camera_config.bandwidth_hz:
+        longest = min(longest, _PHOTORECEPTOR_INTERVAL_US)
+    return max(longest, 1.0)
+
+
+def _events(
+    config: SceneConfig, world: World, frames: Iterator[Frame], t_us: Int[ndarray, "p"], progress: Progress | None
+) -> tuple[EventBatch, Int[Tensor, "n"]]:
+    """Events that the frames cause, and what caused each (see :class:`SimulatedSequence`)."""
+    sensor = EventCamera(config.event_camera_config, world.camera.width, world.camera.height, config.seed)
     previous = next(frames)
-    state, batches = sensor.start(torch.from_numpy(previous.luminance), int(t_us[0])), []
+    state, batches, sources = sensor.start(torch.from_numpy(previous.luminance), int(t_us[0])), [], []
     for done, (frame, frame_us) in enumerate(zip(frames, t_us[1:].tolist(), strict=True), start=1):
-        changed = [region.slices for region in merge_regions([*previous.regions, *frame.regions])]
-        state, events = sensor.step(state, torch.from_numpy(frame.luminance), frame_us, changed)
+        changed = None if world.changes_everywhere else [region.slices for region in merge_regions([*previous.regions, *frame.regions])]
+        state, events, is_noise = sensor.step_with_causes(state, torch.from_numpy(frame.luminance), frame_us, changed)
         batches.append(events)
+        sources.append(event_sources(events, is_noise, previous, frame))
         previous = frame
         if progress is not None:
             progress(done / (len(t_us) - 1))
-    return concatenate(batches)
+    return concatenate(batches), torch.cat(sources)
 
 
-def _meta(config: SceneConfig, frames: int, worst_px: float) -> dict[str, Any]:
+def event_sources(events: EventBatch, is_noise: Bool[Tensor, "n"], before: Frame, after: Frame) -> Int[Tensor, "n"]:
+    """What caused each event: who holds its pixel in either frame or, at an outline, a pixel beside it."""
+    x, y = events.x.numpy(), events.y.numpy()
+    source = np.where(is_noise.numpy(), NOISE, BACKGROUND).astype(np.int16)
+    for reach in range(_OUTLINE_REACH_PX + 1):
+        for dy, dx in _ring(reach):
+            for frame in (after, before):
+                open_ones = np.flatnonzero(source == BACKGROUND)
+                if not len(open_ones):
+                    return torch.from_numpy(source)
+                rows = (y[open_ones] + dy).clip(0, frame.object_index.shape[0] - 1)
+                columns = (x[open_ones] + dx).clip(0, frame.object_index.shape[1] - 1)
+                source[open_ones] = frame.object_index[rows, columns]
+    return torch.from_numpy(source)
+
+
+def _ring(reach: int) -> list[tuple[int, int]]:
+    """Offsets (rows, columns) that are ``reach`` away, as a king walks on a chessboard."""
+    span = range(-reach, reach + 1)
+    return [(dy, dx) for dy in span for dx in span if max(abs(dy), abs(dx)) == reach]
+
+
+def _meta(config: SceneConfig, world: World, frames: int, worst_px: float) -> dict[str, Any]:
     """Settings and facts, under the names that sequences of this layout use."""
     return {
         "name": config.name,
         "duration_s": config.duration_s,
-        "speed": config.speed,
+        "speed": config.peak_speed or config.speed,
+        "time_factor": world.speed,
+        "bg": config.background.kind if config.background.image is None else "image",
+        "occluder": bool(config.occluders),
         "noise": "custom" if config.event_camera else config.noise,
         "event_camera": config.event_camera_config.model_dump(),
         "seed": config.seed,
@@ -123,27 +190,3 @@ def _meta(config: SceneConfig, frames: int, worst_px: float) -> dict[str, Any]:
         "convention": "OpenCV camera, object->camera, metres, pixel centre at integer",
         "scene": config.model_dump(mode="json"),
     }
-
-
-def write(sequence: SimulatedSequence, path: str | Path) -> Path:
-    """Write a sequence to the ``.npz`` file ``path``, with its meshes beside it; see :mod:`torchtrack.io.sequence`.
-
-    Raises:
-        EventDataError: if ``path`` is not a ``.npz`` file.
-    """
-    events = sequence.events
-    write_sequence(
-        path,
-        x=events.x.numpy(),
-        y=events.y.numpy(),
-        t_us=events.t_us.numpy(),
-        polarity=events.polarity.numpy().astype(np.uint8),
-        camera=sequence.camera,
-        labels=sequence.labels,
-        # A texture doubles vertices along its seams; the bare geometry needs each of them once.
-        meshes=[trimesh.Trimesh(mesh.vertices, mesh.faces, process=True) for mesh in sequence.meshes],
-        trajectories=sequence.trajectories,
-        meta=sequence.meta,
-        textured=[mesh if isinstance(mesh.visual, trimesh.visual.TextureVisuals) else None for mesh in sequence.meshes],
-    )
-    return Path(path)

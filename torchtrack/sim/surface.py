@@ -47,6 +47,7 @@ class RenderObject:
         albedo: reflectance of the corners; it multiplies the texture.
         texture: reflectances ``[h, w]``; one texel where there is no texture.
         gloss: strength of the highlight.
+        is_closed: whether it is closed and wound outwards, so that the backs of its faces are never seen.
     """
 
     corners: Float[ndarray, "f 3 3"]
@@ -55,6 +56,7 @@ class RenderObject:
     albedo: Float[ndarray, "f 3"]
     texture: Float[ndarray, "h w"]
     gloss: float = 0.1
+    is_closed: bool = False
 
     @classmethod
     def from_mesh(
@@ -78,7 +80,13 @@ class RenderObject:
             uv = printed[1][faces] * [1, -1] + [0, 1]
         elif isinstance(mesh.visual, trimesh.visual.ColorVisuals) and mesh.visual.defined:
             albedo = grey_reflectance(np.asarray(mesh.visual.vertex_colors))[faces]
-        return cls(corners, corner_normals(corners, crease_angle_deg), uv, albedo, texture, gloss)
+        return cls(corners, corner_normals(corners, crease_angle_deg), uv, albedo, texture, gloss, _is_closed(mesh))
+
+
+def _is_closed(mesh: trimesh.Trimesh) -> bool:
+    """Whether the mesh is closed and wound outwards, once vertices at one place are joined."""
+    welded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    return bool(welded.is_watertight and welded.is_winding_consistent and welded.volume > 0)
 
 
 def _texture(mesh: trimesh.Trimesh) -> tuple[ndarray, ndarray] | None:
@@ -117,6 +125,10 @@ def _corner_pairs(vertex: Int[ndarray, "c"]) -> tuple[Int[ndarray, "p"], Int[nda
     return first, order[np.repeat(starts[vertex[order]], per_corner) + step]
 
 
+Parts = RenderObject | tuple[RenderObject, ...]
+"""An object, or its parts."""
+
+
 @dataclass(frozen=True)
 class Scene:
     """All objects of a scene as one list of triangles.
@@ -124,44 +136,49 @@ class Scene:
     Args:
         corners, normals: of every face, in the frame of its object.
         object_faces: which faces belong to each object.
+        part_faces: the same for the parts of each object, which have a texture each.
+        is_closed: of each object (see :class:`RenderObject`).
         look: the other fields of :class:`torchtrack.sim.shading.Surface`.
     """
 
     corners: Float[ndarray, "f 3 3"]
     normals: Float[ndarray, "f 3 3"]
     object_faces: tuple[slice, ...]
+    part_faces: tuple[tuple[slice, ...], ...]
+    is_closed: Bool[ndarray, "o"]
     look: dict[str, Any]
 
-    def at_poses(self, T_cam_obj: Float[ndarray, "o 4 4"]) -> tuple[Float[ndarray, "f 3 3"], Float[ndarray, "f 3 3"]]:
-        """Corners and normals in the camera frame; normals are turned so that both sides of a face are lit."""
-        corners, normals = np.empty_like(self.corners), np.empty_like(self.normals)
-        for faces, T in zip(self.object_faces, T_cam_obj, strict=True):
-            corners[faces] = self.corners[faces] @ T[:3, :3].T + T[:3, 3]
-            normals[faces] = self.normals[faces] @ T[:3, :3].T
-        area_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals *= np.where((area_normals * corners[:, 0]).sum(1) > 0, -1.0, 1.0)[:, None, None]
-        return corners, normals.astype(np.float32)
 
-
-def merge_objects(objects: Sequence[RenderObject]) -> Scene:
-    """One list of triangles, with all textures in one array of texels."""
-    counts = [len(item.corners) for item in objects]
+def merge_objects(objects: Sequence[Parts]) -> Scene:
+    """One list of triangles, with all textures in one array of texels; an object may have parts with a texture each."""
+    groups = [item if isinstance(item, tuple) else (item,) for item in objects]
+    parts = [part for group in groups for part in group]
+    owner = [number for number, group in enumerate(groups) for _ in group]
+    counts = [len(part.corners) for part in parts]
     ends = np.cumsum(counts)
-    sizes = [item.texture.size for item in objects]
+    sizes = [part.texture.size for part in parts]
     starts = np.cumsum(sizes) - sizes
-    textures = [(start, item.texture.shape[1], item.texture.shape[0]) for start, item in zip(starts, objects, strict=True)]
-    normals = np.concatenate([item.normals for item in objects])
+    textures = [(start, part.texture.shape[1], part.texture.shape[0]) for start, part in zip(starts, parts, strict=True)]
+    normals = np.concatenate([part.normals for part in parts])
     look = {
-        "uv": np.concatenate([item.uv for item in objects]).astype(np.float32),
-        "albedo": np.concatenate([item.albedo for item in objects]).astype(np.float32),
+        "uv": np.concatenate([part.uv for part in parts]).astype(np.float32),
+        "albedo": np.concatenate([part.albedo for part in parts]).astype(np.float32),
         "is_flat": _is_flat(normals),
         "texture": np.repeat(np.array(textures, dtype=np.int64), counts, axis=0),
-        "texels": np.concatenate([item.texture.ravel() for item in objects]).astype(np.float32),
-        "face_object": np.repeat(np.arange(len(objects)), counts),
-        "gloss": np.repeat(np.array([item.gloss for item in objects], dtype=np.float32), counts),
+        "texels": np.concatenate([part.texture.ravel() for part in parts]).astype(np.float32),
+        "face_object": np.repeat(np.array(owner), counts),
+        "gloss": np.repeat(np.array([part.gloss for part in parts], dtype=np.float32), counts),
     }
-    slices = tuple(slice(int(end - count), int(end)) for end, count in zip(ends, counts, strict=True))
-    return Scene(np.concatenate([item.corners for item in objects]), normals, slices, look)
+    of_parts = [slice(int(end - count), int(end)) for end, count in zip(ends, counts, strict=True)]
+    by_object = [[faces for faces, number in zip(of_parts, owner, strict=True) if number == wanted] for wanted in range(len(groups))]
+    return Scene(
+        np.concatenate([part.corners for part in parts]),
+        normals,
+        tuple(slice(of_object[0].start, of_object[-1].stop) for of_object in by_object),
+        tuple(tuple(of_object) for of_object in by_object),
+        np.array([all(part.is_closed for part in group) for group in groups]),
+        look,
+    )
 
 
 def _is_flat(normals: Float[ndarray, "f 3 3"]) -> Bool[ndarray, "f"]:

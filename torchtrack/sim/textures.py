@@ -123,4 +123,53 @@ def foil(height: int, width: int) -> Image:
     return image
 
 
+def planar_pattern(size: int) -> Image:
+    """Dark shapes on paper, as printed for calibration by hand: polygons, a disc, a star, bars."""
+    image = _paper(size, size)
+    shapes = [
+        [(0.10, 0.12), (0.32, 0.08), (0.36, 0.30), (0.14, 0.34)],
+        [(0.52, 0.10), (0.66, 0.34), (0.44, 0.32)],
+        [(0.10, 0.60), (0.30, 0.52), (0.38, 0.70), (0.26, 0.88), (0.10, 0.80)],
+        [(0.48, 0.62), (0.56, 0.62), (0.56, 0.54), (0.64, 0.54), (0.64, 0.62), (0.72, 0.62), (0.72, 0.70), (0.48, 0.70)],
+        [(0.50, 0.80), (0.92, 0.84), (0.92, 0.90), (0.50, 0.88)],
+    ]
+    for shape in shapes:
+        cv2.fillPoly(image, [np.rint(16 * size * np.array(shape)).astype(np.int32)], INK, cv2.LINE_AA, 4)
+    angle = np.pi * np.arange(10) / 5
+    star = np.stack(
+        [0.84 + 0.1 * np.where(np.arange(10) % 2, 0.45, 1) * np.sin(angle), 0.52 - 0.1 * np.where(np.arange(10) % 2, 0.45, 1) * np.cos(angle)], 1
+    )
+    cv2.fillPoly(image, [np.rint(16 * size * star).astype(np.int32)], INK, cv2.LINE_AA, 4)
+    cv2.circle(image, (int(0.82 * size), int(0.22 * size)), int(0.11 * size), INK, -1, cv2.LINE_AA)
+    return image
+
+
+def clutter(height: int, width: int, seed: int = 0) -> Image:
+    """A messy picture: overlapping polygons, discs, rings, lines and words of all sizes and greys on uneven ground."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.uniform(60, 190, (max(2, height // 120), max(2, width // 120))).astype(np.float32)
+    image = np.rint(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 255)).astype(np.uint8)
+    # As many per area whatever the size, so that the same picture can be larger and not emptier.
+    for _ in range(max(12, height * width // 2600)):
+        _scribble(image, rng, (int(rng.uniform(0, width)), int(rng.uniform(0, height))), 8 + rng.exponential(18), int(rng.uniform(20, 240)))
+    return image
+
+
+def _scribble(image: Image, rng: np.random.Generator, centre: tuple[int, int], size: float, grey: int) -> None:
+    """One thing of a messy picture, drawn into the image."""
+    kind, thickness = rng.choice(["polygon", "disc", "ring", "line", "word"], p=[0.4, 0.15, 0.1, 0.2, 0.15]), 1 + int(rng.integers(4))
+    if kind == "polygon":
+        angle = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 7)))
+        corners = np.array(centre) + size * np.stack([np.cos(angle), np.sin(angle)], 1)
+        cv2.fillPoly(image, [np.rint(16 * corners).astype(np.int32)], grey, cv2.LINE_AA, 4)
+    elif kind == "line":
+        end = np.array(centre) + 3 * size * rng.normal(size=2)
+        cv2.line(image, centre, (int(end[0]), int(end[1])), grey, thickness, cv2.LINE_AA)
+    elif kind == "word":
+        word = "".join(rng.choice(list("AEIORSTNKLM"), rng.integers(2, 7)))
+        cv2.putText(image, word, centre, _FONT, size / 30, grey, max(1, int(size / 14)), cv2.LINE_AA)
+    else:
+        cv2.circle(image, centre, int(size * 0.7), grey, -1 if kind == "disc" else thickness, cv2.LINE_AA)
+
+
 CUBE_FACES: tuple[Callable[[int], Image], ...] = (checker, target, stripes, letter, discs, cross)

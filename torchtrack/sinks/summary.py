@@ -52,6 +52,7 @@ class RunSummary:
         tracking_real_time_factor: stream time by the time of the tracker alone, without reading, drawing and writing.
         step_median_ms, step_p95_ms: time of one tracker step.
         objects: by label.
+        dropped_windows, dropped_events: of a live source, what came too fast to be tracked.
     """
 
     source: str
@@ -69,6 +70,8 @@ class RunSummary:
     step_median_ms: float
     step_p95_ms: float
     objects: dict[str, ObjectSummary]
+    dropped_windows: int = 0
+    dropped_events: int = 0
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; numbers that are not finite become None, as JSON has none."""

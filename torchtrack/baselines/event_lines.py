@@ -1,0 +1,234 @@
+"""What the methods on events and straight lines share: which events are near which projected line, and how a window ends.
+
+A projected line is the straight contour points of a model (:mod:`torchtrack.baselines.straight_edges`) with their
+normals: the distance of an event from the line is that from its nearest point, along the normal.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack import lie, quality
+from torchtrack.baselines.straight_edges import straight_edges_only, too_curved
+from torchtrack.camera import MIN_DEPTH_M, Camera
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.contour_index import index_contours
+from torchtrack.contours import Contours, reproject, select_ranked, take_points
+from torchtrack.corners import no_corners
+from torchtrack.errors import ModelError
+from torchtrack.events import EventBatch, pad_streams
+from torchtrack.image_motion import object_plane_velocity, pixel_velocity
+from torchtrack.matching import Matches
+from torchtrack.object_model import ObjectModel
+from torchtrack.pose_solver import Linearisation, PoseProblem, solve_pose
+from torchtrack.time_surface import at_pixels, update_last_event
+from torchtrack.tracker import StepResult, Tracker, TrackerState
+
+# Contour points lie so far apart at most that an event on a line is within this of one of its points (px).
+_POINT_SPACING_PX = 6.0
+# A contour point farther than this beside a line is on another one (px).
+_OFF_LINE_PX = 1.5
+
+
+@dataclass(frozen=True)
+class LineEvents:
+    """Events near each object's lines, padded.
+
+    Args:
+        pixels: ideal pixels.
+        age_s: time from the event to the window's end (s).
+        mask: which entries exist.
+    """
+
+    pixels: Float[Tensor, "b n 2"]
+    age_s: Float[Tensor, "b n"]
+    mask: Bool[Tensor, "b n"]
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where a window begins.
+
+    Args:
+        t_us: end of the window of each stream (µs).
+        duration_s: its length for each object (s).
+        last_event_us: newest event time of every pixel (µs).
+        T_start: predicted pose of each object.
+        velocity: predicted rotation and velocity of the centre (rad/s, m/s), zero where it led nowhere.
+    """
+
+    t_us: Int[Tensor, "s"]
+    duration_s: Float[Tensor, "b"]
+    last_event_us: Int[Tensor, "s h w"]
+    T_start: Float[Tensor, "b 4 4"]
+    velocity: Float[Tensor, "b 6"]
+
+
+def nearest_lines(
+    pixels: Float[Tensor, "b n 2"], contours: Contours, gate_px: float, apart_px: float = 0.0
+) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
+    """The nearest visible contour point of each event, and whether the event belongs to its line.
+
+    It does where it lies within ``gate_px`` of the line, and no other line is within ``apart_px`` of it: an event
+    between two lines may be of either.
+    """
+    distance = torch.cdist(pixels, contours.pixels).masked_fill(~contours.mask[:, None], torch.inf)
+    nearest_px, point = distance.min(-1)
+    normals = take_points(contours.normals, point)
+    offset = ((take_points(contours.pixels, point) - pixels) * normals).sum(-1)
+    belongs = (offset.abs() < gate_px) & (nearest_px < gate_px + _POINT_SPACING_PX)
+    if apart_px > 0:
+        place = ((pixels * normals).sum(-1) + offset)[..., None]
+        across = torch.baddbmm(-place, normals, contours.pixels.transpose(1, 2)).abs()
+        other = torch.where(across > _OFF_LINE_PX, distance, torch.inf).amin(-1)
+        belongs = belongs & (other > apart_px)
+    return point, belongs
+
+
+class EventLineTracker(Tracker):
+    """Base of the methods that align events with straight model lines; a subclass says how in ``step``.
+
+    Raises:
+        ModelError: if a model is curved.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[ObjectModel],
+        camera: Camera | Sequence[Camera],
+        config: TrackerConfig | None = None,
+        stream_index: Sequence[int] | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        distinct = {id(model): model for model in objects}
+        for model in distinct.values():
+            if reason := too_curved(model):
+                raise ModelError(f"{reason}. A method that tracks straight lines alone cannot follow it: use the preset default, paper or nns.")
+        # Objects with one model go on having one: they are handled together.
+        straight = {key: straight_edges_only(model) for key, model in distinct.items()}
+        super().__init__([straight[id(model)] for model in objects], camera, config, stream_index, dtype)
+
+    def _open(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None, velocity: Float[Tensor, "b 6"]) -> Window:
+        """The window's times, and each object carried on with ``velocity``."""
+        if t_end_us is None:
+            t_us = state.t_us.scatter_reduce(0, events.stream_index, events.t_us, "amax")
+        else:
+            t_us = torch.as_tensor(t_end_us, dtype=torch.int64, device=state.t_us.device).expand(self.streams).clone()
+        duration_s = ((t_us - state.t_us).to(velocity.dtype) * 1e-6)[self.stream_index]
+        T_last = state.T_cam_obj.to(velocity.dtype)
+        T_start = lie.retract_about(T_last, velocity * duration_s[:, None], self.centre_obj)
+        usable = torch.isfinite(T_start).flatten(1).all(-1) & (self._centre_cam(T_start)[:, 2] > MIN_DEPTH_M)
+        T_start = torch.where(usable[:, None, None], T_start, T_last)
+        return Window(t_us, duration_s, update_last_event(state.last_event_us, events), T_start, torch.where(usable[:, None], velocity, 0))
+
+    def _centre_cam(self, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 3"]:
+        """Centre of each object in the camera's frame (m)."""
+        return lie.transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0]
+
+    def _contour_velocity(self, window: Window, contours: Contours) -> Float[Tensor, "b m 2"]:
+        """Image velocity of contour points as predicted (px/s)."""
+        return pixel_velocity(contours.points_cam, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
+
+    def _events_near(self, window: Window, events: EventBatch, contours: Contours) -> LineEvents:
+        """Events that lie near each object's lines once moved to the window's end, spread evenly in time."""
+        padded = pad_streams(events, self.streams, window.t_us)
+        stream = torch.arange(self.streams, device=window.t_us.device)[:, None]
+        pixels = at_pixels(self.ideal_pixels, stream, padded.x, padded.y)[self.stream_index]
+        age_s = padded.age_us[self.stream_index].to(pixels.dtype) * 1e-6
+        velocity = object_plane_velocity(pixels, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
+        matching = self.config.matching
+        index = index_contours(contours, self.image_size, int(max(matching.gates_px)) + 1, matching.index_cell_px)
+        near = padded.mask[self.stream_index] & (index.look_up(torch.addcmul(pixels, velocity, age_s[..., None])) >= 0)
+        chosen, exists = select_ranked(near, matching.max_events)
+        taken = take_points(torch.cat([pixels, age_s[..., None]], -1), chosen)
+        return LineEvents(taken[..., :2], taken[..., 2], exists)
+
+    def _solve_rounds(
+        self, window: Window, events: EventBatch, information: Float[Tensor, "b 6 6"], weight: float, apart_px: float
+    ) -> tuple[Linearisation, Contours, Matches]:
+        """Associate and solve, one round per gate, with the lines extracted anew for the second.
+
+        Args:
+            information: of the prediction, in the solver's chart.
+            weight: information of one event's distance (1/px²).
+            apart_px: events with two lines as near as this are left out.
+        """
+        T_cam_obj, contours = window.T_start, self._extract(window.T_start)
+        near = self._events_near(window, events, contours)
+        plane = object_plane_velocity(near.pixels, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
+        targets = torch.addcmul(near.pixels, plane, near.age_s[..., None])
+        for number, gate_px in enumerate(self.config.matching.gates_px):
+            if number == 1:
+                contours = self._extract(T_cam_obj)
+            point, belongs = nearest_lines(targets, contours, gate_px, apart_px)
+            motion = take_points(self._contour_velocity(window, contours), point)
+            targets = torch.addcmul(near.pixels, motion, near.age_s[..., None])
+            matched = near.mask & belongs
+            matched = matched & (matched.sum(-1, keepdim=True) >= self.config.quality.min_observations)
+            matches = Matches(
+                contour=point,
+                mask=matched,
+                weights=torch.full_like(near.age_s, weight),
+                targets=targets,
+                directions=take_points(contours.normals, point),
+            )
+            solution = solve_pose(self._problem(window, matches, contours, information, gate_px), T_cam_obj, self.config.solver)
+            T_cam_obj = solution.T_cam_obj
+            contours = reproject(contours, T_cam_obj, self.intrinsics)
+        return solution, contours, matches
+
+    def _problem(self, window: Window, matches: Matches, contours: Contours, information: Tensor, gate_px: float) -> PoseProblem:
+        """Distances of events from their lines, and the prediction; objects without a match stay where they are."""
+        idle = ~matches.mask.any(-1)
+        return PoseProblem(
+            points_obj=take_points(contours.points_obj, matches.contour),
+            targets=matches.targets,
+            directions=matches.directions,
+            weights=matches.mask * matches.weights,
+            intrinsics=self.intrinsics,
+            centre_obj=self.centre_obj,
+            scale_px=torch.full_like(self.centre_obj[:, 0], gate_px),
+            T_prior=window.T_start,
+            prior_information=torch.where(idle[:, None, None], torch.zeros_like(information), information),
+        )
+
+    def _judge(
+        self, window: Window, solution: Linearisation, contours: Contours, matches: Matches
+    ) -> tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]]:
+        """Status and quality of each object, and which poses are taken."""
+        settings = self.config.quality
+        share = quality.explained_share(contours, matches, self._contour_velocity(window, contours), self.image_size, settings.min_speed_px_s)
+        step = lie.small_difference_about(window.T_start, solution.T_cam_obj, self.centre_obj)
+        in_view = quality.visible_share(contours, self.image_size)
+        status = quality.judge(share, matches.mask.sum(-1), in_view, step, self.diameter_m, settings)
+        return status, share, status < int(quality.Status.TOO_FEW_EVENTS)
+
+    def _close(
+        self,
+        state: TrackerState,
+        window: Window,
+        solution: Linearisation,
+        contours: Contours,
+        matches: Matches,
+        judged: tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]],
+        velocity: Float[Tensor, "b 6"],
+    ) -> tuple[TrackerState, StepResult]:
+        """The next state, and what the window gave; a pose that is not taken is the predicted one."""
+        status, share, taken = judged
+        T_cam_obj = lie.orthonormalise(torch.where(taken[:, None, None], solution.T_cam_obj, window.T_start).double())
+        contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
+        result = StepResult(
+            t_us=window.t_us,
+            T_cam_obj=T_cam_obj,
+            status=status,
+            quality=share,
+            contours=contours,
+            corners=no_corners(contours.pixels),
+            observation_count=matches.mask.sum(-1),
+            solution=solution,
+            centre_obj=self.centre_obj,
+        )
+        return replace(state, T_cam_obj=T_cam_obj, velocity=velocity, t_us=window.t_us, last_event_us=window.last_event_us), result

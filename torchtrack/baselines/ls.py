@@ -1,0 +1,31 @@
+"""``ls``: least squares of the distances between events and projected model lines, the paper's second comparison method."""
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from torchtrack import lie
+from torchtrack.baselines.event_lines import EventLineTracker
+from torchtrack.events import EventBatch
+from torchtrack.tracker import StepResult, TrackerState
+
+
+class LeastSquaresTracker(EventLineTracker):
+    """Every event near a projected line draws it, all alike: no robust loss, no prior, no doubt which line an event is of.
+
+    The paper says of it that it "optimizes the pose and tracks the object by minimizing the distance between events and
+    lines", and nothing else. To be as good as that allows, the last motion is carried on, events are moved to the
+    window's end with the line's own velocity, and the gate around the lines narrows from round to round.
+    """
+
+    def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
+        """Advance every object by one window; see :meth:`torchtrack.tracker.Tracker.step`."""
+        window = self._open(state, events, t_end_us, state.velocity)
+        nothing = torch.zeros(len(state.velocity), 6, 6, dtype=state.velocity.dtype, device=state.velocity.device)
+        found = self._solve_rounds(window, events, nothing, weight=1.0, apart_px=0.0)
+        judged = self._judge(window, *found)
+        moved = lie.small_difference_about(state.T_cam_obj, found[0].T_cam_obj.double(), self.centre_obj.double()).to(state.velocity.dtype)
+        gain = self.config.motion.velocity_gain
+        mixed = gain * moved / window.duration_s.clamp(min=1e-6)[:, None] + (1 - gain) * state.velocity
+        # A pose that was not taken says nothing of the motion: it is not carried on for long.
+        return self._close(state, window, *found, judged, torch.where(judged[2][:, None], mixed, 0.5 * state.velocity))

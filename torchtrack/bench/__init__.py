@@ -1,0 +1,1 @@
+"""How fast the parts are: each measured many times, and told as medians and quartiles."""

@@ -1,0 +1,88 @@
+"""The commands about files of events: their options, as the command line types them."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from torchtrack.config.formats import OutputFormat
+from torchtrack.errors import ConfigError
+
+_Size = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what is in a file of events: format, sensor, times, rates, gaps, and what is wrong with it."""
+
+    file: Positional[Annotated[str, arg(metavar="FILE")]]
+    """A file of events, or the folder of a ROS 2 recording."""
+    width: _Size = None
+    """Sensor width (px), where the file does not say it."""
+    height: _Size = None
+    """Sensor height (px), where the file does not say it."""
+    max_events: _Size = None
+    """Read so many events and no more."""
+    strict: bool = False
+    """What is wrong is an error."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        from torchtrack.commands_io import info
+
+        _refuse(overrides)
+        return info(self.file, self.width, self.height, self.max_events, strict=self.strict, as_json=self.json)
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write the events of a file in another format, exactly: the same events in the same order, to the µs."""
+
+    source: Positional[Annotated[str, arg(metavar="IN")]]
+    """The file to read; its format is told by its content."""
+    target: Positional[Annotated[str, arg(metavar="OUT")]]
+    """The file to write: .raw (EVT3), .aedat4, .h5, .npz or .csv."""
+    format: Annotated[OutputFormat | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Its format: evt2, evt3, aedat4, dsec, npz, csv or sequence; by default as its suffix says."""
+    width: _Size = None
+    """Sensor width (px), where the file does not say it."""
+    height: _Size = None
+    """Sensor height (px), where the file does not say it."""
+    strict: bool = False
+    """What is wrong is an error."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        from torchtrack.commands_io import convert_file
+
+        _refuse(overrides)
+        return convert_file(self.source, self.target, self.format, self.width, self.height, strict=self.strict)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure the speed of a part; write JSON and Markdown, with medians and quartiles."""
+
+    part: Positional[Literal["io", "sim"]]
+    """io: reading events, per format. sim: rendering and making events."""
+    output: Annotated[str, arg(aliases=["-o"], metavar="DIR")]
+    """Folder for the results."""
+    repeats: Annotated[int, arg(metavar="N")] = 7
+    """How often everything is measured."""
+    events: Annotated[int, arg(metavar="N")] = 5_000_000
+    """Of io: events of each file."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        from torchtrack.bench.command import bench
+
+        _refuse(overrides)
+        return bench(self.part, self.output, repeats=self.repeats, events=self.events)
+
+
+def _refuse(overrides: dict[str, Any]) -> None:
+    """Raise :class:`ConfigError` where settings are given to a command that has none."""
+    if overrides:
+        raise ConfigError(f"command line: this command takes no settings, got --{', --'.join(overrides)}.")

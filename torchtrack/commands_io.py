@@ -1,0 +1,76 @@
+"""What the commands about files of events do: facts about a file, and conversion."""
+
+import json
+import warnings
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from torchtrack.commands import output_console
+from torchtrack.config.formats import OutputFormat
+from torchtrack.errors import TorchtrackWarning
+from torchtrack.exit_codes import ExitCode
+from torchtrack.io.convert import convert
+from torchtrack.io.event_file import EventFile
+from torchtrack.io.formats import FORMAT_NAMES, open_events
+from torchtrack.io.info import EventInfo, as_plain
+from torchtrack.io.raw_file import RawFile
+
+
+def info(file: str, width: int | None, height: int | None, max_events: int | None, *, strict: bool, as_json: bool) -> int:
+    """Show facts about a file of events; returns the exit code."""
+    source = open_events(Path(file), width, height, strict)
+    with warnings.catch_warnings():
+        # What is wrong is part of the facts.
+        warnings.simplefilter("ignore", TorchtrackWarning)
+        facts = source.info(max_events)
+    if as_json:
+        # Plain text: a console would break lines and colour them.
+        Console(soft_wrap=True, highlight=False, markup=False).print(json.dumps({"format": format_name(source), **as_plain(facts)}, indent=2))
+        return ExitCode.DONE
+    table = Table(show_header=False, box=None)
+    for row in _rows(source, facts):
+        table.add_row(*row)
+    output_console().print(table)
+    return ExitCode.DONE
+
+
+def format_name(source: EventFile) -> str:
+    """What a person calls the format of a file."""
+    name = FORMAT_NAMES[type(source)]
+    return f"{name} ({source.encoding.upper()})" if isinstance(source, RawFile) else name
+
+
+def _rows(source: EventFile, facts: EventInfo) -> list[tuple[str, str]]:
+    rows = [("format", format_name(source)), ("sensor", f"{facts.width}x{facts.height}")]
+    count = "unknown" if facts.count is None else f"{facts.count:,}"
+    rows.append(("events", count if facts.complete else f"about {count} (not all were read)"))
+    if facts.first_us is None or facts.last_us is None:
+        return [*rows, *_faults(facts)]
+    longest = "; ".join(f"{gap.duration_us / 1000:,.1f} ms at {gap.start_us:,} µs" for gap in facts.gaps)
+    return [
+        *rows,
+        ("time", f"{facts.first_us:,} … {facts.last_us:,} µs"),
+        ("duration", f"{1e-6 * facts.duration_us:.6f} s"),
+        ("rate", f"{1e-6 * facts.mean_rate:.3f} Mev/s mean, {1e-6 * facts.peak_rate:.3f} Mev/s in the busiest 10 ms"),
+        ("brighter", f"{100 * facts.brighter_share:.1f} %"),
+        ("gaps over 10 ms", f"{facts.gap_count}; longest: {longest}" if facts.gap_count else "none"),
+        *_faults(facts),
+    ]
+
+
+def _faults(facts: EventInfo) -> list[tuple[str, str]]:
+    return [("left out", f"{count:,} {problem}") for problem, count in facts.problems.items()] or [("left out", "nothing")]
+
+
+def convert_file(source: str, target: str, format: OutputFormat | None, width: int | None, height: int | None, *, strict: bool) -> int:
+    """Write the events of one file into another, say how many; returns the exit code."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchtrackWarning)
+        done = convert(source, target, format, width, height, strict)
+    console = output_console()
+    console.print(f"{done.count:,} events are in {target} ({done.format})")
+    if done.problems is not None and done.problems.counts:
+        console.print(f"left out: {done.problems}", markup=False)
+    return ExitCode.DONE

@@ -1,0 +1,37 @@
+"""Settings of where events come from, and what is done with them before they are tracked."""
+
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
+
+from torchtrack.config.settings import Settings, absolute_path
+
+_LIVE = re.compile(r"(dv|evk4|davis|stdin)://\S*|-")
+
+
+def is_live(source: Path | str) -> bool:
+    """Whether a source is a camera or a stream, not a file: ``dv://HOST:PORT``, ``evk4://``, ``davis://``, ``stdin://`` or ``-``."""
+    return isinstance(source, str) and _LIVE.fullmatch(source) is not None
+
+
+def _file_or_live(value: Any, info: Any) -> Any:
+    """A live source as it is, or an absolute path; ``info`` is pydantic's ValidationInfo."""
+    return str(value) if is_live(value) else absolute_path(value, info)
+
+
+EventSourcePath = Annotated[Path | str, BeforeValidator(_file_or_live)]
+
+
+class EventsConfig(Settings):
+    """What is done with events before they are tracked; the camera follows by itself."""
+
+    strict: bool = Field(False, description="What is wrong in a file is an error; otherwise it is left out, counted and reported.")
+    region: tuple[int, int, int, int] | None = Field(None, description="Part of the sensor to use: left, top, columns, rows (px).")
+    downscale: int = Field(1, ge=1, le=16, description="So many pixels become one, in each direction; for HD sensors.")
+    hot_pixels: bool = Field(False, description="Leave out pixels that fire all the time, found in the first half second of a file.")
+    background_us: int | None = Field(None, ge=1, description="Leave out events without a neighbour that fired in so many µs before.")
+    live_windows: int = Field(
+        64, ge=1, le=100_000, description="Windows of a live source that may wait; of more, the oldest are dropped and counted."
+    )

@@ -1,0 +1,59 @@
+"""Events as plain numpy arrays: what decoders give, before it is checked and becomes an :class:`EventBatch`."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchtrack.events import EventBatch
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Events of one stream, in the order of the file.
+
+    Args:
+        t_us: times in microseconds, int64.
+        x, y: sensor pixels, of any integer type.
+        polarity: whether it got brighter: bool, or numbers that count as brighter where they are > 0.
+    """
+
+    t_us: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    polarity: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+    def __getitem__(self, index: slice | np.ndarray) -> "Columns":
+        return Columns(self.t_us[index], self.x[index], self.y[index], self.polarity[index])
+
+    @classmethod
+    def empty(cls) -> "Columns":
+        """No events."""
+        pixels = np.zeros(0, np.uint16)
+        return cls(np.zeros(0, np.int64), pixels, pixels, np.zeros(0, bool))
+
+    @classmethod
+    def of(cls, events: EventBatch) -> "Columns":
+        """The events of a batch of one stream."""
+        return cls(events.t_us.numpy(), events.x.numpy(), events.y.numpy(), events.polarity.numpy())
+
+    def batch(self) -> EventBatch:
+        """The same events as tensors.
+
+        Raises:
+            EventDataError: if they are not integers, or do not fit.
+        """
+        return EventBatch.from_numpy(self.x, self.y, self.t_us, self.polarity)
+
+
+def join(parts: Iterable[Columns]) -> Columns:
+    """Events one after the other."""
+    parts = list(parts)
+    if not parts:
+        return Columns.empty()
+    if len(parts) == 1:
+        return parts[0]
+    return Columns(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("t_us", "x", "y", "polarity")))

@@ -1,0 +1,114 @@
+"""The base of all readers of event files: checks, faults, and where to start."""
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from torchtrack.errors import EventDataError, MissingFileError
+from torchtrack.events import EventBatch
+from torchtrack.io.columns import Columns
+from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
+from torchtrack.io.event_stream import EventStream
+from torchtrack.io.problems import Problem, Problems
+from torchtrack.io.soundness import mended, sound
+
+
+@dataclass(frozen=True)
+class EventFile(EventStream):
+    """Events of one file; a reader says how to open it and how to read its events.
+
+    Args:
+        path: the file.
+        width, height: sensor size in pixels; 0 where the file says it, or the format has a default.
+        strict: whether faults are errors; otherwise what can be read is read, and the rest is counted in
+            :attr:`problems` and reported by a warning at the end.
+        start_us: events before this time are passed over.
+
+    Raises:
+        MissingFileError: if there is no such file.
+        EventDataError: if it is damaged so that nothing can be read, or the sensor size is unknown or disagrees.
+    """
+
+    path: Path
+    width: int = 0
+    height: int = 0
+    strict: bool = True
+    start_us: int | None = None
+    problems: Problems = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))
+        if not self.path.exists():
+            raise MissingFileError(f"event file '{self.path}' does not exist.")
+        object.__setattr__(self, "problems", Problems(str(self.path), self.strict))
+        self._open()
+        check_sensor_size(self.width, self.height, str(self.path))
+
+    def chunks(self, max_events: int = DEFAULT_CHUNK_EVENTS) -> Iterator[EventBatch]:
+        """The events in time order; see :class:`torchtrack.io.event_source.EventSource`.
+
+        Faults of this pass are counted in :attr:`problems`.
+        """
+        check_max_events(max_events)
+        return self._checked(max_events)
+
+    def seek(self, t_us: int) -> "EventFile":
+        """The same file from the first event with ``t >= t_us`` on."""
+        return replace(self, start_us=t_us)
+
+    @property
+    def known_count(self) -> int | None:
+        """How many events there are, where the file tells that without being read; an estimate where it is compressed."""
+        return None
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Read the header, and set what it says."""
+
+    @abstractmethod
+    def _read(self, max_events: int) -> Iterator[Columns]:
+        """The events as they are in the file, in parts of about ``max_events``; it may leave out those before ``start_us``."""
+
+    def _checked(self, max_events: int) -> Iterator[EventBatch]:
+        self.problems.clear()
+        last_us, count = None, 0
+        parts = self._readable(max_events)
+        for part in parts if self.strict else mended(parts):
+            events = self._started(part)
+            usable = sound(events, self.width, self.height, self.problems, last_us, count)
+            count += len(events)
+            if len(usable):
+                last_us = int(usable.t_us[-1])
+            for start in range(0, len(usable), max_events):
+                yield usable[start : start + max_events].batch()
+        self.problems.warn()
+
+    def _readable(self, max_events: int) -> Iterator[Columns]:
+        """What can be read: where it breaks off, the rest counts as damaged."""
+        try:
+            yield from self._read(max_events)
+        except EventDataError as error:
+            if self.strict:
+                raise
+            self.problems.found(Problem.DAMAGED, 1, str(error))
+
+    def _started(self, events: Columns) -> Columns:
+        if self.start_us is None or len(events) == 0 or events.t_us.min() >= self.start_us:
+            return events
+        return events[events.t_us >= self.start_us]
+
+    def _settle_size(self, width: int | None, height: int | None, default: tuple[int, int] | None = None) -> None:
+        """Set the sensor size from what the file says, what was given, or a default.
+
+        Raises:
+            EventDataError: if the file and what was given disagree, or nobody says it.
+        """
+        for index, (name, stored) in enumerate((("width", width), ("height", height))):
+            given = getattr(self, name)
+            if given and stored and given != stored:
+                raise EventDataError(f"'{self.path}' says that the sensor's {name} is {stored}, but {given} was given. Leave it out, or correct it.")
+            value = stored or given or (default[index] if default and not (self.width and self.height) else 0)
+            if not value:
+                raise EventDataError(f"'{self.path}' does not say the sensor's {name}. Give width and height in pixels.")
+            object.__setattr__(self, name, value)

@@ -1,0 +1,212 @@
+"""Events in HDF5 files: DSEC and its relatives (arrays x, y, t, p), Prophesee's (records), and our own sequences.
+
+Layouts, told by what is there:
+
+- a group with the arrays ``x y t p`` (DSEC and our own: ``events``; M3ED: ``prophesee/left``) or ``xs ys ts ps``; integer times
+  are in µs, others in seconds. ``t_offset``, beside the group or in it, is added, as DSEC has it; ``ms_to_idx`` speeds up seeking.
+- ``CD/events``: records ``x y p t`` of Prophesee, compressed by their filter ECF, which has to be installed apart.
+
+The sensor size comes from ``width`` and ``height`` (attributes of the group or the file), ``resolution``, ``sensor_resolution``
+or ``geometry``, else from the custom of the layout: 640x480 for DSEC, 1280x720 for Prophesee.
+
+Reference: dsec.ifi.uzh.ch/data-format; docs.prophesee.ai, HDF5 event file format.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from torchtrack.errors import EventDataError, MissingExtraError, UnknownFormatError
+from torchtrack.io.columns import Columns
+from torchtrack.io.event_file import EventFile
+from torchtrack.io.event_source import PART_EVENTS
+from torchtrack.io.extras import optional
+
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_LAYOUTS = (("x", "y", "t", "p"), ("xs", "ys", "ts", "ps"))
+_ECF_FILTER = 0x8ECF
+_DSEC_SIZE, _PROPHESEE_SIZE = (640, 480), (1280, 720)
+# Per array; events are read in order, and no part of a file twice.
+_CACHE_BYTES = 1 << 20
+# What h5py is known to raise over damaged files.
+_DAMAGED = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError, AttributeError)
+_ECF_HELP = (
+    "it is compressed by Prophesee's filter ECF, which is not installed. Install it from https://github.com/prophesee-ai/hdf5_ecf "
+    "(it also comes with the Metavision SDK), and set HDF5_PLUGIN_PATH to its folder."
+)
+
+
+@contextmanager
+def open_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading; what h5py raises over damage becomes an :class:`EventDataError`."""
+    try:
+        with h5py.File(path, "r", rdcc_nbytes=_CACHE_BYTES) as file:
+            yield file
+    except (EventDataError, UnknownFormatError, MissingExtraError):
+        raise
+    except _DAMAGED as error:
+        raise EventDataError(f"'{path}' is truncated or damaged ({error}). Copy or make it again.") from error
+
+
+@dataclass(frozen=True)
+class Hdf5Events(EventFile):
+    """Events of an HDF5 file; see :class:`torchtrack.io.event_file.EventFile`.
+
+    Raises:
+        UnknownFormatError: if no layout fits.
+        MissingExtraError: if a filter is missing that the extra ``hdf5`` brings.
+        EventDataError: if Prophesee's filter is missing, or arrays are of the wrong kind.
+    """
+
+    group: str = field(init=False, default="")
+    count: int = field(init=False, default=0)
+
+    @property
+    def known_count(self) -> int | None:
+        """How many events there are."""
+        return self.count
+
+    def _open(self) -> None:
+        with open_hdf5(self.path) as file:
+            group = find_events(file)
+            if group is None:
+                raise UnknownFormatError(
+                    f"'{self.path}' is an HDF5 file without events that are known: x, y, t and p in one group, or CD/events. "
+                    f"It holds: {', '.join(sorted(file)) or 'nothing'}."
+                )
+            arrays = _arrays(file, group)
+            lengths = {array.shape for array in arrays}
+            if len(lengths) != 1 or len(next(iter(lengths))) != 1:
+                raise EventDataError(f"'{self.path}': x, y, t and p must be flat and of one length, got {[array.shape for array in arrays]}.")
+            for array in arrays:
+                _check_filters(array, self.path)
+            object.__setattr__(self, "group", group)
+            object.__setattr__(self, "count", arrays[0].shape[0])
+            size = _sensor_size(file, group)
+        self._settle_size(*size, default=_PROPHESEE_SIZE if group == "CD/events" else _DSEC_SIZE)
+
+    def _read(self, max_events: int) -> Iterator[Columns]:
+        with open_hdf5(self.path) as file:
+            offset_us = _time_offset(file, self.group)
+            arrays = _arrays(file, self.group)
+            size = min(max_events, PART_EVENTS)
+            for start in range(self._first(file, offset_us), self.count, size):
+                part = slice(start, min(start + size, self.count))
+                yield self._part(arrays, part, offset_us)
+
+    def _part(self, arrays: list[h5py.Dataset], part: slice, offset_us: int) -> Columns:
+        if len(arrays) == 1:
+            records = arrays[0][part]
+            t, x, y, p = (records[name] for name in ("t", "x", "y", "p"))
+        else:
+            x, y, t, p = (array[part] for array in arrays)
+        for name, values, kinds in (("t", t, "iuf"), ("x", x, "iuf"), ("y", y, "iuf"), ("p", p, "iufb")):
+            if values.dtype.kind not in kinds:
+                raise EventDataError(f"'{self.path}': '{name}' must hold numbers, got {values.dtype}.")
+        return Columns(_microseconds(t) + offset_us, _whole(x), _whole(y), p > 0)
+
+    def _first(self, file: h5py.File, offset_us: int) -> int:
+        """Index of an event not after ``start_us``, by the table of milliseconds where there is one."""
+        table = file.get(f"{self.group}/ms_to_idx") or file.get("ms_to_idx")
+        if self.start_us is None or not isinstance(table, h5py.Dataset) or len(table) == 0 or table.dtype.kind not in "iu":
+            return 0
+        millisecond = min(max((self.start_us - offset_us) // 1000, 0), len(table) - 1)
+        return min(max(int(table[millisecond]), 0), self.count)
+
+
+def find_events(file: h5py.File) -> str | None:
+    """The group of a file that holds events, or ``CD/events``; None if there is none."""
+    records = file.get("CD/events")
+    if isinstance(records, h5py.Dataset):
+        return "CD/events" if records.dtype.names and {"x", "y", "p", "t"} <= set(records.dtype.names) else None
+    for name in ("events", "prophesee/left", "davis/left/events", "/"):
+        if _names(file, name) is not None:
+            return name
+    return None
+
+
+def _names(file: h5py.File, group: str) -> tuple[str, ...] | None:
+    """Names of x, y, t and p in a group."""
+    found = file.get(group)
+    if not isinstance(found, h5py.Group):
+        return None
+    return next((names for names in _LAYOUTS if all(isinstance(found.get(name), h5py.Dataset) for name in names)), None)
+
+
+def _arrays(file: h5py.File, group: str) -> list[h5py.Dataset]:
+    """The one array of records, or those of x, y, t and p."""
+    names = _names(file, group)
+    return [file[group]] if names is None else [file[group][name] for name in names]
+
+
+def _check_filters(array: h5py.Dataset, path: Path) -> None:
+    """Raise an error that helps where an array is compressed by a filter that is not there."""
+    plist = array.id.get_create_plist()
+    for index in range(plist.get_nfilters()):
+        code = plist.get_filter(index)[0]
+        if h5py.h5z.filter_avail(code):
+            continue
+        if code == _ECF_FILTER:
+            raise EventDataError(f"'{path}': {_ECF_HELP}")
+        # Importing it registers its filters.
+        optional("hdf5plugin", "hdf5plugin", "hdf5", f"reading '{path}' (HDF5 filter {code})")
+        if not h5py.h5z.filter_avail(code):
+            raise EventDataError(f"'{path}' is compressed by the HDF5 filter {code}, which is not installed. Set HDF5_PLUGIN_PATH to its folder.")
+
+
+def _time_offset(file: h5py.File, group: str) -> int:
+    for place in (f"{group}/t_offset", "t_offset"):
+        found = file.get(place)
+        if isinstance(found, h5py.Dataset) and found.size == 1 and found.dtype.kind in "iu":
+            return int(found[()].item())
+    return 0
+
+
+def _sensor_size(file: h5py.File, group: str) -> tuple[int | None, int | None]:
+    places: list[Any] = [file[group], file[group].parent, file]
+    for place in places:
+        attributes = place.attrs
+        if "width" in attributes and "height" in attributes:
+            return _length(attributes["width"]), _length(attributes["height"])
+        if "geometry" in attributes:
+            width, _, height = str(attributes["geometry"]).partition("x")
+            return _length(width), _length(height)
+    # Written as height and width.
+    if "sensor_resolution" in file.attrs and np.size(file.attrs["sensor_resolution"]) == 2:
+        height, width = np.ravel(file.attrs["sensor_resolution"]).tolist()
+        return _length(width), _length(height)
+    resolution = file.get(f"{group}/calib/resolution") or file.get("resolution")
+    if isinstance(resolution, h5py.Dataset) and resolution.size == 2:
+        width, height = np.ravel(resolution[()]).tolist()
+        return _length(width), _length(height)
+    return None, None
+
+
+def _length(value: Any) -> int | None:
+    try:
+        length = int(value)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return length if 0 < length <= 1 << 16 else None
+
+
+def _microseconds(t: np.ndarray) -> np.ndarray:
+    """Whole µs; other numbers are seconds, rounded to the nearest µs."""
+    if t.dtype.kind != "f":
+        return t.astype(np.int64)
+    if not np.isfinite(t).all() or (np.abs(t) > 9e12).any():
+        raise EventDataError("times are not finite seconds.")
+    return np.floor(t.astype(np.float64) * 1e6 + 0.5).astype(np.int64)
+
+
+def _whole(pixels: np.ndarray) -> np.ndarray:
+    if pixels.dtype.kind != "f":
+        return pixels
+    if not (np.isfinite(pixels) & (np.floor(pixels) == pixels) & (np.abs(pixels) < 2**31)).all():
+        raise EventDataError("pixels are not whole numbers.")
+    return pixels.astype(np.int64)

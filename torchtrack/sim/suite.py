@@ -1,0 +1,187 @@
+"""Many scenes at once: in parallel processes, with progress, and taken up again where it was broken off.
+
+::
+
+    scenes = scenes_of(Path("configs/simulate/paper.yaml"))
+    failures = run_suite(scenes, Path("outputs/paper"), jobs=4)
+
+A suite is a YAML file ``scenes: [paper/*.yaml, other.yaml]``, a folder of YAML files, or a scene with variants.
+"""
+
+import multiprocessing
+import queue
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import Field
+
+from torchtrack.config.load import load, read_yaml
+from torchtrack.config.settings import Settings
+from torchtrack.errors import ConfigError, MissingFileError, TorchtrackError
+from torchtrack.io.sequence import read_sequence
+from torchtrack.sim.output import check_output, write
+from torchtrack.sim.scenes import SceneConfig
+from torchtrack.sim.simulation import Progress, simulate
+
+# Progress of a scene is told in steps of this share.
+_PROGRESS_STEP = 0.02
+_POLL_S = 0.2
+_YAML = (".yaml", ".yml")
+
+Told = Callable[[str, float], None]
+"""Called with the name of a scene and the share of it that is done."""
+
+
+class SuiteConfig(Settings):
+    """A list of scenes."""
+
+    scenes: tuple[str, ...] = Field(min_length=1, description="YAML files of scenes or of suites; * and ? stand for any text.")
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A scene that could not be simulated, and why."""
+
+    name: str
+    reason: str
+
+
+def is_suite(path: Path) -> bool:
+    """Whether a path holds several scenes: a folder, a list of scenes, or a scene with variants."""
+    return path.is_dir() or not {"scenes", "variants"}.isdisjoint(read_yaml(path))
+
+
+def scenes_of(path: Path, overrides: Mapping[str, Any] | None = None) -> list[SceneConfig]:
+    """All scenes of a suite, each variant as a scene; ``overrides`` (dotted key to value) are laid over every one.
+
+    Raises:
+        MissingFileError: if a file that is named is not there.
+        ConfigError: if settings are wrong, suites contain one another, or two scenes have the same name.
+    """
+    scenes = _expanded(path, overrides or {}, ())
+    names = [scene.name for scene in scenes]
+    if doubles := sorted({name for name in names if names.count(name) > 1}):
+        raise ConfigError(f"{path}: several scenes are called {', '.join(doubles)}; each becomes a file of its name. Name them differently.")
+    return scenes
+
+
+def _expanded(path: Path, overrides: Mapping[str, Any], within: tuple[Path, ...]) -> list[SceneConfig]:
+    path = path.resolve()
+    if path in within:
+        raise ConfigError(f"{path}: this suite contains itself. Remove it from its list of scenes.")
+    inner = partial(_expanded, overrides=overrides, within=(*within, path))
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.suffix in _YAML)
+        if not files:
+            raise MissingFileError(f"the folder {path} holds no scene (.yaml). Check the path.")
+        return [scene for file in files for scene in inner(file)]
+    values = read_yaml(path)
+    if "scenes" not in values:
+        variants = values.get("variants") or {}
+        if not variants or "variant" in overrides:
+            return [load(SceneConfig, path, overrides)]
+        return [load(SceneConfig, path, {**overrides, "variant": name}) for name in variants]
+    return [scene for pattern in load(SuiteConfig, path).scenes for file in _matching(path.parent, pattern) for scene in inner(file)]
+
+
+def _matching(folder: Path, pattern: str) -> list[Path]:
+    """Files that a pattern names, relative to a folder."""
+    found = sorted(folder.glob(pattern)) if not Path(pattern).is_absolute() else [Path(pattern)]
+    if not found:
+        raise MissingFileError(f"scenes: nothing at {folder / pattern}. Check the path.")
+    return found
+
+
+def is_done(scene: SceneConfig, path: Path) -> bool:
+    """Whether a whole sequence of just this scene is there already."""
+    try:
+        return path.is_file() and bool(read_sequence(path).meta.get("scene") == scene.model_dump(mode="json"))
+    except TorchtrackError:
+        return False
+
+
+def simulate_to_file(scene: SceneConfig, path: Path, progress: Progress | None = None, *, preview: bool = False) -> Path:
+    """Simulate a scene and write it; with a preview, ``NAME.mp4`` beside it.
+
+    Raises:
+        EventDataError: if ``path`` is neither a ``.npz`` nor a ``.h5`` file.
+        TorchtrackError: as :func:`torchtrack.sim.simulation.simulate`.
+    """
+    check_output(path)
+    sequence = simulate(scene, progress)
+    if preview:
+        # What draws pictures loads the whole tracker; those who want none need not wait for it.
+        from torchtrack.sim.preview import write_preview
+
+        write_preview(sequence, scene, path.with_suffix(".mp4"))
+    return write(sequence, path)
+
+
+def run_suite(
+    scenes: Sequence[SceneConfig], folder: Path, jobs: int, told: Told = lambda name, share: None, *, preview: bool = False
+) -> list[Failure]:
+    """Simulate all scenes that are not there yet into ``folder/NAME.npz``; one that fails does not stop the others.
+
+    Args:
+        scenes: each with another name.
+        folder: where sequences go; a sequence of the same settings is kept as it is.
+        jobs: processes, of one thread each.
+        told: for a progress bar.
+        preview: whether to write a video of each.
+    """
+    pending = []
+    for scene in scenes:
+        if is_done(scene, folder / f"{scene.name}.npz"):
+            told(scene.name, 1.0)
+        else:
+            pending.append(scene)
+    if not pending:
+        return []
+    context = multiprocessing.get_context("spawn")
+    with context.Manager() as manager, ProcessPoolExecutor(min(jobs, len(pending)), mp_context=context) as pool:
+        progress = manager.Queue()
+        running = {pool.submit(_simulate_one, scene, folder / f"{scene.name}.npz", progress, preview): scene.name for scene in pending}
+        try:
+            return _gathered(running, progress, told)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+def _gathered(running: Mapping[Future[None], str], progress: Any, told: Told) -> list[Failure]:
+    """Wait for all scenes; returns what failed."""
+    failures, open_ones = [], set(running)
+    while open_ones:
+        done, open_ones = wait(open_ones, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+        while True:
+            try:
+                told(*progress.get_nowait())
+            except queue.Empty:
+                break
+        for future in done:
+            error = future.exception()
+            if error is not None:
+                failures.append(Failure(running[future], f"{type(error).__name__}: {error}"))
+            told(running[future], 1.0)
+    return failures
+
+
+def _simulate_one(scene: SceneConfig, path: Path, progress: Any, preview: bool) -> None:
+    """What one process does with one scene."""
+    torch.set_num_threads(1)
+    reached = 0.0
+
+    def tell(share: float) -> None:
+        nonlocal reached
+        if share >= reached + _PROGRESS_STEP:
+            reached = share
+            progress.put((scene.name, share))
+
+    simulate_to_file(scene, path, tell, preview=preview)
