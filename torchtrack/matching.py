@@ -34,6 +34,8 @@ class Matches:
         weights: how far each match is to be trusted, 0 to 1.
         targets: ideal pixels of the observations, moved to the window's end.
         directions: unit directions along which the distance counts.
+        offsets: distance of each observation from its contour along the normal, in px over the widening of the gate.
+        near: which observations have a contour so near that ``offsets`` says something, matched or not.
     """
 
     contour: Int[Tensor, "b n"]
@@ -68,9 +70,9 @@ def match_nearest(
     index: ContourIndex,
     belief: Belief,
     contour_velocity: Float[Tensor, "b m 2"],
-    gate_px: Float[Tensor, "b"],
-    widen: Float[Tensor, "b"],
+    gate_px: float,
     config: MatchingConfig,
+    wider: Float[Tensor, "b"] | None = None,
 ) -> tuple[Matches, Belief]:
     """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
 
@@ -78,30 +80,47 @@ def match_nearest(
         contours: at the current pose; ``index`` may be of an earlier one.
         belief: where to look for each observation; returned anew for the next round.
         contour_velocity: velocity of each contour point (px/s); zero to switch motion compensation off.
+        wider: by how much the gate, and all that is measured against contours, is wider for each object.
     """
+    wider = torch.ones_like(contours.pixels[:, 0, 0]) if wider is None else wider
     believed_velocity, believed_moved = belief.motion.chunk(2, -1)
     found = index.look_up(torch.addcmul(observations.pixels - believed_moved, believed_velocity, observations.age_s[..., None]))
     contour = found.clamp(min=0)
-    # The limb of a smooth surface is no step: its shading fades towards it.
-    sharp = (contours.kind != int(ContourKind.LIMB)).to(contour_velocity.dtype)
-    moved = contours.pixels - index.pixels
-    table = torch.cat([contours.pixels, contours.normals, contour_velocity, moved, sharp[..., None]], -1)
-    values = take_points(table, contour)
+    values = take_points(_contour_table(contours, index, contour_velocity), contour)
     pixels, normals, velocity = values[..., :6].chunk(3, -1)
+    sharp, oriented = values[..., 8:].unbind(-1)
     targets = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
-    targets = targets - config.dark_shift_px * towards_dark(observations.polarity * values[..., 8], normals, velocity)
-    near = (pixels - targets).square().sum(-1) < gate_px[:, None] ** 2
-    matched = observations.mask & (found >= 0) & near
+    # Where the dark side of the contour is, by the polarity: along the normal, or against it.
+    dark = observations.polarity * softsign((normals * velocity).sum(-1) / _SLOW_PX_S)
+    targets = targets - (config.dark_shift_px * dark * sharp)[..., None] * normals
+    near = observations.mask & (found >= 0)
+    matched = near & ((pixels - targets).square().sum(-1) < (gate_px * wider)[:, None].square())
     motion = torch.where(matched[..., None], values[..., 4:8], belief.motion)
-    weights = torch.ones_like(observations.age_s)
-    offsets, around = ((pixels - targets) * normals).sum(-1) / widen[:, None], observations.mask & (found >= 0)
+    offsets = ((pixels - targets) * normals).sum(-1) / wider[:, None]
+    weights = _weights(offsets, targets, near, dark * oriented, config)
+    return Matches(contour, matched, weights, targets, normals, offsets, near), Belief(motion)
+
+
+def _contour_table(contours: Contours, index: ContourIndex, velocity: Tensor) -> Tensor:
+    """What observations take from their contour point: place, normal, velocity, way since indexing, and two marks.
+
+    Sharp are all but the limbs of smooth surfaces: these are no step, as their shading fades towards them. Oriented
+    outwards are the normals of the mesh's own edges.
+    """
+    sharp = contours.kind != int(ContourKind.LIMB)
+    oriented = (contours.kind == int(ContourKind.LIMB)) | (contours.kind == int(ContourKind.CREASE))
+    marks = torch.stack([sharp, oriented], -1).to(velocity.dtype)
+    return torch.cat([contours.pixels, contours.normals, velocity, contours.pixels - index.pixels, marks], -1)
+
+
+def _weights(offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, config: MatchingConfig) -> Tensor:
+    """How far each observation is to be trusted, by those around it."""
+    weights = torch.ones_like(offsets)
     if config.concentration:
-        weights = concentration(offsets, targets, around, config)
-    if config.polarity_floor < 1:
-        across = (normals * velocity).sum(-1)
-        outward = take_points((contours.kind <= 1).to(across)[..., None], contour)[..., 0]
-        weights = weights * agreement(outward * observations.polarity * softsign(across / _SLOW_PX_S), offsets, targets, around, config)
-    return Matches(contour, matched, weights, targets, normals, offsets, around), Belief(motion)
+        weights = concentration(offsets, targets, near, config)
+    if config.polarity:
+        weights = weights * polarity_agreement(dark, offsets, targets, near, config)
+    return weights
 
 
 def concentration(
@@ -120,12 +139,23 @@ def concentration(
     return ((share - config.smeared_share) / (config.gathered_share - config.smeared_share)).clamp(config.least_trust, 1)
 
 
-def agreement(sign, offsets, targets, near, config):
+def polarity_agreement(
+    dark: Float[Tensor, "b n"], offsets: Float[Tensor, "b n"], targets: Float[Tensor, "b n 2"], near: Bool[Tensor, "b n"], config: MatchingConfig
+) -> Float[Tensor, "b n"]:
+    """How far each observation's polarity agrees with that of most others on the contour around it.
+
+    The two sides of a contour keep their brightness over a patch: an event that says the opposite comes from shading
+    within the object, from the background's own edges, or is noise.
+
+    Args:
+        dark: +1 where the polarity says that the contour's outer side is the darker one, -1 the inner one, 0 unknown.
+    """
     cell = patch(targets)
     on = (near & (offsets.abs() < _ON_CONTOUR_PX)).to(offsets.dtype)
     nothing = torch.zeros(len(offsets), _PATCHES**2, dtype=offsets.dtype, device=offsets.device)
-    vote = nothing.scatter_add(1, cell, on * sign).gather(1, cell) / (nothing.scatter_add(1, cell, on).gather(1, cell) + 2)
-    return (1 + (sign * vote * config.polarity_gain).clamp(max=0)).clamp(min=config.polarity_floor)
+    votes, voters = (nothing.scatter_add(1, cell, values).gather(1, cell) for values in (on * dark, on))
+    agreement = dark * votes / (voters + 2)
+    return (1 + config.polarity_gain * agreement).clamp(config.least_agreement, 1)
 
 
 def patch(pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
@@ -147,18 +177,8 @@ def patch_counts(
     return on, around
 
 
-def towards_dark(polarity: Float[Tensor, "b n"], normals: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
-    """Unit vector across each contour to its darker side; shorter where the contour hardly moves across itself.
-
-    A pixel gets brighter when the bright side moves over it: the dark side is then ahead. A pixel sees the logarithm of
-    a blurred step, whose middle lies at ``Φ⁻¹(1 / (1 + √contrast))`` blur widths: always on the dark side.
-    """
-    across = (normals * velocity).sum(-1)
-    return (polarity * softsign(across / _SLOW_PX_S))[..., None] * normals
-
-
 def match_along_flow(
-    observations: Observations, contours: Contours, contour_velocity: Float[Tensor, "b m 2"], gate_px: Float[Tensor, "b"], config: MatchingConfig
+    observations: Observations, contours: Contours, contour_velocity: Float[Tensor, "b m 2"], gate_px: float, config: MatchingConfig
 ) -> Matches:
     """Match each corner with the contour point nearest to it along the line of its flow, either way (the paper's 3.3).
 
@@ -172,18 +192,18 @@ def match_along_flow(
     along = (offsets * heading[:, :, None]).sum(-1)
     across = offsets[..., 1] * heading[..., None, 0] - offsets[..., 0] * heading[..., None, 1]
     crossing = (contours.normals[:, None] * heading[:, :, None]).sum(-1).abs()
-    allowed = contours.mask[:, None] & (across.abs() < config.flow_tolerance_px) & (along.abs() < gate_px[:, None, None]) & (crossing > _MIN_CROSSING)
+    allowed = contours.mask[:, None] & (across.abs() < config.flow_tolerance_px) & (along.abs() < gate_px) & (crossing > _MIN_CROSSING)
     distance, contour = torch.where(allowed, along.square() + across.square(), torch.inf).min(-1)
     targets = observations.pixels + take_points(contour_velocity, contour) * observations.age_s[..., None]
     directions = heading if config.residual == "flow" else take_points(contours.normals, contour)
     mask = observations.mask & observations.has_flow & torch.isfinite(distance)
     offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
-    return Matches(contour, mask, torch.ones_like(targets[..., 0]), targets, directions, offsets, mask)
+    return Matches(contour, mask, torch.ones_like(offsets), targets, directions, offsets, mask)
 
 
 def both_coordinates(matches: Matches) -> Matches:
     """The same matches with the distance in u and in v, as two observations each."""
     axes = torch.eye(2, dtype=matches.targets.dtype, device=matches.targets.device)
     directions = torch.cat([axes[axis].expand_as(matches.targets) for axis in range(2)], 1)
-    contour, mask, weights, targets, offsets, near = (torch.cat([getattr(matches, name)] * 2, 1) for name in ("contour", "mask", "weights", "targets", "offsets", "near"))
-    return Matches(contour, mask, weights, targets, directions, offsets, near)
+    twice = {name: torch.cat([value, value], 1) for name, value in vars(matches).items()}
+    return Matches(**(twice | {"directions": directions}))

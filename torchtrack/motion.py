@@ -1,40 +1,83 @@
 """How objects are expected to move from one window to the next: a constant velocity, disturbed by accelerations.
 
-The pose and the velocity of each object have a joint covariance, in the chart of :func:`torchtrack.lie.retract_about`:
-``[rotation, move of the centre, angular velocity, velocity of the centre]``. What a window's events say is weighed
-against it direction by direction: what they hold well follows them, what they hardly see goes on as it moved before.
+Pose and velocity of each object have a joint covariance, in the chart of :func:`torchtrack.lie.retract_about`:
+``[rotation, move of the centre, angular velocity, velocity of the centre]``. It is the prediction of an iterated Kalman
+filter: what a window's events say is weighed against it direction by direction, so that what they hold well follows
+them, and what they hardly see (an edge that moves along itself, depth) goes on as it moved before.
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import MotionConfig
+from torchtrack.lie import hat
+
+# A prediction is not let grow less certain than this (rad, and diameters).
+_MOST_UNCERTAIN = 0.5
 
 
 def initial_covariance(diameter_m: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 12 12"]:
-    """Covariance of a pose that is given by hand, and of a velocity that is not known."""
-    size = torch.ones_like(diameter_m[:, None]).double()
-    radius_m = 0.5 * diameter_m[:, None].double()
-    shift, speed = config.initial_shift * diameter_m[:, None].double(), config.initial_speed_m_s * size
-    sigma = torch.cat([(shift / radius_m).expand(-1, 3), shift.expand(-1, 3), (speed / radius_m).expand(-1, 3), speed.expand(-1, 3)], -1)
+    """Covariance of a pose that is given, and of a velocity that is not known (float64)."""
+    diameter_m = diameter_m.double()[:, None]
+    shift_m, speed_m_s = config.initial_shift * diameter_m, torch.full_like(diameter_m, config.initial_speed_m_s)
+    sigma = torch.cat([_both(shift_m, diameter_m), _both(speed_m_s, diameter_m)], -1)
     return torch.diag_embed(sigma.square())
 
 
+def _both(way_m: Tensor, diameter_m: Tensor) -> Tensor:
+    """A way of the object's rim and of its centre: three rotations and three translations."""
+    return torch.cat([(2 * way_m / diameter_m).expand(-1, 3), way_m.expand(-1, 3)], -1)
+
+
 def predict_covariance(
-    covariance: Float[Tensor, "b 12 12"], velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], diameter_m: Float[Tensor, "b"], config: MotionConfig
+    covariance: Float[Tensor, "b 12 12"],
+    velocity: Float[Tensor, "b 6"],
+    dt_s: Float[Tensor, "b"],
+    diameter_m: Float[Tensor, "b"],
+    config: MotionConfig,
 ) -> Float[Tensor, "b 12 12"]:
-    """Covariance after ``dt_s`` of constant velocity, with an acceleration that grows with the speed."""
-    dt = dt_s.double()[:, None, None]
-    eye = torch.eye(6, dtype=torch.float64, device=dt.device).expand(len(dt_s), 6, 6)
-    zero = torch.zeros_like(eye)
-    carry = torch.cat([torch.cat([eye, dt * eye], -1), torch.cat([zero, eye], -1)], -2)
-    radius_m = 0.5 * diameter_m.double()
-    speed = velocity[:, 3:].double().norm(dim=-1) + velocity[:, :3].double().norm(dim=-1) * radius_m
-    acceleration = config.acceleration_rate_hz * speed + config.acceleration_floor_m_s2
-    per_axis = torch.stack([*[acceleration / radius_m] * 3, *[acceleration] * 3], -1)
-    push = torch.cat([0.5 * dt.square() * eye, dt * eye], -2) * per_axis[:, None]
-    drift = dt.squeeze(-1) * torch.stack([*[config.drift_m_s / radius_m] * 3, *[torch.full_like(radius_m, config.drift_m_s)] * 3], -1)
-    noise = push @ push.transpose(-1, -2)
-    noise[:, :6, :6] += torch.diag_embed(drift.square())
-    return carry @ covariance @ carry.transpose(-1, -2) + noise
+    """Covariance after ``dt_s`` of constant velocity, with an acceleration that is constant over it (float64).
+
+    How much acceleration is to be expected grows with the speed: slow objects are held still, fast ones are free to turn.
+    """
+    dt_s, diameter_m, velocity = dt_s.double()[:, None], diameter_m.double()[:, None], velocity.double()
+    eye = torch.eye(6, dtype=torch.float64, device=velocity.device).expand(len(velocity), 6, 6)
+    by_time = eye * dt_s[..., None]
+    carry = torch.cat([torch.cat([eye, by_time], -1), torch.cat([torch.zeros_like(eye), eye], -1)], -2)
+    rim_m_s = velocity[:, 3:].norm(dim=-1, keepdim=True) + 0.5 * diameter_m * velocity[:, :3].norm(dim=-1, keepdim=True)
+    acceleration = torch.diag_embed(_both(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m))
+    push = torch.cat([0.5 * by_time**2, by_time], -2) @ acceleration
+    predicted = carry @ covariance @ carry.transpose(-1, -2) + push @ push.transpose(-1, -2)
+    sigma = predicted.diagonal(dim1=-2, dim2=-1).sqrt()
+    lost = (sigma[:, :3] > _MOST_UNCERTAIN).any(-1) | (sigma[:, 3:6] > _MOST_UNCERTAIN * diameter_m).any(-1)
+    return torch.where(lost[:, None, None], covariance, predicted)
+
+
+def inverse(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:
+    """Inverse of symmetric positive definite matrices; infinite on the diagonal where one is not.
+
+    Taken with a unit diagonal: rotations and translations, poses and velocities differ by many orders of magnitude.
+    """
+    scale = matrices.diagonal(dim1=-2, dim2=-1).clamp(min=1e-30).rsqrt()
+    factor, info = torch.linalg.cholesky_ex(matrices * scale[:, :, None] * scale[:, None])
+    eye = torch.eye(matrices.shape[-1], dtype=matrices.dtype, device=matrices.device).expand_as(matrices)
+    good = (info == 0)[:, None, None]
+    result = torch.cholesky_solve(eye, torch.where(good, factor, eye)) * scale[:, :, None] * scale[:, None]
+    return torch.where(good, result, torch.where(eye > 0, torch.inf, 0.0))
+
+
+def left_covariance(covariance: Float[Tensor, "b 6 6"], centre_cam: Float[Tensor, "b 3"]) -> Float[Tensor, "b 6 6"]:
+    """Covariance of the left perturbation ``[φ, ρ]`` of a pose, from that of a turn about its centre: ``ρ_left = ρ - φ × c``."""
+    unknown = torch.isinf(covariance).any(-1).any(-1)[:, None, None]
+    to_left = torch.eye(6, dtype=covariance.dtype, device=covariance.device).repeat(len(covariance), 1, 1)
+    to_left[:, 3:, :3] = hat(centre_cam)
+    known = to_left @ torch.where(unknown, 0.0, covariance) @ to_left.transpose(1, 2)
+    return torch.where(unknown, covariance, known)
+
+
+def fade(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], failed: Bool[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 6"]:
+    """Velocities where nothing confirmed them: a coasting object must not leave for good."""
+    if config.without_events == "hold":
+        return torch.where(failed[:, None], 0.0, velocity)
+    return torch.where(failed[:, None], velocity * torch.exp(-dt_s / config.coast_s)[:, None], velocity)

@@ -36,26 +36,44 @@ class Observations:
     has_flow: Bool[Tensor, "b n"]
 
 
+@dataclass(frozen=True)
+class WindowEvents:
+    """The events of a window as each object's camera saw them, padded.
+
+    Args:
+        pixels: ideal pixels.
+        age_s: time from the event to the window's end (s).
+        polarity: +1 where the pixel got brighter, -1 where darker.
+        mask: which entries exist.
+    """
+
+    pixels: Float[Tensor, "b e 2"]
+    age_s: Float[Tensor, "b e"]
+    polarity: Float[Tensor, "b e"]
+    mask: Bool[Tensor, "b e"]
+
+    def of(self, number: int) -> "WindowEvents":
+        """The events of one object."""
+        return WindowEvents(*(value[number : number + 1] for value in vars(self).values()))
+
+    def repeated(self, count: int) -> "WindowEvents":
+        """The events of one object, for ``count`` of its kind."""
+        return WindowEvents(*(value.expand(count, *value.shape[1:]) for value in vars(self).values()))
+
+
 def corner_observations(corners: Corners) -> Observations:
     """The corners as observations; their polarity is not known."""
     return Observations(corners.pixels, corners.age_s, torch.zeros_like(corners.age_s), corners.mask, corners.flow, corners.has_flow)
 
 
-def select_events(
-    pixels: Float[Tensor, "b e 2"],
-    age_s: Float[Tensor, "b e"],
-    polarity: Float[Tensor, "b e"],
-    mask: Bool[Tensor, "b e"],
-    index: ContourIndex,
-    plane_velocity: Float[Tensor, "b e 2"],
-    count: int,
-) -> Observations:
+def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Float[Tensor, "b e 2"], count: int) -> Observations:
     """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time.
 
     Which of them are taken hangs on each event's own number, not on how many come before it: a pose that is a little
     different takes almost the same events.
     """
-    near = mask & (index.look_up(pixels + plane_velocity * age_s[..., None]) >= 0)
+    pixels, mask = events.pixels, events.mask
+    near = mask & (index.look_up(torch.addcmul(pixels, plane_velocity, events.age_s[..., None])) >= 0)
     number = torch.arange(mask.shape[1], device=mask.device, dtype=torch.float64)
     # Multiples of the golden ratio fill the unit interval evenly, whichever stretch of them is taken.
     lot = (number * _GOLDEN_RATIO) % 1
@@ -63,7 +81,7 @@ def select_events(
     share = torch.where(total > count, _FILL * count / total.clamp(min=1), 1.0)
     chosen, exists = select_ranked(near & (lot < share), count)
     flow = torch.zeros(*chosen.shape, 2, dtype=pixels.dtype, device=pixels.device)
-    values = take_points(torch.cat([pixels, age_s[..., None], polarity[..., None]], -1), chosen)
+    values = take_points(torch.cat([pixels, events.age_s[..., None], events.polarity[..., None]], -1), chosen)
     return Observations(values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
 
 

@@ -6,6 +6,7 @@ paper's Eq. 16 and 17 cancel, which cannot be meant.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +18,26 @@ from torchtrack.lie import cayley, move_about, small_difference_about
 
 # Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
 _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
+
+
+@dataclass(frozen=True)
+class WindowTerms:
+    """What observations tell of beside the pose, which the solver then finds with it.
+
+    An observation that is older than the pose tells of the velocity: the two are found together, so that a velocity
+    that was predicted wrong neither biases the pose nor is learned one window late. And all limbs of an object may stand
+    out of its outline, or within it, by one unknown way, as smooth shading makes them: without it, depth would be
+    believed to be seen far better than it is.
+
+    Args:
+        age_s: time from each observation to the pose (s).
+        velocity: offset from the predicted velocity that the targets were moved with (rad/s, m/s).
+        outward: 1 where the outline's swelling counts along the direction, 0 where not.
+    """
+
+    age_s: Float[Tensor, "b n"]
+    velocity: Float[Tensor, "b 6"]
+    outward: Float[Tensor, "b n"]
 
 
 @dataclass(frozen=True)
@@ -33,8 +54,7 @@ class PoseProblem:
         scale_px: scale of the robust loss, per object.
         T_prior: pose the prior draws to.
         prior_information: information of the prior in the solver's chart; zero for no prior.
-        ages_s: time from each observation to the pose (s).
-        compensated: offset of the velocity from the prior's that ``targets`` were moved with.
+        window: further unknowns; then the chart is ``[pose 6, velocity 6, swelling (px) 1]`` instead of the pose alone.
     """
 
     points_obj: Float[Tensor, "b n 3"]
@@ -45,10 +65,8 @@ class PoseProblem:
     centre_obj: Float[Tensor, "b 3"]
     scale_px: Float[Tensor, "b"]
     T_prior: Float[Tensor, "b 4 4"]
-    prior_information: Float[Tensor, "b 12 12"]
-    ages_s: Float[Tensor, "b n"]
-    compensated: Float[Tensor, "b 6"]
-    swelling: Float[Tensor, "b n"]
+    prior_information: Float[Tensor, "b k k"]
+    window: WindowTerms | None = None
 
 
 @dataclass(frozen=True)
@@ -59,14 +77,14 @@ class Linearisation:
         T_cam_obj: the pose.
         cost: robust cost, prior included.
         gradient, hessian: of the cost; the Hessian is Gauss-Newton's.
-        from_prior: rotation and move of the centre from the prior's pose.
+        from_prior: offset from the prior: rotation and move of the centre, and the further unknowns where there are.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]
     cost: Float[Tensor, "b"]
-    gradient: Float[Tensor, "b 6"]
-    hessian: Float[Tensor, "b 6 6"]
-    from_prior: Float[Tensor, "b 6"]
+    gradient: Float[Tensor, "b k"]
+    hessian: Float[Tensor, "b k k"]
+    from_prior: Float[Tensor, "b k"]
 
 
 def robust_loss(residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss: str) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
@@ -122,14 +140,17 @@ def pose_jacobian(
 
 @dataclass(frozen=True)
 class _Seen:
-    """The matched points as a pose shows them: gradients ``(gx, gy)`` of the residuals in x and y, and the residuals."""
+    """The matched points as a pose shows them: gradients ``g = dπᵀ n`` of the residuals, and the residuals."""
 
     points_cam: Tensor
     centre_cam: Tensor
-    inverse_depth: Tensor
-    gradient: tuple[Tensor, Tensor]
-    along: Tensor
+    gradient: tuple[Tensor, Tensor, Tensor]
     residuals: Tensor
+
+    @cached_property
+    def jacobian(self) -> Tensor:
+        """Of the residuals, by the pose."""
+        return pose_jacobian(self.points_cam, self.centre_cam, self.gradient)
 
 
 def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor) -> _Seen:
@@ -140,11 +161,19 @@ def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tenso
     gx, gy = (rows.slope * inverse_depth[:, None]).unbind(1)
     along = torch.addcmul(gx * points_cam[:, 0], gy, points_cam[:, 1])
     centre_cam = torch.baddbmm(translation, rotation, problem.centre_obj[..., None])[..., 0]
-    gz = -along * inverse_depth
-    difference = from_prior[:, 6:12] - problem.compensated
-    x, y, z = (torch.linalg.cross(difference[:, :3, None].expand_as(points_cam), points_cam - centre_cam[..., None], dim=1) + difference[:, 3:, None]).unbind(1)
-    moved = gx * x + gy * y + gz * z
-    return _Seen(points_cam, centre_cam, inverse_depth, (gx, gy), along, along - rows.offset - problem.ages_s * moved + problem.swelling * from_prior[:, 12:])
+    seen = _Seen(points_cam, centre_cam, (gx, gy, -along * inverse_depth), along - rows.offset)
+    if problem.window is None:
+        return seen
+    faster = (from_prior[:, None, 6:12] - problem.window.velocity[:, None]) @ seen.jacobian
+    further = problem.window.outward * from_prior[:, 12:] - problem.window.age_s * faster[:, 0]
+    return replace(seen, residuals=seen.residuals + further)
+
+
+def _chart_jacobian(problem: PoseProblem, seen: _Seen) -> Tensor:
+    """Jacobian of the residuals by all unknowns."""
+    if problem.window is None:
+        return seen.jacobian
+    return torch.cat([seen.jacobian, -problem.window.age_s[:, None] * seen.jacobian, problem.window.outward[:, None]], 1)
 
 
 def _cost(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Tensor:
@@ -161,14 +190,19 @@ def _with_prior(problem: PoseProblem, value: Tensor, from_prior: Tensor) -> tupl
 
 def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
     """Cost, gradient and Gauss-Newton Hessian of ``problem`` at a pose."""
-    return _linearise(problem, _as_rows(problem), T_cam_obj, small_difference_about(problem.T_prior, T_cam_obj, problem.centre_obj), loss)
+    return _linearise(problem, _as_rows(problem), T_cam_obj, _from_prior(problem, T_cam_obj), loss)
+
+
+def _from_prior(problem: PoseProblem, T_cam_obj: Tensor) -> Tensor:
+    """Offset of a pose from the prior; whatever else is unknown is as predicted."""
+    moved = small_difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
+    return torch.nn.functional.pad(moved, (0, problem.prior_information.shape[-1] - moved.shape[-1]))
 
 
 def _linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Linearisation:
     """:func:`linearise`, given what does not change from one iteration to the next."""
     seen = _see(problem, rows, T_cam_obj, from_prior)
-    jacobian = pose_jacobian(seen.points_cam, seen.centre_cam, (*seen.gradient, -seen.along * seen.inverse_depth))
-    jacobian = torch.cat([jacobian, -problem.ages_s[:, None] * jacobian, problem.swelling[:, None]], 1)
+    jacobian = _chart_jacobian(problem, seen)
     value, robust = robust_loss(seen.residuals, problem.scale_px, loss)
     weighted = jacobian * (robust * problem.weights)[:, None]
     cost, pull = _with_prior(problem, value, from_prior)
@@ -177,7 +211,7 @@ def _linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior:
     return Linearisation(T_cam_obj, cost, gradient, hessian, from_prior)
 
 
-def solve_positive(matrix: Float[Tensor, "b 6 6"], right: Float[Tensor, "b 6 k"]) -> tuple[Float[Tensor, "b 6 k"], Bool[Tensor, "b"]]:
+def solve_positive(matrix: Float[Tensor, "b n n"], right: Float[Tensor, "b n k"]) -> tuple[Float[Tensor, "b n k"], Bool[Tensor, "b"]]:
     """Solve with symmetric positive definite matrices; where one is not, zero and False.
 
     The matrix is made sane before it is factorised: masking afterwards would leave gradients that are not finite.
@@ -195,13 +229,13 @@ def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
     """The Levenberg-Marquardt step, damped along the Hessian's diagonal."""
     diagonal = at.hessian.diagonal(dim1=-2, dim2=-1)
     # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is.
-    floor = 1e-9 * diagonal + 1e-12
+    floor = 1e-9 * diagonal[:, :6].amax(-1, keepdim=True) + 1e-12
     damped = at.hessian + torch.diag_embed(diagonal * damping[:, None] + floor)
     return solve_positive(damped, -at.gradient[..., None])[0].squeeze(-1)
 
 
 def solve_pose(
-    problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig, from_prior: Float[Tensor, "b 12"] | None = None
+    problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig, from_prior: Float[Tensor, "b k"] | None = None
 ) -> Linearisation:
     """Minimise each object's cost from ``T_start``: Levenberg-Marquardt with a damping of its own per object.
 
@@ -216,7 +250,7 @@ def solve_pose(
     rows = _as_rows(problem)
     T_cam_obj, damping = T_start, torch.full_like(T_start[:, 0, 0], config.damping)
     if from_prior is None:
-        from_prior = torch.cat([small_difference_about(problem.T_prior, T_start, problem.centre_obj), torch.zeros_like(problem.compensated)], -1)
+        from_prior = _from_prior(problem, T_start)
     for _ in range(config.iterations):
         at = _linearise(problem, rows, T_cam_obj, from_prior, config.loss)
         step = _damped_step(at, damping)

@@ -1,96 +1,158 @@
-"""Many poses tried at once, where an object's prediction is too uncertain for one."""
+"""Many poses tried at once, where one prediction is too uncertain: after an occlusion, or when a pose begins to slip.
 
-import copy
+Thousands of poses are drawn from the prediction's covariance and marked by how many more events lie on their contours
+than beside them; the most promising are aligned as one batch, and the one that explains most is taken.
+"""
+
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import lie, quality
-from torchtrack.alignment import Alignment, AlignmentResult, align, index_for
+from torchtrack import quality
+from torchtrack.alignment import Fit, align, gate_widening, index_for
 from torchtrack.camera import project
-from torchtrack.contours import ContourModel, Contours, mesh_contours
-from torchtrack.observations import select_events
+from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.contours import Contours
+from torchtrack.lie import retract_about, transform_points
+from torchtrack.observations import WindowEvents, select_events
 from torchtrack.pose_solver import Linearisation
-from torchtrack.visibility import Scene, remove_hidden
+from torchtrack.prediction import Prediction
+
+# Events beside a contour are counted this far from it (px), and more than this many of them in one place say no more.
+_BESIDE_PX, _ENOUGH_EVENTS = 4.0, 3.0
+# Contour points that a drawn pose is marked by, at most.
+_MARKED_POINTS = 200
+# Pixels around the image that events and contours may lie in.
+_BORDER_PX = 2
 
 
-def offsets(covariance: Tensor, count: int) -> Tensor:
-    """``count`` offsets of pose and velocity ``[12]``: drawn evenly from the covariance; the first is zero."""
-    sobol = torch.quasirandom.SobolEngine(6, scramble=False).draw(count + 1)[1:].to(covariance)
-    normal = torch.erfinv(2 * sobol - 1) * 2**0.5
+@dataclass(frozen=True)
+class Found:
+    """What one window gave for each object.
+
+    Args:
+        fit: poses, and what they stand on.
+        share: share of the moving contour that events explain.
+        count: matched observations.
+    """
+
+    fit: Fit
+    share: Float[Tensor, "b"]
+    count: Int[Tensor, "b"]
+
+
+def judge_fit(prediction: Prediction, fit: Fit, config: TrackerConfig) -> Found:
+    """A fit with its quality; without enough observations it explains nothing."""
+    velocity = prediction.contour_velocity(fit.contours)
+    share = quality.explained_share(fit.contours, fit.matches, velocity, prediction.objects.image_size, config.quality.min_speed_px_s)
+    return Found(fit, share, fit.matches.mask.sum(-1))
+
+
+def wanted(share: Float[Tensor, "b"], sigma_px: Float[Tensor, "b"], usual_share: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+    """Which objects are to be searched for: uncertain ones, and those whose explained share stays below the usual."""
+    return (sigma_px > config.from_sigma_px) | (share < config.dropped_to * usual_share)
+
+
+def search(number: int, prediction: Prediction, sigma_px: float, events: WindowEvents, found: Found, config: TrackerConfig) -> Found:
+    """Try other poses for the object ``number``; ``found`` with the best of them in its place, if that is better.
+
+    Args:
+        sigma_px: standard deviation of the object's prediction in the image.
+        events: of all objects.
+    """
+    settings, count = config.search, config.search.hypotheses
+    widen = max(settings.least_sigma_px / max(sigma_px, 1e-6), 1.0)
+    offsets = draw_offsets(prediction.covariance[number] * widen**2, settings.drawn).to(prediction.velocity.dtype)
+    one, seen = prediction.copies(number, 1), events.of(number)
+    density = event_density(seen.pixels + one.plane_velocity(seen.pixels) * seen.age_s[..., None], seen.mask, prediction.objects.image_size)
+    marks = mark(one, found.fit.contours, number, offsets, density)
+    # The prediction itself is always among those that are tried.
+    marks[0] = torch.inf
+    offsets = offsets[marks.topk(min(count, len(marks))).indices]
+    tried = _align_all(prediction.copies(number, len(offsets)), offsets, seen, config)
+    share = torch.where(tried.count >= config.quality.min_observations, tried.share, 0)
+    best = int(share.argmax())
+    mine = found.share[number] if found.count[number] >= config.quality.min_observations else 0.0
+    return _replaced(found, number, tried, best) if share[best] > mine + settings.margin else found
+
+
+def draw_offsets(covariance: Float[Tensor, "12 12"], count: int) -> Float[Tensor, "n 13"]:
+    """Offsets of pose and velocity, drawn evenly from a covariance; the first is none. The swelling, last, is not drawn.
+
+    The sequence is the same every time: a search can be repeated.
+    """
+    even = torch.quasirandom.SobolEngine(6, scramble=False).draw(count + 1)[1:].to(covariance)
+    normal = torch.erfinv(2 * even - 1) * 2**0.5
     normal[0] = 0
-    pose = covariance[:6, :6]
-    factor = torch.linalg.cholesky(pose)
-    drawn = normal @ factor.T
-    carried = torch.linalg.solve(pose, covariance[:6, 6:12])
-    return torch.cat([drawn, drawn @ carried, torch.zeros_like(drawn[:, :1])], -1)
+    pose = normal @ torch.linalg.cholesky(covariance[:6, :6]).T
+    # A pose that is off implies a velocity that was.
+    velocity = pose @ torch.linalg.solve(covariance[:6, :6], covariance[:6, 6:])
+    return torch.nn.functional.pad(torch.cat([pose, velocity], -1), (0, 1))
 
 
-def repeated(model: ContourModel, count: int) -> ContourModel:
-    clone = copy.copy(model)
-    clone._buffers = dict(model._buffers)
-    clone._buffers["members"] = torch.arange(count)
-    return clone
-
-
-_RING_PX, _ENOUGH, _POINTS = 4.0, 3.0, 200
-
-
-def event_density(targets: Tensor, mask: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """Events in the 3x3 neighbourhood of every pixel, with a border of two."""
-    height, width = image_size[0] + 4, image_size[1] + 4
-    u = (targets[..., 0].round().clamp(-1, width - 4) + 2).long()
-    v = (targets[..., 1].round().clamp(-1, height - 4) + 2).long()
-    image = torch.zeros(height * width, dtype=targets.dtype).scatter_add(0, v * width + u, mask.to(targets.dtype)).view(height, width)
+def event_density(pixels: Float[Tensor, "1 e 2"], mask: Bool[Tensor, "1 e"], image_size: tuple[int, int]) -> Float[Tensor, "h w"]:
+    """Events in the 3x3 pixels around every pixel of the image with its border."""
+    height, width = (size + 2 * _BORDER_PX for size in image_size)
+    place = (pixels[0].round() + _BORDER_PX).nan_to_num(-1)
+    inside = mask[0] & (place >= 1).all(-1) & (place[:, 0] < width - 1) & (place[:, 1] < height - 1)
+    u, v = torch.where(inside[:, None], place, 0).long().unbind(-1)
+    image = torch.zeros(height * width, dtype=pixels.dtype, device=pixels.device)
+    image = image.scatter_add(0, v * width + u, inside.to(pixels.dtype)).view(height, width)
     rows = image[:-2] + image[1:-1] + image[2:]
     return torch.nn.functional.pad(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:], (1, 1, 1, 1))
 
 
-def ranked(start: Alignment, k: int, contours: Contours, density: Tensor, delta: Tensor) -> Tensor:
-    step = max(contours.mask.shape[1] // _POINTS, 1)
-    points, mask, normals = contours.points_obj[k, ::step], contours.mask[k, ::step], contours.normals[k, ::step]
-    points, normals = points[mask], normals[mask]
-    T = lie.retract_about(start.T_prior[k].expand(len(delta), 4, 4), delta[:, :6], start.centre_obj[k].expand(len(delta), 3))
-    pixels = project(lie.transform_points(T, points.expand(len(delta), -1, -1)), start.intrinsics[k].expand(len(delta), 4))
-    height, width = density.shape
-    total = 0
-    for side, weight in ((0.0, 1.0), (_RING_PX, -0.5), (-_RING_PX, -0.5)):
-        place = (pixels + side * normals).round() + 2
-        u, v = place[..., 0].clamp(0, width - 1).long(), place[..., 1].clamp(0, height - 1).long()
-        total = total + weight * density.flatten()[v * width + u].clamp(max=_ENOUGH)
-    return total.mean(-1)
+def mark(
+    prediction: Prediction, contours: Contours, number: int, offsets: Float[Tensor, "n 13"], density: Float[Tensor, "h w"]
+) -> Float[Tensor, "n"]:
+    """How much denser events are on the contours of each pose than beside them.
+
+    The contours are those of one pose, moved: over a few degrees they stay contours, even on a smooth surface.
+
+    Args:
+        prediction: of the one object.
+        contours: of all objects, of which this is ``number``.
+    """
+    step = max(contours.mask.shape[1] // _MARKED_POINTS, 1)
+    visible = contours.mask[number, ::step]
+    points, normals = contours.points_obj[number, ::step][visible], contours.normals[number, ::step][visible]
+    count, objects = len(offsets), prediction.objects
+    poses = retract_about(prediction.T_cam_obj.expand(count, 4, 4), offsets[:, :6], objects.centre_obj.expand(count, 3))
+    pixels = project(transform_points(poses, points.expand(count, -1, -1)), objects.intrinsics.expand(count, 4))
+    limit = pixels.new_tensor([density.shape[1] - 1, density.shape[0] - 1])
+    total = pixels.new_zeros(count)
+    for side_px, weight in ((0.0, 1.0), (_BESIDE_PX, -0.5), (-_BESIDE_PX, -0.5)):
+        u, v = torch.minimum(((pixels + side_px * normals).round() + _BORDER_PX).clamp(min=0), limit).long().unbind(-1)
+        total = total + weight * density.flatten()[v * density.shape[1] + u].clamp(max=_ENOUGH_EVENTS).sum(-1)
+    return total
 
 
-def search(tracker, start: Alignment, k: int, covariance: Tensor, pixels, age_s, polarity, mask, count: int, seen: Contours):
-    model = next(m for m in tracker.models if (m.members == k).any())
-    model = repeated(model, count)
-    config = tracker.config
-    dtype = start.velocity.dtype
-    delta = offsets(covariance.double(), config.search.drawn).to(dtype)
-    plane = start.plane_velocity(pixels)
-    density = event_density(pixels[k] + plane[k] * age_s[k, :, None], mask[k], start.image_size)
-    marks = ranked(start, k, seen, density, delta)
-    marks[0] = torch.inf
-    delta = delta[marks.topk(count).indices]
-    row = lambda t: t[k : k + 1].expand(count, *t.shape[1:])
-    T_start = lie.retract_about(row(start.T_prior), delta[:, :6], row(start.centre_obj))
-    many = Alignment(row(start.T_prior), row(start.usable), row(start.prior_information), row(start.prior_covariance), row(start.velocity), row(start.centre_obj), row(start.intrinsics), start.image_size)
-    one = Alignment(T_start, many.usable, many.prior_information, many.prior_covariance, many.velocity + delta[:, 6:12], many.centre_obj, many.intrinsics, many.image_size)
+def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: TrackerConfig) -> Found:
+    """Align copies of one object, each from its own offset, on the events of the object."""
+    begin = copies.moved(offsets)
+    contours = copies.objects.contours(begin.T_cam_obj, config.contours)
+    index = index_for(contours, copies.objects.image_size, config)
+    events = seen.repeated(len(offsets))
+    observations = select_events(events, index, begin.plane_velocity(events.pixels), config.matching.max_events)
+    tight = gate_widening(torch.zeros_like(offsets[:, 0]), config)
+    return judge_fit(copies, align(copies, contours, index, tight, observations, config, offsets), config)
 
-    def extract(T: Tensor) -> Contours:
-        contours = mesh_contours([model], T, many.intrinsics, config.contours)
-        scene = Scene([model], T, many.intrinsics, torch.arange(count), tracker.diameter_m[k].expand(count), (count, *many.image_size), False)
-        return remove_hidden(contours, scene, config.contours)
 
-    contours = extract(T_start)
-    index = index_for(contours, many.image_size, config)
-    expand = lambda t: t[k : k + 1].expand(count, *t.shape[1:])
-    observations = select_events(expand(pixels), expand(age_s), expand(polarity), expand(mask), index, one.plane_velocity(expand(pixels)), config.matching.max_events)
-    ones = torch.ones(count)
-    aligned = align(many, contours, index, ones, observations, extract, config, T_start, delta)
-    velocity = many.contour_velocity(aligned.contours)
-    share = quality.explained_share(aligned.contours, aligned.matches, velocity, many.image_size, config.quality.min_speed_px_s)
-    number = aligned.matches.mask.sum(-1)
-    share = torch.where(number >= config.quality.min_observations, share, 0)
-    return share, number, aligned
+def _replaced(found: Found, number: int, other: Found, row: int) -> Found:
+    """``found`` with one object's poses, contours and quality from another."""
+
+    def put(mine: Tensor, theirs: Tensor) -> Tensor:
+        value = mine.clone()
+        value[number] = theirs[row]
+        return value
+
+    def put_points(mine: Tensor, theirs: Tensor) -> Tensor:
+        missing = mine.shape[1] - theirs.shape[1]
+        return put(mine, torch.cat([theirs, theirs.new_zeros(len(theirs), missing, *theirs.shape[2:])], 1))
+
+    mine, theirs = found.fit, other.fit
+    solution = Linearisation(*(put(value, getattr(theirs.solution, name)) for name, value in vars(mine.solution).items()))
+    contours = Contours(*(put_points(value, getattr(theirs.contours, name)) for name, value in vars(mine.contours).items()))
+    return Found(Fit(solution, contours, mine.matches), put(found.share, other.share), put(found.count, other.count))

@@ -83,7 +83,7 @@ class MatchingConfig(Settings):
     )
     gates_px: tuple[float, ...] = Field((5.0, 2.5, 1.5, 1.2), min_length=1, description="One round of matching and solving per gate (px).")
     max_gate_px: float = Field(16.0, gt=0, description="The first gate opens up to this where the prediction is uncertain (px).")
-    gate_sigmas: float = Field(3.0, gt=0, description="Width of the first gate, in standard deviations of the prediction in the image.")
+    gate_sigmas: float = Field(3.0, gt=0, description="Width of an uncertain object's first gate, in standard deviations of its prediction.")
     index_cell_px: int = Field(2, ge=1, le=4, description="Cell of the index of nearest contour points (px).")
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
@@ -91,8 +91,9 @@ class MatchingConfig(Settings):
     smeared_share: float = Field(0.35, ge=0, lt=1, description="Share of observations on the contour at which a patch counts least.")
     gathered_share: float = Field(0.6, gt=0, le=1, description="Share of observations on the contour at which a patch counts in full.")
     least_trust: float = Field(0.02, ge=0, le=1, description="What a smeared patch still counts.")
-    polarity_floor: float = 0.05
-    polarity_gain: float = 1.5
+    polarity: bool = Field(True, description="Trust events less whose polarity is not that of most others on the contour around them.")
+    polarity_gain: float = Field(1.5, ge=0, description="How fast trust falls with the majority of the others.")
+    least_agreement: float = Field(0.05, ge=0, le=1, description="What an event of the wrong polarity still counts.")
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
@@ -111,37 +112,33 @@ class SolverConfig(Settings):
     iterations: int = Field(1, ge=1, le=100, description="Iterations in each round.")
     loss: Literal["tukey", "huber", "none"] = Field("tukey", description="Robust loss, with the round's gate as its scale.")
     damping: float = Field(1e-6, ge=0, description="Initial damping, as a share of the Hessian's diagonal.")
-    prior: bool = Field(True, description="Hold the pose near the predicted one.")
+    prior: bool = Field(True, description="Weigh the observations against the prediction by its covariance, and find the velocity with the pose.")
     observation_px: float = Field(1.5, gt=0, description="Standard deviation of one observation (px), with its share of what all have in common.")
-    swelling_px: float = 0.2
-    swelling_kind: int = 0
-    prior_rotation_rad: float = Field(0.006, gt=0, description="Standard deviation of the prediction's rotation (rad), per 1 px of residual noise.")
-    prior_translation_m: float = Field(0.003, gt=0, description="Standard deviation of the prediction's translation (m), per 1 px of residual noise.")
-
-
-class SearchConfig(Settings):
-    """Many poses tried where one prediction is too uncertain."""
-
-    drawn: int = Field(1000, ge=0, description="Poses drawn and looked at.")
-    hypotheses: int = Field(8, ge=0, le=1000, description="Poses tried at once; 0 switches the search off.")
-    from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
-    dropped_to: float = Field(0.8, ge=0, le=1, description="Share of the usual explained share below which others are tried.")
-    least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
-    below_share: float = Field(0.4, ge=0, le=1, description="Share of the moving contour explained by events below which others are tried.")
+    velocity_in_window: bool = Field(True, description="Older observations tell of the velocity: pose and velocity are found together.")
+    swelling_px: float = Field(0.2, ge=0, description="Standard deviation of how far smooth limbs stand out, in a window (px); 0 for not at all.")
 
 
 class MotionConfig(Settings):
     """Prediction of the next pose."""
 
     model: Literal["constant_velocity", "hold"] = Field("constant_velocity", description="Carry the velocity on, or start from the last pose.")
-    initial_shift: float = Field(0.005, gt=0, description="Standard deviation of the initial pose (diameters).")
+    initial_shift: float = Field(0.005, gt=0, le=1, description="Standard deviation of the initial pose (diameters).")
     initial_speed_m_s: float = Field(0.3, gt=0, description="Standard deviation of the initial speed (m/s).")
     acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
-    drift_m_s: float = Field(0.0, ge=0, description="Further uncertainty of each predicted pose (m/s).")
-    velocity_gain: float = Field(0.6, gt=0, le=1, description="Share of a new window in the velocity.")
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
     coast_s: float = Field(0.2, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
+
+
+class SearchConfig(Settings):
+    """Many poses tried at once, where one prediction is too uncertain or a pose explains less than it did."""
+
+    hypotheses: int = Field(24, ge=0, le=1000, description="Poses aligned at once; 0 switches the search off.")
+    drawn: int = Field(2000, ge=1, le=100_000, description="Poses drawn from the prediction, of which the most promising are aligned.")
+    from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
+    dropped_to: float = Field(0.8, ge=0, le=1, description="Share of the usual quality below which others are tried.")
+    least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
+    margin: float = Field(0.1, ge=0, le=1, description="By how much the quality of another pose must be better.")
 
 
 class QualityConfig(Settings):
@@ -151,7 +148,9 @@ class QualityConfig(Settings):
     min_visible_share: float = Field(0.2, ge=0, le=1, description="A smaller share of the contour inside the image: out of view.")
     uncertain_below: float = Field(0.4, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is uncertain.")
     lost_below: float = Field(0.2, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is lost.")
-    caught_above: float = Field(0.45, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object counts as found again.")
+    caught_above: float = Field(
+        0.45, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object is found again."
+    )
     min_speed_px_s: float = Field(30.0, ge=0, description="Contours moving slower than this across themselves need not fire (px/s).")
     max_step_rotation_rad: float = Field(0.5, gt=0, description="A larger rotation against the prediction within one window has diverged (rad).")
     max_step_translation: float = Field(0.5, gt=0, description="A larger move against the prediction within one window has diverged (diameters).")

@@ -1,0 +1,62 @@
+"""The objects that are handled as one batch: their models, cameras and streams, and their contours at any poses."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchtrack.config.tracker import ContourConfig
+from torchtrack.contours import ContourModel, Contours, mesh_contours
+from torchtrack.splat import splat_contours
+from torchtrack.visibility import Scene, remove_hidden
+
+
+@dataclass(frozen=True)
+class ObjectBatch:
+    """What does not change of the objects.
+
+    Args:
+        models: the distinct models, with the objects that have each.
+        intrinsics: ``[fx, fy, cx, cy]`` of each object's camera.
+        centre_obj: centre of each object (m).
+        diameter_m: diameter of each object.
+        stream_index: the stream that each object is seen in.
+        image_shape: streams, height and width of the image.
+        shared: whether any stream has more than one object.
+    """
+
+    models: Sequence[ContourModel]
+    intrinsics: Float[Tensor, "b 4"]
+    centre_obj: Float[Tensor, "b 3"]
+    diameter_m: Float[Tensor, "b"]
+    stream_index: Int[Tensor, "b"]
+    image_shape: tuple[int, int, int]
+    shared: bool
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Height and width of the image."""
+        return self.image_shape[1:]
+
+    def contours(self, T_cam_obj: Float[Tensor, "b 4 4"], config: ContourConfig) -> Contours:
+        """Visible contours at given poses."""
+        if config.source == "splat":
+            return splat_contours(self.models, T_cam_obj, self.intrinsics, config)
+        contours = mesh_contours(self.models, T_cam_obj, self.intrinsics, config)
+        if not config.remove_hidden:
+            return contours
+        scene = Scene(self.models, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, self.image_shape, self.shared)
+        return remove_hidden(contours, scene, config)
+
+    def copies(self, number: int, count: int) -> "ObjectBatch":
+        """One object many times, each in a stream of its own: copies do not hide one another."""
+        streams = torch.arange(count, device=self.stream_index.device)
+        has_it = next(model for model in self.models if bool((model.members == number).any()))
+        # A shallow copy shares all tensors but the list of members.
+        model = copy.copy(has_it)
+        model._buffers = {**has_it._buffers, "members": streams}
+        rows = (value[number : number + 1].expand(count, *value.shape[1:]) for value in (self.intrinsics, self.centre_obj, self.diameter_m))
+        return ObjectBatch([model], *rows, streams, (count, *self.image_size), False)

@@ -1,0 +1,70 @@
+"""Where objects are expected at a window's end, how they move, and how certain that is."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchtrack.camera import MIN_DEPTH_M
+from torchtrack.contours import Contours
+from torchtrack.image_motion import object_plane_velocity, pixel_velocity
+from torchtrack.lie import retract_about, transform_points
+from torchtrack.object_batch import ObjectBatch
+from torchtrack.pose_solver import pose_jacobian
+
+# Contour points that the uncertainty is looked at, at most.
+_LOOKED_AT = 64
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted pose and motion of each object at the window's end.
+
+    Args:
+        objects: the objects.
+        T_cam_obj: predicted pose; some pose in view where the predicted one is not usable.
+        usable: which predictions are finite poses before the camera.
+        velocity: rotation and velocity of the centre (rad/s, m/s).
+        covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.motion`.
+    """
+
+    objects: ObjectBatch
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    usable: Bool[Tensor, "b"]
+    velocity: Float[Tensor, "b 6"]
+    covariance: Float[Tensor, "b 12 12"]
+
+    @cached_property
+    def centre_cam(self) -> Float[Tensor, "b 3"]:
+        """Centre of each object in the camera's frame (m)."""
+        return transform_points(self.T_cam_obj, self.objects.centre_obj[:, None])[:, 0]
+
+    def plane_velocity(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
+        """Image velocity of pixels at the depth of the object's centre (px/s)."""
+        return object_plane_velocity(pixels, self.velocity, self.centre_cam, self.objects.intrinsics)
+
+    def contour_velocity(self, contours: Contours) -> Float[Tensor, "b m 2"]:
+        """Image velocity of contour points (px/s)."""
+        return pixel_velocity(contours.points_cam, self.velocity, self.centre_cam, self.objects.intrinsics)
+
+    def moved(self, offset: Float[Tensor, "b k"]) -> "Prediction":
+        """The prediction with its pose and velocity moved; the covariance stays."""
+        T_cam_obj = retract_about(self.T_cam_obj, offset[:, :6], self.objects.centre_obj)
+        return Prediction(self.objects, T_cam_obj, self.usable, self.velocity + offset[:, 6:12], self.covariance)
+
+    def copies(self, number: int, count: int) -> "Prediction":
+        """One object's prediction many times, each in a stream of its own."""
+        rows = (value[number : number + 1].expand(count, *value.shape[1:]) for value in (self.T_cam_obj, self.usable, self.velocity, self.covariance))
+        return Prediction(self.objects.copies(number, count), *rows)
+
+    def sigma_px(self, contours: Contours) -> Float[Tensor, "b"]:
+        """Standard deviation of the contours across themselves in the image (px), in the mean over them."""
+        step = max(contours.mask.shape[1] // _LOOKED_AT, 1)
+        points, normals, mask = (value[:, ::step] for value in (contours.points_cam, contours.normals, contours.mask))
+        inverse_depth = points[..., 2].clamp(min=MIN_DEPTH_M).reciprocal()
+        slope = normals * self.objects.intrinsics[:, None, :2] * inverse_depth[..., None]
+        along = -(slope * points[..., :2]).sum(-1) * inverse_depth
+        jacobian = pose_jacobian(points.transpose(1, 2), self.centre_cam, (*slope.unbind(-1), along))
+        variance = (jacobian * (self.covariance[:, :6, :6].to(jacobian.dtype) @ jacobian)).sum(1)
+        return ((variance * mask).sum(-1) / mask.sum(-1).clamp(min=1)).sqrt()
