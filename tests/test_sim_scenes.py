@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from torchtrack.camera import project
 from torchtrack.config.load import load
-from torchtrack.errors import ConfigError, EventDataError, MissingFileError, UnknownFormatError
+from torchtrack.errors import ConfigError, EventDataError, MissingFileError, ModelError, UnknownFormatError
 from torchtrack.io.sequence import read_sequence
 from torchtrack.lie import transform_points
 from torchtrack.sim import BackgroundConfig, CameraConfig, MotionConfig, ObjectConfig, SceneConfig, simulate, write
@@ -229,6 +229,22 @@ def test_settings_are_checked(tmp_path):
     assert "widht" in str(error.value)
 
 
+@pytest.mark.parametrize("values", [{}, {"shape": "cube", "mesh": "cube.ply"}])
+def test_an_object_has_one_model(values):
+    with pytest.raises(ValidationError, match="either shape or mesh"):
+        ObjectConfig(label="a", **values)
+
+
+def test_meshes_that_cannot_be_drawn_are_errors(tmp_path):
+    with pytest.raises(MissingFileError, match=r"nowhere\.ply"):
+        ObjectConfig(label="a", mesh=tmp_path / "nowhere.ply").build()
+    make_mesh("cube").export(tmp_path / "cube.ply")
+    with pytest.raises(ModelError, match="unit"):
+        ObjectConfig(label="a", mesh=tmp_path / "cube.ply", unit="mm").build()
+    (part,) = ObjectConfig(label="a", mesh=tmp_path / "cube.ply", scale=2.0).build()
+    assert part.extents == pytest.approx([0.24] * 3)
+
+
 def test_event_camera_parameters_can_replace_the_profile():
     assert scene().event_camera_config == EVENT_CAMERA_PROFILES["ideal"]
     own = EventCameraConfig(threshold_on=0.4)
@@ -254,3 +270,16 @@ def test_background_image_is_linear_in_light(tmp_path):
 def test_camera_is_centred_unless_told_otherwise():
     assert (SMALL.build().cx, SMALL.build().cy) == (59.5, 44.5)
     assert CameraConfig(cx=10.0).build().cx == 10.0
+
+
+def test_camera_can_come_from_a_calibration_file(tmp_path):
+    (tmp_path / "calib.txt").write_text("199.1 198.8 132.2 110.7 -0.368 0.151 -0.0003 -0.0008 0.0\n")
+    (tmp_path / "scene.yaml").write_text("objects: [{label: a, shape: cube}]\ncamera: {calibration: calib.txt, width: 240, height: 180}\n")
+    camera = load(SceneConfig, tmp_path / "scene.yaml").camera.build()
+    assert (camera.fx, camera.cy, camera.width, camera.height) == (199.1, 110.7, 240, 180)
+    assert camera.distortion_model == "plumb_bob"
+    world = make_world(load(SceneConfig, tmp_path / "scene.yaml"))
+    # The ideal image is larger: barrel distortion pulls what is outside of it in.
+    assert world.ideal.width > 240
+    assert world.ideal.distortion_model == "none"
+    assert world.still_background().shape == (world.ideal.height, world.ideal.width)

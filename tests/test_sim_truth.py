@@ -59,7 +59,10 @@ def outline_of_ball(centre_m, camera, count=720):
 LENS = {"distortion_model": "plumb_bob", "distortion": (-0.3, 0.1, 0.001, -0.0005)}
 
 
-@pytest.mark.parametrize("lens", [{}, LENS], ids=["pinhole", "distorted"])
+FISHEYE = {"distortion_model": "fisheye", "distortion": (0.05, -0.01, 0.002, -0.0005)}
+
+
+@pytest.mark.parametrize("lens", [{}, LENS, FISHEYE], ids=["pinhole", "plumb bob", "fisheye"])
 @pytest.mark.parametrize("background", [{"luminance": 0.05}, {"luminance": 0.9}], ids=["before dark", "before bright"])
 def test_events_of_a_curved_object_lie_on_its_outline(ball, lens, background):
     sequence = simulate(ball_scene(ball, camera=CameraConfig(**SMALL, **lens), background=BackgroundConfig(**background)))

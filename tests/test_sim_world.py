@@ -121,6 +121,8 @@ def test_messy_pictures_are_the_same_for_a_seed_and_full_of_edges():
     assert not np.array_equal(first, other)
     edges = np.abs(np.diff(np.log(first + 0.005), axis=1)) > 0.2
     assert 0.01 < edges.mean() < 0.3
+    faint = np.log(BackgroundConfig(kind="messy", seed=1, contrast=0.3).picture(320, 240))
+    assert faint.std() == pytest.approx(0.3 * np.log(first).std(), rel=0.01)
     dimmed = BackgroundConfig(kind="messy", seed=1, brightness=0.5).picture(320, 240)
     assert np.allclose(dimmed, 0.5 * first)
 

@@ -100,11 +100,11 @@ class Backdrop:
 def _between_grid(values: Float[ndarray, "gh gw"], height: int, width: int) -> Float[ndarray, "h w"]:
     """Values at every pixel, bilinear between those at the grid's points; float32."""
     down, across = _line_weights(height, values.shape[0]), _line_weights(width, values.shape[1])
-    return (down @ values @ across.T).astype(np.float32)
+    return down @ values.astype(np.float32) @ across.T
 
 
 @cache
 def _line_weights(size: int, points: int) -> Float[ndarray, "n p"]:
     """Weights of the grid's points for every pixel of a line."""
     at = np.append(np.arange(0, size - 1, _GRID_PX), size - 1.0)
-    return np.stack([np.interp(np.arange(size), at, one) for one in np.eye(points)], 1)
+    return np.stack([np.interp(np.arange(size), at, one) for one in np.eye(points)], 1).astype(np.float32)

@@ -16,6 +16,8 @@ from torchtrack.sim.render import plain_background
 from torchtrack.sim.surface import grey_reflectance
 from torchtrack.sim.textures import clutter
 
+# Luminance below which contrast is not changed: black has no logarithm.
+_DARKEST = 1e-3
 # Grey values of an 8-bit image as colours, for one table of linear light.
 _ALL_GREYS = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
 
@@ -27,6 +29,7 @@ class BackgroundConfig(Settings):
     luminance: float = Field(0.1, ge=0, le=1, description="Of a plain background, linear in light: 1 is white.")
     image: ConfigPath | None = Field(None, description="An image instead.")
     brightness: float = Field(1.0, gt=0, le=1, description="Dims a messy background or an image.")
+    contrast: float = Field(1.0, ge=0, le=2, description="Of a messy background or an image, in log luminance about its mean: 0 is even.")
     blur_px: float = Field(0.6, ge=0, le=20, description="Standard deviation of its blur, pixels; one below 0.5 flickers when it moves.")
     projection: Literal["screen", "wall", "panorama"] = Field(
         "screen", description="Fixed before the sensor; on a wall that stands in the world; or at infinity all around (an equirectangular image)."
@@ -68,7 +71,7 @@ class BackgroundConfig(Settings):
             UnknownFormatError: if it cannot be read as an image.
         """
         if self.image is not None:
-            return self.brightness * _read_linear(self.image, width, height)
+            return self._toned(_read_linear(self.image, width, height))
         if self.kind == "plain":
             return plain_background(width, height, self.luminance)
         linear = grey_reflectance(_ALL_GREYS).astype(np.float32)
@@ -76,7 +79,14 @@ class BackgroundConfig(Settings):
         grey = np.concatenate([half, half[:, ::-1]], 1)[:, :width] if self.projection == "panorama" else half
         # The seams of the mirrored halves come to lie at the sides.
         grey = np.roll(grey, width // 4, axis=1) if self.projection == "panorama" else grey
-        return np.float32(self.brightness) * linear[grey]
+        return self._toned(linear[grey])
+
+    def _toned(self, luminance: Float[ndarray, "h w"]) -> Float[ndarray, "h w"]:
+        """With the brightness and the contrast asked for."""
+        if self.contrast != 1:
+            level = np.log(np.maximum(luminance, _DARKEST))
+            luminance = np.exp(level.mean() + self.contrast * (level - level.mean())).clip(max=1)
+        return (self.brightness * luminance).astype(np.float32)
 
     def _picture_size(self, camera: Camera) -> tuple[int, int]:
         """Width and height of the picture, texels: one per pixel, and enough to look around."""

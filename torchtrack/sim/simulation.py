@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,6 +32,7 @@ BACKGROUND, NOISE = -1, -2
 
 # Lens blur and the motion between frames carry an outline's events about this far from its object.
 _OUTLINE_REACH_PX = 2
+_NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 # Poses per round, to bound memory.
 _POSES_PER_ROUND = 2048
 # Straight lines between this many frames follow a sine to a percent of its amplitude.
@@ -149,25 +151,13 @@ def _events(
 
 
 def event_sources(events: EventBatch, is_noise: Bool[Tensor, "n"], before: Frame, after: Frame) -> Int[Tensor, "n"]:
-    """What caused each event: who holds its pixel in either frame or, at an outline, a pixel beside it."""
-    x, y = events.x.numpy(), events.y.numpy()
-    source = np.where(is_noise.numpy(), NOISE, BACKGROUND).astype(np.int16)
-    for reach in range(_OUTLINE_REACH_PX + 1):
-        for dy, dx in _ring(reach):
-            for frame in (after, before):
-                open_ones = np.flatnonzero(source == BACKGROUND)
-                if not len(open_ones):
-                    return torch.from_numpy(source)
-                rows = (y[open_ones] + dy).clip(0, frame.object_index.shape[0] - 1)
-                columns = (x[open_ones] + dx).clip(0, frame.object_index.shape[1] - 1)
-                source[open_ones] = frame.object_index[rows, columns]
-    return torch.from_numpy(source)
-
-
-def _ring(reach: int) -> list[tuple[int, int]]:
-    """Offsets (rows, columns) that are ``reach`` away, as a king walks on a chessboard."""
-    span = range(-reach, reach + 1)
-    return [(dy, dx) for dy in span for dx in span if max(abs(dy), abs(dx)) == reach]
+    """What caused each event: who holds its pixel after it or before it or, at an outline, a pixel beside it."""
+    owner = np.where(after.object_index >= 0, after.object_index, before.object_index)
+    for _ in range(_OUTLINE_REACH_PX):
+        # Where two meet outside of both, what passes before the objects comes first.
+        owner = np.where(owner >= 0, owner, cv2.dilate(owner, _NEIGHBOURS))
+    source = owner[events.y.numpy(), events.x.numpy()]
+    return torch.from_numpy(np.where(is_noise.numpy(), NOISE, source).astype(np.int16))
 
 
 def _meta(config: SceneConfig, world: World, frames: int, worst_px: float) -> dict[str, Any]:
