@@ -70,7 +70,7 @@ def align(
     if offset is None:
         offset = prediction.velocity.new_zeros(len(widening), 13)
     information = _information(prediction, config)
-    begin = prediction.moved(offset) if bool(config.solver.prior) else prediction
+    begin = prediction.moved(offset) if config.solver.prior else prediction
     T_cam_obj, offset = begin.T_cam_obj, offset[:, : information.shape[-1]]
     compensate = 1.0 if config.matching.motion_compensation else 0.0
     belief = Belief.from_velocity(compensate * begin.plane_velocity(observations.pixels))
@@ -83,9 +83,10 @@ def align(
         wider = widening ** (1 - number / max(rounds - 1, 1))
         velocity = compensate * begin.contour_velocity(contours)
         matches, belief = _match(observations, contours, index, belief, velocity, gate_px, wider, config)
-        problem = _problem(prediction, information, matches, contours, gate_px * wider, config)
+        rows = both_coordinates(matches) if config.matching.residual == "point" else matches
+        problem = _problem(prediction, information, rows, contours, gate_px * wider)
         if config.solver.prior:
-            problem = replace(problem, window=_window_terms(observations, contours, matches, offset, config))
+            problem = replace(problem, window=_window_terms(observations, contours, rows, offset, config))
         solution = solve_pose(problem, T_cam_obj, config.solver, offset)
         T_cam_obj, offset = solution.T_cam_obj, solution.from_prior
         contours = reproject(contours, T_cam_obj, objects.intrinsics)
@@ -128,17 +129,16 @@ def _window_terms(
     observations: Observations, contours: Contours, matches: Matches, offset: Float[Tensor, "b 13"], config: TrackerConfig
 ) -> WindowTerms:
     """What observations tell beside the pose: of the velocity by their ages, and of how far limbs stand out."""
-    age_s = observations.age_s if config.solver.velocity_in_window else torch.zeros_like(observations.age_s)
-    limb = (contours.kind == int(ContourKind.LIMB)).to(age_s.dtype)
+    # Two rows for each observation where both of its coordinates count.
+    age_s = observations.age_s.repeat(1, matches.mask.shape[1] // observations.mask.shape[1])
+    if not config.solver.velocity_in_window:
+        age_s = torch.zeros_like(age_s)
+    limb = ((contours.kind == int(ContourKind.LIMB)) & (config.matching.residual == "normal")).to(age_s.dtype)
     return WindowTerms(age_s, offset[:, 6:12], take_points(limb[..., None], matches.contour)[..., 0])
 
 
-def _problem(
-    prediction: Prediction, information: Tensor, matches: Matches, contours: Contours, gate_px: Float[Tensor, "b"], config: TrackerConfig
-) -> PoseProblem:
+def _problem(prediction: Prediction, information: Tensor, matches: Matches, contours: Contours, gate_px: Float[Tensor, "b"]) -> PoseProblem:
     """The least squares problem of one round; objects without a match stay where they are."""
-    if config.matching.residual == "point":
-        matches = both_coordinates(matches)
     return PoseProblem(
         points_obj=take_points(contours.points_obj, matches.contour),
         targets=matches.targets,

@@ -58,5 +58,10 @@ class ObjectBatch:
         # A shallow copy shares all tensors but the list of members.
         model = copy.copy(has_it)
         model._buffers = {**has_it._buffers, "members": streams}
-        rows = (value[number : number + 1].expand(count, *value.shape[1:]) for value in (self.intrinsics, self.centre_obj, self.diameter_m))
-        return ObjectBatch([model], *rows, streams, (count, *self.image_size), False)
+        intrinsics, centre_obj, diameter_m = (repeat_row(value, number, count) for value in (self.intrinsics, self.centre_obj, self.diameter_m))
+        return ObjectBatch([model], intrinsics, centre_obj, diameter_m, streams, (count, *self.image_size), False)
+
+
+def repeat_row(values: Tensor, number: int, count: int) -> Tensor:
+    """One row of a tensor ``count`` times, without a copy."""
+    return values[number : number + 1].expand(count, *values.shape[1:])

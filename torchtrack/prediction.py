@@ -10,7 +10,7 @@ from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.contours import Contours
 from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.lie import retract_about, transform_points
-from torchtrack.object_batch import ObjectBatch
+from torchtrack.object_batch import ObjectBatch, repeat_row
 from torchtrack.pose_solver import pose_jacobian
 
 # Contour points that the uncertainty is looked at, at most.
@@ -55,8 +55,10 @@ class Prediction:
 
     def copies(self, number: int, count: int) -> "Prediction":
         """One object's prediction many times, each in a stream of its own."""
-        rows = (value[number : number + 1].expand(count, *value.shape[1:]) for value in (self.T_cam_obj, self.usable, self.velocity, self.covariance))
-        return Prediction(self.objects.copies(number, count), *rows)
+        T_cam_obj, usable, velocity, covariance = (
+            repeat_row(value, number, count) for value in (self.T_cam_obj, self.usable, self.velocity, self.covariance)
+        )
+        return Prediction(self.objects.copies(number, count), T_cam_obj, usable, velocity, covariance)
 
     def sigma_px(self, contours: Contours) -> Float[Tensor, "b"]:
         """Standard deviation of the contours across themselves in the image (px), in the mean over them."""

@@ -22,6 +22,7 @@ from torchtrack.errors import ModelError
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.matching import Matches
+from torchtrack.motion import left_covariance
 from torchtrack.object_model import ObjectModel
 from torchtrack.pose_solver import Linearisation, PoseProblem, solve_pose
 from torchtrack.time_surface import at_pixels, update_last_event
@@ -174,6 +175,8 @@ class EventLineTracker(Tracker):
                 weights=torch.full_like(near.age_s, weight),
                 targets=targets,
                 directions=take_points(contours.normals, point),
+                offsets=((take_points(contours.pixels, point) - targets) * take_points(contours.normals, point)).sum(-1),
+                near=near.mask & belongs,
             )
             solution = solve_pose(self._problem(window, matches, contours, information, gate_px), T_cam_obj, self.config.solver)
             T_cam_obj = solution.T_cam_obj
@@ -215,20 +218,25 @@ class EventLineTracker(Tracker):
         matches: Matches,
         judged: tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]],
         velocity: Float[Tensor, "b 6"],
+        covariance: Float[Tensor, "b 6 6"],
     ) -> tuple[TrackerState, StepResult]:
-        """The next state, and what the window gave; a pose that is not taken is the predicted one."""
+        """The next state, and what the window gave; a pose that is not taken is the predicted one.
+
+        Args:
+            covariance: of each pose, turned about its centre (float64).
+        """
         status, share, taken = judged
         T_cam_obj = lie.orthonormalise(torch.where(taken[:, None, None], solution.T_cam_obj, window.T_start).double())
         contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
+        centre_cam = lie.transform_points(T_cam_obj, self.centre_obj[:, None].double())[:, 0]
         result = StepResult(
             t_us=window.t_us,
             T_cam_obj=T_cam_obj,
+            covariance=left_covariance(covariance, centre_cam),
             status=status,
             quality=share,
             contours=contours,
             corners=no_corners(contours.pixels),
             observation_count=matches.mask.sum(-1),
-            solution=solution,
-            centre_obj=self.centre_obj,
         )
         return replace(state, T_cam_obj=T_cam_obj, velocity=velocity, t_us=window.t_us, last_event_us=window.last_event_us), result

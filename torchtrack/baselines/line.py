@@ -11,7 +11,7 @@ its line: to first order the same, and it runs on the package's one solver, whic
 test of each innovation is here the gate, and a robust loss.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -32,34 +32,17 @@ _FIRST_DEVIATIONS = (0.01, 0.005, 3.0, 0.5)
 _APART_PX = 3.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class LineState(TrackerState):
-    """The tracker's state with what the filter knows of it.
-
-    Args:
-        covariance: of pose and velocity errors, each [rotation about the centre, move of the centre] in the camera's axes.
-    """
-
-    covariance: Float[Tensor, "b 12 12"]
-
-
 class LineTracker(EventLineTracker):
     """An error-state Kalman filter on pose and velocity, corrected with the distances of events from model lines."""
 
-    def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> LineState:
+    def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
         """The state before the first window; see :meth:`torchtrack.tracker.Tracker.init`."""
         state = super().init(T_cam_obj, t_us)
         deviations = torch.tensor(_FIRST_DEVIATIONS, dtype=torch.float64, device=state.T_cam_obj.device).repeat_interleave(3)
-        return LineState(**vars(state), covariance=torch.diag(deviations.square()).repeat(len(state.T_cam_obj), 1, 1))
+        return replace(state, covariance=torch.diag(deviations.square()).repeat(len(state.T_cam_obj), 1, 1))
 
     def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
-        """Advance every object by one window; see :meth:`torchtrack.tracker.Tracker.step`.
-
-        Raises:
-            TypeError: if the state is not one of this tracker's.
-        """
-        if not isinstance(state, LineState):
-            raise TypeError(f"the line tracker needs a state from its own init, got a {type(state).__name__}.")
+        """Advance every object by one window; see :meth:`torchtrack.tracker.Tracker.step`."""
         window = self._open(state, events, t_end_us, state.velocity)
         predicted = predicted_covariance(state.covariance, window.duration_s.double())
         eye = torch.eye(6, dtype=predicted.dtype, device=predicted.device).expand(len(predicted), 6, 6)
@@ -69,9 +52,9 @@ class LineTracker(EventLineTracker):
         taken = judged[2]
         correction, covariance = corrected(predicted, information, found[0])
         velocity = window.velocity + torch.where(taken[:, None], correction, 0).to(window.velocity.dtype)
-        next_state, result = self._close(state, window, *found, judged, velocity)
         kept = torch.where(taken[:, None, None], covariance, predicted)
-        return LineState(**{**vars(next_state), "covariance": kept}), result
+        next_state, result = self._close(state, window, *found, judged, velocity, kept[:, :6, :6])
+        return replace(next_state, covariance=kept), result
 
 
 def predicted_covariance(covariance: Float[Tensor, "b 12 12"], duration_s: Float[Tensor, "b"]) -> Float[Tensor, "b 12 12"]:

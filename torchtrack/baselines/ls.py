@@ -7,7 +7,11 @@ from torch import Tensor
 from torchtrack import lie
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.events import EventBatch
+from torchtrack.motion import inverse
 from torchtrack.tracker import StepResult, TrackerState
+
+# Share of a new window in the velocity.
+_VELOCITY_GAIN = 0.6
 
 
 class LeastSquaresTracker(EventLineTracker):
@@ -25,7 +29,7 @@ class LeastSquaresTracker(EventLineTracker):
         found = self._solve_rounds(window, events, nothing, weight=1.0, apart_px=0.0)
         judged = self._judge(window, *found)
         moved = lie.small_difference_about(state.T_cam_obj, found[0].T_cam_obj.double(), self.centre_obj.double()).to(state.velocity.dtype)
-        gain = self.config.motion.velocity_gain
-        mixed = gain * moved / window.duration_s.clamp(min=1e-6)[:, None] + (1 - gain) * state.velocity
+        mixed = torch.lerp(state.velocity, moved / window.duration_s.clamp(min=1e-6)[:, None], _VELOCITY_GAIN)
         # A pose that was not taken says nothing of the motion: it is not carried on for long.
-        return self._close(state, window, *found, judged, torch.where(judged[2][:, None], mixed, 0.5 * state.velocity))
+        velocity = torch.where(judged[2][:, None], mixed, 0.5 * state.velocity)
+        return self._close(state, window, *found, judged, velocity, inverse(found[0].hessian.double()))
