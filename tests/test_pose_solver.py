@@ -42,12 +42,17 @@ def problem_at(T_true, count=60, *, outliers=0, noise_px=0.0, prior=0.0, seed=0,
     return cast(problem, dtype)
 
 
+def tensors_of(problem):
+    """The tensors of a problem without further unknowns, by name."""
+    return {field.name: getattr(problem, field.name) for field in fields(problem) if field.name != "window"}
+
+
 def cast(problem, dtype):
-    return PoseProblem(**{field.name: getattr(problem, field.name).to(dtype) for field in fields(problem)})
+    return PoseProblem(**{name: value.to(dtype) for name, value in tensors_of(problem).items()})
 
 
 def rows_of(problem, rows):
-    return PoseProblem(**{field.name: getattr(problem, field.name)[rows] for field in fields(problem)})
+    return PoseProblem(**{name: value[rows] for name, value in tensors_of(problem).items()})
 
 
 def cost_of(problem, T, loss):
@@ -244,10 +249,10 @@ def test_no_input_is_changed(dtype):
     T_true = random_pose(2)
     problem = problem_at(T_true, outliers=5, dtype=dtype)
     start = perturbed(T_true).to(dtype)
-    copies = [getattr(problem, field.name).clone() for field in fields(problem)], start.clone()
+    copies, start_copy = [value.clone() for value in tensors_of(problem).values()], start.clone()
     solve_pose(problem, start, THOROUGH)
-    assert all(torch.equal(getattr(problem, field.name), copy) for field, copy in zip(fields(problem), copies[0], strict=True))
-    assert torch.equal(start, copies[1])
+    assert all(torch.equal(value, copy) for value, copy in zip(tensors_of(problem).values(), copies, strict=True))
+    assert torch.equal(start, start_copy)
 
 
 # ---- rejected steps
