@@ -16,8 +16,8 @@ from torchtrack.errors import TorchtrackError
 from torchtrack.object_model import ObjectModel
 from torchtrack.pose_solver import Linearisation
 from torchtrack.quality import Status
+from torchtrack.state import StepResult
 from torchtrack.time_surface import empty_last_event
-from torchtrack.tracker import StepResult
 from torchtrack.viz import OverlayObject, OverlayWriter, draw_overlay, overlay_objects, save_still
 
 CAMERA = Camera(200.0, 200.0, 119.5, 89.5, 240, 180)

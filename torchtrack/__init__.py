@@ -45,19 +45,19 @@ if TYPE_CHECKING:
     from torchtrack.object_model import ObjectModel as ObjectModel
     from torchtrack.quality import Status as Status
     from torchtrack.runner import track as track
-    from torchtrack.tracker import StepResult as StepResult
+    from torchtrack.state import StepResult as StepResult
+    from torchtrack.state import TrackerState as TrackerState
     from torchtrack.tracker import Tracker as Tracker
-    from torchtrack.tracker import TrackerState as TrackerState
 
 _HOME = {
     "Camera": "camera",
     "EventBatch": "events",
     "ObjectModel": "object_model",
     "Status": "quality",
-    "StepResult": "tracker",
+    "StepResult": "state",
     "Tracker": "tracker",
     "TrackerConfig": "config.tracker",
-    "TrackerState": "tracker",
+    "TrackerState": "state",
     "Trajectory": "io",
     "open_events": "io",
     "preset": "config.presets",

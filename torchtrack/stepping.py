@@ -10,7 +10,8 @@ from torchtrack.config.tracker import WindowConfig
 from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch, EventWindow, windows_by_count, windows_by_time
 from torchtrack.io import EventSource
-from torchtrack.tracker import StepResult, Tracker, TrackerState
+from torchtrack.state import StepResult, TrackerState
+from torchtrack.tracker import Tracker
 
 
 @dataclass(frozen=True)

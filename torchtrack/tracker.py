@@ -4,10 +4,10 @@ The only state is an immutable :class:`TrackerState`; ``step`` is pure: the same
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor, nn
 
 from torchtrack import lie, quality
@@ -26,6 +26,7 @@ from torchtrack.observations import WindowEvents, corner_observations, join, sel
 from torchtrack.pose_solver import Linearisation
 from torchtrack.prediction import Prediction
 from torchtrack.search import Found, judge_fit, search, wanted
+from torchtrack.state import StepResult, TrackerState
 from torchtrack.time_surface import at_pixels, empty_last_event, object_regions, time_surface, update_last_event
 
 # Contours this far outside the image still find their place on a distorted sensor (px).
@@ -34,54 +35,6 @@ _BORDER_PX = 64
 _MAX_DEPTH_M = 1e4
 # Share of a new window in the usual quality.
 _USUAL_GAIN = 0.1
-
-
-@dataclass(frozen=True)
-class TrackerState:
-    """Everything the tracker remembers between windows.
-
-    Args:
-        T_cam_obj: pose of each object at its stream's ``t_us`` (float64).
-        velocity: rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s).
-        covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.motion`.
-        share: of the moving contour, what events explained in the last window.
-        usual_share: its running mean.
-        t_us: end of the last window of each stream (µs).
-        last_event_us: time of the newest event of every sensor pixel (µs).
-    """
-
-    T_cam_obj: Float[Tensor, "b 4 4"]
-    velocity: Float[Tensor, "b 6"]
-    covariance: Float[Tensor, "b 12 12"]
-    share: Float[Tensor, "b"]
-    usual_share: Float[Tensor, "b"]
-    t_us: Int[Tensor, "s"]
-    last_event_us: Int[Tensor, "s h w"]
-
-
-@dataclass(frozen=True)
-class StepResult:
-    """What one window gave.
-
-    Args:
-        t_us: end of the window of each stream (µs).
-        T_cam_obj: pose of each object at that time (float64).
-        covariance: of the left perturbation ``[φ, ρ]`` of each pose (rad, m), with all that earlier windows told.
-        status: :class:`torchtrack.quality.Status` of each object.
-        quality: share of the moving contour that events explain.
-        contours: visible contours at the pose.
-        corners: corners and their flow.
-        observation_count: matched observations of each object.
-    """
-
-    t_us: Int[Tensor, "s"]
-    T_cam_obj: Float[Tensor, "b 4 4"]
-    covariance: Float[Tensor, "b 6 6"]
-    status: Int[Tensor, "b"]
-    quality: Float[Tensor, "b"]
-    contours: Contours
-    corners: Corners
-    observation_count: Int[Tensor, "b"]
 
 
 class Tracker(nn.Module):

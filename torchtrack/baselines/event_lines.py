@@ -25,8 +25,9 @@ from torchtrack.matching import Matches
 from torchtrack.motion import left_covariance
 from torchtrack.object_model import ObjectModel
 from torchtrack.pose_solver import Linearisation, PoseProblem, solve_pose
+from torchtrack.state import StepResult, TrackerState
 from torchtrack.time_surface import at_pixels, update_last_event
-from torchtrack.tracker import StepResult, Tracker, TrackerState
+from torchtrack.tracker import Tracker
 
 # Contour points lie so far apart at most that an event on a line is within this of one of its points (px).
 _POINT_SPACING_PX = 6.0

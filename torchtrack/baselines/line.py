@@ -20,7 +20,7 @@ from torch import Tensor
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.events import EventBatch
 from torchtrack.pose_solver import Linearisation, solve_positive
-from torchtrack.tracker import StepResult, TrackerState
+from torchtrack.state import StepResult, TrackerState
 
 # Deviation of the distance between an event and its line (px): much is common to the events of a line, so it is not small.
 _EVENT_PX = 4.0

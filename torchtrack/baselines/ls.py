@@ -8,7 +8,7 @@ from torchtrack import lie
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.events import EventBatch
 from torchtrack.motion import inverse
-from torchtrack.tracker import StepResult, TrackerState
+from torchtrack.state import StepResult, TrackerState
 
 # Share of a new window in the velocity.
 _VELOCITY_GAIN = 0.6

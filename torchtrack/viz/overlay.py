@@ -20,7 +20,7 @@ from torchtrack.camera import MIN_DEPTH_M, Camera, distort, project
 from torchtrack.lie import transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.quality import Status
-from torchtrack.tracker import StepResult
+from torchtrack.state import StepResult
 
 # Sensors are enlarged by a whole number until they are at least this wide.
 _LEAST_WIDTH_PX = 900

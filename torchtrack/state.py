@@ -1,0 +1,57 @@
+"""What the tracker remembers between windows, and what one window gives: both immutable."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchtrack.contours import Contours
+from torchtrack.corners import Corners
+
+
+@dataclass(frozen=True)
+class TrackerState:
+    """Everything the tracker remembers between windows.
+
+    Args:
+        T_cam_obj: pose of each object at its stream's ``t_us`` (float64).
+        velocity: rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s).
+        covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.motion`.
+        share: of the moving contour, what events explained in the last window.
+        usual_share: its running mean.
+        t_us: end of the last window of each stream (µs).
+        last_event_us: time of the newest event of every sensor pixel (µs).
+    """
+
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    velocity: Float[Tensor, "b 6"]
+    covariance: Float[Tensor, "b 12 12"]
+    share: Float[Tensor, "b"]
+    usual_share: Float[Tensor, "b"]
+    t_us: Int[Tensor, "s"]
+    last_event_us: Int[Tensor, "s h w"]
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one window gave.
+
+    Args:
+        t_us: end of the window of each stream (µs).
+        T_cam_obj: pose of each object at that time (float64).
+        covariance: of the left perturbation ``[φ, ρ]`` of each pose (rad, m), with all that earlier windows told.
+        status: :class:`torchtrack.quality.Status` of each object.
+        quality: share of the moving contour that events explain.
+        contours: visible contours at the pose.
+        corners: corners and their flow.
+        observation_count: matched observations of each object.
+    """
+
+    t_us: Int[Tensor, "s"]
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    covariance: Float[Tensor, "b 6 6"]
+    status: Int[Tensor, "b"]
+    quality: Float[Tensor, "b"]
+    contours: Contours
+    corners: Corners
+    observation_count: Int[Tensor, "b"]
