@@ -15,6 +15,7 @@ from torchtrack.eval.metrics import PoseErrors, pose_errors, summarise
 from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table
 from torchtrack.io import Trajectory
+from torchtrack.io.convert import convert
 from torchtrack.lie import se3_interpolate, so3_exp
 from torchtrack.sinks.summary import finite
 
@@ -172,3 +173,9 @@ def test_finding_sequences(folder, tmp_path):
         find_sequences([tmp_path / "nowhere"])
     with pytest.raises(MissingFileError, match="holds no sequence"):
         find_sequences([tmp_path])
+
+
+def test_sequences_in_hdf5_are_found_in_a_folder_and_other_hdf5_is_not(folder, tmp_path):
+    convert(folder / "one.npz", tmp_path / "one.h5")
+    convert(folder / "one.npz", tmp_path / "events_alone.h5", "dsec")
+    assert [path.name for path in find_sequences([tmp_path])] == ["one.h5"]

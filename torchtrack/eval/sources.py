@@ -7,26 +7,31 @@ from torchtrack.config.evaluate import CellConfig
 from torchtrack.config.load import load
 from torchtrack.errors import ConfigError, MissingFileError
 from torchtrack.eval.results import Failure
+from torchtrack.io.sequence import is_sequence
 from torchtrack.sim import SceneConfig
 from torchtrack.sim.suite import Told, run_suite
 
 
 def find_sequences(paths: Sequence[Path]) -> list[Path]:
-    """The ``.npz`` files that are named, or lie in the folders that are named, each once.
+    """The sequences (``.npz``, or ``.h5`` of ours) that are named, or lie in the folders that are named, each once.
+
+    What else lies in a folder is passed over: recordings of events alone, and other HDF5 files.
 
     Raises:
         ConfigError: if none is named.
         MissingFileError: if a path is not there, or a folder holds none.
     """
     if not paths:
-        raise ConfigError("paths: nothing to evaluate. Name sequences (.npz), or folders of them.")
+        raise ConfigError("paths: nothing to evaluate. Name sequences (.npz or .h5), or folders of them.")
     found: dict[Path, None] = {}
     for path in paths:
         if not path.exists():
             raise MissingFileError(f"no sequence or folder at {path}. Check the path.")
-        inside = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+        inside = [path]
+        if path.is_dir():
+            inside = [file for file in sorted(path.iterdir()) if file.suffix == ".npz" or (file.suffix == ".h5" and is_sequence(file))]
         if not inside:
-            raise MissingFileError(f"the folder {path} holds no sequence (.npz). Check the path.")
+            raise MissingFileError(f"the folder {path} holds no sequence (.npz or .h5). Check the path.")
         found.update(dict.fromkeys(inside))
     return list(found)
 
