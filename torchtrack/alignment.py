@@ -130,7 +130,7 @@ def _window_terms(
 ) -> WindowTerms:
     """What observations tell beside the pose: of the velocity by their ages, and of how far limbs stand out."""
     # Two rows for each observation where both of its coordinates count.
-    age_s = observations.age_s.repeat(1, matches.mask.shape[1] // observations.mask.shape[1])
+    age_s = observations.age_s.repeat(1, 2 if config.matching.residual == "point" else 1)
     if not config.solver.velocity_in_window:
         age_s = torch.zeros_like(age_s)
     limb = ((contours.kind == int(ContourKind.LIMB)) & (config.matching.residual == "normal")).to(age_s.dtype)

@@ -81,3 +81,9 @@ def fade(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], failed: Bool[
     if config.without_events == "hold":
         return torch.where(failed[:, None], 0.0, velocity)
     return torch.where(failed[:, None], velocity * torch.exp(-dt_s / config.coast_s)[:, None], velocity)
+
+
+def with_dropped(covariance: Float[Tensor, "b 12 12"], dropped: Float[Tensor, "b 6"]) -> Float[Tensor, "b 12 12"]:
+    """Covariance where part of the velocity was set aside: it is uncertain by that much."""
+    dropped = torch.nn.functional.pad(dropped.to(covariance.dtype), (6, 0))
+    return covariance + dropped[:, :, None] * dropped[:, None]

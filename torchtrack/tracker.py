@@ -19,7 +19,7 @@ from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.flow import estimate_flow
-from torchtrack.motion import fade, initial_covariance, inverse, left_covariance, predict_covariance
+from torchtrack.motion import fade, initial_covariance, inverse, left_covariance, predict_covariance, with_dropped
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import WindowEvents, corner_observations, join, select_events
@@ -243,7 +243,10 @@ class Tracker(nn.Module):
         trusted = torch.where(failed | ~torch.isfinite(posterior).flatten(1).all(-1), 0, quality.trust(share, config.quality))
         velocity = prediction.velocity + trusted[:, None] * solution.from_prior[:, 6:12]
         covariance = torch.where(trusted[:, None, None] > 0, torch.lerp(predicted, posterior, trusted[:, None, None].double()), predicted)
-        return fade(velocity, window_s[self.stream_index], failed, config.motion), covariance
+        faded = fade(velocity, window_s[self.stream_index], failed, config.motion)
+        if config.motion.without_events == "hold":
+            covariance = with_dropped(covariance, velocity - faded)
+        return faded, covariance
 
 
 def _check_setup(objects: Sequence[ObjectModel], cameras: list[Camera], streams: list[int], config: TrackerConfig) -> None:

@@ -1,0 +1,207 @@
+"""What the solver finds beside the pose: a velocity from the ages of observations, and how far limbs stand out."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import SMALL_CAMERA, generator, pose_errors, random_pose
+
+from torchtrack.camera import project
+from torchtrack.config.tracker import SolverConfig
+from torchtrack.lie import retract_about, transform_points
+from torchtrack.pose_solver import PoseProblem, WindowTerms, linearise, solve_pose
+
+THOROUGH = SolverConfig(iterations=20)
+WINDOW_S = 0.01
+# How far the true velocity is from the predicted one (rad/s, m/s).
+FASTER = torch.tensor([0.6, -0.4, 0.8, 0.1, -0.08, 0.06], dtype=torch.float64)
+
+
+def windowed(T_true, *, count=300, faster=FASTER, swelling_px=0.0, noise_px=0.0, prior=1e-6, age_s=None, seed=0, dtype=torch.float64):
+    """A body that moves by ``faster`` more than predicted, seen at random times of a window; every other point is a limb's."""
+    rng = generator(seed)
+    batch = len(T_true)
+    points = 0.05 * torch.randn((batch, count, 3), generator=rng, dtype=torch.float64)
+    angle = 6.28 * torch.rand((batch, count), generator=rng, dtype=torch.float64)
+    ages = WINDOW_S * torch.rand((batch, count), generator=rng, dtype=torch.float64) if age_s is None else torch.full((batch, count), age_s).double()
+    directions = torch.stack([angle.cos(), angle.sin()], -1)
+    intrinsics = SMALL_CAMERA.intrinsics(torch.float64).expand(batch, 4)
+    centre = torch.tensor([0.01, -0.02, 0.005], dtype=torch.float64).expand(batch, 3)
+    outward = (torch.arange(count) % 2).double().expand(batch, count)
+    # Where each point was at its own time, by the part of the motion that the prediction left out.
+    T_then = retract_about(T_true[:, None].expand(batch, count, 4, 4), -ages[..., None] * faster, centre[:, None].expand(batch, count, 3))
+    then = transform_points(T_then.flatten(0, 1), points.flatten(0, 1)[:, None])
+    targets = project(then, intrinsics.repeat_interleave(count, 0))[:, 0].unflatten(0, (batch, count))
+    targets = targets + swelling_px * outward[..., None] * directions + noise_px * torch.randn(targets.shape, generator=rng, dtype=torch.float64)
+    problem = PoseProblem(
+        points_obj=points.to(dtype),
+        targets=targets.to(dtype),
+        directions=directions.to(dtype),
+        weights=torch.ones(batch, count, dtype=dtype),
+        intrinsics=intrinsics.to(dtype),
+        centre_obj=centre.to(dtype),
+        scale_px=torch.full((batch,), 10.0, dtype=dtype),
+        T_prior=T_true.to(dtype),
+        prior_information=prior * torch.eye(13, dtype=dtype).expand(batch, 13, 13),
+    )
+    return replace(problem, window=WindowTerms(ages.to(dtype), torch.zeros(batch, 6, dtype=dtype), outward.to(dtype)))
+
+
+def without_window(problem):
+    return replace(problem, window=None, prior_information=problem.prior_information[:, :6, :6])
+
+
+# ---- what is found
+
+
+def test_a_velocity_that_was_predicted_wrong_is_found_with_the_pose(dtype):
+    T_true = random_pose(4, seed=1)
+    problem = windowed(T_true, dtype=dtype)
+    found = solve_pose(problem, T_true.to(dtype), THOROUGH)
+    degrees, millimetres = pose_errors(found.T_cam_obj.double(), T_true)
+    error = (found.from_prior[:, 6:12].double() - FASTER).abs()
+    # What is left is the motion's curvature within the window.
+    assert float(degrees.max()) < 0.005
+    assert float(millimetres.max()) < 0.01
+    assert float(error[:, :3].max()) < 0.05
+    assert float(error[:, 3:].max()) < 0.01
+
+
+def test_without_the_ages_the_same_motion_biases_the_pose():
+    T_true = random_pose(4, seed=1)
+    problem = windowed(T_true)
+    biased = pose_errors(solve_pose(without_window(problem), T_true, THOROUGH).T_cam_obj, T_true)
+    # Half the window's excess of motion.
+    half_mm, half_deg = 1e3 * 0.5 * WINDOW_S * float(FASTER[3:].norm()), 0.5 * WINDOW_S * float(torch.rad2deg(FASTER[:3].norm()))
+    assert float(biased[0].mean()) == pytest.approx(half_deg, rel=0.2)
+    assert float(biased[1].mean()) > 0.5 * half_mm
+    found = pose_errors(solve_pose(problem, T_true, THOROUGH).T_cam_obj, T_true)
+    assert float(found[0].max()) < 0.05 * float(biased[0].min())
+
+
+def test_noise_leaves_pose_and_velocity_unbiased():
+    """The mean over many windows is far nearer to the truth than one is."""
+    T_true = random_pose(1, seed=2).expand(200, 4, 4)
+    found = solve_pose(windowed(T_true, noise_px=0.5), T_true, SolverConfig(iterations=4))
+    velocity = found.from_prior[:, 6:12] - FASTER
+    centre = found.from_prior[:, :6]
+    for error in (velocity, centre):
+        assert (error.mean(0).abs() < 4 * error.std(0) / 200**0.5 + 2e-3 * error.std(0)).all()
+
+
+@pytest.mark.parametrize("swelling_px", [-0.7, 0.4])
+def test_the_swelling_of_limbs_is_found(swelling_px, dtype):
+    T_true = random_pose(3, seed=3)
+    problem = windowed(T_true, faster=torch.zeros(6, dtype=torch.float64), swelling_px=swelling_px, dtype=dtype)
+    found = solve_pose(problem, T_true.to(dtype), THOROUGH)
+    torch.testing.assert_close(found.from_prior[:, 12], torch.full((3,), swelling_px, dtype=dtype), rtol=0, atol=2e-3)
+    degrees, millimetres = pose_errors(found.T_cam_obj.double(), T_true)
+    assert float(degrees.max()) < 0.01
+    assert float(millimetres.max()) < 0.01
+
+
+def test_observations_of_one_time_say_nothing_of_the_velocity():
+    """With age zero the predicted velocity stays, and its prior is all that is known of it."""
+    T_true = random_pose(2, seed=4)
+    found = solve_pose(windowed(T_true, age_s=0.0, noise_px=0.3, prior=1.0), T_true, THOROUGH)
+    assert float(found.from_prior[:, 6:12].abs().max()) < 1e-9
+    torch.testing.assert_close(found.hessian[:, 6:12, 6:12], torch.eye(6, dtype=torch.float64).expand(2, 6, 6), rtol=0, atol=1e-9)
+
+
+def test_a_prior_weighs_velocities_against_the_ages():
+    """The stronger the prior, the less of the velocity is taken; a prior that couples pose and velocity is kept to."""
+    T_true = random_pose(3, seed=5)
+    taken = []
+    for prior in (1e-3, 1e2, 1e7):
+        problem = windowed(T_true, noise_px=0.2)
+        information = problem.prior_information.clone()
+        information[:, 6:12, 6:12] = prior * torch.eye(6, dtype=torch.float64)
+        found = solve_pose(replace(problem, prior_information=information), T_true, THOROUGH)
+        taken.append(float(found.from_prior[:, 6:9].norm(dim=-1).mean() / FASTER[:3].norm()))
+    assert taken[0] == pytest.approx(1, abs=0.2)
+    assert taken[0] > taken[1] > taken[2]
+    assert taken[2] < 0.01
+
+
+# ---- against the problem of the pose alone, and against finite differences
+
+
+@pytest.mark.parametrize("loss", ["tukey", "huber", "none"])
+def test_six_and_thirteen_unknowns_agree_where_the_further_ones_are_held(loss, dtype):
+    T_true = random_pose(4, seed=6)
+    problem = windowed(T_true, noise_px=0.8, age_s=0.0, prior=10.0, dtype=dtype)
+    problem = replace(problem, window=replace(problem.window, outward=torch.zeros_like(problem.window.outward)))
+    config = SolverConfig(iterations=5, loss=loss)
+    start = retract_about(T_true, torch.full((4, 6), 2e-3, dtype=torch.float64), problem.centre_obj.double()).to(dtype)
+    six, thirteen = solve_pose(without_window(problem), start, config), solve_pose(problem, start, config)
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-9
+    torch.testing.assert_close(thirteen.T_cam_obj, six.T_cam_obj, rtol=0, atol=tolerance)
+    torch.testing.assert_close(thirteen.from_prior[:, :6], six.from_prior, rtol=0, atol=tolerance)
+    torch.testing.assert_close(thirteen.cost, six.cost, rtol=1e-4 if dtype == torch.float32 else 1e-10, atol=tolerance)
+    assert (thirteen.from_prior[:, 6:] == 0).all()
+
+
+def cost_with(problem, T_cam_obj, further):
+    """Cost at a pose, with an offset of velocity and swelling ``[b, 7]``, by the solver itself."""
+    shift = replace(problem.window, velocity=problem.window.velocity - further[:, :6])
+    targets = problem.targets - (further[:, 6:] * problem.window.outward)[..., None] * problem.directions
+    moved = replace(problem, targets=targets, window=shift, prior_information=torch.zeros_like(problem.prior_information))
+    return linearise(moved, T_cam_obj, "tukey").cost
+
+
+def test_the_gradient_by_all_unknowns_is_that_of_the_cost():
+    T = random_pose(2, seed=7)
+    problem = windowed(T, noise_px=0.8, swelling_px=0.3, prior=0.0)
+    at = linearise(problem, T, "tukey")
+    for axis in range(13):
+        step = 1e-6 if axis < 6 else 1e-4
+        costs = []
+        for sign in (1, -1):
+            offset = torch.zeros(2, 13, dtype=torch.float64)
+            offset[:, axis] = sign * step
+            costs.append(cost_with(problem, retract_about(T, offset[:, :6], problem.centre_obj), offset[:, 6:]))
+        numeric = (costs[0] - costs[1]) / (2 * step)
+        torch.testing.assert_close(at.gradient[:, axis], numeric, rtol=1e-4, atol=1e-4 * float(at.gradient.abs().max()))
+    assert (at.gradient.abs().amax(0) > 1e-3).all()
+
+
+def test_the_hessian_by_all_unknowns_is_that_of_residuals_near_zero():
+    """Without residuals the Gauss-Newton Hessian is exact: gradients of neighbouring points differ by it."""
+    T = random_pose(1, seed=8)
+    problem = windowed(T, faster=torch.zeros(6, dtype=torch.float64), count=40, prior=3.0)
+    hessian = linearise(problem, T, "none").hessian[0]
+    torch.testing.assert_close(hessian, hessian.T)
+    for axis in range(13):
+        offset = torch.zeros(1, 13, dtype=torch.float64)
+        offset[0, axis] = 1e-7 if axis < 6 else 1e-4
+        start = retract_about(T, offset[:, :6], problem.centre_obj)
+        at = solve_pose(problem, start, SolverConfig(iterations=1, loss="none", damping=0), offset)
+        torch.testing.assert_close(at.gradient[0] / offset[0, axis], hessian[axis], rtol=1e-3, atol=1e-3 * float(hessian[axis].abs().max()))
+
+
+# ---- what must not happen
+
+
+def test_a_batch_is_its_elements(dtype):
+    T_true = random_pose(3, seed=9)
+    problem = windowed(T_true, noise_px=0.5, swelling_px=0.2, prior=0.1, dtype=dtype)
+    together = solve_pose(problem, T_true.to(dtype), THOROUGH)
+    for row in range(3):
+        part = slice(row, row + 1)
+        window = WindowTerms(*(value[part] for value in vars(problem.window).values()))
+        own = PoseProblem(**{name: value[part] for name, value in vars(problem).items() if name != "window"}, window=window)
+        alone = solve_pose(own, T_true[part].to(dtype), THOROUGH)
+        torch.testing.assert_close(together.T_cam_obj[part], alone.T_cam_obj, rtol=0, atol=5e-5 if dtype == torch.float32 else 1e-10)
+
+
+@pytest.mark.parametrize("where", ["age_s", "velocity", "outward"])
+def test_a_bad_element_harms_no_neighbour(where, dtype):
+    T_true = random_pose(3, seed=10)
+    problem = windowed(T_true, noise_px=0.3, prior=1.0, dtype=dtype)
+    expected = solve_pose(problem, T_true.to(dtype), THOROUGH)
+    broken = getattr(problem.window, where).clone()
+    broken[1, 0] = torch.nan
+    at = solve_pose(replace(problem, window=replace(problem.window, **{where: broken})), T_true.to(dtype), THOROUGH)
+    torch.testing.assert_close(at.T_cam_obj[[0, 2]], expected.T_cam_obj[[0, 2]], rtol=1e-5, atol=1e-5)
+    assert torch.equal(at.T_cam_obj[1], T_true[1].to(dtype))
+    assert (at.from_prior[1] == 0).all()
