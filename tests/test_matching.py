@@ -11,13 +11,13 @@ from torchtrack.contour_index import index_contours
 from torchtrack.contours import ContourKind, Contours, group_by_model, mesh_contours, reproject
 from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.lie import retract_about
-from torchtrack.matching import Belief, both_coordinates, concentration, match_along_flow, match_nearest, towards_dark
+from torchtrack.matching import Belief, both_coordinates, concentration, match_along_flow, match_nearest
 from torchtrack.observations import Observations
 
 
 def matching(**settings):
     """Settings without what corrects and weights the matches, unless it is asked for."""
-    return MatchingConfig(**{"dark_shift_px": 0.0, "concentration": False, **settings})
+    return MatchingConfig(**{"dark_shift_px": 0.0, "concentration": False, "polarity": False, **settings})
 
 
 def nearest(observations, contours, *, velocity=(0.0, 0.0), believed=None, gate_px=3.0, index=None, cell_px=1, **settings):
@@ -185,11 +185,23 @@ def test_the_dark_side_does_not_depend_on_the_sign_of_the_normal(dtype):
     normals = torch.nn.functional.normalize(torch.randn((2, 50, 2), generator=generator(), dtype=dtype), dim=-1)
     velocity = 300 * torch.randn((2, 50, 2), generator=generator(1), dtype=dtype)
     polarity = torch.randn((2, 50), generator=generator(2), dtype=dtype).sign()
-    dark = towards_dark(polarity, normals, velocity)
-    torch.testing.assert_close(towards_dark(polarity, -normals, velocity), dark)
-    assert (dark.norm(dim=-1) <= 1).all()
-    ahead = (dark * velocity).sum(-1) * polarity
-    assert (ahead >= 0).all()
+    pixels = 40 + 60 * torch.rand((2, 50, 2), generator=generator(3), dtype=dtype)
+    shifted = []
+    for sign in (1, -1):
+        contours = contours_at(pixels, sign * normals, dtype=dtype)
+        belief, index = Belief.from_velocity(velocity), index_contours(contours, IMAGE_SIZE, 8, 1)
+        moved, still = (
+            match_nearest(seen(pixels, polarity=polarity, dtype=dtype), contours, index, belief, velocity, 5.0, matching(dark_shift_px=shift))[0]
+            for shift in (1.0, 0.0)
+        )
+        shifted.append(moved.targets - still.targets)
+        assert torch.equal(moved.contour, still.contour)
+    torch.testing.assert_close(*shifted)
+    assert (shifted[0].norm(dim=-1) <= 1).all()
+    # The dark side, from which events are moved back, is ahead where it got brighter.
+    ahead = -(shifted[0] * velocity.gather(1, moved.contour[..., None].expand_as(velocity))).sum(-1) * polarity
+    assert (ahead >= -1e-3).all()
+    assert float(shifted[0].norm(dim=-1).median()) > 0.9
 
 
 def test_matches_of_an_object_do_not_depend_on_the_others(dtype):

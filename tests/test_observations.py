@@ -5,7 +5,7 @@ import torch
 from helpers import IMAGE_SIZE, contours_at, generator, seen, upright_line
 
 from torchtrack.contour_index import index_contours
-from torchtrack.observations import join, select_events
+from torchtrack.observations import WindowEvents, join, select_events
 
 # Events of a window, and those near a contour among them.
 EVENTS, NEAR = 6000, 4000
@@ -13,12 +13,12 @@ EVENTS, NEAR = 6000, 4000
 
 def numbered(near, count):
     """Numbers of the events taken of ``near [b, e]``: one set per object."""
-    events = near.shape[1]
-    number = torch.arange(events, dtype=torch.float64).expand(len(near), events)
+    number = torch.arange(near.shape[1], dtype=torch.float64).expand(near.shape)
     pixels = torch.stack([torch.where(near, 80.0, 10.0), torch.full_like(number, 60.0)], -1)
     lines = contours_at(upright_line(80.0).pixels.expand(len(near), -1, -1))
     index = index_contours(lines, IMAGE_SIZE, 5, 1)
-    chosen = select_events(pixels, number, torch.ones_like(number), torch.ones_like(near), index, torch.zeros_like(pixels), count)
+    events = WindowEvents(pixels, number, torch.ones_like(number), torch.ones_like(near))
+    chosen = select_events(events, index, torch.zeros_like(pixels), count)
     assert chosen.pixels.shape == (len(near), count, 2)
     return [row[mask].long().tolist() for row, mask in zip(chosen.age_s, chosen.mask, strict=True)]
 
@@ -36,7 +36,8 @@ def choose(pixels, contours, *, age_s=0.0, velocity=(0.0, 0.0), count=100, mask=
     observations = seen(pixels, age_s=age_s, mask=mask, polarity=1.0)
     speed = torch.tensor(velocity, dtype=torch.float64).expand_as(observations.pixels)
     index = index_contours(contours, IMAGE_SIZE, 5, 1)
-    return select_events(observations.pixels, observations.age_s, observations.polarity, observations.mask, index, speed, count)
+    events = WindowEvents(observations.pixels, observations.age_s, observations.polarity, observations.mask)
+    return select_events(events, index, speed, count)
 
 
 def test_events_near_a_contour_are_taken_and_others_left():
@@ -122,7 +123,8 @@ def test_values_go_with_their_events(dtype):
     place = torch.stack([torch.full((400,), 80.0, dtype=dtype), torch.linspace(20, 119, 400, dtype=dtype)], -1)[None]
     age_s, polarity = torch.linspace(0, 5e-3, 400, dtype=dtype)[None], torch.where(torch.arange(400) % 2 == 0, 1, -1).to(dtype)[None]
     index = index_contours(upright_line(80.0, dtype), IMAGE_SIZE, 5, 1)
-    chosen = select_events(place, age_s, polarity, torch.ones(1, 400, dtype=torch.bool), index, torch.zeros_like(place), 50)
+    events = WindowEvents(place, age_s, polarity, torch.ones(1, 400, dtype=torch.bool))
+    chosen = select_events(events, index, torch.zeros_like(place), 50)
     number = ((chosen.pixels[0, :, 1] - 20) / 99 * 399).round().long()[chosen.mask[0]]
     assert len(number) > 40
     for found, given in ((chosen.pixels, place), (chosen.age_s, age_s), (chosen.polarity, polarity)):
@@ -141,3 +143,18 @@ def test_joined_observations_are_those_of_both():
     assert both.polarity.tolist() == [[0, -1, -1]]
     assert both.mask.tolist() == [[True, True, False]]
     assert both.has_flow.tolist() == [[True, False, False]]
+
+
+# ---- the events of one object
+
+
+def test_the_events_of_one_object_can_be_repeated():
+    values = [torch.rand((3, 5, *shape), generator=generator(k)) for k, shape in enumerate([(2,), (), ()])]
+    events = WindowEvents(*values, torch.rand((3, 5), generator=generator(4)) < 0.5)
+    repeated = events.of(1).repeated(4)
+    for name, value in vars(events).items():
+        many = getattr(repeated, name)
+        assert many.shape == (4, *value.shape[1:])
+        assert all(torch.equal(row, value[1]) for row in many)
+        # Nothing is copied.
+        assert many.data_ptr() == value[1].data_ptr()

@@ -14,7 +14,6 @@ from torchtrack.contours import Contours
 from torchtrack.corners import Corners
 from torchtrack.errors import TorchtrackError
 from torchtrack.object_model import ObjectModel
-from torchtrack.pose_solver import Linearisation
 from torchtrack.quality import Status
 from torchtrack.state import StepResult
 from torchtrack.time_surface import empty_last_event
@@ -118,9 +117,9 @@ def box_result(T_cam_obj: torch.Tensor) -> StepResult:
     contours = Contours(points, torch.zeros(count, 2, 3), torch.zeros(count, 2, dtype=torch.int64), mask, points, pixels, pixels)
     corners = Corners(pixels.long(), pixels, torch.zeros(count, 2), mask, torch.full((count, 2, 2), 7.0), torch.zeros(count, 2, dtype=torch.bool))
     status = torch.tensor([int(Status.TRACKING), int(Status.OUT_OF_VIEW)])[:count]
-    solution = Linearisation(T_cam_obj.float(), torch.zeros(count), torch.zeros(count, 6), torch.eye(6).expand(count, 6, 6), torch.zeros(count, 6))
     share = torch.full((count,), 0.75)
-    return StepResult(torch.tensor([1000]), T_cam_obj, status, share, contours, corners, status, solution, torch.zeros(count, 3))
+    covariance = torch.eye(6, dtype=torch.float64).expand(count, 6, 6)
+    return StepResult(torch.tensor([1000]), T_cam_obj, covariance, status, share, contours, corners, status)
 
 
 def poses(*depths: float) -> torch.Tensor:
