@@ -131,7 +131,10 @@ def test_results_have_their_shapes_and_types(dtype):
     assert state.T_cam_obj.dtype == result.T_cam_obj.dtype == torch.float64
     assert result.T_cam_obj.shape == (1, 4, 4)
     assert result.covariance.shape == (1, 6, 6)
-    assert result.covariance.dtype == result.contours.pixels.dtype == result.corners.pixels.dtype == result.quality.dtype == dtype
+    assert result.contours.pixels.dtype == result.corners.pixels.dtype == result.quality.dtype == dtype
+    assert state.covariance.dtype == result.covariance.dtype == torch.float64
+    assert state.velocity.dtype == state.share.dtype == state.usual_share.dtype == dtype
+    assert state.covariance.shape == (1, 12, 12)
     assert Status(int(result.status)) == Status.TRACKING
     assert 0.5 < float(result.quality) <= 1
     assert result.t_us.tolist() == state.t_us.tolist() == [5 * WINDOW_US]
@@ -139,7 +142,8 @@ def test_results_have_their_shapes_and_types(dtype):
     assert int(result.observation_count) > 30
     assert result.corners.mask.any()
     assert result.corners.has_flow.any()
-    assert (torch.linalg.eigvalsh(result.covariance[0].double()) > 0).all()
+    assert (torch.linalg.eigvalsh(result.covariance[0]) > 0).all()
+    assert (torch.linalg.eigvalsh(state.covariance[0]) > 0).all()
     assert float(result.covariance[0].diagonal()[:3].sqrt().max()) < 0.01
 
 
@@ -204,7 +208,11 @@ def test_without_events_the_pose_is_held_and_the_status_says_so(dtype):
     assert (after.velocity == 0).all()
     assert after.t_us.tolist() == [35_000]
     assert int(result.observation_count) == 0
-    assert torch.isinf(result.covariance[0].diagonal()).all()
+    # It is not known any more where it goes: less certain in every direction, and of its velocity by what was set aside.
+    assert (torch.linalg.eigvalsh(after.covariance[0, :6, :6] - state.covariance[0, :6, :6]) > 0).all()
+    assert torch.isfinite(result.covariance).all()
+    speed_sigma = after.covariance[0].diagonal()[6:].sqrt()
+    assert (speed_sigma >= state.velocity[0].abs()).all()
 
 
 def test_without_events_the_motion_goes_on_where_asked_for_and_dies_away(dtype):
@@ -220,6 +228,9 @@ def test_without_events_the_motion_goes_on_where_asked_for_and_dies_away(dtype):
     assert 0 < float(after.velocity.norm()) <= float(state.velocity.norm())
     for step in range(60):
         after, result = tracker.step(after, EventBatch.empty(), 35_000 + step * WINDOW_US)
+    died_away = torch.exp(torch.tensor(-61 * 5e-3 / PREDICT.motion.coast_s))
+    torch.testing.assert_close(after.velocity, state.velocity * died_away, rtol=1e-4, atol=1e-6)
+    after, result = tracker.step(after, EventBatch.empty(), 2_000_000)
     assert float(after.velocity.norm()) < 1e-3
     rotation = result.T_cam_obj[0, :3, :3]
     assert float((rotation @ rotation.T - torch.eye(3).double()).abs().max()) < 1e-6
