@@ -157,11 +157,11 @@ class Tracker(nn.Module):
 
     def _predict(self, state: TrackerState, window_s: Tensor) -> Prediction:
         """Predicted pose and motion, and how certain they are."""
-        velocity, dt_s = state.velocity, window_s[self.stream_index]
+        velocity, covariance, dt_s = state.velocity, state.covariance, window_s[self.stream_index]
         if self.config.motion.model == "hold":
-            velocity = torch.zeros_like(velocity)
+            velocity, covariance = torch.zeros_like(velocity), with_dropped(covariance, velocity)
         T_prior = lie.retract_about(state.T_cam_obj.to(velocity.dtype), velocity * dt_s[:, None], self.centre_obj)
-        covariance = predict_covariance(state.covariance, velocity, dt_s, self.diameter_m, self.config.motion)
+        covariance = predict_covariance(covariance, velocity, dt_s, self.diameter_m, self.config.motion)
         T_prior, usable = self._before_camera(T_prior)
         return Prediction(self.objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance)
 
