@@ -4,8 +4,10 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from importlib import import_module
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import tyro
@@ -14,19 +16,24 @@ import yaml
 from torchtrack import cli
 from torchtrack.config.demo import DemoConfig
 from torchtrack.config.evaluate import EvaluateConfig
+from torchtrack.config.events import is_live
 from torchtrack.config.explain import dotted_keys
+from torchtrack.config.formats import OutputFormat
 from torchtrack.config.load import load
-from torchtrack.config.presets import preset
+from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.run import RunConfig
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io import read_calibration
 from torchtrack.quality import Status
 from torchtrack.sim import SceneConfig
+from torchtrack.sim.suite import scenes_of
 from torchtrack.sinks.poses import COLUMNS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 SETTINGS = {"track": RunConfig, "evaluate": EvaluateConfig, "demo": DemoConfig, "simulate": SceneConfig}
+COMMANDS = ("track", "evaluate", "simulate", "demo", "outline", "info", "convert", "bench", "settings")
+BLOCKS = ("ACCURACY", "ABLATION", "PAPER TABLES", "SPEED")
 FILE_SUFFIXES = ("py", "yaml", "txt", "npz", "json", "csv", "tum", "mp4", "png", "obj", "glb", "md")
 
 
@@ -82,7 +89,13 @@ def test_command_lines_parse(arguments):
 
 
 def test_every_command_is_shown():
-    assert {arguments[0] for arguments in commands()} == {"track", "evaluate", "simulate", "demo", "outline", "settings"}
+    assert {arguments[0] for arguments in commands()} == set(COMMANDS)
+
+
+def test_commands_are_all_that_there_are(capsys):
+    with pytest.raises(SystemExit):
+        tyro.cli(cli._Command, args=["--help"])
+    assert set(re.findall(r"• (\w+)", capsys.readouterr().out)) == set(COMMANDS)
 
 
 def test_options_in_running_text_exist(capsys):
@@ -91,7 +104,7 @@ def test_options_in_running_text_exist(capsys):
     assert with_dots and options - with_dots
     for option in with_dots:
         assert is_key(option.replace("-", "_"), RunConfig), option
-    for command in ("track", "evaluate", "simulate", "demo", "outline", "settings"):
+    for command in COMMANDS:
         with pytest.raises(SystemExit):
             tyro.cli(cli._Command, args=[command, "--help"])
     helped = capsys.readouterr().out
@@ -103,14 +116,17 @@ def test_dotted_names_exist():
     names = {span for span in spans() if re.fullmatch(r"[a-z]\w*(\.\w+)+", span) and not span.endswith(FILE_SUFFIXES)}
     assert {"tracker.window.duration_us", "overlay.enabled", "camera.width"} <= names
     for name in names:
-        assert is_key(name, RunConfig), name
+        package, _, attribute = name.partition(".")
+        if package == "torchtrack":
+            assert hasattr(import_module(package), attribute), name
+        else:
+            assert any(is_key(name, settings) for settings in (RunConfig, SceneConfig)), name
 
 
 def test_settings_named_alone_exist():
     every = {part for key in dotted_keys(RunConfig) for part in key.split(".")}
-    assert {"initial_pose", "start_us", "translation_m", "quaternion_xyzw", "matrix", "trajectory", "polylines", "mesh", "unit"} <= every & set(
-        spans()
-    )
+    named = {"initial_pose", "start_us", "translation_m", "quaternion_xyzw", "matrix", "trajectory", "polylines", "mesh", "unit"}
+    assert named | {"source", "sensor_latency_us"} <= every & set(spans())
 
 
 def test_files_exist():
@@ -126,6 +142,15 @@ def test_example_of_a_config_is_one(text, tmp_path):
     path.write_text(text)
     config = load(RunConfig, path)
     assert config.objects[0].mesh == tmp_path / "mug.obj" and config.objects[0].unit == "mm"
+
+
+@pytest.mark.parametrize("text", blocks("yaml simulate"))
+def test_example_of_a_scene_is_one(text, tmp_path):
+    path = tmp_path / "mug_scene.yaml"
+    path.write_text(text)
+    scenes = scenes_of(path)
+    assert [scene.name for scene in scenes] == ["mug_fast", "mug_dim", "mug_occluded"]
+    assert scenes[0].objects[0].mesh == tmp_path / "mug.obj" and scenes[0].objects[0].unit == "mm"
 
 
 @pytest.mark.parametrize("text", blocks("yaml calibration"))
@@ -146,13 +171,33 @@ def flat(settings, prefix="tracker"):
 
 
 def test_table_of_presets_is_true_and_complete():
-    default, paper = (dict(flat(preset(name).model_dump())) for name in ("default", "paper"))
-    rows = re.findall(r"^\| `(tracker\.[\w.]+)` \| (.+?) \| (.+?) \|", README, re.MULTILINE)
-    assert len(rows) > 10
-    for key, ours, theirs in rows:
-        assert (yaml.safe_load(ours), yaml.safe_load(theirs)) == (default[key], paper[key]), key
-    different = {key for key in default if default[key] != paper[key]}
+    names = re.search(r"^\| key \| (.+) \|$", README, re.MULTILINE)[1].replace("`", "").split(" | ")
+    assert names == list(get_args(PresetName))
+    settings = {name: dict(flat(preset(name).model_dump())) for name in names}
+    row = r"^\| `(tracker\.[\w.]+)`" + len(names) * r" \| ([^|]+)" + r" \|$"
+    rows = re.findall(row, README, re.MULTILINE)
+    assert len(rows) >= 8
+    for key, *values in rows:
+        assert [yaml.safe_load(value) for value in values] == [settings[name][key] for name in names], key
+    different = {key for name in names for key, value in settings[name].items() if value != settings["default"][key]}
     assert different <= set(spans())
+
+
+def test_formats_extras_and_live_sources_are_true():
+    table = README[README.index("| format | `convert` writes") :].partition("\n\n")[0]
+    written = {name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split("|")[2])}
+    assert written == set(get_args(OutputFormat))
+    named = set(re.findall(r"extras? `(\w+)`|needs `(\w+)`", README))
+    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert {"aedat", "hdf5", "ros", "live"} <= {name for pair in named for name in pair if name} <= set(extras)
+    addresses = {span for span in spans() if "://" in span and "=" not in span}
+    assert {"dv://HOST:PORT", "davis://", "evk4://", "stdin://"} == addresses
+    assert all(is_live(address) for address in addresses | {"-"})
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_blocks_of_figures_can_be_filled_in(name):
+    assert len(re.findall(rf"^<!-- {name} -->\n.+?\n<!-- /{name} -->$", README, re.MULTILINE | re.DOTALL)) == 1
 
 
 def test_statuses_columns_and_exit_codes_are_true():
@@ -172,7 +217,7 @@ def test_pictures_are_few_and_small():
 
 
 def test_length_and_places():
-    assert len(README.splitlines()) <= 350
+    assert len(README.splitlines()) <= 400
     outside_blocks = re.sub(r"^```text.*?^```", "", README, flags=re.MULTILINE | re.DOTALL)
     assert [line for line in outside_blocks.splitlines() if len(line) > 120] == []
     assert re.findall(r"(?<![\w.])/(?:work|home|tmp|root)/", README) == []
