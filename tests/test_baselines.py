@@ -100,10 +100,20 @@ def test_bad_starts_are_told_as_by_the_tracker():
         tracker_for("line", [box_model()]).init(2 * pose()[None], 0)
 
 
-def test_the_filter_needs_its_own_state():
-    state = Tracker([box_model()], SMALL_CAMERA).init(pose()[None], 0)
-    with pytest.raises(TypeError, match="a state from its own init, got a TrackerState"):
-        tracker_for("line", [box_model()]).step(state, random_events(0), 1000)
+def test_the_filter_starts_with_its_own_uncertainty_and_carries_it_on():
+    _, events = moving_box(pose(), COUNT)
+    tracker = tracker_for("line", [box_model()])
+    first = tracker.init(pose()[None], 0)
+    assert first.covariance[0].diagonal().sqrt().tolist() == pytest.approx([0.01] * 3 + [0.005] * 3 + [3.0] * 3 + [0.5] * 3)
+    state, results = follow(tracker, first, windows(events, COUNT))
+    sigma = state.covariance[0].diagonal().sqrt()
+    # Of events that are nearly all in common, a turn is known to a degree and a half.
+    assert 0.005 < float(sigma[:3].max()) < 0.03
+    assert (sigma[9:] < first.covariance[0].diagonal()[9:].sqrt()).all()
+    # The same, of the left perturbation: what holds of the turn about the centre holds of that.
+    torch.testing.assert_close(results[-1].covariance[0, :3, :3], state.covariance[0, :3, :3])
+    after, _ = tracker.step(state, random_events(0), (COUNT + 1) * WINDOW_US)
+    assert (torch.linalg.eigvalsh(after.covariance[0, :6, :6] - state.covariance[0, :6, :6]) > 0).all()
 
 
 # ---- events and lines

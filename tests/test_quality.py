@@ -41,9 +41,9 @@ def upright_line(u=80.0, count=80, first=20.0):
     return torch.stack([torch.full_like(v, u), v], -1)[None]
 
 
-def share(contours, matches, velocity=(100.0, 0.0), min_speed_px_s=30.0):
+def share(contours, matches, velocity=(100.0, 0.0), config=CONFIG):
     moving = torch.tensor(velocity, dtype=torch.float64).expand_as(contours.pixels)
-    return explained_share(contours, matches, moving, IMAGE_SIZE, min_speed_px_s)
+    return explained_share(contours, matches, moving, IMAGE_SIZE, config)
 
 
 # ---- statuses
@@ -143,10 +143,11 @@ def test_a_contour_without_matches_is_not():
     assert float(share(contours_at(upright_line()), matches_at(upright_line(), near=torch.zeros(1, 80, dtype=torch.bool)))) == 0
 
 
-@pytest.mark.parametrize(("count", "expected"), [(2, 0), (3, 1)])
-def test_a_patch_needs_a_few_observations_on_its_contours(count, expected):
+@pytest.mark.parametrize(("least", "count", "expected"), [(3, 2, 0), (3, 3, 1), (1, 1, 1), (5, 4, 0)])
+def test_a_patch_needs_a_few_observations_on_its_contours(least, count, expected):
     contours = contours_at(upright_line(count=16, first=32.0))
-    assert float(share(contours, matches_at(upright_line(count=count, first=36.0)))) == expected
+    found = share(contours, matches_at(upright_line(count=count, first=36.0)), config=QualityConfig(min_on_contour=least))
+    assert float(found) == expected
 
 
 @pytest.mark.parametrize(("on", "expected"), [(20, 0), (39, 0), (41, 1), (80, 1)])
@@ -173,8 +174,8 @@ def test_what_does_not_move_need_not_be_explained():
     moving[:, 80:, 0] = 100.0
     moving[:, :80, 0] = 20.0
     matches = matches_at(upright_line(80.0))
-    assert float(explained_share(contours, matches, moving, IMAGE_SIZE, 30.0)) == 1
-    assert float(explained_share(contours, matches, moving, IMAGE_SIZE, 10.0)) == 0.5
+    assert float(explained_share(contours, matches, moving, IMAGE_SIZE, QualityConfig(min_speed_px_s=30.0))) == 1
+    assert float(explained_share(contours, matches, moving, IMAGE_SIZE, QualityConfig(min_speed_px_s=10.0))) == 0.5
 
 
 def test_only_motion_across_the_contour_counts():

@@ -13,8 +13,8 @@ from torchtrack.config.tracker import QualityConfig
 from torchtrack.contours import Contours
 from torchtrack.matching import Matches, patch, patch_counts
 
-# A patch explains its contours when this many observations are on them, and this share of those near them.
-_MIN_ON_CONTOUR, _LEAST_SHARE = 3, 0.5
+# A patch explains its contours when this share of the observations near them are on them.
+_LEAST_SHARE = 0.5
 # Fewer moving contour points than this say nothing.
 _MIN_MOVING_POINTS = 16
 
@@ -31,7 +31,7 @@ class Status(IntEnum):
 
 
 def explained_share(
-    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], min_speed_px_s: float
+    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: QualityConfig
 ) -> Float[Tensor, "b"]:
     """Of the visible contour that should fire given its motion, the share with observations on it.
 
@@ -41,9 +41,9 @@ def explained_share(
     on_count, near_count = patch_counts(matches.offsets, matches.targets, matches.near)
     cell = patch(contours.pixels)
     on, near = on_count.gather(1, cell), near_count.gather(1, cell)
-    explained = (on >= _MIN_ON_CONTOUR) & (on + 1 > _LEAST_SHARE * (near + 2))
+    explained = (on >= config.min_on_contour) & (on + 1 > _LEAST_SHARE * (near + 2))
     speed = (contours.normals * contour_velocity).sum(-1).abs()
-    moving = contours.mask & _inside(contours.pixels, image_size) & (speed > min_speed_px_s)
+    moving = contours.mask & _inside(contours.pixels, image_size) & (speed > config.min_speed_px_s)
     total = moving.sum(-1)
     share = (moving & explained).sum(-1) / total.clamp(min=1)
     return torch.where(total < _MIN_MOVING_POINTS, 1.0, share).to(contours.pixels.dtype)

@@ -46,7 +46,7 @@ class Found:
 def judge_fit(prediction: Prediction, fit: Fit, config: TrackerConfig) -> Found:
     """A fit with its quality; without enough observations it explains nothing."""
     velocity = prediction.contour_velocity(fit.contours)
-    share = quality.explained_share(fit.contours, fit.matches, velocity, prediction.objects.image_size, config.quality.min_speed_px_s)
+    share = quality.explained_share(fit.contours, fit.matches, velocity, prediction.objects.image_size, config.quality)
     return Found(fit, share, fit.matches.mask.sum(-1))
 
 

@@ -204,7 +204,7 @@ class EventLineTracker(Tracker):
     ) -> tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]]:
         """Status and quality of each object, and which poses are taken."""
         settings = self.config.quality
-        share = quality.explained_share(contours, matches, self._contour_velocity(window, contours), self.image_size, settings.min_speed_px_s)
+        share = quality.explained_share(contours, matches, self._contour_velocity(window, contours), self.image_size, settings)
         step = lie.small_difference_about(window.T_start, solution.T_cam_obj, self.centre_obj)
         in_view = quality.visible_share(contours, self.image_size)
         status = quality.judge(share, matches.mask.sum(-1), in_view, step, self.diameter_m, settings)

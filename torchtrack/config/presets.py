@@ -33,7 +33,7 @@ def _paper() -> TrackerConfig:
         ),
         solver=SolverConfig(iterations=5, loss="none", damping=1e-3, prior=False),
         motion=MotionConfig(model="hold", without_events="hold"),
-        quality=QualityConfig(min_observations=6),
+        quality=QualityConfig(min_observations=6, min_on_contour=1),
     )
 
 
@@ -67,7 +67,7 @@ def _nns() -> TrackerConfig:
         corners=CornerConfig(max_corners=400, cell_px=5),
         matching=MatchingConfig(along_flow=False, residual="normal", gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False, polarity=False),
         solver=SolverConfig(iterations=2),
-        quality=QualityConfig(min_observations=10),
+        quality=QualityConfig(min_observations=10, min_on_contour=1),
     )
 
 

@@ -151,6 +151,7 @@ class QualityConfig(Settings):
     caught_above: float = Field(
         0.45, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object is found again."
     )
+    min_on_contour: int = Field(3, ge=1, description="Observations on the contours of a patch of the image from which these are explained.")
     min_speed_px_s: float = Field(30.0, ge=0, description="Contours moving slower than this across themselves need not fire (px/s).")
     max_step_rotation_rad: float = Field(0.5, gt=0, description="A larger rotation against the prediction within one window has diverged (rad).")
     max_step_translation: float = Field(0.5, gt=0, description="A larger move against the prediction within one window has diverged (diameters).")
