@@ -54,7 +54,10 @@ def test_a_moving_box_is_followed(rotation, motion, dtype):
     assert len(results) == 12
     assert [Status(int(result.status)) for result in results[2:]] == [Status.TRACKING] * 10
     assert float(degrees[3:].max()) < 0.5
-    assert float(millimetres[3:].max()) < 1.0
+    # A speed that is far from the rest that was assumed takes longer to be learned, in depth above all.
+    speed_m_s = max(abs(part) for part in motion.get("move", (0.0,)))
+    assert float(millimetres[3:].max()) < (2.5 if speed_m_s > 2 * MotionConfig().initial_speed_m_s else 1.0)
+    assert float(millimetres[6:].max()) < 1.0
     # It has not just stood still.
     moved = pose_errors(trajectory.T_cam_obj[-1], trajectory.T_cam_obj[0])
     assert float(moved[0]) > 5 * float(degrees[-1]) or float(moved[1]) > 10 * float(millimetres[-1])

@@ -78,9 +78,9 @@ def test_a_tracker_can_be_saved_and_loaded(tmp_path):
         TrackerConfig(matching=MatchingConfig(index_cell_px=1)),
         TrackerConfig(matching=MatchingConfig(gates_px=(4.0, 2.0))),
         TrackerConfig(surface=SurfaceConfig(filters="kornia")),
-        TrackerConfig(motion=MotionConfig(velocity_gain=1.0)),
+        TrackerConfig(motion=MotionConfig(model="hold")),
     ],
-    ids=["no_corners", "no_prior", "huber", "all_contours", "refreshed", "buffer", "fine_index", "two_rounds", "kornia", "full_gain"],
+    ids=["no_corners", "no_prior", "huber", "all_contours", "refreshed", "buffer", "fine_index", "two_rounds", "kornia", "held"],
 )
 def test_a_box_is_tracked_with_other_settings(config):
     trajectory, events = moving_box(pose(), 10)
