@@ -3,6 +3,7 @@
 The only state is an immutable :class:`TrackerState`; ``step`` is pure: the same state and events give the same result.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -33,6 +34,8 @@ from torchtrack.time_surface import at_pixels, empty_last_event, object_regions,
 _BORDER_PX = 64
 # Nothing that is tracked is farther away (m).
 _MAX_DEPTH_M = 1e4
+# Fewer events than this do not make a part of a window.
+_EVENTS_OF_A_PART = 400
 # Share of a new window in the usual quality.
 _USUAL_GAIN = 0.1
 
@@ -129,8 +132,35 @@ class Tracker(nn.Module):
             events: of all streams, after ``state.t_us`` and up to ``t_end_us``.
             t_end_us: end of the window; the newest event of each stream when not given.
         """
-        config = self.config
         t_us = self._window_end(state, events, t_end_us)
+        parts = self._parts(state, events, t_us)
+        for number in range(1, parts):
+            until_us = state.t_us + (t_us - state.t_us) // (parts - number + 1)
+            early = events.t_us <= until_us[events.stream_index]
+            state, _ = self._advance(state, events[early], until_us)
+            events = events[~early]
+        return self._advance(state, events, t_us)
+
+    def _parts(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> int:
+        """In how many parts the window is taken: more than one while the unknown part of a motion is large within it.
+
+        An object that has just been found may move by more than any gate in a window. Its velocity is learned in short
+        steps first, as far as there are events enough for them.
+        """
+        window = self.config.window
+        if window.max_parts == 1 or not self.config.solver.prior:
+            return 1
+        variance = state.covariance.diagonal(dim1=-2, dim2=-1)[:, 6:].to(self.intrinsics.dtype).unflatten(-1, (2, 3)).mean(-1)
+        unknown_m_s = (variance[:, 1] + variance[:, 0] * (0.5 * self.diameter_m).square()).sqrt()
+        depth_m = lie.transform_points(state.T_cam_obj.to(unknown_m_s.dtype), self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
+        window_s = ((t_us - state.t_us) * 1e-6)[self.stream_index]
+        unknown_px = float((unknown_m_s * window_s * self.intrinsics[:, 0] / depth_m).amax())
+        enough = len(events) // (self.streams * _EVENTS_OF_A_PART)
+        return max(1, min(math.ceil(unknown_px / window.max_unknown_px), window.max_parts, enough))
+
+    def _advance(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult]:
+        """One window, or one part of it."""
+        config = self.config
         window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
         last_event_us = update_last_event(state.last_event_us, events)
         prediction = self._predict(state, window_s)

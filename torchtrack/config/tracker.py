@@ -13,6 +13,8 @@ class WindowConfig(Settings):
     mode: Literal["time", "count"] = Field("time", description="Windows of equal duration, or of an equal number of events.")
     duration_us: int = Field(5_000, ge=100, le=1_000_000, description="Length of a window in mode 'time' (µs).")
     count: int = Field(5_000, ge=10, description="Events of a window in mode 'count'.")
+    max_parts: int = Field(8, ge=1, le=100, description="A window is taken in up to so many parts while a motion is not known.")
+    max_unknown_px: float = Field(2.0, gt=0, description="Largest unknown part of a motion within one part of a window (px).")
     max_age_us: int = Field(20_000, ge=100, description="In mode 'count', a window is closed after this long (µs) with fewer events.")
 
 
@@ -123,7 +125,7 @@ class MotionConfig(Settings):
 
     model: Literal["constant_velocity", "hold"] = Field("constant_velocity", description="Carry the velocity on, or start from the last pose.")
     initial_shift: float = Field(0.005, gt=0, le=1, description="Standard deviation of the initial pose (diameters).")
-    initial_speed_m_s: float = Field(0.3, gt=0, description="Standard deviation of the initial speed (m/s).")
+    initial_speed_m_s: float = Field(0.6, gt=0, description="Standard deviation of the initial speed (m/s).")
     acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
