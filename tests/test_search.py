@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import SMALL_CAMERA, box_model, generator, pose, pose_errors
+from helpers import SMALL_CAMERA, box_model, generator, pose, pose_errors, random_events
 from tracked_boxes import WINDOW_US, follow, moving_box, poses_of, started, tensors_of, windows
 
 from torchtrack import Tracker
 from torchtrack.alignment import align, gate_widening, index_for
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
-from torchtrack.events import EventBatch, concatenate
+from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
 from torchtrack.observations import select_events
 from torchtrack.quality import Status
@@ -217,9 +217,13 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
     assert not torch.equal(poses_of(runs["with"], 1), poses_of(runs["without"], 1))
 
 
-def test_a_search_without_events_finds_nothing_and_says_so():
+@pytest.mark.parametrize(("count", "times"), [(0, 0), (29, 0), (200, 1)])
+def test_without_enough_events_there_is_nothing_to_search_in(count, times, monkeypatch):
+    searched = []
+    monkeypatch.setattr("torchtrack.tracker.search", lambda number, prediction, sigma, seen, found, config: searched.append(number) or found)
     tracker, state, _, _, _ = started()
-    state = replace(state, covariance=1e3 * state.covariance)
-    after, result = tracker.step(state, EventBatch.empty(), 30_000)
-    assert Status(int(result.status)) == Status.TOO_FEW_EVENTS
+    noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
+    after, result = tracker.step(replace(state, covariance=1e3 * state.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)
+    assert len(searched) == times
+    assert count > 0 or Status(int(result.status)) == Status.TOO_FEW_EVENTS
     assert torch.isfinite(after.covariance).all()

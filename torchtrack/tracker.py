@@ -236,7 +236,10 @@ class Tracker(nn.Module):
         config = self.config
         if config.search.hypotheses == 0 or not config.solver.prior:
             return found
-        for number in wanted(torch.maximum(found.share, state.share), sigma_px, state.usual_share, config.search).nonzero()[:, 0].tolist():
+        # Without events no pose is better than another.
+        enough = seen.mask.sum(-1) >= config.quality.min_observations
+        tried = enough & wanted(torch.maximum(found.share, state.share), sigma_px, state.usual_share, config.search)
+        for number in tried.nonzero()[:, 0].tolist():
             found = search(number, prediction, float(sigma_px[number]), seen, found, config)
         return found
 
