@@ -1,8 +1,10 @@
 """What the tracker remembers between windows, and what one window gives: both immutable."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
 
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.contours import Contours
@@ -55,3 +57,21 @@ class StepResult:
     contours: Contours
     corners: Corners
     observation_count: Int[Tensor, "b"]
+
+
+def choose_rows(
+    first: Bool[Tensor, "b"], of_first: tuple[TrackerState, StepResult], of_second: tuple[TrackerState, StepResult]
+) -> tuple[TrackerState, StepResult]:
+    """State and result of two ways to take the same window: of the first way for some objects, of the second for the others."""
+    state, result = (_choose(first, *pair) for pair in zip(of_first, of_second, strict=True))
+    return state, result
+
+
+def _choose(rows: Tensor, first: Any, second: Any) -> Any:
+    """The rows of the tensors of two dataclasses; what belongs to streams is the same in both, and taken from the second."""
+    if is_dataclass(first):
+        streams = ("t_us", "last_event_us")
+        names = [field.name for field in fields(first)]
+        values = {name: getattr(second, name) if name in streams else _choose(rows, getattr(first, name), getattr(second, name)) for name in names}
+        return type(second)(**values)
+    return torch.where(rows.view(-1, *[1] * (first.dim() - 1)), first, second)

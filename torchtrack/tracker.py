@@ -3,7 +3,6 @@
 The only state is an immutable :class:`TrackerState`; ``step`` is pure: the same state and events give the same result.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -27,7 +26,7 @@ from torchtrack.observations import WindowEvents, corner_observations, join, sel
 from torchtrack.pose_solver import Linearisation
 from torchtrack.prediction import Prediction
 from torchtrack.search import Found, judge_fit, search, wanted
-from torchtrack.state import StepResult, TrackerState
+from torchtrack.state import StepResult, TrackerState, choose_rows
 from torchtrack.time_surface import at_pixels, empty_last_event, object_regions, time_surface, update_last_event
 
 # Contours this far outside the image still find their place on a distorted sensor (px).
@@ -133,30 +132,37 @@ class Tracker(nn.Module):
             t_end_us: end of the window; the newest event of each stream when not given.
         """
         t_us = self._window_end(state, events, t_end_us)
-        parts = self._parts(state, events, t_us)
-        for number in range(1, parts):
-            until_us = state.t_us + (t_us - state.t_us) // (parts - number + 1)
-            early = events.t_us <= until_us[events.stream_index]
-            state, _ = self._advance(state, events[early], until_us)
-            events = events[~early]
-        return self._advance(state, events, t_us)
+        whole = self._advance(state, events, t_us)
+        in_parts = self._to_be_parted(state, events, t_us)
+        if not bool(in_parts.any()):
+            return whole
+        return choose_rows(in_parts, self._advance_in_parts(state, events, t_us), whole)
 
-    def _parts(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> int:
-        """In how many parts the window is taken: more than one while the unknown part of a motion is large within it.
+    def _to_be_parted(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> Tensor:
+        """Objects whose window is taken in parts: while a large part of their motion within it is not known.
 
         An object that has just been found may move by more than any gate in a window. Its velocity is learned in short
-        steps first, as far as there are events enough for them.
+        steps first, where there are events enough for them. Each object is asked for itself: its neighbours do not matter.
         """
         window = self.config.window
-        if window.max_parts == 1 or not self.config.solver.prior:
-            return 1
+        if window.parts == 1 or not self.config.solver.prior:
+            return torch.zeros_like(self.stream_index, dtype=torch.bool)
         variance = state.covariance.diagonal(dim1=-2, dim2=-1)[:, 6:].to(self.intrinsics.dtype).unflatten(-1, (2, 3)).mean(-1)
         unknown_m_s = (variance[:, 1] + variance[:, 0] * (0.5 * self.diameter_m).square()).sqrt()
         depth_m = lie.transform_points(state.T_cam_obj.to(unknown_m_s.dtype), self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
         window_s = ((t_us - state.t_us) * 1e-6)[self.stream_index]
-        unknown_px = float((unknown_m_s * window_s * self.intrinsics[:, 0] / depth_m).amax())
-        enough = len(events) // (self.streams * _EVENTS_OF_A_PART)
-        return max(1, min(math.ceil(unknown_px / window.max_unknown_px), window.max_parts, enough))
+        unknown_px = unknown_m_s * window_s * self.intrinsics[:, 0] / depth_m
+        count = torch.bincount(events.stream_index, minlength=self.streams)[self.stream_index]
+        return (unknown_px > window.max_unknown_px) & (count >= window.parts * _EVENTS_OF_A_PART)
+
+    def _advance_in_parts(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult]:
+        """The window as several short ones."""
+        for left in range(self.config.window.parts, 1, -1):
+            until_us = state.t_us + (t_us - state.t_us) // left
+            early = events.t_us <= until_us[events.stream_index]
+            state, _ = self._advance(state, events[early], until_us)
+            events = events[~early]
+        return self._advance(state, events, t_us)
 
     def _advance(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult]:
         """One window, or one part of it."""

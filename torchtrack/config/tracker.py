@@ -13,8 +13,8 @@ class WindowConfig(Settings):
     mode: Literal["time", "count"] = Field("time", description="Windows of equal duration, or of an equal number of events.")
     duration_us: int = Field(5_000, ge=100, le=1_000_000, description="Length of a window in mode 'time' (µs).")
     count: int = Field(5_000, ge=10, description="Events of a window in mode 'count'.")
-    max_parts: int = Field(8, ge=1, le=100, description="A window is taken in up to so many parts while a motion is not known.")
-    max_unknown_px: float = Field(2.0, gt=0, description="Largest unknown part of a motion within one part of a window (px).")
+    parts: int = Field(4, ge=1, le=100, description="Parts in which a window is taken while an object's motion is not known; 1 for never.")
+    max_unknown_px: float = Field(2.0, gt=0, description="Unknown part of a motion in a window from which it is taken in parts (px).")
     max_age_us: int = Field(20_000, ge=100, description="In mode 'count', a window is closed after this long (µs) with fewer events.")
 
 
