@@ -43,9 +43,9 @@ def gate_widening(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[
     return (matching.gate_sigmas * sigma_px / first_px).clamp(1, max(matching.max_gate_px / first_px, 1))
 
 
-def index_for(contours: Contours, image_size: tuple[int, int], config: TrackerConfig, widening: float = 1.0) -> ContourIndex:
-    """The index of contours, wide enough for the first gate."""
-    radius_px = int(widening * max(config.matching.gates_px)) + _INDEX_MARGIN_PX
+def index_for(contours: Contours, image_size: tuple[int, int], config: TrackerConfig, widening: Float[Tensor, "b"]) -> ContourIndex:
+    """The index of contours, wide enough for each object's first gate."""
+    radius_px = (widening * max(config.matching.gates_px)).long() + _INDEX_MARGIN_PX
     return index_contours(contours, image_size, radius_px, config.matching.index_cell_px)
 
 
@@ -78,7 +78,7 @@ def align(
     for number, gate_px in enumerate(config.matching.gates_px):
         if number and number in config.contours.refresh_rounds:
             contours = objects.contours(T_cam_obj, config.contours)
-            index = index_for(contours, objects.image_size, config, float(widening.max()))
+            index = index_for(contours, objects.image_size, config, widening)
             belief = Belief.from_velocity(belief.motion[..., :2])
         wider = widening ** (1 - number / max(rounds - 1, 1))
         velocity = compensate * begin.contour_velocity(contours)

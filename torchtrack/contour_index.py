@@ -43,27 +43,35 @@ class ContourIndex:
         return self.nearest.gather(1, torch.add(column, row, alpha=columns).long())
 
 
-def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: int, cell_px: int) -> ContourIndex:
+def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"], cell_px: int) -> ContourIndex:
     """Index the visible contour points; those far outside the image (height, width) are left out.
 
     Every point writes its distance and number to the cells around it, and the least stays.
+
+    Args:
+        radius_px: how far from a contour it is still found; one for all objects, or one for each.
     """
     batch, count, _ = contours.pixels.shape
     device = contours.pixels.device
-    limit = torch.tensor([image_size[1] - 1, image_size[0] - 1], device=device)
-    inside = contours.mask & ((contours.pixels > -radius_px) & (contours.pixels < limit + radius_px)).all(-1)
+    radius = torch.as_tensor(radius_px, device=device).expand(batch)
+    limit, around_px = torch.tensor([image_size[1] - 1, image_size[0] - 1], device=device), radius[:, None, None]
+    inside = contours.mask & ((contours.pixels > -around_px) & (contours.pixels < limit + around_px)).all(-1)
     centre = torch.where(inside[..., None], contours.pixels / cell_px, 0).round().long()
-    reach = -(-radius_px // cell_px)
+    largest_px = int(radius.max()) if batch else 0
+    reach = -(-largest_px // cell_px)
     low = torch.where(inside[..., None], centre, 2**31).amin(1).clamp(max=2**30) - reach - 1
     columns, rows = (torch.where(inside[..., None], centre - low[:, None], 0).amax((0, 1)) + reach + 2).tolist()
-    disc = _disc(reach, radius_px / cell_px, device)
+    disc = _disc(reach, largest_px / cell_px, device)
     distance_sq = _squared_distances(contours.pixels, cell_px * centre, cell_px * disc)
     key = (_DISTANCE_STEPS * distance_sq).long() * count + torch.arange(count, device=device)[:, None]
+    nothing = torch.iinfo(torch.int64).max
+    # Each object within its own radius, whatever its neighbours need.
+    beyond = disc.square().sum(-1) * cell_px**2 > radius[:, None].square()
+    key = key.masked_fill(beyond[:, None], nothing)
     # Masked points write to spare entries after the last.
     local = centre - low[:, None]
     first = torch.where(inside, local[..., 1] * columns + local[..., 0], rows * columns + reach * (columns + 1))
     cell = first[..., None] + (disc[:, 1] * columns + disc[:, 0])
-    nothing = torch.iinfo(torch.int64).max
     keys = torch.full((batch, rows * columns + 2 * reach * (columns + 1) + 1), nothing, device=device)
     keys = keys.scatter_reduce(1, cell.flatten(1), key.flatten(1), "amin")[:, : rows * columns]
     return ContourIndex(low, (rows, columns), cell_px, torch.where(keys == nothing, -1, keys % count), contours.pixels)

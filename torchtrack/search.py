@@ -133,10 +133,10 @@ def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: 
     """Align copies of one object, each from its own offset, on the events of the object."""
     begin = copies.moved(offsets)
     contours = copies.objects.contours(begin.T_cam_obj, config.contours)
-    index = index_for(contours, copies.objects.image_size, config)
+    tight = gate_widening(torch.zeros_like(offsets[:, 0]), config)
+    index = index_for(contours, copies.objects.image_size, config, tight)
     events = seen.repeated(len(offsets))
     observations = select_events(events, index, begin.plane_velocity(events.pixels), config.matching.max_events)
-    tight = gate_widening(torch.zeros_like(offsets[:, 0]), config)
     return judge_fit(copies, align(copies, contours, index, tight, observations, config, offsets), config)
 
 

@@ -174,7 +174,7 @@ class Tracker(nn.Module):
         corners = self._corners(contours, last_event_us, t_us, window_s)
         sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
         widening = gate_widening(sigma_px, config)
-        index = index_for(contours, self.image_size, config, float(widening.max()))
+        index = index_for(contours, self.image_size, config, widening)
         seen = self._seen(events, t_us)
         observations = corner_observations(corners)
         if config.matching.max_events:
