@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from tyro.conf import Positional, arg, subcommand
 
-from torchtrack.cli_io import Bench, Convert, Info
+from torchtrack.cli_io import Bench, Convert, Info, refuse_settings
 from torchtrack.config.load import typed
 from torchtrack.config.settings import CommandLineText
 from torchtrack.errors import ConfigError, TorchtrackError
@@ -90,7 +90,7 @@ class Evaluate:
         from torchtrack.commands import evaluate, show_latency
 
         if self.estimate_latency:
-            _refuse(overrides)
+            refuse_settings(overrides)
             return show_latency(self.paths)
         chosen = self.methods.split(",") if self.methods else None
         given = _given(self, ("config", "methods", "quiet", "paths", "estimate_latency"))
@@ -180,7 +180,7 @@ class Outline:
         """Carry the command out; returns the exit code."""
         from torchtrack.commands import outline
 
-        _refuse(overrides)
+        refuse_settings(overrides)
         return outline(self.image, self.calibration, self.output, self.distance_m, self.width, self.height)
 
 
@@ -195,7 +195,7 @@ class Settings:
         """Carry the command out; returns the exit code."""
         from torchtrack.commands import list_settings
 
-        _refuse(overrides)
+        refuse_settings(overrides)
         return list_settings(self.command)
 
 
@@ -248,12 +248,6 @@ def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]
             value = following
         overrides[name.replace("-", "_")] = typed(value)
     return options, overrides
-
-
-def _refuse(overrides: dict[str, Any]) -> None:
-    """Raise :class:`ConfigError` where settings are given to a command that has none."""
-    if overrides:
-        raise ConfigError(f"command line: this command takes no settings, got --{', --'.join(overrides)}.")
 
 
 def _given(command: Any, without: tuple[str, ...]) -> dict[str, Any]:

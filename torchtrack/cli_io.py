@@ -32,7 +32,7 @@ class Info:
         """Carry the command out; returns the exit code."""
         from torchtrack.commands_io import info
 
-        _refuse(overrides)
+        refuse_settings(overrides)
         return info(self.file, self.width, self.height, self.max_events, strict=self.strict, as_json=self.json)
 
 
@@ -57,7 +57,7 @@ class Convert:
         """Carry the command out; returns the exit code."""
         from torchtrack.commands_io import convert_file
 
-        _refuse(overrides)
+        refuse_settings(overrides)
         return convert_file(self.source, self.target, self.format, self.width, self.height, strict=self.strict)
 
 
@@ -78,11 +78,11 @@ class Bench:
         """Carry the command out; returns the exit code."""
         from torchtrack.bench.command import bench
 
-        _refuse(overrides)
+        refuse_settings(overrides)
         return bench(self.part, self.output, repeats=self.repeats, events=self.events)
 
 
-def _refuse(overrides: dict[str, Any]) -> None:
+def refuse_settings(overrides: dict[str, Any]) -> None:
     """Raise :class:`ConfigError` where settings are given to a command that has none."""
     if overrides:
         raise ConfigError(f"command line: this command takes no settings, got --{', --'.join(overrides)}.")

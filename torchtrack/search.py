@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import quality
-from torchtrack.alignment import Fit, align, gate_widening, index_for
+from torchtrack.alignment import Fit, align, index_for
 from torchtrack.camera import project
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.contours import Contours
@@ -133,7 +133,7 @@ def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: 
     """Align copies of one object, each from its own offset, on the events of the object."""
     begin = copies.moved(offsets)
     contours = copies.objects.contours(begin.T_cam_obj, config.contours)
-    tight = gate_widening(torch.zeros_like(offsets[:, 0]), config)
+    tight = torch.ones_like(offsets[:, 0])
     index = index_for(contours, copies.objects.image_size, config, tight)
     events = seen.repeated(len(offsets))
     observations = select_events(events, index, begin.plane_velocity(events.pixels), config.matching.max_events)

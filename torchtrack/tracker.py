@@ -132,11 +132,11 @@ class Tracker(nn.Module):
             t_end_us: end of the window; the newest event of each stream when not given.
         """
         t_us = self._window_end(state, events, t_end_us)
-        whole = self._advance(state, events, t_us)
         in_parts = self._to_be_parted(state, events, t_us)
-        if not bool(in_parts.any()):
-            return whole
-        return choose_rows(in_parts, self._advance_in_parts(state, events, t_us), whole)
+        if bool(in_parts.all()):
+            return self._advance_in_parts(state, events, t_us)
+        whole = self._advance(state, events, t_us)
+        return choose_rows(in_parts, self._advance_in_parts(state, events, t_us), whole) if bool(in_parts.any()) else whole
 
     def _to_be_parted(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> Tensor:
         """Objects whose window is taken in parts: while a large part of their motion within it is not known.

@@ -19,14 +19,14 @@ from torchtrack.contour_index import index_contours
 from torchtrack.contours import Contours, reproject, select_ranked, take_points
 from torchtrack.corners import no_corners
 from torchtrack.errors import ModelError
-from torchtrack.events import EventBatch, pad_streams
+from torchtrack.events import EventBatch
 from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.matching import Matches
 from torchtrack.motion import left_covariance
 from torchtrack.object_model import ObjectModel
 from torchtrack.pose_solver import Linearisation, PoseProblem, solve_pose
 from torchtrack.state import StepResult, TrackerState
-from torchtrack.time_surface import at_pixels, update_last_event
+from torchtrack.time_surface import update_last_event
 from torchtrack.tracker import Tracker
 
 # Contour points lie so far apart at most that an event on a line is within this of one of its points (px).
@@ -115,10 +115,7 @@ class EventLineTracker(Tracker):
 
     def _open(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None, velocity: Float[Tensor, "b 6"]) -> Window:
         """The window's times, and each object carried on with ``velocity``."""
-        if t_end_us is None:
-            t_us = state.t_us.scatter_reduce(0, events.stream_index, events.t_us, "amax")
-        else:
-            t_us = torch.as_tensor(t_end_us, dtype=torch.int64, device=state.t_us.device).expand(self.streams).clone()
+        t_us = self._window_end(state, events, t_end_us)
         duration_s = ((t_us - state.t_us).to(velocity.dtype) * 1e-6)[self.stream_index]
         T_last = state.T_cam_obj.to(velocity.dtype)
         T_start = lie.retract_about(T_last, velocity * duration_s[:, None], self.centre_obj)
@@ -136,14 +133,12 @@ class EventLineTracker(Tracker):
 
     def _events_near(self, window: Window, events: EventBatch, contours: Contours) -> LineEvents:
         """Events that lie near each object's lines once moved to the window's end, spread evenly in time."""
-        padded = pad_streams(events, self.streams, window.t_us)
-        stream = torch.arange(self.streams, device=window.t_us.device)[:, None]
-        pixels = at_pixels(self.ideal_pixels, stream, padded.x, padded.y)[self.stream_index]
-        age_s = padded.age_us[self.stream_index].to(pixels.dtype) * 1e-6
+        seen = self._seen(events, window.t_us)
+        pixels, age_s = seen.pixels, seen.age_s
         velocity = object_plane_velocity(pixels, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
         matching = self.config.matching
         index = index_contours(contours, self.image_size, int(max(matching.gates_px)) + 1, matching.index_cell_px)
-        near = padded.mask[self.stream_index] & (index.look_up(torch.addcmul(pixels, velocity, age_s[..., None])) >= 0)
+        near = seen.mask & (index.look_up(torch.addcmul(pixels, velocity, age_s[..., None])) >= 0)
         chosen, exists = select_ranked(near, matching.max_events)
         taken = take_points(torch.cat([pixels, age_s[..., None]], -1), chosen)
         return LineEvents(taken[..., :2], taken[..., 2], exists)

@@ -4,6 +4,7 @@ A RAW clock starts near zero. Where a stream starts later than the clock's range
 where its times count: ``% time_base_us N``. Readers that do not know this keyword give times that are ``N`` µs less.
 """
 
+from abc import abstractmethod
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,6 @@ class RawWriter(EventWriter):
         ]
         self._stream.write(("\n".join(lines) + "\n").encode("ascii"))
 
+    @abstractmethod
     def _encode(self, t_us: np.ndarray, events: Columns) -> np.ndarray:
         """Words of events at ``t_us`` by the clock of the file."""
-        raise NotImplementedError
