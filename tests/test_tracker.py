@@ -115,7 +115,7 @@ def test_the_same_state_and_events_give_the_same_result(dtype):
     first, second = tracker.step(state, events, end_us), tracker.step(state, events, end_us)
     for ours, theirs in zip(first, second, strict=True):
         assert_same(ours, theirs)
-    assert_same(tracker(state, events, end_us)[1], first[1])
+    assert_same(tracker(events, state, end_us)[1], first[1])
 
 
 def test_a_step_changes_neither_state_nor_events_nor_tracker(dtype):

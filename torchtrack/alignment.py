@@ -9,6 +9,7 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_index import ContourIndex, index_contours
 from torchtrack.contours import ContourKind, Contours, reproject, take_points
+from torchtrack.implicit_gradient import with_gradient
 from torchtrack.matching import Belief, Matches, both_coordinates, match_along_flow, match_nearest
 from torchtrack.motion import inverse
 from torchtrack.observations import Observations
@@ -60,6 +61,8 @@ def align(
 ) -> Fit:
     """Match and solve, one round per gate.
 
+    Gradients are those of the last round's problem at its solution: what came before chose the matches, which do not bend.
+
     Args:
         prediction: what the prior draws to.
         contours: visible contours where the rounds begin, and ``index`` of them.
@@ -92,6 +95,7 @@ def align(
         contours = reproject(contours, T_cam_obj, objects.intrinsics)
         if config.solver.prior:
             begin = replace(prediction, T_cam_obj=T_cam_obj, velocity=prediction.velocity + offset[:, 6:12])
+    solution = with_gradient(problem, solution, config.solver)
     return Fit(solution, contours, matches)
 
 
@@ -121,6 +125,8 @@ def _match(
         matches = match_along_flow(observations, contours, contour_velocity, gate_px, config.matching)
     else:
         matches, belief = match_nearest(observations, contours, index, belief, contour_velocity, gate_px, config.matching, wider)
+    if observations.trust is not None:
+        matches = replace(matches, weights=matches.weights * observations.trust)
     enough = (matches.mask * matches.weights).sum(-1, keepdim=True) >= config.quality.min_observations
     return replace(matches, mask=matches.mask & enough), belief
 

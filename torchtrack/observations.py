@@ -26,6 +26,7 @@ class Observations:
         mask: which entries exist.
         flow: velocity (px/s); zero where there is none.
         has_flow: where the flow is known.
+        trust: how far each entry is to be believed, 0 to 1, where something was there to tell it.
     """
 
     pixels: Float[Tensor, "b n 2"]
@@ -34,6 +35,7 @@ class Observations:
     mask: Bool[Tensor, "b n"]
     flow: Float[Tensor, "b n 2"]
     has_flow: Bool[Tensor, "b n"]
+    trust: Float[Tensor, "b n"] | None = None
 
 
 @dataclass(frozen=True)
@@ -86,5 +88,6 @@ def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Flo
 
 
 def join(first: Observations, second: Observations) -> Observations:
-    """Observations of both, for each object."""
-    return Observations(*(torch.cat([getattr(first, name), getattr(second, name)], 1) for name in vars(first)))
+    """Observations of both, for each object; none has been judged yet."""
+    names = [name for name in vars(first) if name != "trust"]
+    return Observations(*(torch.cat([getattr(first, name), getattr(second, name)], 1) for name in names))

@@ -176,6 +176,11 @@ def _chart_jacobian(problem: PoseProblem, seen: _Seen) -> Tensor:
     return torch.cat([seen.jacobian, -problem.window.age_s[:, None] * seen.jacobian, problem.window.outward[:, None]], 1)
 
 
+def robust_cost(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], from_prior: Float[Tensor, "b k"], loss: str) -> Float[Tensor, "b"]:
+    """Robust cost of ``problem`` at a pose, and at an offset of all unknowns from the prior (Eq. 12)."""
+    return _cost(problem, _as_rows(problem), T_cam_obj, from_prior, loss)
+
+
 def _cost(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Tensor:
     """Robust cost at a pose, prior included."""
     value, _ = robust_loss(_see(problem, rows, T_cam_obj, from_prior).residuals, problem.scale_px, loss)
@@ -234,12 +239,15 @@ def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
     return solve_positive(damped, -at.gradient[..., None])[0].squeeze(-1)
 
 
+@torch.no_grad()
 def solve_pose(
     problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig, from_prior: Float[Tensor, "b k"] | None = None
 ) -> Linearisation:
     """Minimise each object's cost from ``T_start``: Levenberg-Marquardt with a damping of its own per object.
 
     A step that does not lower an object's cost is undone and its damping raised; its neighbours are not affected.
+
+    Nothing is recorded: :mod:`torchtrack.implicit_gradient` gives gradients of the solution.
 
     Args:
         from_prior: offset of ``T_start`` from the prior's pose, where it is known.

@@ -1,8 +1,9 @@
 """Where objects are expected at a window's end, how they move, and how certain that is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -39,6 +40,12 @@ class Prediction:
     def centre_cam(self) -> Float[Tensor, "b 3"]:
         """Centre of each object in the camera's frame (m)."""
         return transform_points(self.T_cam_obj, self.objects.centre_obj[:, None])[:, 0]
+
+    def detached(self) -> "Prediction":
+        """The same prediction as a constant, to look for matches from; itself where no gradients are recorded."""
+        if not torch.is_grad_enabled():
+            return self
+        return replace(self, T_cam_obj=self.T_cam_obj.detach(), velocity=self.velocity.detach(), covariance=self.covariance.detach())
 
     def plane_velocity(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
         """Image velocity of pixels at the depth of the object's centre (px/s)."""

@@ -18,6 +18,7 @@ from torchtrack.contours import ContourModel, Contours, group_by_model, reprojec
 from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.events import EventBatch, pad_streams
+from torchtrack.evidence import AgeAt, Evidence, judged
 from torchtrack.flow import estimate_flow
 from torchtrack.motion import fade, initial_covariance, inverse, left_covariance, predict_covariance, with_dropped
 from torchtrack.object_batch import ObjectBatch
@@ -48,6 +49,8 @@ class Tracker(nn.Module):
         config: settings; the ``default`` preset when not given.
         stream_index: the stream each object is seen in; the first for all when not given.
         dtype: precision of the pipeline; poses are kept in float64.
+        weigher: judges every window's :class:`torchtrack.evidence.Evidence`: how far each observation is to be believed,
+            ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it.
     """
 
     intrinsics: Tensor
@@ -64,6 +67,7 @@ class Tracker(nn.Module):
         config: TrackerConfig | None = None,
         stream_index: Sequence[int] | None = None,
         dtype: torch.dtype = torch.float32,
+        weigher: nn.Module | None = None,
     ) -> None:
         super().__init__()
         cameras = [camera] if isinstance(camera, Camera) else list(camera)
@@ -80,6 +84,7 @@ class Tracker(nn.Module):
         self.register_buffer("sensor_pixels", stack_tables([distortion_table(c, _BORDER_PX) for c in cameras]))
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
+        self.weigher = weigher
         self.to(dtype)
 
     @property
@@ -105,10 +110,10 @@ class Tracker(nn.Module):
             PoseError: if a pose is not a rigid motion, or an object is behind the camera.
         """
         T_cam_obj = torch.as_tensor(T_cam_obj, dtype=torch.float64, device=self.intrinsics.device)
-        lie.check_pose(T_cam_obj)
+        lie.check_pose(T_cam_obj.detach())
         if T_cam_obj.shape != (len(self.centre_obj), 4, 4):
             raise PoseError(f"expected one initial pose per object, shape {[len(self.centre_obj), 4, 4]}, got {list(T_cam_obj.shape)}.")
-        depth = lie.transform_points(T_cam_obj, self.centre_obj.double()[:, None])[:, 0, 2]
+        depth = lie.transform_points(T_cam_obj.detach(), self.centre_obj.double()[:, None])[:, 0, 2]
         for name, z in zip(self.object_names, depth.tolist(), strict=True):
             if z < MIN_DEPTH_M:
                 raise PoseError(f"object '{name}' is behind the camera (depth {z:.3f} m): the z axis must point from the camera to the scene.")
@@ -119,12 +124,16 @@ class Tracker(nn.Module):
         last_event_us = empty_last_event(self.streams, *self.image_size, device=T_cam_obj.device)
         return TrackerState(T_cam_obj.clone(), velocity, covariance, nothing, nothing, times, last_event_us)
 
-    def forward(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
-        """The same as :meth:`step`."""
+    def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
+        """:meth:`step`, as a layer of a network: what comes in first."""
         return self.step(state, events, t_end_us)
 
     def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """Advance every object by one window of events.
+
+        Where gradients are recorded, the new poses and velocities are differentiable by the old ones, by the weigher, and by
+        whatever buffer requires it, such as ``intrinsics``; covariances are constants. Autocast leaves this alone: the
+        solver needs the digits.
 
         Args:
             state: from :meth:`init` or the last step.
@@ -132,11 +141,12 @@ class Tracker(nn.Module):
             t_end_us: end of the window; the newest event of each stream when not given.
         """
         t_us = self._window_end(state, events, t_end_us)
-        in_parts = self._to_be_parted(state, events, t_us)
-        if bool(in_parts.all()):
-            return self._advance_in_parts(state, events, t_us)
-        whole = self._advance(state, events, t_us)
-        return choose_rows(in_parts, self._advance_in_parts(state, events, t_us), whole) if bool(in_parts.any()) else whole
+        with torch.autocast(t_us.device.type, enabled=False):
+            in_parts = self._to_be_parted(state, events, t_us)
+            if bool(in_parts.all()):
+                return self._advance_in_parts(state, events, t_us)
+            whole = self._advance(state, events, t_us)
+            return choose_rows(in_parts, self._advance_in_parts(state, events, t_us), whole) if bool(in_parts.any()) else whole
 
     def _to_be_parted(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> Tensor:
         """Objects whose window is taken in parts: while a large part of their motion within it is not known.
@@ -169,7 +179,8 @@ class Tracker(nn.Module):
         config = self.config
         window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
         last_event_us = update_last_event(state.last_event_us, events)
-        prediction = self._predict(state, window_s)
+        recorded = self._predict(state, window_s)
+        prediction = recorded.detached()
         contours = self._extract(prediction.T_cam_obj)
         corners = self._corners(contours, last_event_us, t_us, window_s)
         sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
@@ -180,9 +191,12 @@ class Tracker(nn.Module):
         if config.matching.max_events:
             near = select_events(seen, index, prediction.plane_velocity(seen.pixels), config.matching.max_events)
             observations = join(observations, near)
-        found = judge_fit(prediction, align(prediction, contours, index, widening, observations, config), config)
-        found = self._search(state, prediction, sigma_px, seen, found)
-        next_state, result = self._conclude(state, prediction, widening, found, corners, window_s)
+        if self.weigher is not None:
+            evidence = Evidence(observations, seen, prediction, contours, index, self._event_history(last_event_us, t_us))
+            observations = judged(evidence, self.weigher)
+        found = judge_fit(prediction, align(recorded, contours, index, widening, observations, config), config)
+        found = self._search(state, recorded, sigma_px, seen, found)
+        next_state, result = self._conclude(state, recorded, widening, found, corners, window_s)
         return replace(next_state, t_us=t_us, last_event_us=last_event_us), replace(result, t_us=t_us)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
@@ -197,7 +211,7 @@ class Tracker(nn.Module):
         if self.config.motion.model == "hold":
             velocity, covariance = torch.zeros_like(velocity), with_dropped(covariance, velocity)
         T_prior = lie.retract_about(state.T_cam_obj.to(velocity.dtype), velocity * dt_s[:, None], self.centre_obj)
-        covariance = predict_covariance(covariance, velocity, dt_s, self.diameter_m, self.config.motion)
+        covariance = predict_covariance(covariance.detach(), velocity.detach(), dt_s, self.diameter_m, self.config.motion)
         T_prior, usable = self._before_camera(T_prior)
         return Prediction(self.objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance)
 
@@ -219,15 +233,30 @@ class Tracker(nn.Module):
         config = self.config
         if config.corners.max_corners == 0:
             return no_corners(contours.pixels)
-        height, width = self.sensor_pixels.shape[1:3]
-        # Clamped before the conversion: a far-off pixel does not fit an integer.
-        limit = self.intrinsics.new_tensor([width - 1, height - 1])
-        u, v = torch.minimum((contours.pixels + _BORDER_PX).clamp(min=0), limit).round().long().unbind(-1)
-        sensor = at_pixels(self.sensor_pixels, self.stream_index[:, None], u, v)
+        sensor = self._on_sensor(contours.pixels)
         regions = object_regions(sensor, contours.mask, self.stream_index, self.image_size, config.surface.margin_px)
         surface = time_surface(last_event_us, t_us, regions, config.surface.tau_s, self.intrinsics.dtype)
         corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config.surface, config.corners)
         return estimate_flow(corners, last_event_us, t_us, self.stream_index, self.ideal_pixels, config.flow)
+
+    def _on_sensor(self, pixels: Tensor) -> Tensor:
+        """Where the lens puts ideal pixels."""
+        height, width = self.sensor_pixels.shape[1:3]
+        # Clamped before the conversion: a far-off pixel does not fit an integer.
+        limit = self.intrinsics.new_tensor([width - 1, height - 1])
+        u, v = torch.minimum((pixels + _BORDER_PX).clamp(min=0), limit).round().long().unbind(-1)
+        return at_pixels(self.sensor_pixels, self.stream_index[:, None], u, v)
+
+    def _event_history(self, last_event_us: Tensor, t_us: Tensor) -> AgeAt:
+        """How long ago anything happened at a pixel, for a weigher."""
+
+        def age_s(pixels: Tensor) -> Tensor:
+            limit = pixels.new_tensor([self.image_size[1] - 1, self.image_size[0] - 1])
+            u, v = torch.minimum(self._on_sensor(pixels).round().clamp(min=0), limit).long().unbind(-1)
+            age_us = t_us[self.stream_index, None] - at_pixels(last_event_us, self.stream_index[:, None], u, v)
+            return age_us.to(pixels.dtype) * 1e-6
+
+        return age_s
 
     def _seen(self, events: EventBatch, t_us: Tensor) -> WindowEvents:
         """The window's events as each object's camera saw them."""

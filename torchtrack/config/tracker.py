@@ -113,6 +113,7 @@ class SolverConfig(Settings):
 
     iterations: int = Field(1, ge=1, le=100, description="Iterations in each round.")
     loss: Literal["tukey", "huber", "none"] = Field("tukey", description="Robust loss, with the round's gate as its scale.")
+    gradient_iterations: int = Field(1, ge=0, le=100, description="Newton steps to the optimum where gradients of the pose are asked for.")
     damping: float = Field(1e-6, ge=0, description="Initial damping, as a share of the Hessian's diagonal.")
     prior: bool = Field(True, description="Weigh the observations against the prediction by its covariance, and find the velocity with the pose.")
     observation_px: float = Field(1.5, gt=0, description="Standard deviation of one observation (px), with its share of what all have in common.")
