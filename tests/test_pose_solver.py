@@ -155,17 +155,6 @@ def test_the_hessian_is_that_of_a_cost_without_residuals():
     torch.testing.assert_close(hessian[0], expected[0, :, 0], rtol=1e-7, atol=1e-5)
 
 
-def test_the_solution_can_be_differentiated_by_targets_and_weights():
-    T_true = random_pose(1)
-    problem = problem_at(T_true, 8, noise_px=0.5)
-    T_start = perturbed(T_true, rotation_rad=1e-3, translation_m=1e-4)
-
-    def solution(targets, weights):
-        return solve_pose(replace(problem, targets=targets, weights=weights), T_start, SolverConfig(loss="none", prior=False)).T_cam_obj
-
-    assert gradcheck(solution, (problem.targets.clone().requires_grad_(), problem.weights.clone().requires_grad_()), atol=1e-6)
-
-
 # ---- convergence
 
 
