@@ -6,7 +6,8 @@ import pytest
 from io_files import everything
 
 from torchtrack.bench.io import HEIGHT, TARGETS, WIDTH, measure, synthetic, write_events
-from torchtrack.bench.results import Result, as_markdown
+from torchtrack.bench.results import Report, Result, as_markdown, machine
+from torchtrack.bench.setup import Setup
 from torchtrack.cli import main
 from torchtrack.events import concatenate
 from torchtrack.io import open_events
@@ -23,7 +24,7 @@ def test_files_hold_the_events_that_are_measured(tmp_path, name):
 
 def test_every_format_is_measured():
     seen = []
-    results = measure(2000, 2, seen.append)
+    results = measure(Setup(repeats=2, events=2000, show=seen.append)).results
     assert seen == list(TARGETS)
     assert {result.name for result in results} >= {"evt2", "evt3", "dat", "dsec", "npz", "csv", "davis"}
     assert all(len(result.figures) == 2 and min(result.figures) > 0 for result in results)
@@ -34,8 +35,8 @@ def test_medians_and_quartiles_are_told():
     assert result.quartiles == (20.0, 30.0, 40.0)
     assert result.reached
     assert Result("x", "s", (1.0,)).quartiles == (1.0, 1.0, 1.0)
-    assert "| evt3 | 30.0 Mev/s | 20.0 … 40.0 | ≥ 30 | reached |" in as_markdown("Reading", [result])
-    assert "| missed |" in as_markdown("Reading", [Result("evt3", "Mev/s", (1.0, 2.0), 30.0)])
+    assert "| evt3 | 30.0 Mev/s | 20.0 … 40.0 | ≥ 30 | reached |" in as_markdown(Report("io", "Reading", (result,)), machine())
+    assert "| missed |" in as_markdown(Report("io", "Reading", (Result("evt3", "Mev/s", (1.0, 2.0), 30.0),)), machine())
 
 
 def test_the_command_writes_json_and_markdown(tmp_path, capsys):

@@ -1,10 +1,12 @@
 """The commands about files of events: their options, as the command line types them."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from torchtrack.bench.parts import Part
 from torchtrack.config.formats import OutputFormat
 from torchtrack.errors import ConfigError
 
@@ -63,23 +65,35 @@ class Convert:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure the speed of a part; write JSON and Markdown, with medians and quartiles."""
+    """Measure the speed of a part; write JSON, Markdown and plots, with medians, quartiles and targets."""
 
-    part: Positional[Literal["io", "sim"]]
-    """io: reading events, per format. sim: rendering and making events."""
+    part: Positional[Literal[Part, "all"]]
+    """pipeline: steps of the tracker. stages: of a step. solver: many poses at once. io: reading events, per format. sim: rendering and making
+    events. all: all of them, but those whose libraries are missing."""
     output: Annotated[str, arg(aliases=["-o"], metavar="DIR")]
     """Folder for the results."""
     repeats: Annotated[int, arg(metavar="N")] = 7
     """How often everything is measured."""
+    compare: Annotated[str | None, arg(metavar="OLD.json", help_behavior_hint="")] = None
+    """Earlier results of the same part, or the folder with them: tells how many times faster each figure is now."""
+    device: Annotated[str, arg(metavar="NAME")] = "cpu"
+    """Where to measure: cpu, cuda or cuda:N; io and sim are always on the CPU."""
+    threads: Annotated[int, arg(metavar="N")] = 1
+    """Threads of PyTorch on the CPU."""
     events: Annotated[int, arg(metavar="N")] = 5_000_000
     """Of io: events of each file."""
+    sequence: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Of pipeline and stages: a sequence, in place of simulated scenes."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.bench.command import bench
+        from torchtrack.bench.command import bench, bench_device
+        from torchtrack.bench.setup import Setup
 
         refuse_settings(overrides)
-        return bench(self.part, self.output, repeats=self.repeats, events=self.events)
+        sequence, compare = (Path(text) if text is not None else None for text in (self.sequence, self.compare))
+        setup = Setup(self.repeats, bench_device(self.device), self.threads, self.events, sequence)
+        return bench(self.part, Path(self.output), compare, setup)
 
 
 def refuse_settings(overrides: dict[str, Any]) -> None:

@@ -7,13 +7,13 @@ on an idle machine that is the time that passes, and other work beside it does n
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from torchtrack.bench.results import Result
+from torchtrack.bench.results import Report, Result
+from torchtrack.bench.setup import Setup
 from torchtrack.errors import MissingExtraError
 from torchtrack.events import EventBatch
 from torchtrack.io.convert import WRITERS
@@ -27,33 +27,23 @@ _BATCH = 500_000
 _TEXT_SHARE = 10
 
 
-def measure(events: int, repeats: int, on_format: Callable[[str], None] = lambda name: None) -> list[Result]:
-    """Reading speed per format (Mev/s); formats whose libraries are missing are left out.
-
-    Args:
-        events: how many events each file holds; a tenth of it in text.
-        repeats: how often each file is read.
-        on_format: called with each format before it is measured.
-    """
-    results = []
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            for name, target in TARGETS.items():
-                on_format(name)
-                count = max(events // _TEXT_SHARE, 1) if name in ("davis", "csv") else events
-                path = Path(folder) / f"events{_SUFFIX[name]}"
-                try:
-                    write_events(path, name, count)
-                    figures = [_speed(path, count) for _ in range(repeats + 1)][1:]
-                except MissingExtraError:
-                    continue
-                results.append(Result(name, "Mev/s", tuple(figures), target))
-                path.unlink()
-    finally:
-        torch.set_num_threads(threads)
-    return results
+def measure(setup: Setup) -> Report:
+    """Reading speed per format (Mev/s); text holds a tenth of the events, and formats whose libraries are missing are left out."""
+    results, notes = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, target in TARGETS.items():
+            setup.show(name)
+            count = max(setup.events // _TEXT_SHARE, 1) if name in ("davis", "csv") else setup.events
+            path = Path(folder) / f"events{_SUFFIX[name]}"
+            try:
+                write_events(path, name, count)
+                figures = [_speed(path, count) for _ in range(setup.repeats + 1)][1:]
+            except MissingExtraError as error:
+                notes.append(f"{name}: left out: {error}")
+                continue
+            results.append(Result(name, "Mev/s", tuple(figures), target))
+            path.unlink()
+    return Report("io", "Reading events, one core", tuple(results), tuple(notes))
 
 
 def synthetic(events: int, seed: int = 0) -> Iterator[EventBatch]:

@@ -4,25 +4,36 @@ import json
 import os
 import platform
 import statistics
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from torchtrack.bench.plots import Plot, draw
+from torchtrack.errors import ConfigError, MissingFileError
 from torchtrack.io.atomic import atomic_path
 
 
 @dataclass(frozen=True)
 class Result:
-    """What was measured: its name, the unit, one figure per repeat, and the figure to reach (None: no target)."""
+    """What was measured.
+
+    Args:
+        name: of what was measured.
+        unit: of the figures.
+        figures: one per repeat.
+        target: the figure to reach; None for no target.
+        lower_is_better: whether the target is to be stayed below, as of times, or exceeded, as of rates.
+    """
 
     name: str
     unit: str
     figures: tuple[float, ...]
     target: float | None = None
+    lower_is_better: bool = False
 
     @property
     def quartiles(self) -> tuple[float, float, float]:
@@ -33,14 +44,51 @@ class Result:
         return lower, median, upper
 
     @property
+    def median(self) -> float:
+        """The median."""
+        return self.quartiles[1]
+
+    @property
     def reached(self) -> bool | None:
-        """Whether the median is at the target or above; None without a target."""
-        return None if self.target is None else self.quartiles[1] >= self.target
+        """Whether the median is at the target or better; None without a target."""
+        if self.target is None:
+            return None
+        return self.median <= self.target if self.lower_is_better else self.median >= self.target
+
+    def speed_up(self, older_median: float) -> float:
+        """How many times better than an older median: above 1 is better."""
+        ours, theirs = (older_median, self.median) if self.lower_is_better else (self.median, older_median)
+        return ours / theirs if theirs else float("inf")
 
 
-def machine() -> dict[str, Any]:
+def time_result(name: str, seconds: list[float], target_ms: float | None = None) -> Result:
+    """Times, in ms; the target is to be stayed below."""
+    return Result(name, "ms", tuple(1e3 * value for value in seconds), target_ms, lower_is_better=True)
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that one part of the benchmark gave.
+
+    Args:
+        part: its name on the command line.
+        title: what was measured, and how.
+        results: the figures.
+        notes: what else there is to know: what is missing here, and whether what was timed did its work.
+        plots: pictures of the figures.
+    """
+
+    part: str
+    title: str
+    results: tuple[Result, ...]
+    notes: tuple[str, ...] = ()
+    plots: tuple[Plot, ...] = ()
+
+
+def machine(device: torch.device | None = None) -> dict[str, Any]:
     """What the figures depend on."""
     return {
+        "device": torch.cuda.get_device_name(device) if device is not None and device.type == "cuda" else "cpu",
         "processor": _processor(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
@@ -56,24 +104,77 @@ def _processor() -> str:
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor() or "unknown")
 
 
-def as_markdown(title: str, results: Sequence[Result]) -> str:
-    """A table of the figures, and the machine they are from."""
-    lines = [f"# {title}", "", "| what | median | quartiles | target | |", "|---|---|---|---|---|"]
-    for result in results:
-        lower, median, upper = result.quartiles
-        target = "–" if result.target is None else f"≥ {result.target:g}"
-        verdict = {None: "", True: "reached", False: "missed"}[result.reached]
-        lines.append(f"| {result.name} | {median:.1f} {result.unit} | {lower:.1f} … {upper:.1f} | {target} | {verdict} |")
-    lines += ["", ", ".join(f"{key} {value}" for key, value in machine().items()), ""]
-    return "\n".join(lines)
+def plain(value: float) -> str:
+    """A figure with as many digits as tell something."""
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}" if abs(value) >= 0.1 else f"{value:.3g}"
 
 
-def write_results(folder: Path, part: str, title: str, results: Sequence[Result]) -> None:
-    """Write ``bench_PART.json`` and ``bench_PART.md``."""
-    plain = [
-        {"name": r.name, "unit": r.unit, "quartiles": r.quartiles, "figures": r.figures, "target": r.target, "reached": r.reached} for r in results
-    ]
-    content = {"part": part, "machine": machine(), "results": plain}
-    for suffix, text in (("json", json.dumps(content, indent=2, ensure_ascii=False) + "\n"), ("md", as_markdown(title, results))):
-        with atomic_path(folder / f"bench_{part}.{suffix}") as temporary:
+def as_markdown(report: Report, setup: Mapping[str, Any], older: Mapping[str, float] | None = None) -> str:
+    """A table of the figures, notes, and the machine they are from.
+
+    Args:
+        report: the figures.
+        setup: what they depend on, as of :func:`machine`.
+        older: medians by name that the figures are compared with.
+    """
+    further = (" against before |", "---|") if older is not None else ("", "")
+    lines = [f"# {report.title}", "", f"| what | median | quartiles | target | |{further[0]}", f"|---|---|---|---|---|{further[1]}"]
+    lines += [_row(result, older) for result in report.results]
+    lines += ["", *(f"- {note}" for note in report.notes), *([""] if report.notes else [])]
+    lines += [f"![{plot.title}]({plot_name(report, plot)})\n" for plot in report.plots]
+    return "\n".join([*lines, ", ".join(f"{key} {value}" for key, value in setup.items()), ""])
+
+
+def _row(result: Result, older: Mapping[str, float] | None) -> str:
+    lower, median, upper = (plain(value) for value in result.quartiles)
+    target = "–" if result.target is None else f"{'≤' if result.lower_is_better else '≥'} {result.target:g}"
+    verdict = {None: "", True: "reached", False: "missed"}[result.reached]
+    row = f"| {result.name} | {median} {result.unit} | {lower} … {upper} | {target} | {verdict} |"
+    if older is None:
+        return row
+    return row + (f" {result.speed_up(older[result.name]):.2f}x |" if result.name in older else " new |")
+
+
+def plot_name(report: Report, plot: Plot) -> str:
+    """Name of a plot's file."""
+    return f"bench_{report.part}_{plot.name}.png"
+
+
+def older_medians(path: Path, part: str) -> dict[str, float]:
+    """Medians by name of an earlier benchmark of the same part.
+
+    Args:
+        path: what :func:`write_results` wrote: the file, or the folder with it.
+        part: the part that is compared.
+
+    Raises:
+        MissingFileError: if there is no such file.
+        ConfigError: if it holds something else, or another part.
+    """
+    file = path / f"bench_{part}.json" if path.is_dir() else path
+    if not file.is_file():
+        raise MissingFileError(f"there is no '{file}' to compare with. Give a bench_{part}.json that `torchtrack bench {part}` wrote, or its folder.")
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        found, medians = content["part"], {entry["name"]: float(entry["quartiles"][1]) for entry in content["results"]}
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise ConfigError(f"'{file}' is not a file that `torchtrack bench {part}` wrote ({error!r}). Give its bench_{part}.json.") from error
+    if found != part:
+        raise ConfigError(f"'{file}' holds figures of the part '{found}', and '{part}' is measured. Give a bench_{part}.json.")
+    return medians
+
+
+def write_results(folder: Path, report: Report, setup: Mapping[str, Any], older: Mapping[str, float] | None = None) -> None:
+    """Write ``bench_PART.json``, ``bench_PART.md`` and the plots."""
+    results = [{**asdict(result), "quartiles": result.quartiles, "reached": result.reached} for result in report.results]
+    if older is not None:
+        for entry, result in zip(results, report.results, strict=True):
+            entry["speed_up"] = result.speed_up(older[result.name]) if result.name in older else None
+    content = {"part": report.part, "title": report.title, "machine": dict(setup), "results": results, "notes": report.notes}
+    texts = (("json", json.dumps(content, indent=2, ensure_ascii=False) + "\n"), ("md", as_markdown(report, setup, older)))
+    for suffix, text in texts:
+        with atomic_path(folder / f"bench_{report.part}.{suffix}") as temporary:
             temporary.write_text(text, encoding="utf-8")
+    for plot in report.plots:
+        with atomic_path(folder / plot_name(report, plot)) as temporary:
+            draw(plot, temporary)

@@ -1,0 +1,205 @@
+"""The benchmark's command: files of every part, comparison with earlier figures, what is refused."""
+
+import json
+
+import matplotlib.image
+import pytest
+import torch
+
+from torchtrack.bench import io, pipeline, scene, sim, solver, stages
+from torchtrack.bench.clock import Clock
+from torchtrack.bench.plots import Plot, draw
+from torchtrack.bench.results import Report, Result, as_markdown, machine, older_medians, plain, time_result
+from torchtrack.bench.setup import Setup
+from torchtrack.cli import main
+from torchtrack.errors import ConfigError, MissingExtraError, MissingFileError
+from torchtrack.exit_codes import ExitCode
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Every part as small as it can be."""
+    monkeypatch.setattr(scene, "DURATION_S", 0.04)
+    monkeypatch.setattr(scene, "WARM_UP_WINDOWS", 6)
+    monkeypatch.setattr(pipeline, "SHAPES", ("lbracket",))
+    monkeypatch.setattr(pipeline, "MANY", ((2, 2, 15.0),))
+    monkeypatch.setattr(pipeline, "OUTSIDE_MEV_S", (1.0,))
+    monkeypatch.setattr(pipeline, "HD", (320, 240))
+    monkeypatch.setattr(pipeline, "HD_MEV_S", 4.0)
+    monkeypatch.setattr(stages, "SHAPES", ("lbracket",))
+    monkeypatch.setattr(stages, "MANY", ((2, 2),))
+    monkeypatch.setattr(solver, "TARGETS_MS", {1: 2.0, 3: None})
+    monkeypatch.setattr(sim, "_FRAMES", 3)
+    monkeypatch.setattr(io, "TARGETS", {"evt2": 50.0})
+    scene.simulated.cache_clear()
+    yield
+    scene.simulated.cache_clear()
+
+
+def bench(part, folder, *further):
+    return main(["bench", part, "-o", str(folder), "--repeats", "1", "--events", "1000", *map(str, further)])
+
+
+def written(folder, part):
+    return json.loads((folder / f"bench_{part}.json").read_text())
+
+
+# ---- every part
+
+
+@pytest.fixture
+def simulator():
+    pytest.importorskip("numba", reason="the simulator needs numba: pip install 'torchtrack[sim]'")
+
+
+def test_pipeline(tiny, simulator, tmp_path, capsys):
+    assert bench("pipeline", tmp_path) == ExitCode.DONE
+    content = written(tmp_path, "pipeline")
+    names = [entry["name"] for entry in content["results"]]
+    assert names[:4] == ["1 object (lbracket), median", "1 object (lbracket), 95 %", "2 objects, median", "2 objects, 95 %"]
+    assert names[4:] == ["1 object with 1 Mev/s outside it over none", "1 object in 320x240 at 4 Mev/s, stream over work"]
+    assert all(entry["figures"][0] > 0 and len(entry["figures"]) == 1 for entry in content["results"])
+    assert "100.0% of poses are TRACKING" in content["notes"][0]
+    assert content["machine"]["threads"] == 1 and content["machine"]["device"] == "cpu"
+    assert "1 object (lbracket), median" in capsys.readouterr().out
+
+
+def test_stages(tiny, simulator, tmp_path):
+    assert bench("stages", tmp_path) == ExitCode.DONE
+    entries = written(tmp_path, "stages")["results"]
+    assert {entry["name"] for entry in entries} == {f"{run}: {stage}" for run in ("1 object (lbracket)", "2 objects") for stage in stages.STAGES}
+    assert matplotlib.image.imread(tmp_path / "bench_stages_shares.png").shape[2] == 4
+
+
+def test_solver(tiny, tmp_path):
+    assert bench("solver", tmp_path) == ExitCode.DONE
+    content = written(tmp_path, "solver")
+    assert [(entry["name"], entry["target"], entry["lower_is_better"]) for entry in content["results"]] == [("B=1", 2.0, True), ("B=3", None, True)]
+    assert (tmp_path / "bench_solver_throughput.png").is_file()
+
+
+def test_all_parts_but_those_whose_libraries_are_missing(tiny, simulator, tmp_path, monkeypatch, capsys):
+    def without(setup):
+        raise MissingExtraError("numba", "sim", "the simulator")
+
+    monkeypatch.setattr(pipeline, "measure", without)
+    assert bench("all", tmp_path) == ExitCode.DONE
+    assert {path.name for path in tmp_path.glob("*.json")} == {f"bench_{part}.json" for part in ("stages", "solver", "io", "sim")}
+    assert "left out: pipeline: the simulator needs the library 'numba'" in capsys.readouterr().err
+    assert bench("pipeline", tmp_path) == ExitCode.FAILED
+    assert bench("all", tmp_path, "--compare", tmp_path / "bench_io.json") == ExitCode.WRONG_SETTINGS
+
+
+# ---- figures
+
+
+def test_times_are_to_be_low_and_rates_high():
+    assert time_result("x", [0.003], 4.0).reached
+    assert time_result("x", [0.005], 4.0).reached is False
+    assert time_result("x", [0.005]).reached is None
+    assert time_result("x", [0.002]).speed_up(4.0) == pytest.approx(2.0)
+    assert Result("x", "Mev/s", (2.0,)).speed_up(4.0) == pytest.approx(0.5)
+    assert Result("x", "ms", (0.0,), lower_is_better=True).speed_up(1.0) == float("inf")
+
+
+@pytest.mark.parametrize(("value", "text"), [(123.456, "123.5"), (10.0, "10.0"), (3.14159, "3.14"), (0.01234, "0.0123"), (0.0, "0")])
+def test_figures_have_the_digits_that_tell_something(value, text):
+    assert plain(value) == text
+
+
+def test_lines_and_bars_are_drawn(tmp_path):
+    lines = Plot("a", "title", "x", "y", {"one": ((1.0, 2.0), (2.0, 3.0)), "two": ((1.0, 1.0),)})
+    bars = Plot("b", "title", "x", "y", {"one": ((0.0, 60.0), (1.0, 30.0)), "two": ((0.0, 40.0), (1.0, 70.0))}, "bars", ("a", "b"))
+    for plot in (lines, bars):
+        draw(plot, tmp_path / "plot.png")
+        image = matplotlib.image.imread(tmp_path / "plot.png")
+        assert image.std() > 0.05
+
+
+def test_the_clock_times_one_run():
+    done = []
+    seconds = Clock(CPU).seconds(lambda: done.append(sum(range(20_000))), 3)
+    assert len(seconds) == 3 and all(value > 0 for value in seconds)
+    assert len(done) > 5
+    assert Clock(CPU).meaning != Clock(CPU, 2).meaning
+    assert len(Clock(CPU, 2).seconds(lambda: None, 2)) == 2
+
+
+# ---- comparison
+
+
+def test_figures_are_compared_with_earlier_ones(tiny, tmp_path, capsys):
+    old, new = tmp_path / "old", tmp_path / "new"
+    assert bench("solver", old) == ExitCode.DONE
+    path = old / "bench_solver.json"
+    content = json.loads(path.read_text())
+    content["results"][0]["quartiles"][1] *= 10
+    del content["results"][1]
+    path.write_text(json.dumps(content))
+    for given in (path, old):
+        assert bench("solver", new, "--compare", given) == ExitCode.DONE
+        entries = written(new, "solver")["results"]
+        assert 2 < entries[0]["speed_up"] < 50
+        assert entries[1]["speed_up"] is None
+    table = (new / "bench_solver.md").read_text()
+    assert "against before" in table and "new |" in table
+    assert "against before" in capsys.readouterr().out
+    assert "against" not in (old / "bench_solver.md").read_text()
+
+
+def test_what_cannot_be_compared_with_is_refused(tmp_path):
+    with pytest.raises(MissingFileError, match=r"no '.*bench_solver.json' to compare with"):
+        older_medians(tmp_path, "solver")
+    for text in ("{", "[1, 2]", '{"part": "solver"}', '{"part": "solver", "results": [{"name": "x", "quartiles": [1]}]}'):
+        (tmp_path / "bench_solver.json").write_text(text)
+        with pytest.raises(ConfigError, match="is not a file that `torchtrack bench solver` wrote"):
+            older_medians(tmp_path, "solver")
+    (tmp_path / "other.json").write_text('{"part": "io", "results": []}')
+    with pytest.raises(ConfigError, match="figures of the part 'io', and 'solver' is measured"):
+        older_medians(tmp_path / "other.json", "solver")
+
+
+def test_the_table_says_what_it_was_measured_on():
+    text = as_markdown(Report("solver", "Title", (time_result("B=1", [0.003], 2.0),), ("a note",)), machine(CPU), {"B=1": 6.0})
+    assert "# Title" in text and "- a note" in text and "processor" in text
+    assert "| B=1 | 3.00 ms | 3.00 … 3.00 | ≤ 2 | missed | 2.00x |" in text
+
+
+# ---- what is refused
+
+
+@pytest.mark.parametrize(
+    ("part", "further", "message"),
+    [
+        ("solver", ("--repeats", 0), "at least 1, got 0"),
+        ("solver", ("--threads", 0), "at least 1"),
+        ("io", ("--events", 0), "at least 1"),
+        ("solver", ("--device", "tpu"), "must be cpu, cuda or cuda:N, got 'tpu'"),
+        ("solver", ("--device", "meta"), "must be cpu, cuda or cuda:N, got 'meta'"),
+        ("solver", ("--device", "cuda:99"), "GPUs here. Measure on the CPU"),
+        ("solver", ("--tracker.window.duration_us", 3), "takes no settings"),
+    ],
+)
+def test_wrong_options_are_refused(part, further, message, tmp_path, capsys):
+    assert bench(part, tmp_path / "out", *further) == ExitCode.WRONG_SETTINGS
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_not_there_is_told(tiny, tmp_path, capsys):
+    assert bench("solver", tmp_path, "--compare", tmp_path / "none.json") == ExitCode.FAILED
+    assert "to compare with" in capsys.readouterr().err
+    assert bench("pipeline", tmp_path, "--sequence", tmp_path / "none.npz") == ExitCode.FAILED
+
+
+def test_an_unknown_part_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        bench("wheels", tmp_path)
+    assert "wheels" in capsys.readouterr().err
+
+
+def test_a_setup_measures_on_one_thread_unless_told():
+    assert Setup().clock == Clock(CPU, 1)
+    Setup().show("nothing")

@@ -1,0 +1,69 @@
+"""Stages that are timed from outside: their own times, and all as it was afterwards."""
+
+import pytest
+import torch
+from tracked_boxes import started
+
+from torchtrack.bench.clock import Clock
+from torchtrack.bench.stages import STAGES, StageTimes, owner_of, timed
+
+PLACES = [place for places in STAGES.values() for place in places]
+
+
+class Ticks(Clock):
+    """A clock that goes on by one at every look."""
+
+    def __init__(self):
+        super().__init__(torch.device("cpu"))
+        object.__setattr__(self, "looks", iter(range(1000)))
+
+    def now(self):
+        return float(next(self.looks))
+
+
+def functions():
+    return [getattr(*owner_of(place)) for place in PLACES]
+
+
+def test_afterwards_all_is_as_it_was():
+    before = functions()
+    with timed(StageTimes(Clock(torch.device("cpu")))):
+        assert all(now is not then for now, then in zip(functions(), before, strict=True))
+    assert all(now is then for now, then in zip(functions(), before, strict=True))
+
+
+def test_afterwards_all_is_as_it_was_after_an_error_too():
+    before = functions()
+    with pytest.raises(KeyError), timed(StageTimes(Clock(torch.device("cpu")))):
+        raise KeyError
+    assert all(now is then for now, then in zip(functions(), before, strict=True))
+
+
+def test_a_stage_counts_its_own_time_alone():
+    times = StageTimes(Ticks())
+    inner = times.timing("inner", lambda value: value + 1)
+    outer = times.timing("outer", lambda value: inner(inner(value)))
+    assert outer(1) == 3
+    # Looks at the clock: outer begins at 0, inner at 1 and 3, and outer ends at 5.
+    assert dict(times.seconds) == {"inner": 2.0, "outer": 3.0}
+
+
+def test_a_stage_that_fails_is_counted_too():
+    def fails():
+        raise KeyError
+
+    times = StageTimes(Ticks())
+    with pytest.raises(KeyError):
+        times.timing("fails", fails)()
+    assert dict(times.seconds) == {"fails": 1.0}
+
+
+def test_every_stage_of_a_step_is_timed_and_the_step_is_the_same():
+    tracker, state, _, (events, end_us), _ = started()
+    expected = tracker.step(state, events, end_us)[1]
+    times = StageTimes(Clock(torch.device("cpu")))
+    with timed(times):
+        result = tracker.step(state, events, end_us)[1]
+    assert torch.equal(result.T_cam_obj, expected.T_cam_obj)
+    assert set(times.seconds) == set(STAGES)
+    assert all(value > 0 for value in times.seconds.values())

@@ -1,0 +1,5 @@
+"""Names of the parts that can be measured: each is a module beside this one."""
+
+from typing import Literal
+
+Part = Literal["pipeline", "stages", "solver", "io", "sim"]

@@ -1,0 +1,97 @@
+"""How long a step of the tracker takes, with the preset ``default`` and its windows: few and many objects, many events."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from torchtrack.bench.results import Report, Result, time_result
+from torchtrack.bench.scene import HD, SHAPES, Scene, read, shapes_of, simulated, started, with_events_outside
+from torchtrack.bench.setup import Setup
+from torchtrack.events import EventBatch
+from torchtrack.stepping import cut_windows, steps
+
+# Targets (ms) of the median and of the step that 95 % are faster than.
+ONE_OBJECT_MS = (4.0, 6.0)
+# Objects and columns of cells of each further scene, and the target of the median (ms).
+MANY = ((8, 4, 15.0), (64, 8, 100.0))
+OUTSIDE_MEV_S = (5.0, 20.0)
+HD_MEV_S = 20.0
+# Events outside of all objects may cost what it takes to look at each of them once.
+_MOST_FOR_OUTSIDE = 1.1
+# A camera or a file gives events in chunks of about this many.
+_CHUNK = 100_000
+
+_Part = tuple[list[Result], str]
+
+
+def measure(setup: Setup) -> Report:
+    """Time of a step, and what it depends on.
+
+    Raises:
+        MissingExtraError: if scenes are to be simulated, and the simulator's libraries are not installed.
+    """
+    parts = list(_of_sequence(setup) if setup.sequence is not None else _of_scenes(setup))
+    title = f"One step of the tracker, preset default, windows of 5 ms; {setup.clock.meaning}"
+    return Report("pipeline", title, tuple(result for results, _ in parts for result in results), tuple(note for _, note in parts))
+
+
+def _of_sequence(setup: Setup) -> Iterator[_Part]:
+    if setup.sequence is not None:
+        scene = read(setup.sequence)
+        yield _latency(setup, f"{setup.sequence.stem}, {len(scene.models)} objects", scene)
+
+
+def _of_scenes(setup: Setup) -> Iterator[_Part]:
+    for shape in SHAPES:
+        yield _latency(setup, f"1 object ({shape})", simulated((shape,)), *ONE_OBJECT_MS)
+    for count, columns, target_ms in MANY:
+        yield _latency(setup, f"{count} objects", simulated(shapes_of(count), columns), target_ms)
+    yield _outside(setup)
+    yield _real_time(setup)
+
+
+def _latency(setup: Setup, name: str, scene: Scene, median_ms: float | None = None, p95_ms: float | None = None) -> _Part:
+    """Median and 95 % of the time of a step, each once per repeat, and how well it tracked."""
+    setup.show(name)
+    run = started(scene, setup.device)
+    quality = run.quality(setup.clock)
+    repeats = [run.latencies(setup.clock) for _ in range(setup.repeats)]
+    median, p95 = ([float(value) for value in np.quantile(repeats, share, axis=1)] for share in (0.5, 0.95))
+    results = [time_result(f"{name}, median", median, median_ms), time_result(f"{name}, 95 %", p95, p95_ms)]
+    return results, f"{name}: {scene.mev_per_s:.1f} Mev/s, {quality}"
+
+
+def _outside(setup: Setup) -> _Part:
+    """How many times longer a step takes with events that are near no object."""
+    scene = simulated(SHAPES[:1])
+    setup.show("events outside the object")
+    runs = [started(with_events_outside(scene, rate), setup.device) for rate in (0.0, *OUTSIDE_MEV_S)]
+    # Turn by turn, so that a machine that gets slower does so for all.
+    medians = np.array([[np.median(run.latencies(setup.clock)) for run in runs] for _ in range(setup.repeats)])
+    ratios = medians[:, 1:] / medians[:, :1]
+    name, most = "1 object with {:g} Mev/s outside it over none", _MOST_FOR_OUTSIDE
+    results = [Result(name.format(rate), "times", tuple(ratios[:, number].tolist()), most, True) for number, rate in enumerate(OUTSIDE_MEV_S)]
+    return results, "Events outside an object keep away from its bounding box at all times."
+
+
+def _real_time(setup: Setup) -> _Part:
+    """Seconds of an HD stream per second of work, with one object in it."""
+    name = f"1 object in {HD[0]}x{HD[1]} at {HD_MEV_S:g} Mev/s"
+    setup.show(name)
+    scene = simulated(SHAPES[:1], size=HD)
+    scene = with_events_outside(scene, max(HD_MEV_S - scene.mev_per_s, 0))
+    run = started(scene, setup.device)
+    start_us = int(run.state.t_us[0])
+    stream = scene.events.slice_time(start_us, scene.end_us)
+    factors = []
+    for _ in range(setup.repeats):
+        begun = setup.clock.now()
+        for _ in steps(cut_windows(_chunks(stream), run.tracker.config.window, start_us), run.tracker, run.state):
+            pass
+        factors.append(1e-6 * (scene.end_us - start_us) / (setup.clock.now() - begun))
+    return [Result(f"{name}, stream over work", "times", tuple(factors), 1.0)], f"{name}: {scene.mev_per_s:.1f} Mev/s, {run.quality(setup.clock)}"
+
+
+def _chunks(events: EventBatch) -> Iterator[EventBatch]:
+    for first in range(0, len(events), _CHUNK):
+        yield events[first : first + _CHUNK]

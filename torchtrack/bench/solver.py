@@ -1,0 +1,80 @@
+"""How long Levenberg-Marquardt takes: many poses at once, of 200 observations each, ten iterations."""
+
+from dataclasses import dataclass
+
+import torch
+
+from torchtrack.bench.plots import Plot
+from torchtrack.bench.results import Report, time_result
+from torchtrack.bench.setup import Setup
+from torchtrack.camera import Camera, project
+from torchtrack.config.tracker import SolverConfig
+from torchtrack.lie import retract_about, rotation_angle_deg, so3_exp, transform_points
+from torchtrack.pose_solver import PoseProblem, solve_pose
+
+# Poses at once, and the targets (ms).
+TARGETS_MS = {1: 2.0, 8: 3.0, 32: None, 128: 18.0, 1024: 140.0}
+RESIDUALS, ITERATIONS = 200, 10
+CONFIG = SolverConfig(iterations=ITERATIONS)
+CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
+# Radius of the object (m), and how far off the start is (rad and m), and noise (px).
+_RADIUS_M, _OFF_RAD, _OFF_M, _NOISE_PX = 0.1, 0.02, 0.004, 0.3
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses to be found.
+
+    Args:
+        problem: points, where each was seen, and the direction along which the distance counts.
+        T_start: where the search starts.
+        T_true: what the observations were made with.
+    """
+
+    problem: PoseProblem
+    T_start: torch.Tensor
+    T_true: torch.Tensor
+
+
+def poses(count: int, device: torch.device, dtype: torch.dtype = torch.float32, seed: int = 0) -> Poses:
+    """Objects of random points, seen with noise from random sides."""
+    random = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=random, dtype=torch.float64)
+
+    T_true = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    T_true[:, :3, :3] = so3_exp(normal(count, 3))
+    T_true[:, :3, 3] = 0.05 * normal(count, 3) + torch.tensor([0.0, 0.0, 0.7], dtype=torch.float64)
+    points = _RADIUS_M * torch.nn.functional.normalize(normal(count, RESIDUALS, 3), dim=-1)
+    directions = torch.nn.functional.normalize(normal(count, RESIDUALS, 2), dim=-1)
+    intrinsics = CAMERA.intrinsics(torch.float64).expand(count, 4)
+    centre = torch.zeros(count, 3, dtype=torch.float64)
+    targets = project(transform_points(T_true, points), intrinsics) + _NOISE_PX * normal(count, RESIDUALS, 2)
+    off = torch.tensor([_OFF_RAD] * 3 + [_OFF_M] * 3, dtype=torch.float64)
+    T_start = retract_about(T_true, off * normal(count, 6), centre)
+    ones, scale = torch.ones(count, RESIDUALS), torch.full((count,), 50.0)
+    no_prior = torch.zeros(count, 6, 6)
+    problem = PoseProblem(points, targets, directions, ones, intrinsics, centre, scale, T_start, no_prior)
+    problem = PoseProblem(**{name: value.to(device, dtype) for name, value in vars(problem).items() if value is not None})
+    return Poses(problem, T_start.to(device, dtype), T_true.to(device))
+
+
+def measure(setup: Setup) -> Report:
+    """Time of the solver, by the number of poses."""
+    results, notes = [], []
+    for count, target_ms in TARGETS_MS.items():
+        setup.show(f"B={count}")
+        given = poses(count, setup.device)
+
+        def solve(given: Poses = given) -> torch.Tensor:
+            with torch.inference_mode():
+                return solve_pose(given.problem, given.T_start, CONFIG).T_cam_obj
+
+        results.append(time_result(f"B={count}", setup.clock.seconds(solve, setup.repeats), target_ms))
+        error_deg = rotation_angle_deg(solve()[:, :3, :3].double(), given.T_true[:, :3, :3])
+        notes.append(f"B={count}: median error {float(error_deg.median()):.3f}° after the last iteration")
+    title = f"Levenberg-Marquardt, {RESIDUALS} residuals, {ITERATIONS} iterations, float32; {setup.clock.meaning}"
+    points = tuple((float(count), 1e3 * count / result.median) for count, result in zip(TARGETS_MS, results, strict=True))
+    plot = Plot("throughput", "Levenberg-Marquardt", "poses at once", "poses/s", {"torchtrack": points})
+    return Report("solver", title, tuple(results), tuple(notes), (plot,))
