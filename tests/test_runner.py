@@ -17,9 +17,10 @@ from torchtrack.errors import CalibrationError, ConfigError, EventDataError, Mis
 from torchtrack.events import EventBatch
 from torchtrack.io import read_sequence, read_tum
 from torchtrack.lie import rotation_angle_deg
-from torchtrack.runner import build_tracker, run
+from torchtrack.runner import run
 from torchtrack.session import open_session
 from torchtrack.stepping import clipped, track
+from torchtrack.streams import build_tracker
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +138,7 @@ def test_threads_are_as_before_after_a_run(sequence_path, tmp_path):
 def test_track_yields_one_result_per_window(sequence_path, mode):
     config = RunConfig(source=sequence_path)
     session = open_session(config)
-    tracker = build_tracker(session, config)
+    tracker = build_tracker([session], config)
     state = tracker.init(session.T_cam_obj, session.start_us)
     results = list(track(session.events, tracker, state, WindowConfig(mode=mode, duration_us=10_000, count=400)))
     assert len(results) == (4 if mode == "time" else -(-len(np.load(sequence_path)["t"]) // 400))
@@ -148,7 +149,7 @@ def test_track_yields_one_result_per_window(sequence_path, mode):
 def test_track_says_when_there_is_nothing_to_track(sequence_path):
     config = RunConfig(source=sequence_path)
     session = open_session(config)
-    tracker = build_tracker(session, config)
+    tracker = build_tracker([session], config)
     state = tracker.init(session.T_cam_obj, 10**9)
     with pytest.raises(EventDataError, match="no events after 1000000000"):
         next(track(session.events, tracker, state))

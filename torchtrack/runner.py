@@ -1,54 +1,25 @@
-"""One run: source → tracker → sinks."""
+"""Runs, one or many: source → tracker → outputs."""
 
-import json
-import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
-import torch
-
-from torchtrack.baselines import tracker_class
-from torchtrack.config.load import as_yaml
+from torchtrack.config.executor import ExecutorName
 from torchtrack.config.run import RunConfig, TrackingConfig
-from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
-from torchtrack.events import EventWindow
+from torchtrack.errors import ConfigError, TorchtrackError
+from torchtrack.executor import TaskFailure, Tell
+from torchtrack.executor.groups import run_in_groups
+from torchtrack.executor.tasks import without_errors
 from torchtrack.interrupt import Interrupt
+from torchtrack.run_outputs import RunOutputs
 from torchtrack.session import Session, open_session
 from torchtrack.sinks import Sink
-from torchtrack.sinks.alignment import AlignmentRecord
-from torchtrack.sinks.folder import output_folder
-from torchtrack.sinks.overlay import Overlay
-from torchtrack.sinks.poses import PoseFiles
-from torchtrack.sinks.record import Record
-from torchtrack.sinks.summary import RunSummary, summarise_run
-from torchtrack.stepping import Step, cut_windows, steps, track
-from torchtrack.tracker import Tracker
+from torchtrack.sinks.summary import RunSummary
+from torchtrack.stepping import track
+from torchtrack.streams import follow
+from torchtrack.threads import threads
 
-__all__ = ["build_tracker", "run", "session_steps", "track"]
-
-OUTPUT_FILES = ("trajectory_*.tum", "poses.csv", "config.yaml", "summary.json", "overlay*.mp4", "overlay*.png")
-
-
-def build_tracker(session: Session, config: TrackingConfig) -> Tracker:
-    """The tracker of a session's objects, of the kind that the preset is for, on the configured device.
-
-    Raises:
-        ConfigError: if the device is not there.
-        ModelError: if the method cannot track one of the objects.
-    """
-    if config.device.startswith("cuda") and not torch.cuda.is_available():
-        raise ConfigError(f"device: '{config.device}' was asked for, but PyTorch sees no CUDA device. Use cpu, or a CUDA build of torch.")
-    tracker = tracker_class(config.preset)(list(session.models), session.camera, config.tracker, dtype=getattr(torch, config.dtype))
-    return tracker.to(config.device)
-
-
-def session_steps(session: Session, tracker: Tracker, config: TrackingConfig, windows: Iterator[EventWindow] | None = None) -> Iterator[Step]:
-    """Track a session from its initial poses on, one step per window; ``windows``: where they do not come from the session."""
-    state = tracker.init(session.T_cam_obj.to(config.device), session.start_us)
-    return steps(windows or cut_windows(session.chunks(), config.tracker.window, session.start_us), tracker, state)
+__all__ = ["run", "run_many", "track"]
 
 
 def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None = None) -> RunSummary:
@@ -65,84 +36,38 @@ def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None =
         TorchtrackError: of the kind that fits, if anything that the run needs is missing or wrong.
     """
     session = session or open_session(config)
-    tracker = build_tracker(session, config)
-    record = Record(session.ground_truth)
-    begun = time.perf_counter()
-    with threads(config.threads), output_folder(config.output, OUTPUT_FILES) as folder, Interrupt() as interrupt:
-        with ExitStack() as stack:
-            own: list[Sink] = [record, PoseFiles(folder, session.labels, record), *_optional_sinks(folder, session, config)]
-            every = [stack.enter_context(closing(sink)) for sink in (*own, *sinks)]
-            keep_up = session.keep_up(config.tracker.window)
-            windows = keep_up.until(lambda: interrupt.requested) if keep_up else None
-            for step in session_steps(session, tracker, config, windows):
-                for sink in every:
-                    sink.add(step)
-                if interrupt.requested:
-                    break
-        summary = summarise_run(
-            session.name,
-            session.labels,
-            record,
-            wall_s=time.perf_counter() - begun,
-            device=config.device,
-            interrupted=interrupt.requested,
-            more=_further_facts(config, session.labels, own),
-        )
-        if keep_up:
-            summary = replace(summary, dropped_windows=keep_up.dropped_windows, dropped_events=keep_up.dropped_events)
-        (folder / "config.yaml").write_text(as_yaml(config), encoding="utf-8")
-        write_json(folder / "summary.json", summary.as_json())
-    return summary
+    with threads(config.threads), Interrupt() as interrupt:
+        (outcome,) = follow([lambda: RunOutputs(config, interrupt, sinks, session)], config, lambda: interrupt.requested)
+    if isinstance(outcome, TorchtrackError):
+        raise outcome
+    return outcome
 
 
-def _optional_sinks(folder: Path, session: Session, config: RunConfig) -> list[Overlay | AlignmentRecord]:
-    """The sinks that can be switched on and off."""
-    overlay = [Overlay(folder, session, config.overlay)] if config.overlay.enabled else []
-    return [*overlay, *([AlignmentRecord(session)] if config.alignment else [])]
+def run_many(
+    configs: Sequence[RunConfig], *, streams: int = 1, jobs: int = 1, executor: ExecutorName = "local"
+) -> Iterator[tuple[int, RunSummary | TaskFailure]]:
+    """Track many sources as :func:`run` does each; gives the number of each and its summary, or why it failed, as it comes.
 
-
-def _further_facts(config: RunConfig, labels: Sequence[str], sinks: Sequence[Sink]) -> dict[str, dict[str, Any]]:
-    """By label: what optional sinks measured, and the rotation that is known from elsewhere."""
-    facts: dict[str, dict[str, Any]] = {label: {} for label in labels}
-    if config.reference_angular_velocity is not None:
-        known = {"reference_angular_velocity": read_numbers(config.reference_angular_velocity, 3)}
-        facts = {label: {**found, **known} for label, found in facts.items()}
-    for sink in sinks:
-        if isinstance(sink, AlignmentRecord):
-            facts = {label: {**found, **sink.facts()[label]} for label, found in facts.items()}
-    return facts
-
-
-def read_numbers(path: Path, count: int) -> list[float]:
-    """The numbers of a small text file.
+    Args:
+        configs: one for each source, with a folder of its own for the results.
+        streams: so many are tracked as one batch, as far as their tracking settings are the same.
+        jobs: processes.
+        executor: where they are.
 
     Raises:
-        MissingFileError: if it is not there.
-        UnknownFormatError: if it does not hold ``count`` numbers and nothing else.
+        ConfigError: if two results would go to one folder, or a source is live: it would wait for the others.
     """
-    if not path.is_file():
-        raise MissingFileError(f"no file at {path}. Check the path.")
-    words = path.read_text(encoding="utf-8", errors="replace").split()
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count:
-        raise UnknownFormatError(f"'{path}' must hold {count} numbers, got '{' '.join(words)[:60]}'.")
-    return numbers
+    folders = [config.output for config in configs]
+    if doubles := sorted({str(folder) for folder in folders if folders.count(folder) > 1}):
+        raise ConfigError(f"the results of several sources would go to {', '.join(doubles)}. Give each a folder of its own.")
+    if live := [config.source for config in configs if not isinstance(config.source, Path)]:
+        raise ConfigError(f"'{live[0]}' is live, and others would make it wait. Track it alone.")
+    alike = [config.model_dump_json(include={*TrackingConfig.model_fields, "threads"}) for config in configs]
+    return run_in_groups(_run_group, configs, alike, streams, executor, jobs)
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write plain values as JSON for people to read."""
-    path.write_text(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-
-
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Let PyTorch use ``count`` threads within the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+def _run_group(configs: Sequence[RunConfig], tell: Tell) -> list[RunSummary | TaskFailure]:
+    """Runs that have their tracking settings in common, as one batch."""
+    with threads(configs[0].threads), Interrupt() as interrupt:
+        outputs = [partial(RunOutputs, config, interrupt) for config in configs]
+        return without_errors(follow(outputs, configs[0], lambda: interrupt.requested))

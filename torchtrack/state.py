@@ -1,7 +1,8 @@
 """What the tracker remembers between windows, and what one window gives: both immutable."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -59,19 +60,45 @@ class StepResult:
     observation_count: Int[Tensor, "b"]
 
 
+S = TypeVar("S", TrackerState, StepResult)
+# What belongs to streams; everything else belongs to objects.
+_OF_STREAMS = ("t_us", "last_event_us")
+
+
 def choose_rows(
     first: Bool[Tensor, "b"], of_first: tuple[TrackerState, StepResult], of_second: tuple[TrackerState, StepResult]
 ) -> tuple[TrackerState, StepResult]:
-    """State and result of two ways to take the same window: of the first way for some objects, of the second for the others."""
-    state, result = (_choose(first, *pair) for pair in zip(of_first, of_second, strict=True))
+    """State and result of two ways to take the same window: of the first way for some objects, of the second for the others.
+
+    What belongs to streams is the same in both, and taken from the second.
+    """
+
+    def of_objects(one: Tensor, other: Tensor) -> Tensor:
+        return torch.where(first.view(-1, *[1] * (one.dim() - 1)), one, other)
+
+    state, result = (_mapped(of_objects, lambda _, second: second, *pair) for pair in zip(of_first, of_second, strict=True))
     return state, result
 
 
-def _choose(rows: Tensor, first: Any, second: Any) -> Any:
-    """The rows of the tensors of two dataclasses; what belongs to streams is the same in both, and taken from the second."""
-    if is_dataclass(first):
-        streams = ("t_us", "last_event_us")
-        names = [field.name for field in fields(first)]
-        values = {name: getattr(second, name) if name in streams else _choose(rows, getattr(first, name), getattr(second, name)) for name in names}
-        return type(second)(**values)
-    return torch.where(rows.view(-1, *[1] * (first.dim() - 1)), first, second)
+def take_part(value: S, objects: slice, streams: slice) -> S:
+    """The state or the result of some objects and of the streams that they are in."""
+    part: S = _mapped(lambda tensor: tensor[objects], lambda tensor: tensor[streams], value)
+    return part
+
+
+def joined(states: Sequence[TrackerState]) -> TrackerState:
+    """One state of the objects and streams of several, one after the other."""
+    state: TrackerState = _mapped(lambda *rows: torch.cat(rows), lambda *rows: torch.cat(rows), *states)
+    return state
+
+
+def _mapped(of_objects: Callable[..., Tensor], of_streams: Callable[..., Tensor], *values: Any) -> Any:
+    """A dataclass with its tensors made from those of others of its kind: what belongs to objects, and what belongs to streams."""
+    if not is_dataclass(values[0]):
+        return of_objects(*values)
+    kind: Any = type(values[0])
+    made = {}
+    for field in fields(kind):
+        inner = [getattr(value, field.name) for value in values]
+        made[field.name] = of_streams(*inner) if field.name in _OF_STREAMS else _mapped(of_objects, of_streams, *inner)
+    return kind(**made)

@@ -5,6 +5,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from torchtrack.config.tracker import WindowConfig
 from torchtrack.errors import EventDataError
@@ -16,7 +18,7 @@ from torchtrack.tracker import Tracker
 
 @dataclass(frozen=True)
 class Step:
-    """One window, what the tracker made of it, and how long that took (s)."""
+    """One window, what the tracker made of it, and how long that took (s); of streams that are tracked together, an equal part."""
 
     window: EventWindow
     state: TrackerState
@@ -33,15 +35,21 @@ def cut_windows(chunks: Iterable[EventBatch], config: WindowConfig, t_start_us: 
 
 def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState) -> Iterator[Step]:
     """One step per window; nothing is recorded for gradients."""
-    device = state.T_cam_obj.device
     for window in windows:
-        begun = time.perf_counter()
-        with torch.inference_mode():
-            state, result = tracker.step(state, window.events.to(device), window.t_end_us)
-            if device.type == "cuda":
-                # Work on the GPU is queued: without waiting, the time measured is that of queueing.
-                torch.cuda.synchronize(device)
-        yield Step(window, state, result, time.perf_counter() - begun)
+        state, result, seconds = timed_step(tracker, state, window.events, window.t_end_us)
+        yield Step(window, state, result, seconds)
+
+
+def timed_step(tracker: Tracker, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, float]:
+    """State and result of one window, and how long that took (s)."""
+    device = state.T_cam_obj.device
+    begun = time.perf_counter()
+    with torch.inference_mode():
+        state, result = tracker.step(state, events.to(device), t_end_us)
+        if device.type == "cuda":
+            # Work on the GPU is queued: without waiting, the time measured is that of queueing.
+            torch.cuda.synchronize(device)
+    return state, result, time.perf_counter() - begun
 
 
 def track(

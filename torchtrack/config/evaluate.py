@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
+from torchtrack.config.executor import ExecutorName
 from torchtrack.config.run import Models, TrackingConfig
 from torchtrack.config.settings import ConfigPath, Settings
 
@@ -41,6 +42,8 @@ class EvaluateConfig(Settings):
     methods: dict[Label, MethodConfig] = Field({"default": MethodConfig()}, min_length=1, description="Label of each method and its settings.")
     models: Models = Field("textured", description="Use textured models where a sequence has them, or geometry alone.")
     jobs: int = Field(2, ge=1, le=1024, description="Processes, of one thread each.")
+    executor: ExecutorName = Field("local", description="Processes of this machine, or Ray's: of the cluster at RAY_ADDRESS, else of this machine.")
+    streams: int = Field(1, ge=1, le=1024, description="Sequences that a process tracks at once, as one batch.")
     report: Report = Field(
         "sequences", description="Layout: a row per sequence, object and method; a compact row per method; or the tables of the paper."
     )

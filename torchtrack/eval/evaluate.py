@@ -1,10 +1,9 @@
 """Many sequences under many methods: run, measure, compare."""
 
-import multiprocessing
-import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -12,18 +11,24 @@ import torch
 from torchtrack.baselines import unsuitable
 from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
 from torchtrack.config.run import RunConfig
-from torchtrack.errors import EventDataError, TorchtrackError
+from torchtrack.errors import EventDataError
 from torchtrack.eval.compact import compact_report
 from torchtrack.eval.grid import Report
-from torchtrack.eval.metrics import summarise
+from torchtrack.eval.metrics import PoseErrors, summarise
 from torchtrack.eval.paper import check_cells, paper_report
 from torchtrack.eval.results import Evaluation, Failure, NotApplicable, ObjectResult, write_results
 from torchtrack.eval.sources import cell_sequences, find_sequences
+from torchtrack.events import EventWindow
+from torchtrack.executor import TaskFailure, Tell
+from torchtrack.executor.groups import run_in_groups
+from torchtrack.executor.tasks import without_errors
 from torchtrack.quality import Status
-from torchtrack.runner import build_tracker, session_steps, threads
 from torchtrack.session import Session, open_session
 from torchtrack.sim.suite import Told
 from torchtrack.sinks.record import Record
+from torchtrack.stepping import Step, cut_windows
+from torchtrack.streams import follow
+from torchtrack.threads import threads
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,7 @@ def plan(config: EvaluateConfig, simulating: Told = lambda name, share: None) ->
     """
     check_cells(config.cells)
     found = find_sequences(config.paths) if config.paths or not config.cells else []
-    cells, failures = cell_sequences(config.cells, config.cache, config.jobs, simulating)
+    cells, failures = cell_sequences(config.cells, config.cache, config.jobs, simulating, config.executor)
     failed = {failure.sequence for failure in failures}
     paths = dict.fromkeys([*found, *(path for path in cells.values() if path.stem not in failed)])
     jobs = [Job(path, label, _run_config(path, method, config)) for path in paths for label, method in config.methods.items()]
@@ -80,8 +85,7 @@ def evaluate(config: EvaluateConfig, on_done: Callable[[Job], None] = lambda job
     """
     planned = planned or plan(config)
     outcomes: dict[int, Outcome] = {}
-    limits = (config.lost_rotation_deg, config.lost_translation_cm)
-    for index, outcome in _outcomes(planned.jobs, limits, config.jobs):
+    for index, outcome in _outcomes(planned.jobs, config):
         outcomes[index] = outcome
         on_done(planned.jobs[index])
     ordered = [outcomes[index] for index in range(len(planned.jobs))]
@@ -110,48 +114,57 @@ def _run_config(path: Path, method: MethodConfig, config: EvaluateConfig) -> Run
     return RunConfig(source=path, models=config.models, **{name: getattr(method, name) for name in MethodConfig.model_fields})
 
 
-def _outcomes(jobs: Sequence[Job], limits: tuple[float, float], processes: int) -> Iterator[tuple[int, Outcome]]:
-    """The outcome of each job as it comes, with its place."""
-    with _executor(max(1, min(processes, len(jobs)))) as pool:
-        futures = {pool.submit(measure, job, limits): index for index, job in enumerate(jobs)}
-        for future in as_completed(futures):
-            index = futures[future]
-            error = future.exception()
-            yield index, future.result() if error is None else _failure(jobs[index], error)
+def _outcomes(jobs: Sequence[Job], config: EvaluateConfig) -> Iterator[tuple[int, Outcome]]:
+    """The outcome of each job as it comes, with its number."""
+    function = partial(measure, limits=(config.lost_rotation_deg, config.lost_translation_cm))
+    for number, outcome in run_in_groups(function, jobs, [job.method for job in jobs], config.streams, config.executor, config.jobs):
+        job = jobs[number]
+        yield number, Failure(job.path.stem, job.method, outcome.reason) if isinstance(outcome, TaskFailure) else outcome
 
 
-def _executor(processes: int) -> Executor:
-    """Processes of their own, or one thread where there is nothing to share out."""
-    if processes == 1:
-        return ThreadPoolExecutor(1)
-    # Started afresh, not forked: a fork of a process with threads of its own can hang.
-    return ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn"))
+def measure(jobs: Sequence[Job], tell: Tell, limits: tuple[float, float]) -> list[list[ObjectResult | NotApplicable] | TaskFailure]:
+    """Track sequences with one method, as one batch, from their first true poses on, and compare every window with the truth."""
+    with threads(jobs[0].config.threads):
+        return without_errors(follow([partial(_Measurement, job, limits) for job in jobs], jobs[0].config))
 
 
-def _failure(job: Job, error: BaseException) -> Failure:
-    """What went wrong; an error that is not ours is a bug, and is told with the place where it happened."""
-    if isinstance(error, TorchtrackError):
-        return Failure(job.path.stem, job.method, str(error))
-    if not isinstance(error, Exception):
-        raise error
-    return Failure(job.path.stem, job.method, "".join(traceback.format_exception(error)))
-
-
-def measure(job: Job, limits: tuple[float, float]) -> list[ObjectResult | NotApplicable]:
-    """Track one sequence from its first true poses on and compare every window with the truth.
-
-    Objects that the method is not made for are left out, and told.
+class _Measurement:
+    """Measures one job; objects that the method is not made for are left out, and told.
 
     Raises:
         EventDataError: if the sequence has no ground truth.
     """
-    session = open_session(job.config)
-    if any(truth is None for truth in session.ground_truth):
-        raise EventDataError(f"'{job.path}' has no ground truth (poses, pose_t) to evaluate against. Use `torchtrack track` for it.")
-    reasons = [unsuitable(job.config.preset, model) for model in session.models]
-    left_out = [NotApplicable(session.name, label, job.method, why) for label, why in zip(session.labels, reasons, strict=True) if why]
-    fit = [number for number, reason in enumerate(reasons) if reason is None]
-    return [*(_track(_only(session, fit), job, limits) if fit else []), *left_out]
+
+    def __init__(self, job: Job, limits: tuple[float, float]) -> None:
+        session = open_session(job.config)
+        if any(truth is None for truth in session.ground_truth):
+            raise EventDataError(f"'{job.path}' has no ground truth (poses, pose_t) to evaluate against. Use `torchtrack track` for it.")
+        reasons = [unsuitable(job.config.preset, model) for model in session.models]
+        self._left_out = [NotApplicable(session.name, label, job.method, why) for label, why in zip(session.labels, reasons, strict=True) if why]
+        self.session = _only(session, [number for number, reason in enumerate(reasons) if reason is None])
+        self._record, self._job, self._limits = Record(self.session.ground_truth), job, limits
+
+    def windows(self) -> Iterator[EventWindow]:
+        """The windows of the sequence."""
+        return cut_windows(self.session.chunks(), self._job.config.tracker.window, self.session.start_us)
+
+    def add(self, step: Step) -> None:
+        """Remember one step."""
+        self._record.add(step)
+
+    def finish(self) -> list[ObjectResult | NotApplicable]:
+        """What was measured of each object."""
+        by_label = zip(self.session.labels, self._record.objects, strict=True)
+        return [*(self._result(label, of.errors, of.statuses) for label, of in by_label if of.errors is not None), *self._left_out]
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def _result(self, label: str, errors: PoseErrors, statuses: Counter[int]) -> ObjectResult:
+        status = {Status(number).name: count for number, count in sorted(statuses.items())}
+        seconds = self._record.step_seconds
+        median_step_ms = 1e3 * sorted(seconds)[len(seconds) // 2]
+        return ObjectResult(self.session.name, label, self._job.method, errors, summarise(errors, *self._limits), status, median_step_ms)
 
 
 def _only(session: Session, numbers: Sequence[int]) -> Session:
@@ -163,17 +176,3 @@ def _only(session: Session, numbers: Sequence[int]) -> Session:
         ground_truth=tuple(session.ground_truth[number] for number in numbers),
         T_cam_obj=session.T_cam_obj[torch.tensor(numbers)],
     )
-
-
-def _track(session: Session, job: Job, limits: tuple[float, float]) -> list[ObjectResult]:
-    record = Record(session.ground_truth)
-    with threads(job.config.threads):
-        for step in session_steps(session, build_tracker(session, job.config), job.config):
-            record.add(step)
-    median_step_ms = 1e3 * sorted(record.step_seconds)[len(record.step_seconds) // 2]
-    results = []
-    for label, of_object in zip(session.labels, record.objects, strict=True):
-        if (errors := of_object.errors) is not None:
-            status = {Status(number).name: count for number, count in sorted(of_object.statuses.items())}
-            results.append(ObjectResult(session.name, label, job.method, errors, summarise(errors, *limits), status, median_step_ms))
-    return results

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from torchtrack.config.evaluate import CellConfig
+from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load
 from torchtrack.errors import ConfigError, MissingFileError
 from torchtrack.eval.results import Failure
@@ -37,7 +38,11 @@ def find_sequences(paths: Sequence[Path]) -> list[Path]:
 
 
 def cell_sequences(
-    cells: Mapping[str, CellConfig], cache: Path, jobs: int, simulating: Told = lambda name, share: None
+    cells: Mapping[str, CellConfig],
+    cache: Path,
+    jobs: int,
+    simulating: Told = lambda name, share: None,
+    executor: ExecutorName = "local",
 ) -> tuple[dict[str, Path], tuple[Failure, ...]]:
     """The sequence of each cell of the paper's tables, and which scenes failed; scenes that ``cache`` does not hold are simulated.
 
@@ -49,6 +54,7 @@ def cell_sequences(
         cache: folder of simulated sequences.
         jobs: processes that simulate.
         simulating: called with the name of a scene and how far it is simulated, 0 to 1.
+        executor: where they are.
 
     Raises:
         MissingFileError: if a sequence or a scene's file is not there.
@@ -65,5 +71,5 @@ def cell_sequences(
         paths[name] = cache / f"{scene.name}.npz"
     if not scenes:
         return paths, ()
-    failures = run_suite(list(scenes.values()), cache, jobs, simulating)
+    failures = run_suite(list(scenes.values()), cache, jobs, simulating, executor=executor)
     return {name: paths[name] for name in cells}, tuple(Failure(failure.name, "simulation", failure.reason) for failure in failures)

@@ -1,4 +1,4 @@
-"""Many scenes at once: in parallel processes, with progress, and taken up again where it was broken off.
+"""Many scenes at once: in parallel, with progress, and taken up again where it was broken off.
 
 ::
 
@@ -8,29 +8,27 @@
 A suite is a YAML file ``scenes: [paper/*.yaml, other.yaml]``, a folder of YAML files, or a scene with variants.
 """
 
-import multiprocessing
-import queue
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from pydantic import Field
 
+from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load, read_yaml
 from torchtrack.config.settings import Settings
 from torchtrack.errors import ConfigError, MissingFileError, TorchtrackError
+from torchtrack.executor import TaskFailure, Tell, run_tasks
 from torchtrack.io.sequence import read_sequence
 from torchtrack.sim.output import check_output, write
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import Progress, simulate
+from torchtrack.threads import threads
 
 # Progress of a scene is told in steps of this share.
 _PROGRESS_STEP = 0.02
-_POLL_S = 0.2
 _YAML = (".yaml", ".yml")
 
 Told = Callable[[str, float], None]
@@ -123,7 +121,13 @@ def simulate_to_file(scene: SceneConfig, path: Path, progress: Progress | None =
 
 
 def run_suite(
-    scenes: Sequence[SceneConfig], folder: Path, jobs: int, told: Told = lambda name, share: None, *, preview: bool = False
+    scenes: Sequence[SceneConfig],
+    folder: Path,
+    jobs: int,
+    told: Told = lambda name, share: None,
+    *,
+    preview: bool = False,
+    executor: ExecutorName = "local",
 ) -> list[Failure]:
     """Simulate all scenes that are not there yet into ``folder/NAME.npz``; one that fails does not stop the others.
 
@@ -133,6 +137,7 @@ def run_suite(
         jobs: processes, of one thread each.
         told: for a progress bar.
         preview: whether to write a video of each.
+        executor: where they are simulated.
     """
     pending = []
     for scene in scenes:
@@ -140,48 +145,26 @@ def run_suite(
             told(scene.name, 1.0)
         else:
             pending.append(scene)
-    if not pending:
-        return []
-    context = multiprocessing.get_context("spawn")
-    with context.Manager() as manager, ProcessPoolExecutor(min(jobs, len(pending)), mp_context=context) as pool:
-        progress = manager.Queue()
-        running = {pool.submit(_simulate_one, scene, folder / f"{scene.name}.npz", progress, preview): scene.name for scene in pending}
-        try:
-            return _gathered(running, progress, told)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
-
-
-def _gathered(running: Mapping[Future[None], str], progress: Any, told: Told) -> list[Failure]:
-    """Wait for all scenes; returns what failed."""
-    failures, open_ones = [], set(running)
-    while open_ones:
-        done, open_ones = wait(open_ones, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-        while True:
-            try:
-                told(*progress.get_nowait())
-            except queue.Empty:
-                break
-        for future in done:
-            error = future.exception()
-            if error is not None:
-                failures.append(Failure(running[future], f"{type(error).__name__}: {error}"))
-            told(running[future], 1.0)
+    failures = []
+    targets = [(scene, folder / f"{scene.name}.npz") for scene in pending]
+    for number, outcome in run_tasks(
+        partial(_simulate_one, preview=preview), targets, executor, jobs, lambda number, share: told(pending[number].name, share)
+    ):
+        if isinstance(outcome, TaskFailure):
+            failures.append(Failure(pending[number].name, outcome.reason))
+        told(pending[number].name, 1.0)
     return failures
 
 
-def _simulate_one(scene: SceneConfig, path: Path, progress: Any, preview: bool) -> None:
+def _simulate_one(target: tuple[SceneConfig, Path], tell: Tell, preview: bool) -> None:
     """What one process does with one scene."""
-    torch.set_num_threads(1)
     reached = 0.0
 
-    def tell(share: float) -> None:
+    def tell_in_steps(share: float) -> None:
         nonlocal reached
         if share >= reached + _PROGRESS_STEP:
             reached = share
-            progress.put((scene.name, share))
+            tell(share)
 
-    simulate_to_file(scene, path, tell, preview=preview)
+    with threads(1):
+        simulate_to_file(*target, tell_in_steps, preview=preview)

@@ -1,0 +1,5 @@
+"""Where many tasks are done."""
+
+from typing import Literal
+
+ExecutorName = Literal["local", "ray"]

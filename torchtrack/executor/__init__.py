@@ -1,0 +1,55 @@
+"""Independent tasks in several processes: on this machine, or with Ray on many.
+
+::
+
+    for number, outcome in run_tasks(function, tasks, "local", jobs=4):
+        if isinstance(outcome, TaskFailure): ...
+
+One task that fails does not stop the others. One whose process was killed, for example because memory ran out, is tried
+again, up to :data:`ATTEMPTS` times in all. Whatever ends the loop early, such as Ctrl-C, ends the processes too.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
+
+from torchtrack.config.executor import ExecutorName
+from torchtrack.errors import ConfigError
+from torchtrack.executor.local import run_here, run_in_processes
+from torchtrack.executor.on_ray import run_on_ray
+from torchtrack.executor.tasks import ATTEMPTS, TaskFailure, Tell
+
+__all__ = ["ATTEMPTS", "TaskFailure", "Tell", "run_tasks"]
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def run_tasks(
+    function: Callable[[T, Tell], R],
+    tasks: Sequence[T],
+    executor: ExecutorName = "local",
+    jobs: int = 1,
+    told: Callable[[int, float], None] = lambda number, share: None,
+) -> Iterator[tuple[int, R | TaskFailure]]:
+    """The number of each task and what became of it, as it comes.
+
+    Function, tasks and results are pickled; with Ray, files that they name must be reachable from every machine.
+
+    Args:
+        function: called with a task, and with what tells how far it is, from 0 to 1.
+        tasks: what is to be done.
+        executor: ``local`` for processes of this machine, or for this process itself where there is nothing to share
+            out; ``ray`` for the cluster at ``$RAY_ADDRESS``, or for one that is started on this machine.
+        jobs: how many processes; the cluster at ``$RAY_ADDRESS`` has its own number.
+        told: called with the number of a task and how far it is.
+
+    Raises:
+        MissingExtraError: if Ray is wanted and not installed.
+        ConfigError: if ``jobs`` is less than one, or the cluster cannot be reached.
+    """
+    if jobs < 1:
+        raise ConfigError(f"jobs: at least one process is needed, got {jobs}.")
+    processes = min(jobs, len(tasks))
+    if executor == "ray" and tasks:
+        return run_on_ray(function, tasks, jobs, told)
+    return run_in_processes(function, tasks, processes, told) if processes > 1 else run_here(function, tasks, told)

@@ -1,0 +1,95 @@
+"""Tasks on a Ray cluster: that of ``$RAY_ADDRESS``, or one on this machine that is started for them and ended after them."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from torchtrack.errors import ConfigError
+from torchtrack.executor.tasks import ATTEMPTS, TaskFailure, Tell, attempt, killed, reason_of
+from torchtrack.io.extras import optional
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+# How often progress is asked for (s).
+_POLL_S = 0.2
+# Tasks that are told to end have this long to clean up (s).
+_GRACE_S = 10.0
+
+
+def run_on_ray(
+    function: Callable[[T, Tell], R], tasks: Sequence[T], jobs: int, told: Callable[[int, float], None]
+) -> Iterator[tuple[int, R | TaskFailure]]:
+    """All tasks on the cluster, or in so many processes of one that is started on this machine."""
+    ray = optional("ray", "ray", "cluster", "The executor 'ray'")
+    return _run(ray, function, tasks, jobs, told)
+
+
+def _run(ray: Any, function: Callable[[Any, Tell], Any], tasks: Sequence[Any], jobs: int, told: Callable[[int, float], None]) -> Iterator[Any]:
+    with _cluster(ray, jobs):
+        board = ray.remote(num_cpus=0)(_Board).remote()
+        # Ray tries again where the process is gone; an error of the task itself is its outcome.
+        remote = ray.remote(max_retries=ATTEMPTS - 1)(_work)
+        running = {remote.remote(function, task, number, board): number for number, task in enumerate(tasks)}
+        try:
+            while running:
+                done, _ = ray.wait(list(running), timeout=_POLL_S)
+                for number, share in ray.get(board.take.remote()):
+                    told(number, share)
+                for reference in done:
+                    number = running.pop(reference)
+                    yield number, _outcome(ray, reference)
+        finally:
+            for reference in running:
+                ray.cancel(reference)
+            if running:
+                ray.wait(list(running), num_returns=len(running), timeout=_GRACE_S)
+
+
+@contextmanager
+def _cluster(ray: Any, jobs: int) -> Iterator[None]:
+    """Connected to a cluster; one that the caller is connected to already is used, and left connected."""
+    if ray.is_initialized():
+        yield
+        return
+    address = os.environ.get("RAY_ADDRESS", "local")
+    # A cluster of our own tells nobody that it is there.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    own = {"num_cpus": jobs, "include_dashboard": False} if address == "local" else {}
+    try:
+        ray.init(address, log_to_driver=False, logging_level="error", **own)
+    except (ConnectionError, ValueError) as error:
+        raise ConfigError(f"executor: no Ray cluster can be reached at RAY_ADDRESS={address} ({error}). Correct it, or unset it.") from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+class _Board:
+    """Where tasks say how far they are, until it is read."""
+
+    def __init__(self) -> None:
+        self._shares: list[tuple[int, float]] = []
+
+    def tell(self, number: int, share: float) -> None:
+        self._shares.append((number, share))
+
+    def take(self) -> list[tuple[int, float]]:
+        shares, self._shares = self._shares, []
+        return shares
+
+
+def _work(function: Callable[[Any, Tell], Any], task: Any, number: int, board: Any) -> Any:
+    """What one machine does with one task."""
+    return attempt(function, task, lambda share: board.tell.remote(number, share))
+
+
+def _outcome(ray: Any, reference: Any) -> Any:
+    try:
+        return ray.get(reference)
+    except (ray.exceptions.WorkerCrashedError, ray.exceptions.OutOfMemoryError, ray.exceptions.NodeDiedError) as error:
+        return killed(f"so: {error}")
+    except ray.exceptions.RayError as error:
+        return TaskFailure(reason_of(error))

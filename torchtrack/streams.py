@@ -1,0 +1,180 @@
+"""Many sessions at once, as the streams of one tracker: their windows are one batch.
+
+Each stream has its own camera, objects, clock and end. One that ends or fails leaves, and the others go on as they were.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Protocol, TypeVar, runtime_checkable
+
+import torch
+
+from torchtrack.baselines import tracker_class
+from torchtrack.config.run import TrackingConfig
+from torchtrack.errors import ConfigError, TorchtrackError
+from torchtrack.events import EventWindow, concatenate
+from torchtrack.session import Session
+from torchtrack.state import TrackerState, joined, take_part
+from torchtrack.stepping import Step, timed_step
+from torchtrack.tracker import Tracker
+
+R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
+
+
+@runtime_checkable
+class Follower(Protocol[R_co]):
+    """Who takes the steps of one session, and says what came of them."""
+
+    @property
+    def session(self) -> Session:
+        """What is tracked."""
+        ...
+
+    def windows(self) -> Iterator[EventWindow]:
+        """The windows of the session."""
+        ...
+
+    def add(self, step: Step) -> None:
+        """Take one step."""
+        ...
+
+    def finish(self) -> R_co:
+        """What came of all steps: called once, after the last."""
+        ...
+
+    def close(self) -> None:
+        """Called at the very end; whoever was not finished leaves nothing behind."""
+        ...
+
+
+def follow(
+    followers: Sequence[Callable[[], Follower[R]]], config: TrackingConfig, stopped: Callable[[], bool] = lambda: False
+) -> list[R | TorchtrackError]:
+    """Track many sessions at once; returns what came of each, or the error that ended it, which ends no other.
+
+    Args:
+        followers: each is called once, and opens its session.
+        config: how all of them are tracked.
+        stopped: asked after each step; all are finished with what they have once it says so.
+    """
+    outcomes: dict[int, R | TorchtrackError] = {}
+    opened: dict[int, Follower[R]] = {}
+    with ExitStack() as stack:
+        for number, opening in enumerate(followers):
+            try:
+                opened[number] = stack.enter_context(closing(opening()))
+            except TorchtrackError as error:
+                outcomes[number] = error
+        for number, step in _steps(opened, config):
+            if number not in outcomes:
+                _take(number, step, opened[number], outcomes)
+            if stopped():
+                break
+        for number in opened.keys() - outcomes.keys():
+            _take(number, Ended(), opened[number], outcomes)
+    return [outcomes[number] for number in range(len(followers))]
+
+
+def _take(number: int, step: "Step | Ended", follower: Follower[R], outcomes: dict[int, R | TorchtrackError]) -> None:
+    """Hand a step on; at the end of a stream, note what came of it."""
+    try:
+        if isinstance(step, Step):
+            follower.add(step)
+        else:
+            outcomes[number] = step.error or follower.finish()
+    except TorchtrackError as error:
+        outcomes[number] = error
+
+
+def build_tracker(sessions: Sequence[Session], config: TrackingConfig) -> Tracker:
+    """The tracker of the objects of some sessions, a stream each, of the kind that the preset is for, on the configured device.
+
+    Raises:
+        ConfigError: if the device is not there.
+        ModelError: if the method cannot track one of the objects.
+    """
+    if config.device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError(f"device: '{config.device}' was asked for, but PyTorch sees no CUDA device. Use cpu, or a CUDA build of torch.")
+    models = [model for session in sessions for model in session.models]
+    cameras = [session.camera for session in sessions]
+    stream_index = [stream for stream, session in enumerate(sessions) for _ in session.models]
+    return tracker_class(config.preset)(models, cameras, config.tracker, stream_index, getattr(torch, config.dtype)).to(config.device)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A stream gives no more steps: it came to its end, or failed."""
+
+    error: TorchtrackError | None = None
+
+
+@dataclass
+class _Stream:
+    """One session on its way: what is left of it, and its state."""
+
+    number: int
+    session: Session
+    windows: Iterator[EventWindow]
+    state: TrackerState
+
+
+def _steps(followers: Mapping[int, Follower[R]], config: TrackingConfig) -> Iterator[tuple[int, Step | Ended]]:
+    """Steps of each session from its initial poses on, with its number, and at last that it has ended.
+
+    Sessions whose images have the same size are tracked as one batch, one batch after the other: the images of a
+    tracker are taken to be of one size.
+    """
+    batches: dict[tuple[int, int], list[_Stream]] = {}
+    for number, follower in followers.items():
+        session = follower.session
+        if not session.models:
+            yield number, Ended()
+            continue
+        try:
+            # Each alone: one that cannot be tracked does not stop the others.
+            state = build_tracker([session], config).init(session.T_cam_obj.to(config.device), session.start_us)
+        except TorchtrackError as error:
+            yield number, Ended(error)
+        else:
+            size = (session.camera.width, session.camera.height)
+            batches.setdefault(size, []).append(_Stream(number, session, follower.windows(), state))
+    for streams in batches.values():
+        yield from _one_batch(streams, config)
+
+
+def _one_batch(streams: Sequence[_Stream], config: TrackingConfig) -> Iterator[tuple[int, Step | Ended]]:
+    """The steps of streams whose windows are one batch, as long as there are any."""
+    tracker: Tracker | None = None
+    while True:
+        windows = [(stream, _next_window(stream)) for stream in streams]
+        yield from ((stream.number, window) for stream, window in windows if isinstance(window, Ended))
+        due = [(stream, window) for stream, window in windows if not isinstance(window, Ended)]
+        if not due:
+            return
+        if tracker is None or len(due) < len(streams):
+            streams = [stream for stream, _ in due]
+            tracker = build_tracker([stream.session for stream in streams], config)
+            state, rows = joined([stream.state for stream in streams]), _rows([len(stream.session.models) for stream in streams])
+        events = concatenate(window.events.of_stream(place) for place, (_, window) in enumerate(due))
+        t_end_us = torch.tensor([window.t_end_us for _, window in due], device=config.device)
+        state, result, seconds = timed_step(tracker, state, events, t_end_us)
+        for (stream, window), own in zip(due, rows, strict=True):
+            stream.state = take_part(state, *own)
+            yield stream.number, Step(window, stream.state, take_part(result, *own), seconds / len(due))
+
+
+def _next_window(stream: _Stream) -> EventWindow | Ended:
+    try:
+        window = next(stream.windows, None)
+    except TorchtrackError as error:
+        return Ended(error)
+    return Ended() if window is None else window
+
+
+def _rows(objects: Sequence[int]) -> list[tuple[slice, slice]]:
+    """The rows of each stream's objects, given how many they are, and its own."""
+    ends = list(accumulate(objects))
+    return [(slice(end - count, end), slice(place, place + 1)) for place, (end, count) in enumerate(zip(ends, objects, strict=True))]
