@@ -14,6 +14,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg, subcommand
 
 from torchtrack.cli_io import Bench, Convert, Info, refuse_settings
+from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import typed
 from torchtrack.config.settings import CommandLineText
 from torchtrack.errors import ConfigError, TorchtrackError
@@ -29,17 +30,20 @@ _Output = Annotated[str | None, _option("DIR", "-o")]
 _Preset = Annotated[str | None, _option("NAME")]
 _Models = Annotated[Literal["textured", "geometry"] | None, _option("textured|geometry")]
 _Number = Annotated[int | None, _option("N")]
+_Executor = Annotated[ExecutorName | None, _option("local|ray")]
+# Options that say how several sources are shared out.
+_OF_MANY = ("streams", "jobs", "executor")
 _SETTINGS_HINT = "Any setting can be given by its dotted key, e.g. --tracker.window.duration-us 3000; `torchtrack settings {}` lists them."
 
 
 @dataclass(frozen=True)
 class Track:
-    """Track the objects of one recording or sequence; write poses, overlay and summary."""
+    """Track the objects of recordings or sequences; write poses, overlay and summary of each."""
 
-    config: Positional[Annotated[str, arg(metavar="CONFIG|SOURCE")]]
-    """A YAML config file, or directly a sequence (.npz)."""
+    configs: Positional[Annotated[tuple[str, ...], arg(metavar="CONFIG|SOURCE ...")]]
+    """YAML config files, or directly sequences (.npz)."""
     output: _Output = None
-    """Folder for the results."""
+    """Folder for the results; of several sources, with a folder for each, of its name."""
     preset: _Preset = None
     """Method to track with: default, paper, line, ls or nns."""
     models: _Models = None
@@ -52,14 +56,28 @@ class Track:
     """Where the tracker runs: cpu, cuda or cuda:N."""
     threads: _Number = None
     """Threads of the tracker on the CPU."""
+    streams: _Number = None
+    """Of several sources, so many are tracked at once, as one batch."""
+    jobs: Annotated[int | None, _option("N", "-j")] = None
+    """Processes for several sources."""
+    executor: _Executor = None
+    """Where these are: on this machine, or Ray's (the cluster at RAY_ADDRESS)."""
     quiet: bool = False
     """No progress bar."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands import track
+        from torchtrack.commands import track, track_many
 
-        return track(self.config, _given(self, ("config", "quiet")) | overrides, quiet=self.quiet)
+        if not self.configs:
+            raise ConfigError("command line: track needs a config file or a source.")
+        given = _given(self, ("configs", "quiet", *_OF_MANY)) | overrides
+        of_many = {name: getattr(self, name) for name in _OF_MANY if getattr(self, name) is not None}
+        if len(self.configs) > 1:
+            return track_many(self.configs, given, **of_many, quiet=self.quiet)
+        if of_many:
+            raise ConfigError(f"command line: {', '.join(of_many)}: only for several sources, and one is given.")
+        return track(self.configs[0], given, quiet=self.quiet)
 
 
 @dataclass(frozen=True)
@@ -78,6 +96,10 @@ class Evaluate:
     """Use a sequence's textured models where it has them, or geometry alone."""
     jobs: Annotated[int | None, _option("N", "-j")] = None
     """Processes, of one thread each."""
+    executor: _Executor = None
+    """Where these are: on this machine, or Ray's (the cluster at RAY_ADDRESS)."""
+    streams: _Number = None
+    """Sequences that each tracks at once, as one batch."""
     report: Annotated[Literal["sequences", "compact"] | None, _option("sequences|compact")] = None
     """A row per sequence, object and method; or one per method, also as Markdown, LaTeX, CSV and JSON."""
     estimate_latency: bool = False
@@ -91,6 +113,8 @@ class Evaluate:
 
         if self.estimate_latency:
             refuse_settings(overrides)
+            if useless := [name for name in _OF_MANY if getattr(self, name) is not None]:
+                raise ConfigError(f"command line: {', '.join(useless)}: not with --estimate-latency, which takes one sequence after the other.")
             return show_latency(self.paths)
         chosen = self.methods.split(",") if self.methods else None
         given = _given(self, ("config", "methods", "quiet", "paths", "estimate_latency"))
@@ -111,6 +135,8 @@ class Simulate:
     """One variant of a scene that has several; all of them when not given."""
     jobs: Annotated[int, arg(aliases=["-j"], metavar="N")] = 2
     """Processes of a suite, of one thread each."""
+    executor: Annotated[ExecutorName, arg(metavar="local|ray")] = "local"
+    """Where these are: on this machine, or Ray's (the cluster at RAY_ADDRESS)."""
     preview: bool = False
     """Also write a video of each scene, with events and true contours."""
     video: Annotated[str | None, _option("FILE|DIR")] = None
@@ -132,13 +158,17 @@ class Simulate:
             raise ConfigError("command line: simulate needs an output, as in -o sequence.npz.")
         if bool(self.config) == bool(self.video):
             raise ConfigError("command line: simulate needs either the file of a scene or --video, and not both.")
-        given = _given(self, ("config", "output", "jobs", "preview", "quiet"))
+        given = _given(self, ("config", "output", "jobs", "executor", "preview", "quiet"))
         if self.video:
+            if self.executor != "local":
+                raise ConfigError("command line: executor is for several scenes, not for --video.")
             return simulate_video(given, self.output, overrides)
         scene_only = {name: value for name, value in given.items() if name in ("variant", "noise")}
         if len(scene_only) != len(given):
             raise ConfigError("command line: frames_per_second and timestamps are for --video.")
-        return simulate(self.config, self.output, scene_only | overrides, jobs=self.jobs, preview=self.preview, quiet=self.quiet)
+        return simulate(
+            self.config, self.output, scene_only | overrides, jobs=self.jobs, executor=self.executor, preview=self.preview, quiet=self.quiet
+        )
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from rich.table import Table
 from torchtrack.config.demo import DemoConfig
 from torchtrack.config.describe import described
 from torchtrack.config.evaluate import EvaluateConfig
+from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load, read_yaml
 from torchtrack.config.run import RunConfig
 from torchtrack.config.settings import CommandLineText, Settings
@@ -21,15 +22,17 @@ from torchtrack.eval.grid import markdown
 from torchtrack.eval.latency import estimate_latency
 from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table, run_headline, run_table
+from torchtrack.executor import TaskFailure
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io import read_calibration
 from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines
-from torchtrack.runner import run
+from torchtrack.runner import run, run_many
 from torchtrack.session import open_session
 from torchtrack.sim import SceneConfig
 from torchtrack.sim.suite import is_suite, run_suite, scenes_of, simulate_to_file
 from torchtrack.sim.video import VideoConfig, write_video_events
 from torchtrack.sinks.progress import ProgressBar
+from torchtrack.sinks.summary import RunSummary
 
 # Tables need this much where the output is no terminal, which says how wide it is.
 _FILE_WIDTH = 200
@@ -43,23 +46,58 @@ def output_console() -> Console:
 
 def track(config_or_source: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
     """Track one source, show the summary; returns the exit code."""
+    return _run(_run_config(config_or_source, overrides), quiet)
+
+
+def track_many(
+    configs_or_sources: Sequence[str],
+    overrides: Mapping[str, Any],
+    *,
+    streams: int = 1,
+    jobs: int = 1,
+    executor: ExecutorName = "local",
+    quiet: bool,
+) -> int:
+    """Track several sources, show the summary of each as it comes; returns the exit code, which is not 0 where one failed."""
+    configs = [_in_own_folder(_run_config(text, overrides), Path(text).stem) for text in configs_or_sources]
+    console, codes = output_console(), [ExitCode.DONE]
+    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
+        bar = progress.add_task("sources", total=len(configs))
+        for number, outcome in run_many(configs, streams=streams, jobs=jobs, executor=executor):
+            progress.advance(bar)
+            if isinstance(outcome, TaskFailure):
+                _tell_failure(f"{configs_or_sources[number]}: {outcome.reason}")
+                codes.append(ExitCode.FAILED)
+            else:
+                codes.append(_show_run(console, outcome, configs[number].output))
+    return max(codes)
+
+
+def _in_own_folder(config: RunConfig, name: str) -> RunConfig:
+    return config.model_copy(update={"output": config.output / name})
+
+
+def _run_config(config_or_source: str, overrides: Mapping[str, Any]) -> RunConfig:
+    """The settings of a run, from a YAML file or for a source that needs none."""
     if Path(config_or_source).suffix.lower() in (".yaml", ".yml"):
-        config = load(RunConfig, Path(config_or_source), overrides)
-    else:
-        config = load(RunConfig, None, {"source": CommandLineText(config_or_source), **overrides})
-    return _run(config, quiet)
+        return load(RunConfig, Path(config_or_source), overrides)
+    return load(RunConfig, None, {"source": CommandLineText(config_or_source), **overrides})
 
 
 def _run(config: RunConfig, quiet: bool) -> int:
     console = output_console()
     session = open_session(config)
     progress = [] if quiet else [ProgressBar(Console(stderr=True), session.name, session.known_duration_s)]
-    summary = run(config, progress, session)
+    return _show_run(console, run(config, progress, session), config.output)
+
+
+def _show_run(console: Console, summary: RunSummary, output: Path) -> ExitCode:
+    """Show what came of a run; returns the exit code."""
     console.print(run_headline(summary))
     console.print(run_table(summary))
     if summary.dropped_windows:
         console.print(f"{summary.dropped_windows} windows ({summary.dropped_events} events) came too fast and were dropped")
-    console.print(f"Results are in {config.output}")
+    console.print(f"Results are in {output}")
     return ExitCode.INTERRUPTED if summary.interrupted else ExitCode.DONE
 
 
@@ -84,8 +122,12 @@ def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mappi
         console.print(f"- {reason}", markup=False)
     console.print(f"Results are in {config.output}")
     for failure in evaluation.failures:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {failure.sequence} ({failure.method}): {failure.reason}", markup=False)
+        _tell_failure(f"{failure.sequence} ({failure.method}): {failure.reason}")
     return ExitCode.FAILED if evaluation.failures else ExitCode.DONE
+
+
+def _tell_failure(text: str) -> None:
+    Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {text}", markup=False)
 
 
 def show_latency(paths: Sequence[str]) -> int:
@@ -113,10 +155,12 @@ def _scene_progress(progress: Progress) -> Callable[[str, float], None]:
     return show
 
 
-def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, jobs: int, preview: bool, quiet: bool) -> int:
+def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, jobs: int, executor: ExecutorName, preview: bool, quiet: bool) -> int:
     """Simulate a scene into a sequence, or a suite into a folder; returns the exit code, which is not 0 where a scene failed."""
     file, target = Path(config_file), Path(output)
     if not is_suite(file) or (not file.is_dir() and "variant" in overrides):
+        if executor != "local":
+            raise ConfigError(f"command line: --executor {executor} is for several scenes, and '{config_file}' is one.")
         scene = load(SceneConfig, file, overrides)
         path = _simulated(scene, target if target.suffix else target / f"{scene.name}.npz", quiet, preview)
         output_console().print(f"The sequence is in {path}")
@@ -126,10 +170,12 @@ def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, job
     scenes = scenes_of(file, overrides)
     with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
         bars = {scene.name: progress.add_task(scene.name, total=1.0) for scene in scenes}
-        failures = run_suite(scenes, target, jobs, preview=preview, told=lambda name, share: progress.update(bars[name], completed=share))
+        failures = run_suite(
+            scenes, target, jobs, lambda name, share: progress.update(bars[name], completed=share), preview=preview, executor=executor
+        )
     output_console().print(f"{len(scenes) - len(failures)} of {len(scenes)} sequences are in {target}")
     for failure in failures:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {failure.name}: {failure.reason}", markup=False)
+        _tell_failure(f"{failure.name}: {failure.reason}")
     return ExitCode.FAILED if failures else ExitCode.DONE
 
 

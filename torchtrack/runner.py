@@ -48,6 +48,8 @@ def run_many(
 ) -> Iterator[tuple[int, RunSummary | TaskFailure]]:
     """Track many sources as :func:`run` does each; gives the number of each and its summary, or why it failed, as it comes.
 
+    Ctrl-C ends it, and leaves complete outputs or none.
+
     Args:
         configs: one for each source, with a folder of its own for the results.
         streams: so many are tracked as one batch, as far as their tracking settings are the same.
@@ -55,15 +57,20 @@ def run_many(
         executor: where they are.
 
     Raises:
-        ConfigError: if two results would go to one folder, or a source is live: it would wait for the others.
+        ConfigError: if ``streams`` is less than one, two results would go to one folder, or a source is live: it would wait for the others.
     """
+    if streams < 1:
+        raise ConfigError(f"streams: at least one is needed, got {streams}.")
     folders = [config.output for config in configs]
     if doubles := sorted({str(folder) for folder in folders if folders.count(folder) > 1}):
         raise ConfigError(f"the results of several sources would go to {', '.join(doubles)}. Give each a folder of its own.")
     if live := [config.source for config in configs if not isinstance(config.source, Path)]:
         raise ConfigError(f"'{live[0]}' is live, and others would make it wait. Track it alone.")
     alike = [config.model_dump_json(include={*TrackingConfig.model_fields, "threads"}) for config in configs]
-    return run_in_groups(_run_group, configs, alike, streams, executor, jobs)
+    for numbers, outcomes in run_in_groups(_run_group, configs, alike, streams, executor, jobs):
+        yield from zip(numbers, outcomes, strict=True)
+        if any(outcome.interrupted for outcome in outcomes if isinstance(outcome, RunSummary)):
+            return
 
 
 def _run_group(configs: Sequence[RunConfig], tell: Tell) -> list[RunSummary | TaskFailure]:

@@ -117,9 +117,10 @@ def _run_config(path: Path, method: MethodConfig, config: EvaluateConfig) -> Run
 def _outcomes(jobs: Sequence[Job], config: EvaluateConfig) -> Iterator[tuple[int, Outcome]]:
     """The outcome of each job as it comes, with its number."""
     function = partial(measure, limits=(config.lost_rotation_deg, config.lost_translation_cm))
-    for number, outcome in run_in_groups(function, jobs, [job.method for job in jobs], config.streams, config.executor, config.jobs):
-        job = jobs[number]
-        yield number, Failure(job.path.stem, job.method, outcome.reason) if isinstance(outcome, TaskFailure) else outcome
+    for numbers, outcomes in run_in_groups(function, jobs, [job.method for job in jobs], config.streams, config.executor, config.jobs):
+        for number, outcome in zip(numbers, outcomes, strict=True):
+            job = jobs[number]
+            yield number, Failure(job.path.stem, job.method, outcome.reason) if isinstance(outcome, TaskFailure) else outcome
 
 
 def measure(jobs: Sequence[Job], tell: Tell, limits: tuple[float, float]) -> list[list[ObjectResult | NotApplicable] | TaskFailure]:

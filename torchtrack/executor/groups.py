@@ -17,8 +17,8 @@ def run_in_groups(
     size: int,
     executor: ExecutorName,
     jobs: int,
-) -> Iterator[tuple[int, R | TaskFailure]]:
-    """Tasks of several items each; gives the number of each item and what became of it, as it comes.
+) -> Iterator[tuple[Sequence[int], Sequence[R | TaskFailure]]]:
+    """Tasks of several items each; gives the numbers of the items of each and what became of them, as it comes.
 
     See :func:`torchtrack.executor.run_tasks`.
 
@@ -28,17 +28,8 @@ def run_in_groups(
         size: of a group, at most.
     """
     groups = grouped(alike, size)
-    outcomes = run_tasks(function, [[items[number] for number in group] for group in groups], executor, jobs)
-    return _of_items(groups, outcomes)
-
-
-def _of_items(
-    groups: Sequence[Sequence[int]], outcomes: Iterator[tuple[int, Sequence[R | TaskFailure] | TaskFailure]]
-) -> Iterator[tuple[int, R | TaskFailure]]:
-    """What became of each item, given what became of the groups."""
-    for place, outcome in outcomes:
-        of_each = [outcome] * len(groups[place]) if isinstance(outcome, TaskFailure) else outcome
-        yield from zip(groups[place], of_each, strict=True)
+    for place, outcome in run_tasks(function, [[items[number] for number in group] for group in groups], executor, jobs):
+        yield groups[place], [outcome] * len(groups[place]) if isinstance(outcome, TaskFailure) else outcome
 
 
 def grouped(alike: Sequence[Hashable], size: int) -> list[list[int]]:

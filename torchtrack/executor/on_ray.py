@@ -1,6 +1,7 @@
 """Tasks on a Ray cluster: that of ``$RAY_ADDRESS``, or one on this machine that is started for them and ended after them."""
 
 import os
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -12,6 +13,8 @@ from torchtrack.io.extras import optional
 T = TypeVar("T")
 R = TypeVar("R")
 
+# A cluster that is there answers within this (s).
+_CONNECT_S = 5.0
 # How often progress is asked for (s).
 _POLL_S = 0.2
 # Tasks that are told to end have this long to clean up (s).
@@ -54,17 +57,33 @@ def _cluster(ray: Any, jobs: int) -> Iterator[None]:
         yield
         return
     address = os.environ.get("RAY_ADDRESS", "local")
+    _check_reachable(address)
     # A cluster of our own tells nobody that it is there.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     own = {"num_cpus": jobs, "include_dashboard": False} if address == "local" else {}
     try:
         ray.init(address, log_to_driver=False, logging_level="error", **own)
     except (ConnectionError, ValueError) as error:
-        raise ConfigError(f"executor: no Ray cluster can be reached at RAY_ADDRESS={address} ({error}). Correct it, or unset it.") from error
+        raise _unreachable(address, error) from error
     try:
         yield
     finally:
         ray.shutdown()
+
+
+def _check_reachable(address: str) -> None:
+    """Raise :class:`ConfigError` where nobody listens at ``HOST:PORT``: Ray itself would wait for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), _CONNECT_S).close()
+    except OSError as error:
+        raise _unreachable(address, error) from error
+
+
+def _unreachable(address: str, error: Exception) -> ConfigError:
+    return ConfigError(f"executor: no Ray cluster can be reached at RAY_ADDRESS={address} ({error}). Correct it, or unset it.")
 
 
 class _Board:
