@@ -1,5 +1,6 @@
 """Fixtures that every test may use. Shapes and types of the whole package are checked while tests run."""
 
+import importlib.util
 import os
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from jaxtyping import install_import_hook
 install_import_hook("torchtrack", "beartype.beartype")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs ray: pip install 'torchtrack[cluster]'")
 
 
 @pytest.fixture(scope="session", autouse=True)

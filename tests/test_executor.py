@@ -1,6 +1,5 @@
 """Tasks in this process, in processes, and on Ray: what fails is told, what was killed is tried again, nothing is left behind."""
 
-import importlib.util
 import os
 import signal
 import subprocess
@@ -9,13 +8,12 @@ import time
 
 import odd_tasks
 import pytest
-from conftest import REPOSITORY
+from conftest import REPOSITORY, needs_ray
 
 from torchtrack.errors import ConfigError, MissingExtraError
 from torchtrack.executor import ATTEMPTS, TaskFailure, run_tasks
 from torchtrack.executor.groups import grouped, run_in_groups
 
-needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs ray: pip install 'torchtrack[cluster]'")
 PARALLEL = ["local", pytest.param("ray", marks=needs_ray)]
 
 
