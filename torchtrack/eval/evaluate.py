@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import torch
-
 from torchtrack.baselines import unsuitable
 from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
 from torchtrack.config.run import RunConfig
@@ -175,5 +173,5 @@ def _only(session: Session, numbers: Sequence[int]) -> Session:
         labels=tuple(session.labels[number] for number in numbers),
         models=tuple(session.models[number] for number in numbers),
         ground_truth=tuple(session.ground_truth[number] for number in numbers),
-        T_cam_obj=session.T_cam_obj[torch.tensor(numbers)],
+        T_cam_obj=session.T_cam_obj[list(numbers)],
     )
