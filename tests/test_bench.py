@@ -5,8 +5,9 @@ import json
 import matplotlib.image
 import pytest
 import torch
+from tiny_sequence import write_tiny_sequence
 
-from torchtrack.bench import io, pipeline, scene, sim, solver, stages
+from torchtrack.bench import flow, io, peers, pipeline, scaling, scene, sim, solver, stages, surface
 from torchtrack.bench.clock import Clock
 from torchtrack.bench.plots import Plot, draw
 from torchtrack.bench.results import Report, Result, as_markdown, machine, older_medians, plain, time_result
@@ -18,24 +19,33 @@ from torchtrack.exit_codes import ExitCode
 CPU = torch.device("cpu")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_scenes():
+    """Simulated once, for all tests here."""
+    scene.simulated.cache_clear()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene, "DURATION_S", 0.04)
+        patch.setattr(scene, "WARM_UP_WINDOWS", 6)
+        yield
+    scene.simulated.cache_clear()
+
+
 @pytest.fixture
 def tiny(monkeypatch):
     """Every part as small as it can be."""
-    monkeypatch.setattr(scene, "DURATION_S", 0.04)
-    monkeypatch.setattr(scene, "WARM_UP_WINDOWS", 6)
-    monkeypatch.setattr(pipeline, "SHAPES", ("lbracket",))
-    monkeypatch.setattr(pipeline, "MANY", ((2, 2, 15.0),))
-    monkeypatch.setattr(pipeline, "OUTSIDE_MEV_S", (1.0,))
-    monkeypatch.setattr(pipeline, "HD", (320, 240))
-    monkeypatch.setattr(pipeline, "HD_MEV_S", 4.0)
-    monkeypatch.setattr(stages, "SHAPES", ("lbracket",))
-    monkeypatch.setattr(stages, "MANY", ((2, 2),))
-    monkeypatch.setattr(solver, "TARGETS_MS", {1: 2.0, 3: None})
-    monkeypatch.setattr(sim, "_FRAMES", 3)
-    monkeypatch.setattr(io, "TARGETS", {"evt2": 50.0})
-    scene.simulated.cache_clear()
-    yield
-    scene.simulated.cache_clear()
+    small = {
+        pipeline: {"SHAPES": ("lbracket",), "MANY": ((2, 2, 15.0),), "OUTSIDE_MEV_S": (1.0,), "HD": (320, 240), "HD_MEV_S": 4.0},
+        stages: {"SHAPES": ("lbracket",), "MANY": ((2, 2),)},
+        solver: {"TARGETS_MS": {1: 2.0, 3: None}},
+        surface: {"WINDOWS": ((64, 48, 500),)},
+        flow: {"CORNERS": (32, 64)},
+        scaling: {"HD": (320, 240), "COLUMNS": 2, "OBJECTS": (1, 2), "STREAMS": (1, 2)},
+        sim: {"_FRAMES": 3},
+        io: {"TARGETS": {"evt2": 50.0}},
+    }
+    for module, values in small.items():
+        for name, value in values.items():
+            monkeypatch.setattr(module, name, value)
 
 
 def bench(part, folder, *further):
@@ -66,6 +76,16 @@ def test_pipeline(tiny, simulator, tmp_path, capsys):
     assert "1 object (lbracket), median" in capsys.readouterr().out
 
 
+def test_a_sequence_in_place_of_simulated_scenes(tiny, tmp_path, capsys):
+    sequence = write_tiny_sequence(tmp_path, duration_us=60_000)
+    for part in ("pipeline", "stages"):
+        assert bench(part, tmp_path, "--sequence", sequence) == ExitCode.DONE
+        assert written(tmp_path, part)["results"][0]["name"].startswith("tiny")
+    short = write_tiny_sequence(tmp_path, "short", duration_us=20_000)
+    assert bench("pipeline", tmp_path / "none", "--sequence", short) == ExitCode.WRONG_SETTINGS
+    assert "more than 6 windows of 5000 µs are needed, and the scene lasts 19501 µs" in " ".join(capsys.readouterr().err.split())
+
+
 def test_stages(tiny, simulator, tmp_path):
     assert bench("stages", tmp_path) == ExitCode.DONE
     entries = written(tmp_path, "stages")["results"]
@@ -80,13 +100,43 @@ def test_solver(tiny, tmp_path):
     assert (tmp_path / "bench_solver_throughput.png").is_file()
 
 
+def test_surface(tiny, tmp_path):
+    assert bench("surface", tmp_path) == ExitCode.DONE
+    entries = written(tmp_path, "surface")["results"]
+    assert [entry["name"] for entry in entries] == [
+        "newest times, 64x48, 500 events",
+        "surface, 64x48, 208x208 px of it",
+        "surface, 64x48, 64x48 px of it",
+    ]
+    assert entries[0]["target"] == 300 and not entries[0]["lower_is_better"]
+
+
+def test_flow(tiny, tmp_path):
+    assert bench("flow", tmp_path) == ExitCode.DONE
+    content = written(tmp_path, "flow")
+    assert [entry["name"] for entry in content["results"]] == ["32 corners", "64 corners"]
+    for note in content["notes"]:
+        assert "100% have a flow" in note
+        assert float(note.split("median error ")[1].split("%")[0]) < 5
+
+
+def test_scaling(tiny, simulator, tmp_path):
+    assert bench("scaling", tmp_path) == ExitCode.DONE
+    content = written(tmp_path, "scaling")
+    names = [entry["name"] for entry in content["results"]]
+    assert names[:4] == ["1 objects in one stream", "2 objects in one stream", "1 streams of one object", "2 streams of one object"]
+    assert names[4:] == ["a further one of 2 objects over the first", "a further one of 2 streams over the first"]
+    assert (tmp_path / "bench_scaling_latency.png").is_file() and (tmp_path / "bench_scaling_throughput.png").is_file()
+
+
 def test_all_parts_but_those_whose_libraries_are_missing(tiny, simulator, tmp_path, monkeypatch, capsys):
     def without(setup):
         raise MissingExtraError("numba", "sim", "the simulator")
 
-    monkeypatch.setattr(pipeline, "measure", without)
+    for part in (pipeline, scaling, peers):
+        monkeypatch.setattr(part, "measure", without)
     assert bench("all", tmp_path) == ExitCode.DONE
-    assert {path.name for path in tmp_path.glob("*.json")} == {f"bench_{part}.json" for part in ("stages", "solver", "io", "sim")}
+    assert {path.name for path in tmp_path.glob("*.json")} == {f"bench_{part}.json" for part in ("stages", "solver", "surface", "flow", "io", "sim")}
     assert "left out: pipeline: the simulator needs the library 'numba'" in capsys.readouterr().err
     assert bench("pipeline", tmp_path) == ExitCode.FAILED
     assert bench("all", tmp_path, "--compare", tmp_path / "bench_io.json") == ExitCode.WRONG_SETTINGS

@@ -148,7 +148,8 @@ def read(path: Path) -> Scene:
         TorchtrackError: of the kind that fits, if the sequence cannot be read.
     """
     session = open_session(RunConfig(source=path))
-    end_us = session.start_us + round(1e6 * DURATION_S)
+    duration_s = min(DURATION_S, session.known_duration_s or DURATION_S)
+    end_us = session.start_us + round(1e6 * duration_s)
     events = concatenate(clipped(session.events.chunks(), session.start_us, end_us))
     return Scene(events, None, session.camera, session.models, session.ground_truth, session.T_cam_obj, session.start_us, end_us)
 
@@ -246,6 +247,9 @@ def started(scene: Scene, device: torch.device, streams: int = 1, config: Tracke
         device: where the tracker runs.
         streams: how many cameras see the same scene, each in a stream of its own.
         config: settings; those of the preset ``default`` when not given.
+
+    Raises:
+        ConfigError: if the scene ends with its first windows.
     """
     count = len(scene.models)
     index = [stream for stream in range(streams) for _ in range(count)]
@@ -254,6 +258,9 @@ def started(scene: Scene, device: torch.device, streams: int = 1, config: Tracke
     windows = []
     for events, end_us in scene.windows(tracker.config.window.duration_us):
         windows.append((concatenate([events.of_stream(stream) for stream in range(streams)]).to(device), end_us))
+    if len(windows) <= WARM_UP_WINDOWS:
+        needed = f"more than {WARM_UP_WINDOWS} windows of {tracker.config.window.duration_us} µs"
+        raise ConfigError(f"there is nothing to measure: {needed} are needed, and the scene lasts {scene.end_us - scene.start_us} µs.")
     with torch.inference_mode():
         for events, end_us in windows[:WARM_UP_WINDOWS]:
             state, _ = tracker.step(state, events, end_us)

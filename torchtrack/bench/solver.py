@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from torchtrack.bench.plots import Plot
 from torchtrack.bench.results import Report, time_result
@@ -19,6 +20,8 @@ CONFIG = SolverConfig(iterations=ITERATIONS)
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
 # Radius of the object (m), and how far off the start is (rad and m), and noise (px).
 _RADIUS_M, _OFF_RAD, _OFF_M, _NOISE_PX = 0.1, 0.02, 0.004, 0.3
+# Scale of the robust loss: all are inliers (px).
+_SCALE_PX = 50.0
 
 
 @dataclass(frozen=True)
@@ -32,29 +35,47 @@ class Poses:
     """
 
     problem: PoseProblem
-    T_start: torch.Tensor
-    T_true: torch.Tensor
+    T_start: Tensor
+    T_true: Tensor
 
 
-def poses(count: int, device: torch.device, dtype: torch.dtype = torch.float32, seed: int = 0) -> Poses:
-    """Objects of random points, seen with noise from random sides."""
-    random = torch.Generator().manual_seed(seed)
+def poses(count: int, device: torch.device, dtype: torch.dtype = torch.float32) -> Poses:
+    """Objects of random points, each seen with noise along a random direction."""
+    random = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(count, RESIDUALS, 2, generator=random, dtype=torch.float64), dim=-1)
+    return _poses(_points(count, RESIDUALS, random), directions, random, device, dtype)
 
-    def normal(*shape: int) -> torch.Tensor:
+
+def poses_of_points(count: int, device: torch.device, dtype: torch.dtype = torch.float32) -> Poses:
+    """Objects of half as many random points, both of whose coordinates are seen with noise: u and v by turns."""
+    random = torch.Generator().manual_seed(0)
+    axes = torch.eye(2, dtype=torch.float64).repeat(RESIDUALS // 2, 1).expand(count, -1, -1)
+    return _poses(_points(count, RESIDUALS // 2, random).repeat_interleave(2, 1), axes, random, device, dtype)
+
+
+def _points(count: int, each: int, random: torch.Generator) -> Tensor:
+    """Points on a ball."""
+    return _RADIUS_M * torch.nn.functional.normalize(torch.randn(count, each, 3, generator=random, dtype=torch.float64), dim=-1)
+
+
+def _poses(points: Tensor, directions: Tensor, random: torch.Generator, device: torch.device, dtype: torch.dtype) -> Poses:
+    """Random poses of points, what is seen of them, and where the search starts."""
+
+    def normal(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=random, dtype=torch.float64)
 
+    count = len(points)
     T_true = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
     T_true[:, :3, :3] = so3_exp(normal(count, 3))
     T_true[:, :3, 3] = 0.05 * normal(count, 3) + torch.tensor([0.0, 0.0, 0.7], dtype=torch.float64)
-    points = _RADIUS_M * torch.nn.functional.normalize(normal(count, RESIDUALS, 3), dim=-1)
-    directions = torch.nn.functional.normalize(normal(count, RESIDUALS, 2), dim=-1)
     intrinsics = CAMERA.intrinsics(torch.float64).expand(count, 4)
     centre = torch.zeros(count, 3, dtype=torch.float64)
-    targets = project(transform_points(T_true, points), intrinsics) + _NOISE_PX * normal(count, RESIDUALS, 2)
+    # Noise of a point is the same in both of its rows.
+    noise = _NOISE_PX * normal(count, RESIDUALS // 2, 2).repeat_interleave(2, 1)
+    targets = project(transform_points(T_true, points), intrinsics) + noise
     off = torch.tensor([_OFF_RAD] * 3 + [_OFF_M] * 3, dtype=torch.float64)
     T_start = retract_about(T_true, off * normal(count, 6), centre)
-    ones, scale = torch.ones(count, RESIDUALS), torch.full((count,), 50.0)
-    no_prior = torch.zeros(count, 6, 6)
+    ones, scale, no_prior = torch.ones(count, RESIDUALS), torch.full((count,), _SCALE_PX), torch.zeros(count, 6, 6)
     problem = PoseProblem(points, targets, directions, ones, intrinsics, centre, scale, T_start, no_prior)
     problem = PoseProblem(**{name: value.to(device, dtype) for name, value in vars(problem).items() if value is not None})
     return Poses(problem, T_start.to(device, dtype), T_true.to(device))
@@ -67,7 +88,7 @@ def measure(setup: Setup) -> Report:
         setup.show(f"B={count}")
         given = poses(count, setup.device)
 
-        def solve(given: Poses = given) -> torch.Tensor:
+        def solve(given: Poses = given) -> Tensor:
             with torch.inference_mode():
                 return solve_pose(given.problem, given.T_start, CONFIG).T_cam_obj
 
