@@ -1,0 +1,63 @@
+"""Where a computation would make the CPU wait for a GPU, found on the CPU alone.
+
+Values that are read back, shapes that depend on values, and tensors that are made of Python numbers: on a GPU each of them waits
+until all that was asked of it before is done.
+"""
+
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+# In inference mode some operations arrive here whole, and else as what they are made of.
+_READS = ("item", "_local_scalar_dense", "is_nonzero", "equal", "nonzero", "masked_select", "bincount", "_unique2", "unique_dim")
+
+
+class _Watch(TorchDispatchMode):
+    """Notes the line of the package that asked for each operation that waits."""
+
+    def __init__(self, found: list[str]) -> None:
+        super().__init__()
+        self.found = found
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func._schema.name.removeprefix("aten::")
+        made_here = name == "lift_fresh" and args[0].dim() > 0
+        counted = name == "repeat_interleave" and func._overloadname in ("Tensor", "self_Tensor")
+        if name in _READS or made_here or counted or (name.startswith("index") and _by_mask(args)):
+            self.found.append(_place(name))
+        return func(*args, **(kwargs or {}))
+
+
+def _by_mask(args) -> bool:
+    indices = args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else []
+    return any(torch.is_tensor(index) and index.dtype == torch.bool for index in indices)
+
+
+def _place(name: str) -> str:
+    """The operation, and the innermost line of the package."""
+    for frame in reversed(traceback.extract_stack()):
+        _, within, path = frame.filename.rpartition("/torchtrack/")
+        if within:
+            return f"{path}:{frame.lineno} {name}: {frame.line}"
+    return f"outside: {name}"
+
+
+@contextmanager
+def host_reads() -> Iterator[list[str]]:
+    """The places that would wait, while it is open."""
+    found: list[str] = []
+    to_list = torch.Tensor.tolist
+
+    def noted(tensor: torch.Tensor):
+        found.append(_place("tolist"))
+        return to_list(tensor)
+
+    torch.Tensor.tolist = noted
+    try:
+        with _Watch(found):
+            yield found
+    finally:
+        torch.Tensor.tolist = to_list
