@@ -151,6 +151,12 @@ def test_padding_keeps_every_event_in_its_row():
         assert torch.equal(padded.polarity[stream][row], own.polarity)
 
 
+def test_streams_that_are_mixed_up_are_an_error():
+    events = concatenate([random_events(5, stream=1), random_events(3, stream=0)])
+    with pytest.raises(EventDataError, match=r"after one of stream 1 there is one of stream 0 \(event 5\)"):
+        pad_streams(events, 2, torch.tensor([20_000, 20_000]))
+
+
 def test_padding_of_no_events():
     padded = pad_streams(EventBatch.empty(), 2, torch.tensor([0, 0]))
     assert padded.mask.shape[0] == 2

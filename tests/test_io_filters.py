@@ -85,6 +85,12 @@ def test_info_finds_gaps_and_the_busiest_time(tmp_path):
     assert (info.gap_count, info.peak_rate, info.brighter_share) == (3, 300.0, 1.0)
 
 
+@pytest.mark.parametrize("times", [[0, 1000, 2000, 4000], [9_000, 9_500, 10_500, 11_000]])
+def test_the_peak_of_a_short_recording_is_not_below_its_mean(tmp_path, times):
+    info = stream(tmp_path, [(t, 1, 1, 1) for t in times]).info()
+    assert info.peak_rate == info.mean_rate == 4 / (1e-6 * (times[-1] - times[0]))
+
+
 # ---- regions and down-scaling
 
 

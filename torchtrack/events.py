@@ -218,8 +218,26 @@ class PaddedEvents:
     mask: Bool[Tensor, "s e"]
 
 
+def _check_streams_in_order(stream_index: Int[Tensor, "e"]) -> None:
+    """Raise :class:`EventDataError` unless the streams come one after the other."""
+    back = stream_index[1:] < stream_index[:-1]
+    if bool(back.any()):
+        at = int(back.nonzero()[0])
+        before, after = stream_index[at : at + 2].tolist()
+        raise EventDataError(
+            f"events of several streams must come one stream after the other, but after one of stream {before} there is one of stream {after} "
+            f"(event {at + 1}). Sort them by stream, then time, or join the batches of the streams with torchtrack.events.concatenate."
+        )
+
+
 def pad_streams(events: EventBatch, streams: int, t_end_us: Int[Tensor, "s"]) -> PaddedEvents:
-    """Ragged events as one padded row per stream, with ages at ``t_end_us``."""
+    """Ragged events as one padded row per stream, with ages at ``t_end_us``.
+
+    Raises:
+        EventDataError: if the streams are mixed up. It is not looked for on a GPU, which would have to be waited for.
+    """
+    if streams > 1 and events.stream_index.device.type == "cpu":
+        _check_streams_in_order(events.stream_index)
     bounds = torch.searchsorted(events.stream_index, torch.arange(streams + 1, device=events.stream_index.device))
     counts = torch.diff(bounds)
     column = torch.arange(max(int(counts.max()), 1), device=bounds.device)

@@ -48,9 +48,10 @@ def _column_name(sequence: str, label: str, columns: Sequence[tuple[str, str]]) 
     return sequence if sum(other == sequence for other, _ in columns) == 1 else f"{sequence}: {label}"
 
 
-def _overall(results: Sequence[ObjectResult]) -> _Overall:
+def _overall(results: Sequence[ObjectResult]) -> _Overall | None:
+    """The means; None where there is nothing to take them of."""
     if not results:
-        return _Overall(*[math.nan] * 5)
+        return None
     metrics = [result.metrics for result in results]
     return _Overall(
         fmean(one.mean_rotation_deg for one in metrics),
@@ -61,16 +62,20 @@ def _overall(results: Sequence[ObjectResult]) -> _Overall:
     )
 
 
-def _row(method: str, results: Sequence[ObjectResult | None], overall: _Overall, first: _Overall) -> tuple[Cell, ...]:
+def _row(method: str, results: Sequence[ObjectResult | None], overall: _Overall | None, first: _Overall | None) -> tuple[Cell, ...]:
+    texts = ["-"] * 5 if overall is None or first is None else _means(overall, first)
+    return (Cell(method), *(Cell(_cell(result)) for result in results), *(Cell(text) for text in texts))
+
+
+def _means(overall: _Overall, first: _Overall) -> list[str]:
     change = f"{overall.rotation_deg - first.rotation_deg:+.3f} / {overall.translation_mm - first.translation_mm:+.2f}"
-    texts = [
+    return [
         _errors(overall.rotation_deg, overall.translation_mm),
         change if overall is not first else "",
         f"{100 * overall.lost_fraction:.1f} %",
-        f"{overall.peak:.1f}",
+        f"{overall.peak:.1f}" if math.isfinite(overall.peak) else "-",
         f"{overall.step_ms:.1f} ms",
     ]
-    return (Cell(method), *(Cell(_cell(result)) for result in results), *(Cell(text) for text in texts))
 
 
 def _cell(result: ObjectResult | None) -> str:

@@ -30,7 +30,7 @@ class EventInfo:
         count: events read, or, where ``complete`` is False, an estimate for all of the stream (None if there is none).
         complete: whether all of the stream was read.
         first_us, last_us: times of the first and last event read; None without events.
-        mean_rate, peak_rate: events per second, over all that was read and in the busiest 10 ms.
+        mean_rate, peak_rate: events per second, over all that was read and in the busiest 10 ms, or in all where that is less.
         brighter_share: share of events where it got brighter.
         gaps: the longest times without events, of more than 10 ms.
         gap_count: how many of these there are.
@@ -76,7 +76,8 @@ def summarise(source: EventSource, max_events: int | None = None) -> EventInfo:
         first_us=tally.first_us,
         last_us=tally.last_us,
         mean_rate=tally.mean_rate,
-        peak_rate=tally.peak.count / (1e-6 * _PEAK_SPAN_US),
+        # Where all is shorter than a span, or the last one is cut off, no span is full.
+        peak_rate=max(tally.peak.count / (1e-6 * _PEAK_SPAN_US), tally.mean_rate),
         brighter_share=tally.brighter / max(tally.count, 1),
         gaps=tuple(sorted(tally.gaps, key=lambda gap: gap.start_us)),
         gap_count=tally.gap_count,
