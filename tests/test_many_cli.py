@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from conftest import REPOSITORY, needs_ray
 from tiny_sequence import write_tiny_sequence
@@ -94,6 +95,20 @@ def test_evaluate_gives_the_same_on_a_ray_cluster(cluster, folder, tmp_path):
     assert done.returncode == ExitCode.FAILED, done.stderr
     assert "failed: bad (default)" in done.stderr
     assert metrics(tmp_path / "ray") == metrics(tmp_path / "local")
+
+
+@needs_ray
+def test_simulate_gives_the_same_on_a_ray_cluster(cluster, tmp_path):
+    pytest.importorskip("numba", reason="the rasteriser needs numba: pip install 'torchtrack[sim]'")
+    (tmp_path / "scenes").mkdir()
+    for name in "ab":
+        (tmp_path / "scenes" / f"{name}.yaml").write_text(SCENE.replace("name: a", f"name: {name}"))
+    arguments = ["simulate", str(tmp_path / "scenes"), "--quiet"]
+    assert main([*arguments, "--jobs", "1", "-o", str(tmp_path / "local")]) == ExitCode.DONE
+    assert main([*arguments, "--executor", "ray", "-o", str(tmp_path / "ray")]) == ExitCode.DONE
+    for name in "ab":
+        expected, found = (dict(np.load(tmp_path / where / f"{name}.npz")) for where in ("local", "ray"))
+        assert all(np.array_equal(found[key], expected[key]) for key in ("t", "x", "y", "p", "poses"))
 
 
 def test_ray_that_is_missing_is_told(folder, tmp_path, monkeypatch, capsys):

@@ -32,7 +32,8 @@ def run_tasks(
 ) -> Iterator[tuple[int, R | TaskFailure]]:
     """The number of each task and what became of it, as it comes.
 
-    Function, tasks and results are pickled; with Ray, files that they name must be reachable from every machine.
+    Function, tasks and results are pickled. With Ray every machine needs torchtrack, and the files that tasks name at the
+    same paths, for example on a shared disk.
 
     Args:
         function: called with a task, and with what tells how far it is, from 0 to 1.
