@@ -34,7 +34,13 @@ def short_scenes():
 def tiny(monkeypatch):
     """Every part as small as it can be."""
     small = {
-        pipeline: {"SHAPES": ("lbracket",), "MANY": ((2, 2, 15.0),), "OUTSIDE_MEV_S": (1.0,), "HD": (320, 240), "HD_MEV_S": 4.0},
+        pipeline: {
+            "SHAPES": ("lbracket",),
+            "MANY": {"cpu": ((2, 2, 1, 15.0), (2, 2, 2, None))},
+            "OUTSIDE_MEV_S": (1.0,),
+            "HD": (320, 240),
+            "HD_MEV_S": 4.0,
+        },
         stages: {"SHAPES": ("lbracket",), "MANY": ((2, 2),)},
         solver: {"TARGETS_MS": {1: 2.0, 3: None}},
         surface: {"WINDOWS": ((64, 48, 500),)},
@@ -69,7 +75,8 @@ def test_pipeline(tiny, simulator, tmp_path, capsys):
     content = written(tmp_path, "pipeline")
     names = [entry["name"] for entry in content["results"]]
     assert names[:4] == ["1 object (lbracket), median", "1 object (lbracket), 95 %", "2 objects, median", "2 objects, 95 %"]
-    assert names[4:] == ["1 object with 1 Mev/s outside it over none", "1 object in 320x240 at 4 Mev/s, stream over work"]
+    assert names[4:6] == ["4 objects in 2 streams, median", "4 objects in 2 streams, 95 %"]
+    assert names[6:] == ["1 object with 1 Mev/s outside it over none", "1 object in 320x240 at 4 Mev/s, stream over work"]
     assert all(entry["figures"][0] > 0 and len(entry["figures"]) == 1 for entry in content["results"])
     assert "100.0% of poses are TRACKING" in content["notes"][0]
     assert content["machine"]["threads"] == 1 and content["machine"]["device"] == "cpu"
@@ -248,6 +255,12 @@ def test_an_unknown_part_is_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         bench("wheels", tmp_path)
     assert "wheels" in capsys.readouterr().err
+
+
+def test_targets_of_a_cpu_are_none_of_a_gpu():
+    assert Setup().cpu_target(2.0) == 2.0
+    assert Setup(device=torch.device("cuda")).cpu_target(2.0) is None
+    assert set(pipeline.MANY) == set(pipeline.ONE_OBJECT_MS) == {"cpu", "cuda"}
 
 
 def test_a_setup_measures_on_one_thread_unless_told():

@@ -197,7 +197,7 @@ class Run:
         tracker: the tracker.
         state: after the warm-up.
         windows: events, on the tracker's device, and end of each window.
-        truth: true poses of each object.
+        truth: true poses of the objects of the first stream.
     """
 
     tracker: Tracker
@@ -264,4 +264,4 @@ def started(scene: Scene, device: torch.device, streams: int = 1, config: Tracke
     with torch.inference_mode():
         for events, end_us in windows[:WARM_UP_WINDOWS]:
             state, _ = tracker.step(state, events, end_us)
-    return Run(tracker, state, windows[WARM_UP_WINDOWS:], scene.truth * streams)
+    return Run(tracker, state, windows[WARM_UP_WINDOWS:], scene.truth)

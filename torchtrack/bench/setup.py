@@ -38,3 +38,7 @@ class Setup:
     def clock(self) -> Clock:
         """The clock that fits the device."""
         return Clock(self.device, self.threads)
+
+    def cpu_target(self, target: float | None) -> float | None:
+        """A target that holds on a CPU alone; None elsewhere."""
+        return target if self.device.type == "cpu" else None
