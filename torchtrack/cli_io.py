@@ -68,8 +68,8 @@ class Bench:
     """Measure the speed of a part; write JSON, Markdown and plots, with medians, quartiles and targets."""
 
     part: Positional[Literal[Part, "all"]]
-    """pipeline: steps of the tracker. stages: of a step. solver: many poses at once. io: reading events, per format. sim: rendering and making
-    events. all: all of them, but those whose libraries are missing."""
+    """pipeline: a step of the tracker. stages: what it is made of. solver, surface, flow: these alone. scaling: with objects and streams.
+    peers: other libraries beside ours. io: reading events. sim: rendering and making events. all: those whose libraries are installed."""
     output: Annotated[str, arg(aliases=["-o"], metavar="DIR")]
     """Folder for the results."""
     repeats: Annotated[int, arg(metavar="N")] = 7
@@ -83,7 +83,7 @@ class Bench:
     events: Annotated[int, arg(metavar="N")] = 5_000_000
     """Of io: events of each file."""
     sequence: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Of pipeline and stages: a sequence, in place of simulated scenes."""
+    """Of pipeline and stages: a sequence (.npz), in place of simulated scenes."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -50,16 +51,21 @@ def draw(plot: Plot, path: Path) -> None:
         axes.grid(alpha=0.3, which="both")
     axes.set(title=plot.title, xlabel=plot.x, ylabel=plot.y)
     if len(plot.series) > 1:
-        axes.legend(fontsize="small")
+        # Bars fill the picture: what they mean stands beside it.
+        if plot.kind == "bars":
+            axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
+        else:
+            axes.legend(fontsize="small")
     figure.savefig(path, format="png")
 
 
 def _draw_bars(axes: Axes, plot: Plot) -> None:
     """Horizontal bars, the first on top, stacked label upon label."""
     places, begun = range(len(plot.ticks)), [0.0] * len(plot.ticks)
-    for label, points in plot.series.items():
+    colours = matplotlib.colormaps["tab20"]
+    for number, (label, points) in enumerate(plot.series.items()):
         values = [value for _, value in points]
-        axes.barh(places, values, left=begun, label=label)
+        axes.barh(places, values, left=begun, label=label, color=colours(number % colours.N))
         begun = [sum(pair) for pair in zip(begun, values, strict=True)]
     axes.set_yticks(places, plot.ticks)
     axes.invert_yaxis()
