@@ -11,8 +11,10 @@ from torch.utils.data import DataLoader, Dataset
 from tracked_boxes import assert_same, moving_box, started, windows
 
 from torchtrack import Status, Tracker, TrackerConfig
+from torchtrack.camera import project
 from torchtrack.config.tracker import MatchingConfig, SearchConfig, SolverConfig
-from torchtrack.lie import se3_exp
+from torchtrack.lie import cayley, se3_exp, se3_log, transform_points
+from torchtrack.pose_solver import robust_loss
 
 # One round that converges: its problem is that of the whole window.
 ONE_ROUND = TrackerConfig(
@@ -173,7 +175,33 @@ def test_nothing_is_recorded_where_gradients_are_off(mode):
     assert_same(off, recorded)
 
 
-# ---- what PyTorch does with modules
+# ---- what PyTorch does with functions and modules
+
+
+def _pixels(twist):
+    """Two points of a body 2 m away, in the image."""
+    away = torch.tensor([[0.1, 0.0, 2.0], [0.0, 0.2, 3.0]], dtype=twist.dtype)
+    return project(transform_points(se3_exp(0.1 * twist), away), SMALL_CAMERA.intrinsics(twist.dtype))
+
+
+MAPPED = {
+    "exponential": se3_exp,
+    "logarithm": lambda twist: se3_log(se3_exp(twist)),
+    "cayley": lambda twist: cayley(twist[..., :3]),
+    "projection": _pixels,
+    "tukey": lambda twist: robust_loss(twist[None], torch.ones(1, dtype=twist.dtype), "tukey")[0][0],
+    "huber": lambda twist: robust_loss(twist[None], torch.ones(1, dtype=twist.dtype), "huber")[0][0],
+}
+
+
+@pytest.mark.parametrize("name", MAPPED)
+def test_pure_functions_can_be_mapped_and_differentiated(name):
+    twists = random_twist(5, seed=2)
+    twists[0] = 0
+    one_by_one = torch.stack([MAPPED[name](twist) for twist in twists])
+    torch.testing.assert_close(torch.func.vmap(MAPPED[name])(twists), one_by_one)
+    jacobians = torch.func.vmap(torch.func.jacrev(MAPPED[name]))(twists)
+    assert jacobians.shape == (*one_by_one.shape, 6) and torch.isfinite(jacobians).all()
 
 
 def test_the_weigher_moves_with_the_tracker():

@@ -29,6 +29,7 @@ from torchtrack.prediction import Prediction
 from torchtrack.search import Found, judge_fit, search, wanted
 from torchtrack.state import StepResult, TrackerState, choose_rows
 from torchtrack.time_surface import at_pixels, empty_last_event, object_regions, time_surface, update_last_event
+from torchtrack.trust import TrustNetwork
 
 # Contours this far outside the image still find their place on a distorted sensor (px).
 _BORDER_PX = 64
@@ -50,7 +51,9 @@ class Tracker(nn.Module):
         stream_index: the stream each object is seen in; the first for all when not given.
         dtype: precision of the pipeline; poses are kept in float64.
         weigher: judges every window's :class:`torchtrack.evidence.Evidence`: how far each observation is to be believed,
-            ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it.
+            ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
+            comes with the package where ``matching.learned_trust`` is on, and none otherwise. Other poses that a search
+            tries are aligned without it.
     """
 
     intrinsics: Tensor
@@ -84,7 +87,7 @@ class Tracker(nn.Module):
         self.register_buffer("sensor_pixels", stack_tables([distortion_table(c, _BORDER_PX) for c in cameras]))
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
-        self.weigher = weigher
+        self.weigher = TrustNetwork.shipped() if weigher is None and self.config.matching.learned_trust else weigher
         self.to(dtype)
 
     @property

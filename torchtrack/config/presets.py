@@ -1,4 +1,4 @@
-"""Presets: ``default`` (ours), ``paper`` (the paper's letter), and the paper's comparison methods ``line``, ``ls`` and ``nns``."""
+"""Presets: ``default`` and ``learned`` (ours), ``paper`` (the paper's letter), and its comparison methods ``line``, ``ls`` and ``nns``."""
 
 from collections.abc import Callable
 from typing import Literal, get_args
@@ -17,7 +17,12 @@ from torchtrack.config.tracker import (
 )
 from torchtrack.errors import ConfigError
 
-PresetName = Literal["default", "paper", "line", "ls", "nns"]
+PresetName = Literal["default", "learned", "paper", "line", "ls", "nns"]
+
+
+def _learned() -> TrackerConfig:
+    """The default, with a network's word on how far each observation is to be believed."""
+    return TrackerConfig(matching=MatchingConfig(learned_trust=True))
 
 
 def _paper() -> TrackerConfig:
@@ -77,7 +82,14 @@ def preset(name: PresetName | str) -> TrackerConfig:
     Raises:
         ConfigError: if there is no such preset.
     """
-    makers: dict[str, Callable[[], TrackerConfig]] = {"default": TrackerConfig, "paper": _paper, "line": _line, "ls": _ls, "nns": _nns}
+    makers: dict[str, Callable[[], TrackerConfig]] = {
+        "default": TrackerConfig,
+        "learned": _learned,
+        "paper": _paper,
+        "line": _line,
+        "ls": _ls,
+        "nns": _nns,
+    }
     if name in makers:
         return makers[name]()
     raise ConfigError(f"unknown preset '{name}': use one of {', '.join(get_args(PresetName))}.")

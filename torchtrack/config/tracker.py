@@ -99,6 +99,7 @@ class MatchingConfig(Settings):
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
+    learned_trust: bool = Field(False, description="Trust observations as a small network has learned from the events around them.")
     max_events: int = Field(1000, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
     @model_validator(mode="after")

@@ -1,0 +1,33 @@
+"""Which observations are of the object's contour: what a weigher is to learn, from the true pose."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.alignment import index_for
+from torchtrack.contours import take_points
+from torchtrack.evidence import Evidence
+from torchtrack.prediction import Prediction
+from torchtrack.tracker import Tracker
+
+
+def true_distance(tracker: Tracker, evidence: Evidence, T_cam_obj: Float[Tensor, "b 4 4"], velocity: Float[Tensor, "b 6"]) -> Float[Tensor, "b n"]:
+    """How far each observation lies from the true contour once both are at the window's end (px); infinite where none is near.
+
+    Args:
+        tracker: that made the evidence.
+        evidence: of a window.
+        T_cam_obj: true poses at its end.
+        velocity: true rotation of each object and velocity of its centre there (rad/s, m/s), as in the tracker's state.
+    """
+    observations, predicted = evidence.observations, evidence.prediction
+    dtype = predicted.velocity.dtype
+    truth = Prediction(predicted.objects, T_cam_obj.to(dtype), predicted.usable, velocity.to(dtype), predicted.covariance)
+    contours = predicted.objects.contours(truth.T_cam_obj, tracker.config.contours)
+    index = index_for(contours, predicted.objects.image_size, tracker.config, torch.ones_like(truth.velocity[:, 0]))
+    moved = torch.addcmul(observations.pixels, truth.plane_velocity(observations.pixels), observations.age_s[..., None])
+    found = index.look_up(moved)
+    table = torch.cat([contours.pixels, contours.normals, truth.contour_velocity(contours)], -1)
+    pixels, normals, speed = take_points(table, found.clamp(min=0)).chunk(3, -1)
+    distance = ((torch.addcmul(observations.pixels, speed, observations.age_s[..., None]) - pixels) * normals).sum(-1).abs()
+    return torch.where((found >= 0) & observations.mask, distance, torch.inf)
