@@ -11,6 +11,7 @@ from torchtrack.camera import Camera, project
 from torchtrack.contours import ContourKind, Contours
 from torchtrack.events import EventBatch
 from torchtrack.io import Trajectory
+from torchtrack.image_motion import MovingObjects
 from torchtrack.lie import rotation_angle_deg, se3_exp, so3_exp, transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import Observations
@@ -162,6 +163,14 @@ def contours_at(pixels, normals=None, kind=ContourKind.CREASE, mask=None, dtype=
     points = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1)
     mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
     return Contours(points, torch.zeros_like(points), torch.full(mask.shape, int(kind)), mask, points, pixels, normals)
+
+
+def moving_objects(velocity_px_s, batch=1, dtype=torch.float64):
+    """Objects that show contours of :func:`contours_at` where they are, and move across the image at ``velocity_px_s``."""
+    intrinsics = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=dtype).expand(batch, 4)
+    velocity = torch.zeros(batch, 6, dtype=dtype)
+    velocity[:, 3:5] = torch.as_tensor(velocity_px_s, dtype=dtype)
+    return MovingObjects(torch.eye(4, dtype=dtype).expand(batch, 4, 4), velocity, torch.zeros(batch, 3, dtype=dtype), intrinsics)
 
 
 def upright_line(u, dtype=torch.float64, **kwargs):

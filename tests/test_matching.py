@@ -1,17 +1,18 @@
 """Association of observations with contours: the index, motion compensation, gates, concentration, the dark side, the paper's search."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, pose, random_pose, seen, upright_line
+from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_pose, seen, upright_line
 
 from torchtrack.config.tracker import ContourConfig, MatchingConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contours import ContourKind, Contours, group_by_model, mesh_contours, reproject
-from torchtrack.image_motion import object_plane_velocity, pixel_velocity
+from torchtrack.image_motion import MovingObjects, object_plane_velocity
 from torchtrack.lie import retract_about
-from torchtrack.matching import Belief, both_coordinates, concentration, match_along_flow, match_nearest
+from torchtrack.matching import ContourTable, both_coordinates, concentration, match_along_flow, match_nearest, on_and_around, patch, patch_sums
 from torchtrack.observations import Observations
 
 
@@ -22,10 +23,12 @@ def matching(**settings):
 
 def nearest(observations, contours, *, velocity=(0.0, 0.0), believed=None, gate_px=3.0, index=None, cell_px=1, **settings):
     """The matches of ``match_nearest``, with all contours moving at ``velocity`` (px/s)."""
-    moving = torch.as_tensor(velocity, dtype=contours.pixels.dtype).expand_as(contours.pixels)
-    believed = torch.as_tensor(velocity if believed is None else believed, dtype=contours.pixels.dtype).expand_as(observations.pixels)
-    index = index or index_contours(contours, IMAGE_SIZE, 8, cell_px)
-    return match_nearest(observations, contours, index, Belief.from_velocity(believed), moving, gate_px, matching(**settings))
+    dtype = contours.pixels.dtype
+    moving = moving_objects(velocity, len(contours.pixels), dtype)
+    believed = torch.as_tensor(velocity if believed is None else believed, dtype=dtype)
+    table = ContourTable.of(contours, index or index_contours(contours, IMAGE_SIZE, 8, cell_px))
+    place = observations.pixels + believed * observations.age_s[..., None]
+    return match_nearest(observations, table, place, moving, gate_px, matching(**settings))
 
 
 def brute_force(contours, places, number):
@@ -139,12 +142,10 @@ def test_observations_are_moved_to_the_end_of_the_window():
 def test_the_velocity_is_the_contours_own_not_what_was_believed():
     """Believed 400 px/s, the contour that is found moves at 500: the target is carried with 500."""
     observation = seen([[[76.0, 60.0]]], age_s=8e-3)
-    matches, belief = nearest(observation, upright_line(80.0), velocity=(500.0, 0.0), believed=(400.0, 0.0))
+    matches, place = nearest(observation, upright_line(80.0), velocity=(500.0, 0.0), believed=(400.0, 0.0))
     assert matches.targets[0, 0].tolist() == pytest.approx([80.0, 60.0])
-    still, index = torch.zeros(1, 100, 2).double(), index_contours(upright_line(80.0), IMAGE_SIZE, 8, 1)
-    again, _ = match_nearest(observation, upright_line(80.0), index, belief, still, 9.0, matching())
     # It is now looked for where the matched contour's velocity puts it.
-    assert again.contour.tolist() == [[40]]
+    assert place[0, 0].tolist() == pytest.approx([80.0, 60.0])
 
 
 def test_an_index_of_an_earlier_pose_still_finds_the_contours():
@@ -153,19 +154,18 @@ def test_an_index_of_an_earlier_pose_still_finds_the_contours():
     index = index_contours(before, IMAGE_SIZE, 5, 1)
     after = upright_line(84.0)
     observation = seen([[[84.5, 60.0]]])
-    first, belief = nearest(observation, after, index=index)
+    first, place = nearest(observation, after, index=index)
     assert first.mask.all()
-    far = upright_line(87.0)
-    second = match_nearest(seen([[[86.5, 60.0]]]), far, index, belief, torch.zeros(1, 100, 2).double(), 3.0, matching())[0]
+    assert place[0, 0].tolist() == pytest.approx([80.5, 60.0])
+    table = ContourTable.of(upright_line(87.0), index)
+    second = match_nearest(seen([[[86.5, 60.0]]]), table, place, moving_objects((0.0, 0.0)), 3.0, matching())[0]
     assert second.mask.all()
     assert second.contour.tolist() == [[40]]
 
 
 def test_unmatched_observations_keep_what_was_believed():
-    _, belief = nearest(seen([[[140.0, 60.0]]], age_s=8e-3), upright_line(80.0), velocity=(500.0, 0.0), believed=(-10.0, 3.0))
-    _, expected = nearest(seen([[[140.0, 60.0]]], age_s=8e-3), upright_line(80.0), velocity=(700.0, 0.0), believed=(-10.0, 3.0))
-    for name in vars(belief):
-        assert torch.equal(getattr(belief, name), getattr(expected, name))
+    _, place = nearest(seen([[[140.0, 60.0]]], age_s=8e-3), upright_line(80.0), velocity=(500.0, 0.0), believed=(-10.0, 3.0))
+    assert place[0, 0].tolist() == pytest.approx([140.0 - 0.08, 60.0 + 0.024])
 
 
 @pytest.mark.parametrize(("polarity", "speed", "shift"), [(1.0, 490.0, -0.98), (-1.0, 490.0, 0.98), (1.0, -490.0, 0.98), (0.0, 490.0, 0.0)])
@@ -183,15 +183,14 @@ def test_the_limb_of_a_smooth_surface_has_no_dark_side():
 
 def test_the_dark_side_does_not_depend_on_the_sign_of_the_normal(dtype):
     normals = torch.nn.functional.normalize(torch.randn((2, 50, 2), generator=generator(), dtype=dtype), dim=-1)
-    velocity = 300 * torch.randn((2, 50, 2), generator=generator(1), dtype=dtype)
+    velocity = torch.tensor([[400.0, -200.0], [-30.0, 500.0]], dtype=dtype)
     polarity = torch.randn((2, 50), generator=generator(2), dtype=dtype).sign()
     pixels = 40 + 60 * torch.rand((2, 50, 2), generator=generator(3), dtype=dtype)
     shifted = []
     for sign in (1, -1):
         contours = contours_at(pixels, sign * normals, dtype=dtype)
-        belief, index = Belief.from_velocity(velocity), index_contours(contours, IMAGE_SIZE, 8, 1)
         moved, still = (
-            match_nearest(seen(pixels, polarity=polarity, dtype=dtype), contours, index, belief, velocity, 5.0, matching(dark_shift_px=shift))[0]
+            nearest(seen(pixels, polarity=polarity, dtype=dtype), contours, velocity=velocity, believed=(0.0, 0.0), gate_px=5.0, dark_shift_px=shift)[0]
             for shift in (1.0, 0.0)
         )
         shifted.append(moved.targets - still.targets)
@@ -199,7 +198,7 @@ def test_the_dark_side_does_not_depend_on_the_sign_of_the_normal(dtype):
     torch.testing.assert_close(*shifted)
     assert (shifted[0].norm(dim=-1) <= 1).all()
     # The dark side, from which events are moved back, is ahead where it got brighter.
-    ahead = -(shifted[0] * velocity.gather(1, moved.contour[..., None].expand_as(velocity))).sum(-1) * polarity
+    ahead = -(shifted[0] * velocity[:, None]).sum(-1) * polarity
     assert (ahead >= -1e-3).all()
     assert float(shifted[0].norm(dim=-1).median()) > 0.9
 
@@ -210,7 +209,7 @@ def test_matches_of_an_object_do_not_depend_on_the_others(dtype):
     together, _ = nearest(observations, contours, velocity=(200.0, -100.0), cell_px=2)
     for number in range(3):
         own = Contours(*(getattr(contours, name)[number : number + 1] for name in vars(contours)))
-        one = Observations(*(getattr(observations, name)[number : number + 1] for name in vars(observations)))
+        one = Observations(*(getattr(observations, name)[number : number + 1] for name in vars(observations) if name != "trust"))
         alone, _ = nearest(one, own, velocity=(200.0, -100.0), cell_px=2)
         for name in vars(alone):
             torch.testing.assert_close(getattr(alone, name)[0], getattr(together, name)[number])
@@ -227,15 +226,15 @@ def test_events_of_a_moving_box_are_all_matched_within_a_pixel():
     contours = mesh_contours([group.double() for group in group_by_model([box_model()], config)], T_now, intrinsics, config)
     earlier = reproject(contours, T_before, intrinsics)
     observations = seen(earlier.pixels.round(), age_s=5e-3)
-    speed = pixel_velocity(contours.points_cam, velocity, T_now[:, :3, 3], intrinsics)
-    index = index_contours(contours, IMAGE_SIZE, 8, 1)
-    plane = object_plane_velocity(observations.pixels, velocity, T_now[:, :3, 3], intrinsics)
+    objects = MovingObjects(T_now, velocity, T_now[:, :3, 3], intrinsics)
+    table = ContourTable.of(contours, index_contours(contours, IMAGE_SIZE, 8, 1))
+    place = observations.pixels + 5e-3 * object_plane_velocity(observations.pixels, velocity, T_now[:, :3, 3], intrinsics)
     inside = ((earlier.pixels > 0) & (earlier.pixels < torch.tensor([199, 149]))).all(-1)
     assert int(inside.sum()) > 200
-    matches, _ = match_nearest(observations, contours, index, Belief.from_velocity(plane), speed, 1.5, matching())
+    matches, _ = match_nearest(observations, table, place, objects, 1.5, matching())
     assert float(matches.mask[inside].double().mean()) > 0.97
-    still = torch.zeros_like(plane)
-    uncompensated, _ = match_nearest(observations, contours, index, Belief.from_velocity(still), still, 1.5, matching())
+    still = replace(objects, velocity=torch.zeros_like(velocity))
+    uncompensated, _ = match_nearest(observations, table, observations.pixels, still, 1.5, matching())
     residual = [
         ((contours.pixels[0][m.contour[0]] - m.targets[0]) * m.directions[0]).sum(-1)[m.mask[0]].abs().mean() for m in (matches, uncompensated)
     ]
@@ -244,6 +243,13 @@ def test_events_of_a_moving_box_are_all_matched_within_a_pixel():
 
 
 # ---- concentration
+
+
+def trust(offsets, targets, near, config):
+    """The concentration around observations with given offsets from their contours."""
+    cell, counted = patch(targets), torch.stack(on_and_around(offsets, near), 1)
+    on, around = patch_sums(cell, counted).gather(2, cell[:, None].expand(-1, 2, -1)).unbind(1)
+    return concentration(on, around, config)
 
 
 def line_with_offsets(*groups):
@@ -272,7 +278,7 @@ def test_a_smeared_patch_is_trusted_least_and_a_gathered_one_fully(least_trust, 
     on = torch.cat([torch.ones(100), torch.zeros(100), torch.arange(100) % 2]).to(dtype)
     offsets = torch.where(on > 0, 0.3, -2.0).to(dtype)[None]
     config = MatchingConfig(smeared_share=0.25, gathered_share=0.75, least_trust=least_trust)
-    weights = concentration(offsets, targets, torch.ones(1, 300, dtype=torch.bool), config)[0].view(3, 100)
+    weights = trust(offsets, targets, torch.ones(1, 300, dtype=torch.bool), config)[0].view(3, 100)
     assert weights.dtype == dtype
     torch.testing.assert_close(weights, torch.tensor([1.0, least_trust, 0.5], dtype=dtype)[:, None].expand(3, 100), rtol=0, atol=1e-6)
 
@@ -282,7 +288,7 @@ def test_trust_rises_with_the_share_on_the_contour():
     for on in range(0, 101, 10):
         offsets = torch.where(torch.arange(100) < on, 0.0, 2.0).double()[None]
         near, targets = torch.ones(1, 100, dtype=torch.bool), torch.full((1, 100, 2), 50.0, dtype=torch.float64)
-        shares.append(float(concentration(offsets, targets, near, MatchingConfig())[0, 0]))
+        shares.append(float(trust(offsets, targets, near, MatchingConfig())[0, 0]))
     assert shares == sorted(shares)
     assert shares[:3] == [MatchingConfig().least_trust] * 3
     assert shares[-3:] == [1.0] * 3
@@ -293,19 +299,19 @@ def test_trust_rises_with_the_share_on_the_contour():
 def test_of_a_single_observation_the_share_is_drawn_towards_a_half(offset, near, expected):
     """One on the contour counts as two of three, one beside it as one of three, and none as one of two."""
     config = MatchingConfig(smeared_share=0.35, gathered_share=0.6, least_trust=0.02)
-    weight = concentration(torch.tensor([[offset]]), torch.full((1, 1, 2), 50.0), torch.tensor([[near]]), config)
+    weight = trust(torch.tensor([[offset]]), torch.full((1, 1, 2), 50.0), torch.tensor([[near]]), config)
     assert float(weight) == pytest.approx(expected, abs=1e-6)
 
 
 def test_observations_far_from_the_contour_count_neither_way():
     offsets = torch.cat([torch.zeros(40), torch.full((40,), 3.5)]).double()[None]
     targets, near = torch.full((1, 80, 2), 50.0, dtype=torch.float64), torch.ones(1, 80, dtype=torch.bool)
-    assert (concentration(offsets, targets, near, MatchingConfig()) == 1).all()
+    assert (trust(offsets, targets, near, MatchingConfig()) == 1).all()
 
 
 def test_places_outside_the_image_have_patches_too():
     targets = torch.tensor([[[-1e9, 50.0], [1e9, 1e9], [50.0, -3.0]]])
-    weights = concentration(torch.zeros(1, 3), targets, torch.ones(1, 3, dtype=torch.bool), MatchingConfig())
+    weights = trust(torch.zeros(1, 3), targets, torch.ones(1, 3, dtype=torch.bool), MatchingConfig())
     assert torch.isfinite(weights).all()
 
 
@@ -319,8 +325,8 @@ def test_observations_without_a_contour_nearby_do_not_count_against_others():
     offset = torch.cat([torch.zeros(1, 40), torch.full((1, 40), 2.0)], 1)
     config = MatchingConfig(smeared_share=0.35, gathered_share=0.6)
     near = torch.arange(80)[None] < 40
-    assert (concentration(offset, targets, near, config)[0, :40] == 1).all()
-    assert (concentration(offset, targets, torch.ones_like(near), config)[0, :40] < 1).all()
+    assert (trust(offset, targets, near, config)[0, :40] == 1).all()
+    assert (trust(offset, targets, torch.ones_like(near), config)[0, :40] < 1).all()
 
 
 def test_the_concentration_of_an_object_does_not_depend_on_the_others():
@@ -336,7 +342,7 @@ def test_the_concentration_of_an_object_does_not_depend_on_the_others():
 
 
 def along(observations, contours, *, gate_px=8.0, velocity=(0.0, 0.0), **settings):
-    moving = torch.tensor(velocity, dtype=contours.pixels.dtype).expand_as(contours.pixels)
+    moving = moving_objects(velocity, len(contours.pixels), contours.pixels.dtype)
     return match_along_flow(observations, contours, moving, gate_px, MatchingConfig(along_flow=True, **settings))
 
 

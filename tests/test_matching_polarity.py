@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from helpers import IMAGE_SIZE, generator, seen, upright_line
+from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
 
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contours import ContourKind
-from torchtrack.matching import Belief, match_nearest, patch, polarity_agreement
+from torchtrack.matching import ContourTable, match_nearest, on_and_around, patch, patch_sums, polarity_agreement
 
 CONFIG = MatchingConfig(polarity_gain=1.5, least_agreement=0.05)
 
@@ -17,7 +17,9 @@ def agreement(dark, *, offsets=0.0, near=True, place=50.0, config=CONFIG):
     dark = torch.as_tensor(dark, dtype=torch.float64)[None]
     offsets, near = torch.as_tensor(offsets, dtype=torch.float64).expand(dark.shape), torch.as_tensor(near).expand(dark.shape)
     targets = torch.as_tensor(place, dtype=torch.float64).expand(dark.shape)[..., None].expand(*dark.shape, 2)
-    return polarity_agreement(dark, offsets, targets, near, config)[0]
+    cell, (on, _) = patch(targets), on_and_around(offsets, near)
+    votes, voters = patch_sums(cell, torch.stack([on * dark, on], 1)).gather(2, cell[:, None].expand(-1, 2, -1)).unbind(1)
+    return polarity_agreement(dark, votes, voters, config)[0]
 
 
 def test_those_of_one_mind_count_in_full():
@@ -80,11 +82,10 @@ def weights_on_a_line(polarity, *, speed=500.0, kind=ContourKind.CREASE, polarit
     contours = upright_line(80.0, kind=kind)
     v = 32 + 15 * torch.rand(len(polarity), generator=generator(), dtype=torch.float64)
     places = torch.stack([torch.full_like(v, 80.0), v], -1)[None]
-    velocity = torch.tensor([speed, 0.0], dtype=torch.float64)
     observations = seen(places, polarity=torch.tensor(polarity, dtype=torch.float64)[None])
-    belief, index = Belief.from_velocity(velocity.expand_as(places)), index_contours(contours, IMAGE_SIZE, 8, 1)
+    table = ContourTable.of(contours, index_contours(contours, IMAGE_SIZE, 8, 1))
     config = MatchingConfig(concentration=False, dark_shift_px=0.0, polarity=polarity_counts)
-    return match_nearest(observations, contours, index, belief, velocity.expand_as(contours.pixels), 3.0, config)[0].weights[0]
+    return match_nearest(observations, table, places, moving_objects((speed, 0.0)), 3.0, config)[0].weights[0]
 
 
 @pytest.mark.parametrize("kind", [ContourKind.LIMB, ContourKind.CREASE])

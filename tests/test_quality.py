@@ -33,7 +33,9 @@ def matches_at(targets, near=None, offsets=0.0):
     near = torch.ones(targets.shape[:2], dtype=torch.bool) if near is None else torch.as_tensor(near)
     offsets = torch.as_tensor(offsets, dtype=torch.float64).expand(near.shape)
     nothing = torch.zeros(near.shape, dtype=torch.int64)
-    return Matches(nothing, torch.zeros_like(near), torch.ones_like(offsets), targets, torch.zeros_like(targets), offsets, near)
+    points = torch.zeros(*near.shape, 3, dtype=torch.float64)
+    directions, limb = torch.zeros_like(targets), torch.zeros_like(offsets)
+    return Matches(nothing, torch.zeros_like(near), torch.ones_like(offsets), points, targets, directions, offsets, near, limb)
 
 
 def upright_line(u=80.0, count=80, first=20.0):

@@ -143,7 +143,7 @@ def test_gradients_by_the_initial_pose_are_those_of_finite_differences():
 def test_gradients_flow_through_windows_to_everything():
     trajectory, events = moving_box(pose(), 3)
     tracker = Tracker([box_model()], SMALL_CAMERA, dtype=torch.float64, weigher=ByAge(slope=-0.5, offset=1.0))
-    wanted = {"intrinsics": tracker.intrinsics, "ideal pixels": tracker.ideal_pixels, "contour points": tracker.models[0].edge_start}
+    wanted = {"intrinsics": tracker.intrinsics, "ideal pixels": tracker.ideal_pixels, "contour points": tracker.models[0].edges}
     for value in wanted.values():
         value.requires_grad_()
     wanted |= {"slope": tracker.weigher.slope, "initial pose": trajectory.T_cam_obj[:1].clone().requires_grad_()}

@@ -106,7 +106,8 @@ def test_one_triangle_hides_what_is_behind_it_and_inside_its_cone(dtype):
     triangle = torch.tensor([[[[-0.1, -0.1, 0.5], [0.1, -0.1, 0.5], [0.0, 0.1, 0.5]]]], dtype=dtype)
     points = torch.tensor([[[0.0, 0.0, 0.6], [0.0, 0.0, 0.4], [0.0, 0.0, 0.5005], [0.3, 0.0, 0.9], [0.0, 0.0, -0.6], [0.0, -0.19, 1.0]]], dtype=dtype)
     for order in ([0, 1, 2], [2, 1, 0]):
-        hidden = hidden_by_faces(points, triangle[:, :, order], torch.tensor([1e-3], dtype=dtype))
+        normal = torch.tensor([[[0.0, 0.0, 1.0 if order[0] == 0 else -1.0]]], dtype=dtype)
+        hidden = hidden_by_faces(points, triangle[:, :, order], normal, torch.tensor([1e-3], dtype=dtype))
         assert hidden.tolist() == [[True, False, False, False, False, True]]
 
 

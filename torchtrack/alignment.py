@@ -1,5 +1,6 @@
 """One window's alignment: rounds of matching and solving with ever tighter gates."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -8,9 +9,9 @@ from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_index import ContourIndex, index_contours
-from torchtrack.contours import ContourKind, Contours, reproject, take_points
+from torchtrack.contours import Contours, reproject
 from torchtrack.implicit_gradient import with_gradient
-from torchtrack.matching import Belief, Matches, both_coordinates, match_along_flow, match_nearest
+from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
 from torchtrack.motion import inverse
 from torchtrack.observations import Observations
 from torchtrack.pose_solver import Linearisation, PoseProblem, WindowTerms, solve_pose
@@ -69,34 +70,42 @@ def align(
         widening: of each object's first gate; it is taken back by the last.
         offset: of the beginning from the prediction: pose, velocity and swelling; none when not given.
     """
-    objects = prediction.objects
-    if offset is None:
-        offset = prediction.velocity.new_zeros(len(widening), 13)
+    objects, matching = prediction.objects, config.matching
     information = _information(prediction, config)
-    begin = prediction.moved(offset) if config.solver.prior else prediction
-    T_cam_obj, offset = begin.T_cam_obj, offset[:, : information.shape[-1]]
-    compensate = 1.0 if config.matching.motion_compensation else 0.0
-    belief = Belief.from_velocity(compensate * begin.plane_velocity(observations.pixels))
-    rounds = len(config.matching.gates_px)
-    for number, gate_px in enumerate(config.matching.gates_px):
+    begin = prediction if offset is None else prediction.moved(offset)
+    offset = torch.zeros_like(information[:, 0]) if offset is None else offset
+    place = _first_place(begin, observations, config)
+    table = ContourTable.of(contours, index)
+    for number, (gate_px, wider) in enumerate(zip(matching.gates_px, _narrowing(widening, len(matching.gates_px)), strict=True)):
         if number and number in config.contours.refresh_rounds:
-            contours = objects.contours(T_cam_obj, config.contours)
-            index = index_for(contours, objects.image_size, config, widening)
-            belief = Belief.from_velocity(belief.motion[..., :2])
-        wider = widening ** (1 - number / max(rounds - 1, 1))
-        velocity = compensate * begin.contour_velocity(contours)
-        matches, belief = _match(observations, contours, index, belief, velocity, gate_px, wider, config)
-        rows = both_coordinates(matches) if config.matching.residual == "point" else matches
-        problem = _problem(prediction, information, rows, contours, gate_px * wider)
-        if config.solver.prior:
-            problem = replace(problem, window=_window_terms(observations, contours, rows, offset, config))
-        solution = solve_pose(problem, T_cam_obj, config.solver, offset)
-        T_cam_obj, offset = solution.T_cam_obj, solution.from_prior
-        contours = reproject(contours, T_cam_obj, objects.intrinsics)
-        if config.solver.prior:
-            begin = replace(prediction, T_cam_obj=T_cam_obj, velocity=prediction.velocity + offset[:, 6:12])
+            contours = objects.contours(begin.T_cam_obj, config.contours)
+            table = ContourTable.of(contours, index_for(contours, objects.image_size, config, widening))
+            place = _first_place(begin, observations, config)
+        moving = begin.moving(compensated=matching.motion_compensation)
+        if matching.along_flow:
+            contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
+            matches = match_along_flow(observations, contours, moving, gate_px, matching)
+        else:
+            matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider)
+        matches = _believed(matches, observations, config)
+        problem = _problem(prediction, information, matches, observations, offset, gate_px * wider, config)
+        solution = solve_pose(problem, begin.T_cam_obj, config.solver, offset)
+        begin, offset = prediction.at(solution.T_cam_obj, solution.from_prior), solution.from_prior
     solution = with_gradient(problem, solution, config.solver)
-    return Fit(solution, contours, matches)
+    return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
+
+
+def _narrowing(widening: Float[Tensor, "b"], rounds: int) -> Iterable[Float[Tensor, "b"]]:
+    """How many times wider than configured the gate of every round is: as given at first, not at all at last."""
+    left = torch.linspace(1, 0, rounds, dtype=widening.dtype, device=widening.device)[:, None] if rounds > 1 else widening.new_ones(1, 1)
+    return (widening**left).unbind(0)
+
+
+def _first_place(begin: Prediction, observations: Observations, config: TrackerConfig) -> Float[Tensor, "b n 2"]:
+    """Where the first round looks for each observation: carried to the window's end with the object's plane."""
+    if not config.matching.motion_compensation:
+        return observations.pixels
+    return torch.addcmul(observations.pixels, begin.plane_velocity(observations.pixels), observations.age_s[..., None])
 
 
 def _information(prediction: Prediction, config: TrackerConfig) -> Tensor:
@@ -110,49 +119,48 @@ def _information(prediction: Prediction, config: TrackerConfig) -> Tensor:
     return (config.solver.observation_px**2 * information).to(prediction.velocity.dtype)
 
 
-def _match(
-    observations: Observations,
-    contours: Contours,
-    index: ContourIndex,
-    belief: Belief,
-    contour_velocity: Float[Tensor, "b m 2"],
-    gate_px: float,
-    wider: Float[Tensor, "b"],
-    config: TrackerConfig,
-) -> tuple[Matches, Belief]:
-    """Matches of one round, none for an object with too few of them, and what the next round begins with."""
-    if config.matching.along_flow:
-        matches = match_along_flow(observations, contours, contour_velocity, gate_px, config.matching)
-    else:
-        matches, belief = match_nearest(observations, contours, index, belief, contour_velocity, gate_px, config.matching, wider)
+def _believed(matches: Matches, observations: Observations, config: TrackerConfig) -> Matches:
+    """The matches with weights that hold all there is to be said: none for what has no match, or an object with too few of them."""
+    weights = matches.weights * matches.mask
     if observations.trust is not None:
-        matches = replace(matches, weights=matches.weights * observations.trust)
-    enough = (matches.mask * matches.weights).sum(-1, keepdim=True) >= config.quality.min_observations
-    return replace(matches, mask=matches.mask & enough), belief
+        weights = weights * observations.trust
+    enough = weights.sum(-1, keepdim=True) >= config.quality.min_observations
+    return replace(matches, mask=matches.mask & enough, weights=weights * enough)
 
 
-def _window_terms(
-    observations: Observations, contours: Contours, matches: Matches, offset: Float[Tensor, "b 13"], config: TrackerConfig
-) -> WindowTerms:
-    """What observations tell beside the pose: of the velocity by their ages, and of how far limbs stand out."""
-    # Two rows for each observation where both of its coordinates count.
-    age_s = observations.age_s.repeat(1, 2 if config.matching.residual == "point" else 1)
-    if not config.solver.velocity_in_window:
-        age_s = torch.zeros_like(age_s)
-    limb = ((contours.kind == int(ContourKind.LIMB)) & (config.matching.residual == "normal")).to(age_s.dtype)
-    return WindowTerms(age_s, offset[:, 6:12], take_points(limb[..., None], matches.contour)[..., 0])
-
-
-def _problem(prediction: Prediction, information: Tensor, matches: Matches, contours: Contours, gate_px: Float[Tensor, "b"]) -> PoseProblem:
+def _problem(
+    prediction: Prediction,
+    information: Tensor,
+    matches: Matches,
+    observations: Observations,
+    offset: Float[Tensor, "b k"],
+    gate_px: Float[Tensor, "b"],
+    config: TrackerConfig,
+) -> PoseProblem:
     """The least squares problem of one round; objects without a match stay where they are."""
+    rows = both_coordinates(matches) if config.matching.residual == "point" else matches
     return PoseProblem(
-        points_obj=take_points(contours.points_obj, matches.contour),
-        targets=matches.targets,
-        directions=matches.directions,
-        weights=matches.mask * matches.weights,
+        points_obj=rows.points_obj,
+        targets=rows.targets,
+        directions=rows.directions,
+        weights=rows.weights,
         intrinsics=prediction.objects.intrinsics,
         centre_obj=prediction.objects.centre_obj,
         scale_px=gate_px,
         T_prior=prediction.T_cam_obj,
         prior_information=information,
+        window=_window_terms(rows, observations, offset, config) if config.solver.prior else None,
     )
+
+
+def _window_terms(rows: Matches, observations: Observations, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
+    """What observations tell beside the pose: of the velocity by their ages, and of how far limbs stand out."""
+    age_s, outward = observations.age_s, rows.limb
+    if config.matching.residual == "point":
+        # Two rows for each observation where both of its coordinates count.
+        age_s = age_s.repeat(1, 2)
+    if config.matching.residual != "normal":
+        outward = torch.zeros_like(outward)
+    if not config.solver.velocity_in_window:
+        age_s = torch.zeros_like(age_s)
+    return WindowTerms(age_s, offset[:, 6:12], outward)

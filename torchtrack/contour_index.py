@@ -5,6 +5,7 @@ instead.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float, Int
@@ -12,8 +13,10 @@ from torch import Tensor
 
 from torchtrack.contours import Contours
 
-# Squared distances are compared in these fractions of a pixel².
-_DISTANCE_STEPS = 16
+# Squared distances are compared in these fractions of a pixel²; none that counts comes near this many of them.
+_DISTANCE_STEPS, _FAR_STEPS = 16, 2**30
+# Farther than any cell of an image.
+_FAR_CELLS = 2**20
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,7 @@ class ContourIndex:
         pixels: where the contour points were when the index was made.
     """
 
-    origin: Int[Tensor, "b 2"]
+    origin: Float[Tensor, "b 2"]
     size: tuple[int, int]
     cell_px: int
     nearest: Int[Tensor, "b p"]
@@ -37,10 +40,10 @@ class ContourIndex:
     def look_up(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
         """The contour point nearest to the centre of each pixel's cell, -1 where none is near."""
         rows, columns = self.size
-        place = torch.nan_to_num((pixels / self.cell_px).round() - self.origin[:, None], nan=0.0)
-        # The region's border is empty: whatever lies outside finds nothing there.
-        column, row = torch.minimum(place.clamp(min=0), place.new_tensor([columns - 1, rows - 1])).unbind(-1)
-        return self.nearest.gather(1, torch.add(column, row, alpha=columns).long())
+        column, row = (pixels / self.cell_px - self.origin[:, None]).round().unbind(-1)
+        # The region's border is empty: whatever lies outside finds nothing there, nor does what is not a number.
+        place = torch.add(column.clamp(0, columns - 1), row.clamp(0, rows - 1), alpha=columns)
+        return self.nearest.gather(1, place.nan_to_num_(0.0).long())
 
 
 def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"], cell_px: int) -> ContourIndex:
@@ -54,40 +57,39 @@ def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: i
     batch, count, _ = contours.pixels.shape
     device = contours.pixels.device
     radius = torch.as_tensor(radius_px, device=device).expand(batch)
-    limit, around_px = torch.tensor([image_size[1] - 1, image_size[0] - 1], device=device), radius[:, None, None]
-    inside = contours.mask & ((contours.pixels > -around_px) & (contours.pixels < limit + around_px)).all(-1)
-    centre = torch.where(inside[..., None], contours.pixels / cell_px, 0).round().long()
+    middle = torch.tensor([0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)], dtype=contours.pixels.dtype, device=device)
+    inside = contours.mask & ((contours.pixels - middle).abs() < middle + radius[:, None, None]).all(-1)
     largest_px = int(radius.max()) if batch else 0
     reach = -(-largest_px // cell_px)
-    low = torch.where(inside[..., None], centre, 2**31).amin(1).clamp(max=2**30) - reach - 1
-    columns, rows = (torch.where(inside[..., None], centre - low[:, None], 0).amax((0, 1)) + reach + 2).tolist()
-    disc = _disc(reach, largest_px / cell_px, device)
+    centre = (contours.pixels / cell_px).round()
+    low = torch.where(inside[..., None], centre, torch.inf).amin(1).clamp(max=_FAR_CELLS) - (reach + 1)
+    local = torch.where(inside[..., None], centre - low[:, None], 0)
+    columns, rows = (int(size) + reach + 2 for size in local.amax((0, 1)).tolist())
+    disc = contours.pixels.new_tensor(_disc(reach, largest_px / cell_px))
     distance_sq = _squared_distances(contours.pixels, cell_px * centre, cell_px * disc)
-    key = (_DISTANCE_STEPS * distance_sq).long() * count + torch.arange(count, device=device)[:, None]
-    nothing = torch.iinfo(torch.int64).max
-    # Each object within its own radius, whatever its neighbours need.
-    beyond = disc.square().sum(-1) * cell_px**2 > radius[:, None].square()
-    key = key.masked_fill(beyond[:, None], nothing)
+    if batch > 1:
+        # Each object within its own radius, whatever its neighbours need.
+        distance_sq = distance_sq.masked_fill((disc.square().sum(-1) * cell_px**2 > radius[:, None].square())[:, None], torch.inf)
+    key = (_DISTANCE_STEPS * distance_sq).clamp(max=_FAR_STEPS).long() * count + torch.arange(count, device=device)[:, None]
     # Masked points write to spare entries after the last.
-    local = centre - low[:, None]
-    first = torch.where(inside, local[..., 1] * columns + local[..., 0], rows * columns + reach * (columns + 1))
-    cell = first[..., None] + (disc[:, 1] * columns + disc[:, 0])
+    first = torch.where(inside, torch.add(local[..., 0], local[..., 1], alpha=columns), rows * columns + reach * (columns + 1))
+    cell = (first[..., None] + torch.add(disc[:, 0], disc[:, 1], alpha=columns)).long()
+    nothing = _FAR_STEPS * count
     keys = torch.full((batch, rows * columns + 2 * reach * (columns + 1) + 1), nothing, device=device)
-    keys = keys.scatter_reduce(1, cell.flatten(1), key.flatten(1), "amin")[:, : rows * columns]
-    return ContourIndex(low, (rows, columns), cell_px, torch.where(keys == nothing, -1, keys % count), contours.pixels)
+    keys = keys.scatter_reduce_(1, cell.flatten(1), key.flatten(1), "amin")[:, : rows * columns]
+    return ContourIndex(low, (rows, columns), cell_px, torch.where(keys < nothing, keys % count, -1), contours.pixels)
 
 
-def _disc(reach: int, radius: float, device: torch.device) -> Tensor:
+@lru_cache
+def _disc(reach: int, radius: float) -> tuple[tuple[int, int], ...]:
     """Offsets (column, row) of the cells within ``radius`` cells."""
-    step = torch.arange(-reach, reach + 1, device=device)
-    square = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1).flatten(0, 1)
-    return square[square.square().sum(-1) <= radius**2]
+    steps = range(-reach, reach + 1)
+    return tuple((column, row) for row in steps for column in steps if row**2 + column**2 <= radius**2)
 
 
 def _squared_distances(pixels: Tensor, centres: Tensor, offsets: Tensor) -> Tensor:
     """``|c + o - p|²`` of every point ``p [b, m, 2]``, its ``c`` and every offset ``o [d, 2]``, as one matrix product."""
-    to_centre = centres.to(pixels.dtype) - pixels
-    offsets = offsets.to(pixels.dtype)
+    to_centre = centres - pixels
     point_part = torch.cat([to_centre.square().sum(-1, keepdim=True), torch.ones_like(to_centre[..., :1]), 2 * to_centre], -1)
     offset_part = torch.cat([torch.ones_like(offsets[:, :1]), offsets.square().sum(-1, keepdim=True), offsets], -1)
     return (point_part @ offset_part.T).clamp(min=0)

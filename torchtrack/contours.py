@@ -19,6 +19,8 @@ from torchtrack.object_model import ObjectModel
 
 # Active edges beyond this many are thinned evenly before they are projected.
 _MAX_ACTIVE_EDGES = 8192
+# Tangents that the image shows shorter than this (px/m) have no direction in it.
+_MIN_PX_PER_M = 1e-3
 # Texture seen at a grazing angle (cosine below this) is foreshortened beyond use.
 _MIN_TEXTURE_COSINE = 0.15
 # Faces that meet at more than 60° make a sharp edge, whatever its scale; a scanned mesh is rough at smaller angles.
@@ -61,11 +63,10 @@ class Contours:
 class ContourModel(nn.Module):
     """The constant tensors of one :class:`ObjectModel` that contours are made from, as buffers."""
 
-    edge_start: Tensor
-    edge_end: Tensor
+    edge_ends: Tensor
+    edges: Tensor
     face_normals: Tensor
     face_offsets: Tensor
-    is_sharp: Tensor
     is_crease: Tensor
     is_segment: Tensor
     texture_points: Tensor
@@ -73,6 +74,7 @@ class ContourModel(nn.Module):
     texture_normals: Tensor
     surface_points: Tensor
     triangles: Tensor
+    triangle_normals: Tensor
     members: Tensor
 
     def __init__(self, model: ObjectModel, members: Sequence[int], config: ContourConfig) -> None:
@@ -81,15 +83,14 @@ class ContourModel(nn.Module):
         self.register_buffer("members", torch.tensor(members))
         segments = model.segments if config.segments else model.segments[:0]
         points = torch.cat([model.edge_points, segments])
-        self.register_buffer("edge_start", points[:, 0].clone())
-        self.register_buffer("edge_end", points[:, 1].clone())
         normals = torch.cat([model.edge_normals, torch.zeros_like(segments)])
-        self.register_buffer("face_normals", normals)
-        self.register_buffer("face_offsets", (normals * points[:, :1]).sum(-1))
         is_segment = torch.zeros(len(points), dtype=torch.bool)
         is_segment[len(model.edge_points) :] = True
+        self.register_buffer("edge_ends", points.clone())
+        self.register_buffer("edges", _edge_table(points, normals, is_segment))
+        self.register_buffer("face_normals", normals)
+        self.register_buffer("face_offsets", (normals * points[:, :1]).sum(-1))
         self.register_buffer("is_segment", is_segment)
-        self.register_buffer("is_sharp", (normals[:, 0] * normals[:, 1]).sum(-1) < _SHARP_COSINE)
         self.register_buffer("is_crease", torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)]) & config.creases)
         texture_count = min(len(model.texture_points), config.max_texture_points) if config.texture else 0
         spread = torch.linspace(0, max(len(model.texture_points) - 1, 0), texture_count).long()
@@ -97,7 +98,9 @@ class ContourModel(nn.Module):
             self.register_buffer(name, getattr(model, name)[spread].clone())
         self.register_buffer("surface_points", model.surface_points.clone())
         exact = len(model.triangles) <= config.exact_faces
-        self.register_buffer("triangles", model.triangles.clone() if exact else model.triangles[:0].clone())
+        triangles = model.triangles if exact else model.triangles[:0]
+        self.register_buffer("triangles", triangles.clone())
+        self.register_buffer("triangle_normals", _normals(triangles))
 
     def active_edges(self, camera_obj: Float[Tensor, "b 3"], occluding: bool) -> Bool[Tensor, "b e"]:
         """Which edges are contours for a camera at ``camera_obj`` (object frame)."""
@@ -105,6 +108,22 @@ class ContourModel(nn.Module):
         front, back = facing.unbind(-1)
         active = self.is_crease & (front | back) | self.is_segment
         return active | (front != back) if occluding else active
+
+
+def _edge_table(points: Float[Tensor, "e 2 3"], face_normals: Float[Tensor, "e 2 3"], is_segment: Bool[Tensor, "e"]) -> Float[Tensor, "13 e"]:
+    """Of every edge: start, vector, direction, the way that turns its tangent (see :func:`_edge_points`), and kind."""
+    start, vector = points[:, 0], points[:, 1] - points[:, 0]
+    sharp = (face_normals[:, 0] * face_normals[:, 1]).sum(-1) < _SHARP_COSINE
+    kind = torch.where(is_segment, int(ContourKind.SEGMENT), torch.where(sharp, int(ContourKind.CREASE), int(ContourKind.LIMB)))
+    turning = torch.linalg.cross(vector, face_normals.sum(1), dim=-1)
+    direction = torch.nn.functional.normalize(vector, dim=-1)
+    return torch.cat([start, vector, direction, turning, kind[:, None].to(start.dtype)], -1).T.contiguous()
+
+
+def _normals(triangles: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3"]:
+    """Unit normals."""
+    first, second, third = triangles.unbind(1)
+    return torch.nn.functional.normalize(torch.linalg.cross(second - first, third - first, dim=-1), dim=-1)
 
 
 def group_by_model(models: Sequence[ObjectModel], config: ContourConfig) -> list[ContourModel]:
@@ -121,49 +140,55 @@ def select_ranked(mask: Bool[Tensor, "b n"], count: int) -> tuple[Int[Tensor, "b
     Deterministic, of static shape, and independent of the other rows.
     """
     cumulative = mask.cumsum(-1)
-    total = cumulative[:, -1:].to(torch.float64)
+    total = cumulative[:, -1:]
     step = torch.arange(count, device=mask.device, dtype=torch.float64)
-    rank = (step * (total / count).clamp(min=1)).floor().long() + 1
+    rank = (step * (total / count).clamp(min=1)).long() + 1
     index = torch.searchsorted(cumulative, rank)
-    return index.clamp(max=mask.shape[1] - 1), rank <= cumulative[:, -1:]
+    return index.clamp(max=mask.shape[1] - 1), rank <= total
 
 
 def take_points(values: Float[Tensor, "b n k"], index: Int[Tensor, "b m"]) -> Float[Tensor, "b m k"]:
-    """``values[b, index[b, m]]``, as one selection of rows: half the time of ``gather``."""
-    batch, count, width = values.shape
-    row = index + count * torch.arange(batch, device=index.device)[:, None] if batch > 1 else index
-    return values.reshape(batch * count, width).index_select(0, row.flatten()).view(*index.shape, width)
+    """``values[b, index[b, m]]``.
+
+    In memory the coordinates are rows, before and after, as :func:`torchtrack.lie.transform_points` leaves them.
+    """
+    return values.transpose(1, 2).gather(2, index[:, None].expand(-1, values.shape[2], -1)).transpose(1, 2)
 
 
 def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points (object frame), tangents, kinds and mask on the active edges, spread evenly in the image."""
-    rotation, translation = T_cam_obj[:, :3, :3], T_cam_obj[:, :3, 3]
-    camera_obj = -(rotation.transpose(1, 2) @ translation[..., None]).squeeze(-1)
-    active = model.active_edges(camera_obj, config.occluding)
-    chosen, exists = select_ranked(active, min(_MAX_ACTIVE_EDGES, active.shape[1]))
-    start, end = model.edge_start[chosen], model.edge_end[chosen]
-    ends_cam = transform_points(T_cam_obj, torch.cat([start, end], 1))
-    start_px, end_px = project(ends_cam, intrinsics).chunk(2, 1)
-    start_z, end_z = ends_cam[..., 2].chunk(2, 1)
-    length = torch.where(exists & (start_z > MIN_DEPTH_M) & (end_z > MIN_DEPTH_M), (end_px - start_px).norm(dim=-1), start_z.new_zeros(()))
-    cumulative = length.cumsum(-1)
-    count = config.max_edge_points
-    target = (torch.arange(count, device=length.device, dtype=length.dtype) + 0.5) / count * cumulative[:, -1:]
-    edge = torch.searchsorted(cumulative, target).clamp(max=length.shape[1] - 1)
-    along = 1 - (cumulative.gather(1, edge) - target) / length.gather(1, edge).clamp(min=1e-9)
+    batch, count = len(T_cam_obj), config.max_edge_points
+    camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])
+    active = model.active_edges(camera_obj[..., 0], config.occluding)
+    ends, edges = model.edge_ends.expand(batch, -1, -1, -1), model.edges.expand(batch, -1, -1)
+    if active.shape[1] > _MAX_ACTIVE_EDGES:
+        chosen, active = select_ranked(active, _MAX_ACTIVE_EDGES)
+        ends, edges = model.edge_ends[chosen], model.edges[:, chosen].transpose(0, 1)
+    lengths, start_z, end_z = _lengths_px(ends, T_cam_obj, intrinsics)
+    lengths = lengths * active
+    cumulative = lengths.cumsum(-1)
+    target = (torch.arange(count, device=lengths.device, dtype=lengths.dtype) + 0.5) / count * cumulative[:, -1:]
+    edge = torch.searchsorted(cumulative, target).clamp(max=lengths.shape[1] - 1)[:, None]
+    until, length, z0, z1 = torch.stack([cumulative, lengths, start_z, end_z], 1).gather(2, edge.expand(-1, 4, -1)).unbind(1)
+    along = 1 - (until - target) / length.clamp(min=1e-9)
     # Even steps in the image are not even along the edge: undo the perspective.
-    z0, z1 = start_z.gather(1, edge), end_z.gather(1, edge)
-    along = (along * z0 / (z1 + along * (z0 - z1)).clamp(min=MIN_DEPTH_M)).clamp(0, 1)
-    edge_start, edge_vector = take_points(start, edge), take_points(end - start, edge)
-    points = edge_start + along[..., None] * edge_vector
-    original = chosen.gather(1, edge)
+    along = (along * z0 / torch.addcmul(z1, along, z0 - z1).clamp(min=MIN_DEPTH_M)).clamp(0, 1)
+    start, vector, direction, turning, kind = edges.gather(2, edge.expand(-1, edges.shape[1], -1)).split((3, 3, 3, 3, 1), 1)
+    points = torch.addcmul(start, along[:, None], vector)
     # The normal in the image is to point out of the object: tangents turn with it on their right.
-    outward = model.face_normals[original].sum(2)
-    side = (torch.linalg.cross(edge_vector, outward, dim=-1) * (points - camera_obj[:, None])).sum(-1, keepdim=True)
-    tangents = torch.nn.functional.normalize(torch.where(side > 0, edge_vector, -edge_vector), dim=-1)
-    kind = torch.where(model.is_sharp[original], int(ContourKind.CREASE), int(ContourKind.LIMB))
-    kind = torch.where(model.is_segment[original], int(ContourKind.SEGMENT), kind)
-    return points, tangents, kind, (cumulative[:, -1:] > 0).expand(-1, count)
+    side = (turning * (points - camera_obj)).sum(1, keepdim=True)
+    tangents = torch.where(side > 0, direction, -direction)
+    mask = (cumulative[:, -1:] > 0).expand(-1, count)
+    return points.transpose(1, 2), tangents.transpose(1, 2), kind[:, 0].long(), mask
+
+
+def _lengths_px(ends: Float[Tensor, "b e 2 3"], T_cam_obj: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Lengths of edges in the image, zero for those that reach behind the camera, and the depths of their ends."""
+    ends_cam = transform_points(T_cam_obj, ends.flatten(1, 2)).unflatten(1, (-1, 2))
+    start_z, end_z = ends_cam[..., 2].unbind(-1)
+    start_px, end_px = project(ends_cam.flatten(1, 2), intrinsics).unflatten(1, (-1, 2)).unbind(2)
+    lengths = (end_px - start_px).square().sum(-1).sqrt()
+    return lengths * ((start_z > MIN_DEPTH_M) & (end_z > MIN_DEPTH_M)), start_z, end_z
 
 
 def _texture_mask(model: ContourModel, T_cam_obj: Tensor) -> Tensor:
@@ -176,7 +201,7 @@ def _texture_mask(model: ContourModel, T_cam_obj: Tensor) -> Tensor:
 def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, texture_count: int) -> tuple[Tensor, ...]:
     """Points, tangents, kinds and mask of objects that share a model, before hidden parts are removed."""
     batch, own = len(T_cam_obj), len(model.texture_points)
-    if len(model.edge_start):
+    if len(model.edge_ends):
         points, tangents, kind, mask = _edge_points(model, T_cam_obj, intrinsics, config)
     else:
         points = T_cam_obj.new_zeros(batch, config.max_edge_points, 3)
@@ -203,10 +228,11 @@ def image_normals(
 ) -> tuple[Float[Tensor, "b m 2"], Bool[Tensor, "b m"]]:
     """Unit normals of projected tangents, and where they exist (not along the line of sight)."""
     depth = points_cam[..., 2:].clamp(min=MIN_DEPTH_M)
-    along = (tangents_cam[..., :2] - points_cam[..., :2] / depth * tangents_cam[..., 2:]) / depth * intrinsics[:, None, :2]
-    length = along.norm(dim=-1, keepdim=True)
-    normals = torch.stack([-along[..., 1], along[..., 0]], -1) / length.clamp(min=1e-9)
-    return normals, length[..., 0] > 1e-6
+    along = torch.addcmul(tangents_cam[..., :2], points_cam[..., :2] / depth, tangents_cam[..., 2:], value=-1) / depth * intrinsics[:, None, :2]
+    u, v = along.unbind(-1)
+    length = torch.hypot(u, v)
+    normals = torch.stack([-v, u], 1) / length.clamp(min=1e-9)[:, None]
+    return normals.transpose(1, 2), length > _MIN_PX_PER_M
 
 
 def reproject(contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
@@ -220,6 +246,8 @@ def mesh_contours(
 ) -> Contours:
     """Contours of each object at its pose, hidden parts included."""
     texture_count = max(len(model.texture_points) for model in models)
+    if len(models) == 1:
+        return assemble(*_model_contours(models[0], T_cam_obj, intrinsics, config, texture_count), T_cam_obj, intrinsics)
     parts = [_model_contours(model, T_cam_obj[model.members], intrinsics[model.members], config, texture_count) for model in models]
     order = torch.cat([model.members for model in models]).argsort()
     points, tangents, kind, mask = (torch.cat(column)[order] for column in zip(*parts, strict=True))
@@ -236,7 +264,7 @@ def assemble(
 ) -> Contours:
     """Contours from points in the object's frame; those behind the camera or without a normal are masked."""
     points_cam = transform_points(T_cam_obj, points_obj)
-    tangents_cam = tangents_obj @ T_cam_obj[:, :3, :3].transpose(1, 2)
+    tangents_cam = torch.bmm(T_cam_obj[:, :3, :3], tangents_obj.transpose(1, 2)).transpose(1, 2)
     normals, has_normal = image_normals(points_cam, tangents_cam, intrinsics)
     mask = mask & has_normal & (points_cam[..., 2] > MIN_DEPTH_M)
     return Contours(points_obj, tangents_obj, kind, mask, points_cam, project(points_cam, intrinsics), normals)

@@ -236,6 +236,10 @@ def pad_streams(events: EventBatch, streams: int, t_end_us: Int[Tensor, "s"]) ->
     Raises:
         EventDataError: if the streams are mixed up. It is not looked for on a GPU, which would have to be waited for.
     """
+    if streams == 1 and len(events):
+        # Nothing to pad: the events are the row.
+        mask = torch.ones_like(events.polarity)[None]
+        return PaddedEvents(events.x.long()[None], events.y.long()[None], t_end_us[:, None] - events.t_us, events.polarity[None], mask)
     if streams > 1 and events.stream_index.device.type == "cpu":
         _check_streams_in_order(events.stream_index)
     bounds = torch.searchsorted(events.stream_index, torch.arange(streams + 1, device=events.stream_index.device))

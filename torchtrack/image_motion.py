@@ -1,31 +1,64 @@
-"""How an object's motion moves its image: the velocity of contour points, and of pixels at the object's depth."""
+"""How an object's motion moves its image: the place and velocity of its points, and of pixels at the object's depth."""
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.camera import MIN_DEPTH_M
+from torchtrack.camera import MIN_DEPTH_M, project
+from torchtrack.lie import hat, transform_points
 
 
 def pixel_velocity(
     points_cam: Float[Tensor, "b m 3"], velocity: Float[Tensor, "b 6"], centre_cam: Float[Tensor, "b 3"], intrinsics: Float[Tensor, "b 4"]
 ) -> Float[Tensor, "b m 2"]:
     """Image velocity (px/s) of points that turn about ``centre_cam`` and move with it: ``velocity`` is [rad/s, m/s]."""
-    rotating = torch.linalg.cross(velocity[:, None, :3].expand_as(points_cam), points_cam - centre_cam[:, None], dim=-1)
-    moving = rotating + velocity[:, None, 3:]
-    inverse_depth = points_cam[..., 2:].clamp(min=MIN_DEPTH_M).reciprocal()
-    return (moving[..., :2] - points_cam[..., :2] * inverse_depth * moving[..., 2:]) * inverse_depth * intrinsics[:, None, :2]
+    turning, drift = _turning_and_drift(velocity, centre_cam)
+    depth = points_cam[..., 2].clamp(min=MIN_DEPTH_M)[:, None]
+    points = points_cam.transpose(1, 2)
+    return _across_the_ray(points[:, :2] / depth, torch.baddbmm(drift, turning, points) / depth, intrinsics)
+
+
+def _turning_and_drift(velocity: Tensor, centre_cam: Tensor) -> tuple[Tensor, Tensor]:
+    """The motion ``turning @ point + drift`` of an object's points, in the camera's frame."""
+    turning = hat(velocity[:, :3])
+    return turning, torch.baddbmm(velocity[:, 3:, None], turning, centre_cam[..., None], alpha=-1)
+
+
+def _across_the_ray(ray: Float[Tensor, "b 2 n"], moving: Float[Tensor, "b 3 n"], intrinsics: Tensor) -> Float[Tensor, "b n 2"]:
+    """Image velocity of points ``(x, y, 1)``, by their velocity over their depth: ``(X/Z)˙``."""
+    across = torch.addcmul(moving[:, :2], ray, moving[:, 2:], value=-1)
+    return (across * intrinsics[:, :2, None]).transpose(1, 2)
+
+
+@dataclass(frozen=True)
+class MovingObjects:
+    """Objects at their poses, and how they move, each before its camera.
+
+    Args:
+        T_cam_obj: the poses.
+        velocity: rotation and velocity of the centre (rad/s, m/s).
+        centre_cam: centre of each object (m).
+        intrinsics: ``[fx, fy, cx, cy]``.
+    """
+
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    velocity: Float[Tensor, "b 6"]
+    centre_cam: Float[Tensor, "b 3"]
+    intrinsics: Float[Tensor, "b 4"]
+
+    def show(self, points_obj: Float[Tensor, "b n 3"]) -> tuple[Float[Tensor, "b n 2"], Float[Tensor, "b n 2"]]:
+        """Pixels of points of the objects, and their velocities (px/s)."""
+        points_cam = transform_points(self.T_cam_obj, points_obj)
+        return project(points_cam, self.intrinsics), pixel_velocity(points_cam, self.velocity, self.centre_cam, self.intrinsics)
 
 
 def object_plane_velocity(
     pixels: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b 6"], centre_cam: Float[Tensor, "b 3"], intrinsics: Float[Tensor, "b 4"]
 ) -> Float[Tensor, "b n 2"]:
     """Image velocity (px/s) that a pixel would have at the depth of the object's centre."""
-    x, y = ((pixels - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]).unbind(-1)
-    # The velocity that the camera's origin would have, were it part of the object.
-    drift = velocity[:, 3:] - torch.linalg.cross(velocity[:, :3], centre_cam)
-    vx, vy, vz = (drift / centre_cam[:, 2:].clamp(min=MIN_DEPTH_M)).unsqueeze(1).unbind(-1)
-    wx, wy, wz = velocity[:, None, :3].unbind(-1)
-    # (ẋ, ẏ) = (X/Z)˙ for a point that turns with ω and drifts with v: the motion field of a plane at one depth.
-    tilt = vz + wx * y - wy * x
-    return torch.stack([vx + wy - wz * y - x * tilt, vy + wz * x - wx - y * tilt], -1) * intrinsics[:, None, :2]
+    turning, drift = _turning_and_drift(velocity, centre_cam)
+    ray = (pixels.transpose(1, 2) - intrinsics[:, 2:, None]) / intrinsics[:, :2, None]
+    moving = torch.baddbmm(turning[:, :, 2:] + drift / centre_cam[:, 2:, None].clamp(min=MIN_DEPTH_M), turning[:, :, :2], ray)
+    return _across_the_ray(ray, moving, intrinsics)

@@ -52,7 +52,7 @@ def with_gradient(problem: PoseProblem, solution: Linearisation, config: SolverC
     found = _Place(solution.T_cam_obj.detach().double(), solution.from_prior.detach().double()[:, 6:])
     optimum = _optimum(exact, found, config)
     step, _ = newton_step(exact, optimum.T_cam_obj, optimum.further, config.loss)
-    step = torch.where(torch.isfinite(solution.cost)[:, None], step, 0)
+    step = torch.where(torch.isfinite(solution.gradient), step, 0)
     T_cam_obj, from_prior = found.moved(step - step.detach(), exact)
     followed = (from_prior - from_prior.detach()).to(solution.from_prior.dtype)
     return replace(solution, T_cam_obj=T_cam_obj.to(solution.T_cam_obj.dtype), from_prior=solution.from_prior.detach() + followed)

@@ -24,8 +24,9 @@ _SMALL_ANGLE_SQ = 1e-4
 def hat(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Skew-symmetric matrix of a vector: ``hat(a) @ b == cross(a, b)``."""
     x, y, z = phi.unbind(-1)
+    minus_x, minus_y, minus_z = (-phi).unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    return torch.stack([zero, minus_z, y, z, zero, minus_x, minus_y, x, zero], -1).unflatten(-1, (3, 3))
 
 
 def vee(skew: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
@@ -157,7 +158,11 @@ def transform_points(T_a_b: Float[Tensor, "*b 4 4"], points_b: Float[Tensor, "*b
 
     The product is taken with the coordinates as rows, and stays so in memory: what follows works on long rows.
     """
-    return (T_a_b[..., :3, :3] @ points_b.transpose(-1, -2) + T_a_b[..., :3, 3:]).transpose(-1, -2)
+    rotation, translation = T_a_b[..., :3, :3], T_a_b[..., :3, 3:]
+    if T_a_b.dim() == points_b.dim() == 3 and len(T_a_b) == len(points_b):
+        # The same in one operation, in a third of the time for the few points of one object.
+        return torch.baddbmm(translation, rotation, points_b.transpose(-1, -2)).transpose(-1, -2)
+    return (rotation @ points_b.transpose(-1, -2) + translation).transpose(-1, -2)
 
 
 def se3_interpolate(T_start: Float[Tensor, "*b 4 4"], T_end: Float[Tensor, "*b 4 4"], fraction: Float[Tensor, "*b"]) -> Float[Tensor, "*b 4 4"]:
@@ -172,8 +177,7 @@ def orthonormalise(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     One step of Newton's iteration for the nearest rotation, which squares the deviation.
     """
     rotation = T[..., :3, :3]
-    eye = torch.eye(3, dtype=T.dtype, device=T.device)
-    exact = 0.5 * rotation @ (3 * eye - rotation.transpose(-1, -2) @ rotation)
+    exact = 1.5 * rotation - 0.5 * rotation @ (rotation.transpose(-1, -2) @ rotation)
     return torch.cat([torch.cat([exact, T[..., :3, 3:]], -1), T[..., 3:, :]], -2)
 
 
@@ -229,9 +233,10 @@ def cayley(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
     Half the operations of the exponential, and smooth everywhere: the solver's retraction.
     """
-    skew = hat(phi)
-    factor = 1 / (1 + 0.25 * phi.square().sum(-1))[..., None, None]
-    return torch.eye(3, dtype=phi.dtype, device=phi.device) + factor * (skew + 0.5 * (skew @ skew))
+    half = 0.5 * phi
+    skew = hat(half)
+    factor = 2 / (1 + torch.linalg.vecdot(half, half))[..., None, None]
+    return torch.eye(3, dtype=phi.dtype, device=phi.device) + factor * (skew + skew @ skew)
 
 
 def difference_about(T_from: Float[Tensor, "*b 4 4"], T_to: Float[Tensor, "*b 4 4"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6"]:

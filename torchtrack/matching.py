@@ -9,19 +9,19 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import softsign
 
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import ContourKind, Contours, take_points
+from torchtrack.image_motion import MovingObjects
 from torchtrack.observations import Observations
 
 # An edge this parallel to the flow (|n·f| below) is not crossed by it.
 _MIN_CROSSING = 0.3
 # Contours slower than this across themselves (px/s) have no clear leading side.
 _SLOW_PX_S = 10.0
-# Concentration: side of a patch, patches a side of the image, and offsets that are near and on a contour (px).
-_PATCH_PX, _PATCHES, _SMEAR_PX, _ON_CONTOUR_PX = 16, 64, 3.0, 0.8
+# Concentration: side of a patch (16 px, as a power of two), patches a side of the image, and offsets that are near and on a contour (px).
+_PATCH_BITS, _PATCHES, _SMEAR_PX, _ON_CONTOUR_PX = 4, 64, 3.0, 0.8
 
 
 @dataclass(frozen=True)
@@ -32,128 +32,136 @@ class Matches:
         contour: index of the contour point; 0 where there is none.
         mask: which observations are matched.
         weights: how far each match is to be trusted, 0 to 1.
+        points_obj: the contour point in the object's frame (m).
         targets: ideal pixels of the observations, moved to the window's end.
         directions: unit directions along which the distance counts.
         offsets: distance of each observation from its contour along the normal, in px over the widening of the gate.
         near: which observations have a contour so near that ``offsets`` says something, matched or not.
+        limb: 1 where the contour is the limb of a smooth surface, 0 where not.
     """
 
     contour: Int[Tensor, "b n"]
     mask: Bool[Tensor, "b n"]
     weights: Float[Tensor, "b n"]
+    points_obj: Float[Tensor, "b n 3"]
     targets: Float[Tensor, "b n 2"]
     directions: Float[Tensor, "b n 2"]
     offsets: Float[Tensor, "b n"]
     near: Bool[Tensor, "b n"]
+    limb: Float[Tensor, "b n"]
 
 
 @dataclass(frozen=True)
-class Belief:
-    """What an observation is believed to belong to, from the last round or from the object's plane.
+class ContourTable:
+    """What observations take from their contour point, laid out in rows.
 
     Args:
-        motion: image velocity (px/s) that carries the observation to the window's end, and how far its contour moved
-            since the contours were indexed (px).
+        rows: the values of all contour points, laid out so that one selection takes them for all observations.
+        index: the contour point nearest to each place in the image.
     """
 
-    motion: Float[Tensor, "b n 4"]
+    rows: Float[Tensor, "b k m"]
+    index: ContourIndex
 
     @classmethod
-    def from_velocity(cls, velocity: Float[Tensor, "b n 2"]) -> "Belief":
-        """A velocity, and contours where they were indexed."""
-        return cls(torch.cat([velocity, torch.zeros_like(velocity)], -1))
+    def of(cls, contours: Contours, index: ContourIndex) -> "ContourTable":
+        """The table of contours and their index.
+
+        Limbs of smooth surfaces are no step, as their shading fades towards them. The normals of the mesh's own edges
+        are oriented: they point outwards.
+        """
+        limb = contours.kind == int(ContourKind.LIMB)
+        marks = torch.stack([limb, limb | (contours.kind == int(ContourKind.CREASE))], -1).to(contours.pixels.dtype)
+        values = (contours.points_obj, contours.normals, index.pixels, marks)
+        return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index)
+
+    def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Of given contour points: places on the object, normals, pixels when indexed, whether a limb, whether oriented."""
+        taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
+        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 2), -1)
+        return points_obj, normals, indexed, *marks.unbind(-1)
 
 
 def match_nearest(
     observations: Observations,
-    contours: Contours,
-    index: ContourIndex,
-    belief: Belief,
-    contour_velocity: Float[Tensor, "b m 2"],
+    table: ContourTable,
+    place: Float[Tensor, "b n 2"],
+    objects: MovingObjects,
     gate_px: float,
     config: MatchingConfig,
     wider: Float[Tensor, "b"] | None = None,
-) -> tuple[Matches, Belief]:
+) -> tuple[Matches, Float[Tensor, "b n 2"]]:
     """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
 
     Args:
-        contours: at the current pose; ``index`` may be of an earlier one.
-        belief: where to look for each observation; returned anew for the next round.
-        contour_velocity: velocity of each contour point (px/s); zero to switch motion compensation off.
+        table: of the contours, as they were indexed at some pose.
+        place: where to look for each observation among the contours as indexed; returned anew for the next round.
+        objects: at the current poses; a velocity of zero switches motion compensation off.
         wider: by how much the gate, and all that is measured against contours, is wider for each object.
     """
-    wider = torch.ones_like(contours.pixels[:, 0, 0]) if wider is None else wider
-    believed_velocity, believed_moved = belief.motion.chunk(2, -1)
-    found = index.look_up(torch.addcmul(observations.pixels - believed_moved, believed_velocity, observations.age_s[..., None]))
+    wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
+    found = table.index.look_up(place)
     contour = found.clamp(min=0)
-    values = take_points(_contour_table(contours, index, contour_velocity), contour)
-    pixels, normals, velocity = values[..., :6].chunk(3, -1)
-    sharp, oriented = values[..., 8:].unbind(-1)
-    targets = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
-    # Where the dark side of the contour is, by the polarity: along the normal, or against it.
-    dark = observations.polarity * softsign((normals * velocity).sum(-1) / _SLOW_PX_S)
-    targets = targets - (config.dark_shift_px * dark * sharp)[..., None] * normals
+    points_obj, normals, indexed, limb, oriented = table.take(contour)
+    pixels, velocity = objects.show(points_obj)
+    dark = observations.polarity * _leading((normals * velocity).sum(-1))
+    carried = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
+    targets = torch.addcmul(carried, normals, (dark * (1 - limb))[..., None], value=-config.dark_shift_px)
+    difference = pixels - targets
     near = observations.mask & (found >= 0)
-    matched = near & ((pixels - targets).square().sum(-1) < (gate_px * wider)[:, None].square())
-    motion = torch.where(matched[..., None], values[..., 4:8], belief.motion)
-    offsets = ((pixels - targets) * normals).sum(-1) / wider[:, None]
+    matched = near & (difference.square().sum(-1) < (gate_px * wider)[:, None].square())
+    offsets = (difference * normals).sum(-1) / wider[:, None]
     weights = _weights(offsets, targets, near, dark * oriented, config)
-    return Matches(contour, matched, weights, targets, normals, offsets, near), Belief(motion)
+    matches = Matches(contour, matched, weights, points_obj, targets, normals, offsets, near, limb)
+    # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
+    return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)
 
 
-def _contour_table(contours: Contours, index: ContourIndex, velocity: Tensor) -> Tensor:
-    """What observations take from their contour point: place, normal, velocity, way since indexing, and two marks.
-
-    Sharp are all but the limbs of smooth surfaces: these are no step, as their shading fades towards them. Oriented
-    outwards are the normals of the mesh's own edges.
-    """
-    sharp = contours.kind != int(ContourKind.LIMB)
-    oriented = (contours.kind == int(ContourKind.LIMB)) | (contours.kind == int(ContourKind.CREASE))
-    marks = torch.stack([sharp, oriented], -1).to(velocity.dtype)
-    return torch.cat([contours.pixels, contours.normals, velocity, contours.pixels - index.pixels, marks], -1)
+def _leading(speed_px_s: Tensor) -> Tensor:
+    """Whether a contour moves along its normal or against it: 1 or -1, and less where it is slow."""
+    return speed_px_s / (speed_px_s.abs() + _SLOW_PX_S)
 
 
 def _weights(offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, config: MatchingConfig) -> Tensor:
     """How far each observation is to be trusted, by those around it."""
     weights = torch.ones_like(offsets)
+    if not (config.concentration or config.polarity):
+        return weights
+    cell = patch(targets)
+    on, around = on_and_around(offsets, near)
+    counts = patch_sums(cell, torch.stack([on, around, on * dark], 1)).gather(2, cell[:, None].expand(-1, 3, -1))
+    on_count, near_count, votes = counts.unbind(1)
     if config.concentration:
-        weights = concentration(offsets, targets, near, config)
+        weights = concentration(on_count, near_count, config)
     if config.polarity:
-        weights = weights * polarity_agreement(dark, offsets, targets, near, config)
+        weights = weights * polarity_agreement(dark, votes, on_count, config)
     return weights
 
 
-def concentration(
-    offsets: Float[Tensor, "b n"], targets: Float[Tensor, "b n 2"], near: Bool[Tensor, "b n"], config: MatchingConfig
-) -> Float[Tensor, "b n"]:
-    """How closely the observations around each one lie on the contour, 0 to 1.
+def concentration(on_count: Float[Tensor, "b n"], near_count: Float[Tensor, "b n"], config: MatchingConfig) -> Float[Tensor, "b n"]:
+    """How closely the observations around each one lie on the contour, 0 to 1, by their numbers in its patch of the image.
 
     Events of a contour, moved to the window's end with the contour's own motion, gather within a pixel of it. What moves
-    otherwise (an occluder, the background, another object) is smeared over the whole gate. So: in each patch of the
-    image, the share of the observations near a contour that are on it. No patch counts for nothing: one that is off the
-    contour as a whole must still pull a pose back that has begun to slip.
+    otherwise (an occluder, the background, another object) is smeared over the whole gate. So: in each patch, the share
+    of the observations near a contour that are on it. No patch counts for nothing: one that is off the contour as a whole
+    must still pull a pose back that has begun to slip.
     """
-    cell = patch(targets)
-    on_count, near_count = (count.gather(1, cell) for count in patch_counts(offsets, targets, near))
     share = (on_count + 1) / (near_count + 2)
     return ((share - config.smeared_share) / (config.gathered_share - config.smeared_share)).clamp(config.least_trust, 1)
 
 
 def polarity_agreement(
-    dark: Float[Tensor, "b n"], offsets: Float[Tensor, "b n"], targets: Float[Tensor, "b n 2"], near: Bool[Tensor, "b n"], config: MatchingConfig
+    dark: Float[Tensor, "b n"], votes: Float[Tensor, "b n"], voters: Float[Tensor, "b n"], config: MatchingConfig
 ) -> Float[Tensor, "b n"]:
-    """How far each observation's polarity agrees with that of most others on the contour around it.
+    """How far each observation's polarity agrees with that of most others on the contour in its patch of the image.
 
     The two sides of a contour keep their brightness over a patch: an event that says the opposite comes from shading
     within the object, from the background's own edges, or is noise.
 
     Args:
         dark: +1 where the polarity says that the contour's outer side is the darker one, -1 the inner one, 0 unknown.
+        votes: sum of the same over the observations on the contour, of which there are ``voters``.
     """
-    cell = patch(targets)
-    on = (near & (offsets.abs() < _ON_CONTOUR_PX)).to(offsets.dtype)
-    nothing = torch.zeros(len(offsets), _PATCHES**2, dtype=offsets.dtype, device=offsets.device)
-    votes, voters = (nothing.scatter_add(1, cell, values).gather(1, cell) for values in (on * dark, on))
     agreement = dark * votes / (voters + 2)
     return (1 + config.polarity_gain * agreement).clamp(config.least_agreement, 1)
 
@@ -163,22 +171,25 @@ def patch(pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
 
     Patches wrap around: no object is so large that two of its own would meet.
     """
-    u, v = (pixels / _PATCH_PX).floor().long().remainder(_PATCHES).unbind(-1)
+    # The whole part of a shift to the right is rounded down, below zero too, unlike that of a division.
+    u, v = ((pixels.floor().long() >> _PATCH_BITS) & (_PATCHES - 1)).unbind(-1)
     return torch.add(u, v, alpha=_PATCHES)
 
 
-def patch_counts(
-    offsets: Float[Tensor, "b n"], targets: Float[Tensor, "b n 2"], near: Bool[Tensor, "b n"]
-) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b p"]]:
-    """Observations on a contour, and near one, in each patch."""
-    cell, distance = patch(targets), offsets.abs()
-    nothing = torch.zeros(len(offsets), _PATCHES**2, dtype=offsets.dtype, device=offsets.device)
-    on, around = (nothing.scatter_add(1, cell, (near & (distance < limit)).to(offsets.dtype)) for limit in (_ON_CONTOUR_PX, _SMEAR_PX))
-    return on, around
+def on_and_around(offsets: Float[Tensor, "b n"], near: Bool[Tensor, "b n"]) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
+    """Which observations are on a contour, and which are so near to one that their share tells: 1 or 0."""
+    distance = offsets.abs()
+    return tuple((near & (distance < limit)).to(offsets.dtype) for limit in (_ON_CONTOUR_PX, _SMEAR_PX))
+
+
+def patch_sums(cell: Int[Tensor, "b n"], values: Float[Tensor, "b k n"]) -> Float[Tensor, "b k p"]:
+    """Sums of values over the observations of each patch."""
+    nothing = torch.zeros(*values.shape[:2], _PATCHES**2, dtype=values.dtype, device=values.device)
+    return nothing.scatter_add(2, cell[:, None].expand_as(values), values)
 
 
 def match_along_flow(
-    observations: Observations, contours: Contours, contour_velocity: Float[Tensor, "b m 2"], gate_px: float, config: MatchingConfig
+    observations: Observations, contours: Contours, objects: MovingObjects, gate_px: float, config: MatchingConfig
 ) -> Matches:
     """Match each corner with the contour point nearest to it along the line of its flow, either way (the paper's 3.3).
 
@@ -194,11 +205,13 @@ def match_along_flow(
     crossing = (contours.normals[:, None] * heading[:, :, None]).sum(-1).abs()
     allowed = contours.mask[:, None] & (across.abs() < config.flow_tolerance_px) & (along.abs() < gate_px) & (crossing > _MIN_CROSSING)
     distance, contour = torch.where(allowed, along.square() + across.square(), torch.inf).min(-1)
-    targets = observations.pixels + take_points(contour_velocity, contour) * observations.age_s[..., None]
+    points_obj = take_points(contours.points_obj, contour)
+    targets = torch.addcmul(observations.pixels, objects.show(points_obj)[1], observations.age_s[..., None])
     directions = heading if config.residual == "flow" else take_points(contours.normals, contour)
     mask = observations.mask & observations.has_flow & torch.isfinite(distance)
     offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
-    return Matches(contour, mask, torch.ones_like(offsets), targets, directions, offsets, mask)
+    limb = (contours.kind == int(ContourKind.LIMB)).gather(1, contour).to(offsets.dtype)
+    return Matches(contour, mask, torch.ones_like(offsets), points_obj, targets, directions, offsets, mask, limb)
 
 
 def both_coordinates(matches: Matches) -> Matches:

@@ -42,13 +42,14 @@ def predict_covariance(
     How much acceleration is to be expected grows with the speed: slow objects are held still, fast ones are free to turn.
     """
     dt_s, diameter_m, velocity = dt_s.double()[:, None], diameter_m.double()[:, None], velocity.double()
-    eye = torch.eye(6, dtype=torch.float64, device=velocity.device).expand(len(velocity), 6, 6)
-    by_time = eye * dt_s[..., None]
-    carry = torch.cat([torch.cat([eye, by_time], -1), torch.cat([torch.zeros_like(eye), eye], -1)], -2)
+    # [[1, dt], [0, 1]] P [[1, 0], [dt, 1]], by blocks.
+    carried = torch.cat([torch.addcmul(covariance[:, :6], dt_s[..., None], covariance[:, 6:]), covariance[:, 6:]], 1)
+    carried = torch.cat([torch.addcmul(carried[..., :6], dt_s[..., None], carried[..., 6:]), carried[..., 6:]], 2)
     rim_m_s = velocity[:, 3:].norm(dim=-1, keepdim=True) + 0.5 * diameter_m * velocity[:, :3].norm(dim=-1, keepdim=True)
-    acceleration = torch.diag_embed(_both(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m))
-    push = torch.cat([0.5 * by_time**2, by_time], -2) @ acceleration
-    predicted = carry @ covariance @ carry.transpose(-1, -2) + push @ push.transpose(-1, -2)
+    acceleration = _both(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m)
+    # An acceleration adds half its square of the time to the pose, and its time to the velocity.
+    push = torch.cat([0.5 * dt_s.square() * acceleration, dt_s * acceleration], -1).view(-1, 2, 6)
+    predicted = carried + torch.diag_embed(push[:, :, None] * push[:, None]).permute(0, 1, 3, 2, 4).reshape(-1, 12, 12)
     sigma = predicted.diagonal(dim1=-2, dim2=-1).sqrt()
     lost = (sigma[:, :3] > _MOST_UNCERTAIN).any(-1) | (sigma[:, 3:6] > _MOST_UNCERTAIN * diameter_m).any(-1)
     return torch.where(lost[:, None, None], covariance, predicted)

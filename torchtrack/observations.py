@@ -78,12 +78,12 @@ def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Flo
     near = mask & (index.look_up(torch.addcmul(pixels, plane_velocity, events.age_s[..., None])) >= 0)
     number = torch.arange(mask.shape[1], device=mask.device, dtype=torch.float64)
     # Multiples of the golden ratio fill the unit interval evenly, whichever stretch of them is taken.
-    lot = (number * _GOLDEN_RATIO) % 1
+    lot = (number * _GOLDEN_RATIO).frac()
     total = near.sum(-1, keepdim=True)
-    share = torch.where(total > count, _FILL * count / total.clamp(min=1), 1.0)
+    share = torch.where(total > count, _FILL * count / total, 1.0)
     chosen, exists = select_ranked(near & (lot < share), count)
-    flow = torch.zeros(*chosen.shape, 2, dtype=pixels.dtype, device=pixels.device)
-    values = take_points(torch.cat([pixels, events.age_s[..., None], events.polarity[..., None]], -1), chosen)
+    values = take_points(torch.cat([pixels.transpose(1, 2), events.age_s[:, None], events.polarity[:, None]], 1).transpose(1, 2), chosen)
+    flow = torch.zeros_like(values[..., :2])
     return Observations(values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
 
 

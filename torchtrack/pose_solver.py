@@ -6,7 +6,6 @@ paper's Eq. 16 and 17 cancel, which cannot be meant.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -75,33 +74,43 @@ class Linearisation:
 
     Args:
         T_cam_obj: the pose.
-        cost: robust cost, prior included.
-        gradient, hessian: of the cost; the Hessian is Gauss-Newton's.
+        gradient, hessian: of the robust cost, prior included; the Hessian is Gauss-Newton's.
         from_prior: offset from the prior: rotation and move of the centre, and the further unknowns where there are.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]
-    cost: Float[Tensor, "b"]
     gradient: Float[Tensor, "b k"]
     hessian: Float[Tensor, "b k k"]
     from_prior: Float[Tensor, "b k"]
 
 
-def robust_loss(residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss: str) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
-    """Loss ``ρ(r)`` and weight ``ρ'(r) / r``; both equal least squares (``r²/2``, 1) near zero.
+def robust_loss(residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss: str) -> Float[Tensor, "b n"]:
+    """Loss ``ρ(r)`` of each residual, equal to least squares, ``r²/2``, near zero.
 
-    ``loss`` is ``"tukey"`` (zero weight beyond ``scale``), ``"huber"`` or ``"none"``.
+    ``loss`` is ``"tukey"`` (constant beyond ``scale``), ``"huber"`` or ``"none"``.
     """
     if loss == "none":
-        return 0.5 * residuals.square(), torch.ones_like(residuals)
+        return 0.5 * residuals.square()
     c = scale[:, None]
     if loss == "huber":
-        size = residuals.abs().clamp(min=1e-12)
-        weight = (c / size).clamp(max=1)
-        return torch.where(size <= c, 0.5 * residuals.square(), c * (size - 0.5 * c)), weight
-    inside = (1 - (residuals / c).square()).clamp(min=0)
-    weight = inside.square()
-    return c.square() / 6 * (1 - weight * inside), weight
+        size = residuals.abs()
+        return torch.where(size <= c, 0.5 * residuals.square(), c * (size - 0.5 * c))
+    return c.square() / 6 * (1 - _inside(residuals, c) ** 3)
+
+
+def robust_weight(residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss: str) -> Float[Tensor, "b n"]:
+    """Weight ``ρ'(r) / r`` of each residual (the paper's Eq. 8 for ``"tukey"``): 1 near zero."""
+    if loss == "none":
+        return torch.ones_like(residuals)
+    c = scale[:, None]
+    if loss == "huber":
+        return (c / residuals.abs().clamp(min=1e-12)).clamp(max=1)
+    return _inside(residuals, c).square()
+
+
+def _inside(residuals: Tensor, c: Tensor) -> Tensor:
+    """``1 - (r/c)²``, not below zero."""
+    return (1 - (residuals / c).square()).clamp(min=0)
 
 
 @dataclass(frozen=True)
@@ -132,70 +141,49 @@ def pose_jacobian(
 
     Written out: along this axis the library's vector product takes five times as long.
     """
-    x, y, z = (points_cam - centre_cam[:, :, None]).unbind(1)
+    arm = points_cam - centre_cam[:, :, None]
     gx, gy, gz = gradient
-    turning = (torch.addcmul(a * d, b, c, value=-1) for a, b, c, d in ((y, z, gy, gz), (z, x, gz, gx), (x, y, gx, gy)))
-    return torch.stack([*turning, gx, gy, gz], 1)
+    # Repeated, so that the components one and two further on are rows too.
+    arm, gradients = torch.cat([arm, arm], 1), torch.stack([gx, gy, gz, gx, gy], 1)
+    turning = torch.addcmul(arm[:, 1:4] * gradients[:, 2:], arm[:, 2:5], gradients[:, 1:4], value=-1)
+    return torch.cat([turning, gradients[:, :3]], 1)
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """The matched points as a pose shows them: gradients ``g = dπᵀ n`` of the residuals, and the residuals."""
+    """The matched points as a pose shows them: the residuals, and their Jacobian by all unknowns."""
 
-    points_cam: Tensor
-    centre_cam: Tensor
-    gradient: tuple[Tensor, Tensor, Tensor]
     residuals: Tensor
-
-    @cached_property
-    def jacobian(self) -> Tensor:
-        """Of the residuals, by the pose."""
-        return pose_jacobian(self.points_cam, self.centre_cam, self.gradient)
+    jacobian: Tensor
 
 
 def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor) -> _Seen:
-    """Project the matched points and take their residuals."""
+    """Project the matched points, and take residuals and gradients ``g = dπᵀ n`` of them."""
     rotation, translation = T_cam_obj[:, :3, :3], T_cam_obj[:, :3, 3:]
     points_cam = torch.baddbmm(translation, rotation, rows.points)
     inverse_depth = points_cam[:, 2].clamp(min=MIN_DEPTH_M).reciprocal()
     gx, gy = (rows.slope * inverse_depth[:, None]).unbind(1)
     along = torch.addcmul(gx * points_cam[:, 0], gy, points_cam[:, 1])
     centre_cam = torch.baddbmm(translation, rotation, problem.centre_obj[..., None])[..., 0]
-    seen = _Seen(points_cam, centre_cam, (gx, gy, -along * inverse_depth), along - rows.offset)
+    jacobian = pose_jacobian(points_cam, centre_cam, (gx, gy, along * -inverse_depth))
     if problem.window is None:
-        return seen
-    faster = (from_prior[:, None, 6:12] - problem.window.velocity[:, None]) @ seen.jacobian
-    further = problem.window.outward * from_prior[:, 12:] - problem.window.age_s * faster[:, 0]
-    return replace(seen, residuals=seen.residuals + further)
+        return _Seen(along - rows.offset, jacobian)
+    jacobian = torch.cat([jacobian, jacobian * -problem.window.age_s[:, None], problem.window.outward[:, None]], 1)
+    # Linear in all that is unknown beside the pose; the targets have been moved with one velocity already.
+    residuals = torch.baddbmm((along - rows.offset)[:, None], from_prior[:, None, 6:], jacobian[:, 6:])
+    residuals = torch.baddbmm(residuals, problem.window.velocity[:, None], jacobian[:, 6:12], alpha=-1)
+    return _Seen(residuals[:, 0], jacobian)
 
 
-def _chart_jacobian(problem: PoseProblem, seen: _Seen) -> Tensor:
-    """Jacobian of the residuals by all unknowns."""
-    if problem.window is None:
-        return seen.jacobian
-    return torch.cat([seen.jacobian, -problem.window.age_s[:, None] * seen.jacobian, problem.window.outward[:, None]], 1)
+def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
+    """Gradient and Gauss-Newton Hessian of the cost of ``problem`` at a pose."""
+    from_prior = _from_prior(problem, T_cam_obj)
+    return _linearise(problem, _see(problem, _as_rows(problem), T_cam_obj, from_prior), T_cam_obj, from_prior, loss)
 
 
 def robust_cost(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], from_prior: Float[Tensor, "b k"], loss: str) -> Float[Tensor, "b"]:
     """Robust cost of ``problem`` at a pose, and at an offset of all unknowns from the prior (Eq. 12)."""
-    return _cost(problem, _as_rows(problem), T_cam_obj, from_prior, loss)
-
-
-def _cost(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Tensor:
-    """Robust cost at a pose, prior included."""
-    value, _ = robust_loss(_see(problem, rows, T_cam_obj, from_prior).residuals, problem.scale_px, loss)
-    return _with_prior(problem, value, from_prior)[0]
-
-
-def _with_prior(problem: PoseProblem, value: Tensor, from_prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Cost of each object from its observations' losses and the prior, and the prior's gradient."""
-    pull = (problem.prior_information @ from_prior[..., None]).squeeze(-1)
-    return (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1), pull
-
-
-def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
-    """Cost, gradient and Gauss-Newton Hessian of ``problem`` at a pose."""
-    return _linearise(problem, _as_rows(problem), T_cam_obj, _from_prior(problem, T_cam_obj), loss)
+    return _cost(problem, _see(problem, _as_rows(problem), T_cam_obj, from_prior), from_prior, loss)
 
 
 def _from_prior(problem: PoseProblem, T_cam_obj: Tensor) -> Tensor:
@@ -204,30 +192,38 @@ def _from_prior(problem: PoseProblem, T_cam_obj: Tensor) -> Tensor:
     return torch.nn.functional.pad(moved, (0, problem.prior_information.shape[-1] - moved.shape[-1]))
 
 
-def _linearise(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Linearisation:
-    """:func:`linearise`, given what does not change from one iteration to the next."""
-    seen = _see(problem, rows, T_cam_obj, from_prior)
-    jacobian = _chart_jacobian(problem, seen)
-    value, robust = robust_loss(seen.residuals, problem.scale_px, loss)
-    weighted = jacobian * (robust * problem.weights)[:, None]
-    cost, pull = _with_prior(problem, value, from_prior)
-    gradient = (weighted @ seen.residuals[..., None]).squeeze(-1) + pull
-    hessian = weighted @ jacobian.transpose(1, 2) + problem.prior_information
-    return Linearisation(T_cam_obj, cost, gradient, hessian, from_prior)
+def _cost(problem: PoseProblem, seen: _Seen, from_prior: Tensor, loss: str) -> Tensor:
+    """Robust cost of each object, prior included."""
+    pull = (problem.prior_information @ from_prior[..., None])[..., 0]
+    value = robust_loss(seen.residuals, problem.scale_px, loss)
+    return (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1)
+
+
+def _linearise(problem: PoseProblem, seen: _Seen, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Linearisation:
+    """:func:`linearise`, given what is seen at the pose."""
+    weights = robust_weight(seen.residuals, problem.scale_px, loss) * problem.weights
+    weighted = seen.jacobian * weights[:, None]
+    pull = problem.prior_information @ from_prior[..., None]
+    gradient = torch.baddbmm(pull, weighted, seen.residuals[..., None])[..., 0]
+    hessian = torch.baddbmm(problem.prior_information, weighted, seen.jacobian.transpose(1, 2))
+    return Linearisation(T_cam_obj, gradient, hessian, from_prior)
 
 
 def solve_positive(matrix: Float[Tensor, "b n n"], right: Float[Tensor, "b n k"]) -> tuple[Float[Tensor, "b n k"], Bool[Tensor, "b"]]:
     """Solve with symmetric positive definite matrices; where one is not, zero and False.
 
-    The matrix is made sane before it is factorised: masking afterwards would leave gradients that are not finite.
+    Where gradients are recorded, the matrix is made sane and solved with again: masking alone would leave gradients that
+    are not finite.
     """
-    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    solution = torch.cholesky_solve(right, factor)
     # A sum is finite only where every entry is.
-    sane = torch.isfinite(matrix.sum((-1, -2)) + right.sum((-1, -2)))
-    with torch.no_grad():
-        good = sane & (torch.linalg.cholesky_ex(torch.where(sane[:, None, None], matrix, eye)).info == 0)
-    factor = torch.linalg.cholesky_ex(torch.where(good[:, None, None], matrix, eye)).L
-    return torch.cholesky_solve(torch.where(good[:, None, None], right, 0), factor), good
+    good = (info == 0) & (solution.sum((-1, -2)).abs() < torch.inf)
+    if solution.requires_grad:
+        eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+        factor = torch.linalg.cholesky_ex(torch.where(good[:, None, None], matrix, eye)).L
+        solution = torch.cholesky_solve(torch.where(good[:, None, None], right, 0), factor)
+    return torch.where(good[:, None, None], solution, 0), good
 
 
 def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
@@ -235,8 +231,8 @@ def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
     diagonal = at.hessian.diagonal(dim1=-2, dim2=-1)
     # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is.
     floor = 1e-9 * diagonal[:, :6].amax(-1, keepdim=True) + 1e-12
-    damped = at.hessian + torch.diag_embed(diagonal * damping[:, None] + floor)
-    return solve_positive(damped, -at.gradient[..., None])[0].squeeze(-1)
+    damped = at.hessian + torch.diag_embed(torch.addcmul(floor, diagonal, damping[:, None]))
+    return -solve_positive(damped, at.gradient[..., None])[0][..., 0]
 
 
 @torch.no_grad()
@@ -245,7 +241,9 @@ def solve_pose(
 ) -> Linearisation:
     """Minimise each object's cost from ``T_start``: Levenberg-Marquardt with a damping of its own per object.
 
-    A step that does not lower an object's cost is undone and its damping raised; its neighbours are not affected.
+    The next linearisation judges a step: where the cost rose, the object goes back and its damping is raised; its
+    neighbours are not affected. The last step is not judged: what comes after it, another round of matches or the test of
+    the pose's quality, does so with more than the cost.
 
     Nothing is recorded: :mod:`torchtrack.implicit_gradient` gives gradients of the solution.
 
@@ -256,16 +254,33 @@ def solve_pose(
         The last linearisation, with the pose that its step led to.
     """
     rows = _as_rows(problem)
-    T_cam_obj, damping = T_start, torch.full_like(T_start[:, 0, 0], config.damping)
     if from_prior is None:
         from_prior = _from_prior(problem, T_start)
-    for _ in range(config.iterations):
-        at = _linearise(problem, rows, T_cam_obj, from_prior, config.loss)
-        step = _damped_step(at, damping)
-        T_next = move_about(T_cam_obj, cayley(step[:, :3]), step[:, 3:6], problem.centre_obj)
-        # Steps add up to the offset from the prior, to second order.
-        better = _cost(problem, rows, T_next, from_prior + step, config.loss) <= at.cost
-        T_cam_obj = torch.where(better[:, None, None], T_next, T_cam_obj)
-        from_prior = from_prior + torch.where(better[:, None], step, 0)
+    damping = torch.full_like(problem.scale_px, config.damping)
+    at, cost = _look(problem, rows, T_start, from_prior, config)
+    for _ in range(config.iterations - 1):
+        next_at, next_cost = _look(problem, rows, *_moved(problem, at, damping), config)
+        better = next_cost <= cost
+        at, cost = _choose(better, next_at, at), torch.where(better, next_cost, cost)
         damping = torch.where(better, damping * _DAMPING_DECAY, damping.clamp(min=_DAMPING_START) * _DAMPING_GROWTH)
+    T_cam_obj, from_prior = _moved(problem, at, damping)
     return replace(at, T_cam_obj=T_cam_obj, from_prior=from_prior)
+
+
+def _look(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, config: SolverConfig) -> tuple[Linearisation, Tensor]:
+    """The problem at a pose, and its cost there, where a step is going to be judged by it."""
+    seen = _see(problem, rows, T_cam_obj, from_prior)
+    cost = _cost(problem, seen, from_prior, config.loss) if config.iterations > 1 else problem.scale_px
+    return _linearise(problem, seen, T_cam_obj, from_prior, config.loss), cost
+
+
+def _moved(problem: PoseProblem, at: Linearisation, damping: Tensor) -> tuple[Tensor, Tensor]:
+    """The pose that a step leads to, and its offset from the prior: steps add up, to second order."""
+    step = _damped_step(at, damping)
+    return move_about(at.T_cam_obj, cayley(step[:, :3]), step[:, 3:6], problem.centre_obj), at.from_prior + step
+
+
+def _choose(first: Tensor, of_first: Linearisation, of_second: Linearisation) -> Linearisation:
+    """One of two linearisations for each object."""
+    pairs = zip(vars(of_first).values(), vars(of_second).values(), strict=True)
+    return Linearisation(*(torch.where(first.view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in pairs))

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.camera import MIN_DEPTH_M
-from torchtrack.contours import Contours
-from torchtrack.image_motion import object_plane_velocity, pixel_velocity
+from torchtrack.contours import Contours, select_ranked, take_points
+from torchtrack.image_motion import MovingObjects, object_plane_velocity, pixel_velocity
 from torchtrack.lie import retract_about, transform_points
 from torchtrack.object_batch import ObjectBatch, repeat_row
 from torchtrack.pose_solver import pose_jacobian
@@ -47,6 +47,11 @@ class Prediction:
             return self
         return replace(self, T_cam_obj=self.T_cam_obj.detach(), velocity=self.velocity.detach(), covariance=self.covariance.detach())
 
+    def moving(self, *, compensated: bool) -> MovingObjects:
+        """The objects as predicted; standing still where their motion is not to be compensated for."""
+        velocity = self.velocity if compensated else torch.zeros_like(self.velocity)
+        return MovingObjects(self.T_cam_obj, velocity, self.centre_cam, self.objects.intrinsics)
+
     def plane_velocity(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
         """Image velocity of pixels at the depth of the object's centre (px/s)."""
         return object_plane_velocity(pixels, self.velocity, self.centre_cam, self.objects.intrinsics)
@@ -57,8 +62,12 @@ class Prediction:
 
     def moved(self, offset: Float[Tensor, "b k"]) -> "Prediction":
         """The prediction with its pose and velocity moved; the covariance stays."""
-        T_cam_obj = retract_about(self.T_cam_obj, offset[:, :6], self.objects.centre_obj)
-        return Prediction(self.objects, T_cam_obj, self.usable, self.velocity + offset[:, 6:12], self.covariance)
+        return self.at(retract_about(self.T_cam_obj, offset[:, :6], self.objects.centre_obj), offset)
+
+    def at(self, T_cam_obj: Float[Tensor, "b 4 4"], offset: Float[Tensor, "b k"]) -> "Prediction":
+        """The prediction with another pose, and its velocity moved by what ``offset`` has beside the pose's part."""
+        velocity = self.velocity + offset[:, 6:12] if offset.shape[1] > 6 else self.velocity
+        return Prediction(self.objects, T_cam_obj, self.usable, velocity, self.covariance)
 
     def copies(self, number: int, count: int) -> "Prediction":
         """One object's prediction many times, each in a stream of its own."""
@@ -69,8 +78,9 @@ class Prediction:
 
     def sigma_px(self, contours: Contours) -> Float[Tensor, "b"]:
         """Standard deviation of the contours across themselves in the image (px), in the mean over them."""
-        step = max(contours.mask.shape[1] // _LOOKED_AT, 1)
-        points, normals, mask = (value[:, ::step] for value in (contours.points_cam, contours.normals, contours.mask))
+        # Of the visible points, not of all places: how many there are depends on the other objects.
+        chosen, mask = select_ranked(contours.mask, _LOOKED_AT)
+        points, normals = take_points(contours.points_cam, chosen), take_points(contours.normals, chosen)
         inverse_depth = points[..., 2].clamp(min=MIN_DEPTH_M).reciprocal()
         slope = normals * self.objects.intrinsics[:, None, :2] * inverse_depth[..., None]
         along = -(slope * points[..., :2]).sum(-1) * inverse_depth

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchtrack.config.tracker import QualityConfig
 from torchtrack.contours import Contours
-from torchtrack.matching import Matches, patch, patch_counts
+from torchtrack.matching import Matches, on_and_around, patch, patch_sums
 
 # A patch explains its contours when this share of the observations near them are on them.
 _LEAST_SHARE = 0.5
@@ -38,9 +38,8 @@ def explained_share(
     A patch of the image explains its contours when most of the observations near them are on them: a few of those that
     chance scatters around a contour always are. One where hardly anything moves: nothing speaks against the pose.
     """
-    on_count, near_count = patch_counts(matches.offsets, matches.targets, matches.near)
-    cell = patch(contours.pixels)
-    on, near = on_count.gather(1, cell), near_count.gather(1, cell)
+    counts = patch_sums(patch(matches.targets), torch.stack(on_and_around(matches.offsets, matches.near), 1))
+    on, near = counts.gather(2, patch(contours.pixels)[:, None].expand(-1, 2, -1)).unbind(1)
     explained = (on >= config.min_on_contour) & (on + 1 > _LEAST_SHARE * (near + 2))
     speed = (contours.normals * contour_velocity).sum(-1).abs()
     moving = contours.mask & _inside(contours.pixels, image_size) & (speed > config.min_speed_px_s)
@@ -51,8 +50,8 @@ def explained_share(
 
 def _inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
     """Which pixels lie in the image (height, width)."""
-    limit = torch.tensor([image_size[1], image_size[0]], device=pixels.device)
-    return ((pixels >= 0) & (pixels < limit)).all(-1)
+    u, v = pixels.unbind(-1)
+    return (u >= 0) & (u < image_size[1]) & (v >= 0) & (v < image_size[0])
 
 
 def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:

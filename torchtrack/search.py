@@ -115,9 +115,9 @@ def mark(
         prediction: of the one object.
         contours: of all objects, of which this is ``number``.
     """
-    step = max(contours.mask.shape[1] // _MARKED_POINTS, 1)
-    visible = contours.mask[number, ::step]
-    points, normals = contours.points_obj[number, ::step][visible], contours.normals[number, ::step][visible]
+    visible = contours.mask[number].nonzero()[:, 0]
+    visible = visible[:: max(len(visible) // _MARKED_POINTS, 1)]
+    points, normals = contours.points_obj[number, visible], contours.normals[number, visible]
     count, objects = len(offsets), prediction.objects
     poses = retract_about(prediction.T_cam_obj.expand(count, 4, 4), offsets[:, :6], objects.centre_obj.expand(count, 3))
     pixels = project(transform_points(poses, points.expand(count, -1, -1)), objects.intrinsics.expand(count, 4))

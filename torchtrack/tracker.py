@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchtrack import lie, quality
@@ -62,6 +62,7 @@ class Tracker(nn.Module):
     stream_index: Tensor
     centre_obj: Tensor
     diameter_m: Tensor
+    far_pose: Tensor
 
     def __init__(
         self,
@@ -87,6 +88,7 @@ class Tracker(nn.Module):
         self.register_buffer("sensor_pixels", stack_tables([distortion_table(c, _BORDER_PX) for c in cameras]))
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
+        self.register_buffer("far_pose", _far_pose(self.centre_obj))
         self.weigher = TrustNetwork.shipped() if weigher is None and self.config.matching.learned_trust else weigher
         self.to(dtype)
 
@@ -100,6 +102,11 @@ class Tracker(nn.Module):
         """The objects as one batch."""
         shape = (self.streams, *self.image_size)
         return ObjectBatch(self.models, self.intrinsics, self.centre_obj, self.diameter_m, self.stream_index, shape, self._shared)
+
+    @property
+    def _looks_back(self) -> bool:
+        """Whether anything needs the events of earlier windows: they are not kept for nothing."""
+        return self.config.corners.max_corners > 0 or self.weigher is not None
 
     @property
     def streams(self) -> int:
@@ -158,7 +165,7 @@ class Tracker(nn.Module):
         steps first, where there are events enough for them. Each object is asked for itself: its neighbours do not matter.
         """
         window = self.config.window
-        if window.parts == 1 or not self.config.solver.prior:
+        if window.parts == 1 or not self.config.solver.prior or len(events) < window.parts * _EVENTS_OF_A_PART:
             return torch.zeros_like(self.stream_index, dtype=torch.bool)
         variance = state.covariance.diagonal(dim1=-2, dim2=-1)[:, 6:].to(self.intrinsics.dtype).unflatten(-1, (2, 3)).mean(-1)
         unknown_m_s = (variance[:, 1] + variance[:, 0] * (0.5 * self.diameter_m).square()).sqrt()
@@ -181,7 +188,7 @@ class Tracker(nn.Module):
         """One window, or one part of it."""
         config = self.config
         window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
-        last_event_us = update_last_event(state.last_event_us, events)
+        last_event_us = update_last_event(state.last_event_us, events) if self._looks_back else state.last_event_us
         recorded = self._predict(state, window_s)
         prediction = recorded.detached()
         contours = self._extract(prediction.T_cam_obj)
@@ -213,7 +220,8 @@ class Tracker(nn.Module):
         velocity, covariance, dt_s = state.velocity, state.covariance, window_s[self.stream_index]
         if self.config.motion.model == "hold":
             velocity, covariance = torch.zeros_like(velocity), with_dropped(covariance, velocity)
-        T_prior = lie.retract_about(state.T_cam_obj.to(velocity.dtype), velocity * dt_s[:, None], self.centre_obj)
+        moved = velocity * dt_s[:, None]
+        T_prior = lie.move_about(state.T_cam_obj.to(velocity.dtype), lie.cayley(moved[:, :3]), moved[:, 3:], self.centre_obj)
         covariance = predict_covariance(covariance.detach(), velocity.detach(), dt_s, self.diameter_m, self.config.motion)
         T_prior, usable = self._before_camera(T_prior)
         return Prediction(self.objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance)
@@ -221,11 +229,9 @@ class Tracker(nn.Module):
     def _before_camera(self, T_cam_obj: Tensor) -> tuple[Tensor, Tensor]:
         """The poses with a harmless one in the place of those that are not finite or not before the camera, and which are."""
         depth = lie.transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2]
-        usable = torch.isfinite(T_cam_obj).flatten(1).all(-1) & (depth > MIN_DEPTH_M) & (depth < _MAX_DEPTH_M)
-        harmless = torch.eye(4, dtype=T_cam_obj.dtype, device=T_cam_obj.device).repeat(len(T_cam_obj), 1, 1)
-        harmless[:, :3, 3] = -self.centre_obj
-        harmless[:, 2, 3] += _MAX_DEPTH_M
-        return torch.where(usable[:, None, None], T_cam_obj, harmless), usable
+        # A sum is finite only where every entry is.
+        usable = (T_cam_obj.sum((1, 2)).abs() < torch.inf) & (depth > MIN_DEPTH_M) & (depth < _MAX_DEPTH_M)
+        return torch.where(usable[:, None, None], T_cam_obj, self.far_pose), usable
 
     def _extract(self, T_cam_obj: Tensor) -> Contours:
         """Visible contours at a pose."""
@@ -265,9 +271,12 @@ class Tracker(nn.Module):
         """The window's events as each object's camera saw them."""
         window = pad_streams(events, self.streams, t_us)
         stream = torch.arange(self.streams, device=t_us.device)[:, None]
-        pixels = at_pixels(self.ideal_pixels, stream, window.x, window.y)
-        age_s, polarity = window.age_us.to(pixels.dtype) * 1e-6, 2 * window.polarity.to(pixels.dtype) - 1
-        return WindowEvents(*(value[self.stream_index] for value in (pixels, age_s, polarity, window.mask)))
+        pixels = at_pixels(self.ideal_pixels, stream, window.x, window.y).transpose(1, 2).contiguous().transpose(1, 2)
+        values = (pixels, window.age_us.to(pixels.dtype) * 1e-6, 2 * window.polarity.to(pixels.dtype) - 1, window.mask)
+        if self.streams == 1:
+            # Without a copy for every object.
+            return WindowEvents(*(value.expand(len(self.stream_index), *value.shape[1:]) for value in values))
+        return WindowEvents(*(value[self.stream_index] for value in values))
 
     def _search(self, state: TrackerState, prediction: Prediction, sigma_px: Tensor, seen: WindowEvents, found: Found) -> Found:
         """Try other poses for the objects that need it, one object after the other."""
@@ -286,16 +295,16 @@ class Tracker(nn.Module):
     ) -> tuple[TrackerState, StepResult]:
         """Judge every object, go on as predicted where it failed, and make the next state."""
         config, solution, contours, share = self.config, found.fit.solution, found.fit.contours, found.share
-        T_found = lie.orthonormalise(solution.T_cam_obj.double())
-        step = lie.small_difference_about(prediction.T_cam_obj.double(), T_found, self.centre_obj.double()).to(share.dtype)
+        T_prior, T_found = prediction.T_cam_obj.double(), solution.T_cam_obj.double()
+        step = lie.small_difference_about(T_prior, T_found, self.centre_obj.double()).to(share.dtype)
         in_view = quality.visible_share(contours, self.image_size)
         status = quality.judge(share, found.count, in_view, step, self.diameter_m, config.quality, widening)
         status = torch.where(prediction.usable, status, int(quality.Status.DIVERGED))
         failed = status >= int(quality.Status.LOST)
         T_held = state.T_cam_obj
         if config.motion.without_events == "predict":
-            T_held = torch.where(prediction.usable[:, None, None], lie.orthonormalise(prediction.T_cam_obj.double()), T_held)
-        T_cam_obj = torch.where(failed[:, None, None], T_held, T_found)
+            T_held = torch.where(prediction.usable[:, None, None], T_prior, T_held)
+        T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], T_held, T_found))
         velocity, covariance = self._updated_motion(state, prediction, solution, failed, share, window_s)
         usual = torch.where(failed, state.usual_share, torch.lerp(state.usual_share, share, _USUAL_GAIN))
         contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
@@ -318,6 +327,13 @@ class Tracker(nn.Module):
         if config.motion.without_events == "hold":
             covariance = with_dropped(covariance, velocity - faded)
         return faded, covariance
+
+
+def _far_pose(centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:
+    """A pose of each object with its centre far before the camera."""
+    poses = torch.eye(4, dtype=centre_obj.dtype).repeat(len(centre_obj), 1, 1)
+    poses[:, :3, 3] = torch.tensor([0, 0, _MAX_DEPTH_M], dtype=centre_obj.dtype) - centre_obj
+    return poses
 
 
 def _check_setup(objects: Sequence[ObjectModel], cameras: list[Camera], streams: list[int], config: TrackerConfig) -> None:

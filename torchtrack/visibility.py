@@ -47,35 +47,35 @@ class Scene:
 
 
 def hidden_by_faces(
-    points_cam: Float[Tensor, "b m 3"], triangles_cam: Float[Tensor, "b f 3 3"], tolerance_m: Float[Tensor, "b"]
+    points_cam: Float[Tensor, "b m 3"], triangles_cam: Float[Tensor, "b f 3 3"], normals_cam: Float[Tensor, "b f 3"], tolerance_m: Float[Tensor, "b"]
 ) -> Bool[Tensor, "b m"]:
     """Which points lie behind one of the triangles, as the camera sees them.
 
     The line of sight to a point crosses a triangle when it is on one side of the three planes through the camera and
     an edge; all tests of all points and triangles are one matrix product.
     """
-    corners = triangles_cam.unbind(2)
-    sides = [torch.linalg.cross(corners[i], corners[(i + 1) % 3], dim=-1) for i in range(3)]
-    turn = (sides[0] * corners[2]).sum(-1, keepdim=True).sign()
-    normal = torch.nn.functional.normalize(torch.linalg.cross(corners[1] - corners[0], corners[2] - corners[0], dim=-1), dim=-1)
-    plane = (normal * corners[0]).sum(-1)
-    away = plane.sign()[..., None] * normal
-    tests = torch.cat([*(side * turn for side in sides), away], 1).transpose(1, 2)
-    first, second, third, distance = (points_cam @ tests).chunk(4, -1)
-    behind = distance > (plane.abs() + tolerance_m[:, None])[:, None]
-    return ((first > 0) & (second > 0) & (third > 0) & behind).any(-1)
+    sides = torch.linalg.cross(triangles_cam, triangles_cam.roll(-1, 2), dim=-1)
+    turn = (sides[:, :, 0] * triangles_cam[:, :, 2]).sum(-1)[..., None, None].sign()
+    plane = (normals_cam * triangles_cam[:, :, 0]).sum(-1)
+    away = plane.sign()[..., None] * normals_cam
+    tests = torch.cat([sides * turn, away[:, :, None]], 2).flatten(1, 2)
+    values = torch.bmm(tests, points_cam.transpose(1, 2)).unflatten(1, (-1, 4))
+    behind = values[:, :, 3] > (plane.abs() + tolerance_m[:, None])[..., None]
+    return ((values[:, :, :3].amin(2) > 0) & behind).any(1)
 
 
 def _hidden_by_self(scene: Scene, points_cam: Tensor) -> Tensor:
     """Points of objects with few faces that these hide."""
     hidden = torch.zeros(points_cam.shape[:2], dtype=torch.bool, device=points_cam.device)
     for model in scene.models:
-        members = model.members
-        if len(model.triangles) == 0:
-            continue
-        corners = model.triangles.flatten(0, 1).expand(len(members), -1, -1)
-        triangles = transform_points(scene.T_cam_obj[members], corners).unflatten(1, (-1, 3))
-        hidden[members] = hidden_by_faces(points_cam[members], triangles, _ON_FACE * scene.diameters_m[members])
+        if len(model.triangles):
+            # All objects, where all have the model: a list of them would be looked up.
+            members = slice(None) if len(scene.models) == 1 else model.members
+            T_cam_obj = scene.T_cam_obj[members]
+            corners = model.triangles.flatten(0, 1).expand(len(T_cam_obj), -1, -1)
+            triangles = transform_points(T_cam_obj, corners).unflatten(1, (-1, 3))
+            normals = model.triangle_normals @ T_cam_obj[:, :3, :3].transpose(1, 2)
+            hidden[members] = hidden_by_faces(points_cam[members], triangles, normals, _ON_FACE * scene.diameters_m[members])
     return hidden
 
 

@@ -168,25 +168,27 @@ class EventLineTracker(Tracker):
             matches = Matches(
                 contour=point,
                 mask=matched,
-                weights=torch.full_like(near.age_s, weight),
+                weights=matched * weight,
+                points_obj=take_points(contours.points_obj, point),
                 targets=targets,
                 directions=take_points(contours.normals, point),
                 offsets=((take_points(contours.pixels, point) - targets) * take_points(contours.normals, point)).sum(-1),
                 near=near.mask & belongs,
+                limb=torch.zeros_like(near.age_s),
             )
-            solution = solve_pose(self._problem(window, matches, contours, information, gate_px), T_cam_obj, self.config.solver)
+            solution = solve_pose(self._problem(window, matches, information, gate_px), T_cam_obj, self.config.solver)
             T_cam_obj = solution.T_cam_obj
             contours = reproject(contours, T_cam_obj, self.intrinsics)
         return solution, contours, matches
 
-    def _problem(self, window: Window, matches: Matches, contours: Contours, information: Tensor, gate_px: float) -> PoseProblem:
+    def _problem(self, window: Window, matches: Matches, information: Tensor, gate_px: float) -> PoseProblem:
         """Distances of events from their lines, and the prediction; objects without a match stay where they are."""
         idle = ~matches.mask.any(-1)
         return PoseProblem(
-            points_obj=take_points(contours.points_obj, matches.contour),
+            points_obj=matches.points_obj,
             targets=matches.targets,
             directions=matches.directions,
-            weights=matches.mask * matches.weights,
+            weights=matches.weights,
             intrinsics=self.intrinsics,
             centre_obj=self.centre_obj,
             scale_px=torch.full_like(self.centre_obj[:, 0], gate_px),
