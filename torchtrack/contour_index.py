@@ -24,14 +24,14 @@ class ContourIndex:
     """The nearest contour point of every cell of a region, within a radius.
 
     Args:
-        origin: cell (column, row) of the region's first entry; cell (0, 0) is centred at pixel (0, 0).
+        corner: outer corner (column, row) of the region's first cell; cell (0, 0) is centred at pixel (0, 0).
         size: rows and columns of the region, whose outermost cells are empty.
         cell_px: side of a cell.
         nearest: contour index per cell, -1 where none is near.
         pixels: where the contour points were when the index was made.
     """
 
-    origin: Float[Tensor, "b 2"]
+    corner: Float[Tensor, "b 2"]
     size: tuple[int, int]
     cell_px: int
     nearest: Int[Tensor, "b p"]
@@ -40,7 +40,8 @@ class ContourIndex:
     def look_up(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
         """The contour point nearest to the centre of each pixel's cell, -1 where none is near."""
         rows, columns = self.size
-        column, row = (pixels / self.cell_px - self.origin[:, None]).round().unbind(-1)
+        # Rounded the same way wherever the region begins: events lie halfway between the centres of two cells.
+        column, row = (pixels / self.cell_px - self.corner[:, None]).floor().unbind(-1)
         # The region's border is empty: whatever lies outside finds nothing there, nor does what is not a number.
         place = torch.add(column.clamp(0, columns - 1), row.clamp(0, rows - 1), alpha=columns)
         return self.nearest.gather(1, place.nan_to_num_(0.0).long())
@@ -77,7 +78,7 @@ def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: i
     nothing = _FAR_STEPS * count
     keys = torch.full((batch, rows * columns + 2 * reach * (columns + 1) + 1), nothing, device=device)
     keys = keys.scatter_reduce_(1, cell.flatten(1), key.flatten(1), "amin")[:, : rows * columns]
-    return ContourIndex(low, (rows, columns), cell_px, torch.where(keys < nothing, keys % count, -1), contours.pixels)
+    return ContourIndex(low - 0.5, (rows, columns), cell_px, torch.where(keys < nothing, keys % count, -1), contours.pixels)
 
 
 @lru_cache

@@ -142,7 +142,7 @@ def select_ranked(mask: Bool[Tensor, "b n"], count: int) -> tuple[Int[Tensor, "b
     cumulative = mask.cumsum(-1)
     total = cumulative[:, -1:]
     step = torch.arange(count, device=mask.device, dtype=torch.float64)
-    rank = (step * (total / count).clamp(min=1)).long() + 1
+    rank = (step * (total.double() / count).clamp(min=1)).long() + 1
     index = torch.searchsorted(cumulative, rank)
     return index.clamp(max=mask.shape[1] - 1), rank <= total
 

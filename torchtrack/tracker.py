@@ -301,10 +301,9 @@ class Tracker(nn.Module):
         status = quality.judge(share, found.count, in_view, step, self.diameter_m, config.quality, widening)
         status = torch.where(prediction.usable, status, int(quality.Status.DIVERGED))
         failed = status >= int(quality.Status.LOST)
-        T_held = state.T_cam_obj
-        if config.motion.without_events == "predict":
-            T_held = torch.where(prediction.usable[:, None, None], T_prior, T_held)
-        T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], T_held, T_found))
+        T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], T_prior, T_found))
+        held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
+        T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
         velocity, covariance = self._updated_motion(state, prediction, solution, failed, share, window_s)
         usual = torch.where(failed, state.usual_share, torch.lerp(state.usual_share, share, _USUAL_GAIN))
         contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
