@@ -15,6 +15,8 @@ from torchtrack.contours import Contours
 
 # Squared distances are compared in these fractions of a pixel²; none that counts comes near this many of them.
 _DISTANCE_STEPS, _FAR_STEPS = 16, 2**30
+# From the middle of a cell to its corner, in cells.
+_HALF_DIAGONAL = 0.5**0.5
 # Farther than any cell of an image.
 _FAR_CELLS = 2**20
 
@@ -60,37 +62,52 @@ def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: i
     radius = torch.as_tensor(radius_px, device=device).expand(batch)
     middle = torch.tensor([0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)], dtype=contours.pixels.dtype, device=device)
     inside = contours.mask & ((contours.pixels - middle).abs() < middle + radius[:, None, None]).all(-1)
-    largest_px = int(radius.max()) if batch else 0
-    reach = -(-largest_px // cell_px)
+    radii_px = sorted(set(radius.tolist()))
+    margin = _reach(max(radii_px, default=0), cell_px) + 1
     centre = (contours.pixels / cell_px).round()
-    low = torch.where(inside[..., None], centre, torch.inf).amin(1).clamp(max=_FAR_CELLS) - (reach + 1)
+    low = torch.where(inside[..., None], centre, torch.inf).amin(1).clamp(max=_FAR_CELLS) - margin
     local = torch.where(inside[..., None], centre - low[:, None], 0)
-    columns, rows = (int(size) + reach + 2 for size in local.amax((0, 1)).tolist())
-    disc = contours.pixels.new_tensor(_disc(reach, largest_px / cell_px))
-    distance_sq = _squared_distances(contours.pixels, cell_px * centre, cell_px * disc)
-    if batch > 1:
-        # Each object within its own radius, whatever its neighbours need.
-        distance_sq = distance_sq.masked_fill((disc.square().sum(-1) * cell_px**2 > radius[:, None].square())[:, None], torch.inf)
-    key = (_DISTANCE_STEPS * distance_sq).clamp(max=_FAR_STEPS).long() * count + torch.arange(count, device=device)[:, None]
-    # Masked points write to spare entries after the last.
-    first = torch.where(inside, torch.add(local[..., 0], local[..., 1], alpha=columns), rows * columns + reach * (columns + 1))
-    cell = (first[..., None] + torch.add(disc[:, 0], disc[:, 1], alpha=columns)).long()
-    nothing = _FAR_STEPS * count
-    keys = torch.full((batch, rows * columns + 2 * reach * (columns + 1) + 1), nothing, device=device)
-    keys = keys.scatter_reduce_(1, cell.flatten(1), key.flatten(1), "amin")[:, : rows * columns]
-    return ContourIndex(low - 0.5, (rows, columns), cell_px, torch.where(keys < nothing, keys % count, -1), contours.pixels)
+    columns, rows = (int(size) + margin + 1 for size in local.amax((0, 1)).tolist())
+    keys = torch.full((batch * rows * columns,), _FAR_STEPS * count, device=device)
+    for radius_px in radii_px:
+        # Object by object as far as each needs: one that is looked for far away does not make the others pay.
+        row, point = (inside & (radius == radius_px)[:, None]).nonzero().unbind(1)
+        to_centre = cell_px * centre[row, point] - contours.pixels[row, point]
+        u, v = local[row, point].long().unbind(1)
+        _write(keys, (row * rows + v) * columns + u, to_centre, point, radius_px, cell_px, columns, count)
+    nearest = torch.where(keys < _FAR_STEPS * count, keys % count, -1).view(batch, -1)
+    return ContourIndex(low - 0.5, (rows, columns), cell_px, nearest, contours.pixels)
+
+
+def _write(keys: Tensor, cell: Tensor, to_centre: Tensor, point: Tensor, radius_px: int, cell_px: int, columns: int, count: int) -> None:
+    """Write the distances and numbers of points into the cells around theirs, where they are less than what stands there.
+
+    Args:
+        cell: of each point.
+        to_centre: way from each point to the centre of its cell (px).
+    """
+    disc = to_centre.new_tensor(_disc(radius_px / cell_px))
+    steps = _DISTANCE_STEPS * _squared_distances(to_centre, cell_px * disc)
+    key = torch.add(point[:, None], steps.long(), alpha=count).masked_fill_(steps > _DISTANCE_STEPS * radius_px**2, _FAR_STEPS * count)
+    around = torch.add(disc[:, 0], disc[:, 1], alpha=columns).long()
+    keys.scatter_reduce_(0, (cell[:, None] + around).flatten(), key.flatten(), "amin")
+
+
+def _reach(radius_px: int, cell_px: int) -> int:
+    """How many cells away a point still counts."""
+    return int(radius_px / cell_px + _HALF_DIAGONAL)
 
 
 @lru_cache
-def _disc(reach: int, radius: float) -> tuple[tuple[int, int], ...]:
-    """Offsets (column, row) of the cells within ``radius`` cells."""
+def _disc(radius: float) -> tuple[tuple[int, int], ...]:
+    """Offsets (column, row) of the cells that reach into ``radius`` cells around a cell's middle."""
+    reach = int(radius + _HALF_DIAGONAL)
     steps = range(-reach, reach + 1)
-    return tuple((column, row) for row in steps for column in steps if row**2 + column**2 <= radius**2)
+    return tuple((column, row) for row in steps for column in steps if row**2 + column**2 <= (radius + _HALF_DIAGONAL) ** 2)
 
 
-def _squared_distances(pixels: Tensor, centres: Tensor, offsets: Tensor) -> Tensor:
-    """``|c + o - p|²`` of every point ``p [b, m, 2]``, its ``c`` and every offset ``o [d, 2]``, as one matrix product."""
-    to_centre = centres - pixels
-    point_part = torch.cat([to_centre.square().sum(-1, keepdim=True), torch.ones_like(to_centre[..., :1]), 2 * to_centre], -1)
+def _squared_distances(to_centre: Float[Tensor, "p 2"], offsets: Float[Tensor, "d 2"]) -> Float[Tensor, "p d"]:
+    """``|c + o|²`` of every ``c`` and every offset ``o``, as one matrix product."""
+    point_part = torch.cat([to_centre.square().sum(-1, keepdim=True), torch.ones_like(to_centre[:, :1]), 2 * to_centre], -1)
     offset_part = torch.cat([torch.ones_like(offsets[:, :1]), offsets.square().sum(-1, keepdim=True), offsets], -1)
     return (point_part @ offset_part.T).clamp(min=0)

@@ -59,6 +59,10 @@ class Contours:
     pixels: Float[Tensor, "b m 2"]
     normals: Float[Tensor, "b m 2"]
 
+    def widened(self, count: int) -> "Contours":
+        """The same with at least ``count`` places for the points of each object."""
+        return Contours(*(_widened(value, count) for value in vars(self).values()))
+
 
 class ContourModel(nn.Module):
     """The constant tensors of one :class:`ObjectModel` that contours are made from, as buffers."""
@@ -142,7 +146,7 @@ def select_ranked(mask: Bool[Tensor, "b n"], count: int) -> tuple[Int[Tensor, "b
     cumulative = mask.cumsum(-1)
     total = cumulative[:, -1:]
     step = torch.arange(count, device=mask.device, dtype=torch.float64)
-    rank = (step * (total.double() / count).clamp(min=1)).long() + 1
+    rank = (step * (total.double() / max(count, 1)).clamp(min=1)).long() + 1
     index = torch.searchsorted(cumulative, rank)
     return index.clamp(max=mask.shape[1] - 1), rank <= total
 
@@ -195,32 +199,37 @@ def _texture_mask(model: ContourModel, T_cam_obj: Tensor) -> Tensor:
     """Texture points on faces that look at the camera."""
     points = transform_points(T_cam_obj, model.texture_points.expand(len(T_cam_obj), -1, -1))
     normals = model.texture_normals @ T_cam_obj[:, :3, :3].transpose(1, 2)
-    return (normals * points).sum(-1) < -_MIN_TEXTURE_COSINE * points.norm(dim=-1)
+    return (normals * points).sum(-1) < -_MIN_TEXTURE_COSINE * points.square().sum(-1).sqrt()
 
 
-def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, texture_count: int) -> tuple[Tensor, ...]:
+def _texture_points(model: ContourModel, T_cam_obj: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points, tangents, kinds and mask of the texture that looks at the camera."""
+    facing = _texture_mask(model, T_cam_obj)
+    # On a GPU, which would have to be waited for to know how many there are, all keep their places.
+    count = int(facing.sum(1).amax()) if facing.device.type == "cpu" else facing.shape[1]
+    chosen, mask = select_ranked(facing, count)
+    points, tangents = (values.T[:, chosen].permute(1, 2, 0) for values in (model.texture_points, model.texture_tangents))
+    return points, tangents, torch.full_like(chosen, int(ContourKind.TEXTURE)), mask
+
+
+def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points, tangents, kinds and mask of objects that share a model, before hidden parts are removed."""
-    batch, own = len(T_cam_obj), len(model.texture_points)
+    parts = [_no_points(T_cam_obj)]
     if len(model.edge_ends):
-        points, tangents, kind, mask = _edge_points(model, T_cam_obj, intrinsics, config)
-    else:
-        points = T_cam_obj.new_zeros(batch, config.max_edge_points, 3)
-        tangents, kind = points, torch.zeros(points.shape[:2], dtype=torch.int64, device=points.device)
-        mask = torch.zeros_like(kind, dtype=torch.bool)
-    if texture_count == 0:
-        return points, tangents, kind, mask
-    padding = texture_count - own
-    pad_points = T_cam_obj.new_zeros(batch, padding, 3)
-    texture = torch.cat([model.texture_points.expand(batch, -1, -1), pad_points], 1)
-    texture_tangents = torch.cat([model.texture_tangents.expand(batch, -1, -1), pad_points], 1)
-    texture_mask = torch.nn.functional.pad(_texture_mask(model, T_cam_obj), (0, padding))
-    texture_kind = torch.full((batch, texture_count), int(ContourKind.TEXTURE), device=kind.device)
-    return (
-        torch.cat([points, texture], 1),
-        torch.cat([tangents, texture_tangents], 1),
-        torch.cat([kind, texture_kind], 1),
-        torch.cat([mask, texture_mask], 1),
-    )
+        parts.append(_edge_points(model, T_cam_obj, intrinsics, config))
+    if len(model.texture_points):
+        parts.append(_texture_points(model, T_cam_obj))
+    if len(parts) == 2:
+        return parts[1]
+    points, tangents, kind, mask = (torch.cat(column, 1) for column in zip(*parts, strict=True))
+    return points, tangents, kind, mask
+
+
+def _no_points(T_cam_obj: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """One place of contours, and nothing there: what selects from contours needs a place to point at."""
+    nowhere = T_cam_obj.new_zeros(len(T_cam_obj), 1, 3)
+    nothing = torch.zeros(len(T_cam_obj), 1, dtype=torch.int64, device=T_cam_obj.device)
+    return nowhere, nowhere, nothing, nothing.bool()
 
 
 def image_normals(
@@ -245,13 +254,19 @@ def mesh_contours(
     models: Sequence[ContourModel], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"], config: ContourConfig
 ) -> Contours:
     """Contours of each object at its pose, hidden parts included."""
-    texture_count = max(len(model.texture_points) for model in models)
     if len(models) == 1:
-        return assemble(*_model_contours(models[0], T_cam_obj, intrinsics, config, texture_count), T_cam_obj, intrinsics)
-    parts = [_model_contours(model, T_cam_obj[model.members], intrinsics[model.members], config, texture_count) for model in models]
+        return assemble(*_model_contours(models[0], T_cam_obj, intrinsics, config), T_cam_obj, intrinsics)
+    parts = [_model_contours(model, T_cam_obj[model.members], intrinsics[model.members], config) for model in models]
+    width = max(mask.shape[1] for *_, mask in parts)
     order = torch.cat([model.members for model in models]).argsort()
-    points, tangents, kind, mask = (torch.cat(column)[order] for column in zip(*parts, strict=True))
+    points, tangents, kind, mask = (torch.cat([_widened(value, width) for value in column])[order] for column in zip(*parts, strict=True))
     return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics)
+
+
+def _widened(values: Tensor, count: int) -> Tensor:
+    """Padded with zeros to at least ``count`` places."""
+    missing = max(count - values.shape[1], 0)
+    return torch.cat([values, values.new_zeros(len(values), missing, *values.shape[2:])], 1) if missing else values
 
 
 def assemble(

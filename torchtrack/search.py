@@ -148,11 +148,9 @@ def _replaced(found: Found, number: int, other: Found, row: int) -> Found:
         value[number] = theirs[row]
         return value
 
-    def put_points(mine: Tensor, theirs: Tensor) -> Tensor:
-        missing = mine.shape[1] - theirs.shape[1]
-        return put(mine, torch.cat([theirs, theirs.new_zeros(len(theirs), missing, *theirs.shape[2:])], 1))
-
     mine, theirs = found.fit, other.fit
     solution = Linearisation(*(put(value, getattr(theirs.solution, name)) for name, value in vars(mine.solution).items()))
-    contours = Contours(*(put_points(value, getattr(theirs.contours, name)) for name, value in vars(mine.contours).items()))
+    count = max(mine.contours.mask.shape[1], theirs.contours.mask.shape[1])
+    own, others = mine.contours.widened(count), theirs.contours.widened(count)
+    contours = Contours(*(put(value, getattr(others, name)) for name, value in vars(own).items()))
     return Found(Fit(solution, contours, mine.matches), put(found.share, other.share), put(found.count, other.count))

@@ -1,7 +1,7 @@
 """What the tracker remembers between windows, and what one window gives: both immutable."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import torch
@@ -76,7 +76,11 @@ def choose_rows(
     def of_objects(one: Tensor, other: Tensor) -> Tensor:
         return torch.where(first.view(-1, *[1] * (one.dim() - 1)), one, other)
 
-    state, result = (_mapped(of_objects, lambda _, second: second, *pair) for pair in zip(of_first, of_second, strict=True))
+    results = (of_first[1], of_second[1])
+    places = max(result.contours.mask.shape[1] for result in results)
+    results_of_one_width = [replace(result, contours=result.contours.widened(places)) for result in results]
+    state: TrackerState = _mapped(of_objects, lambda _, second: second, of_first[0], of_second[0])
+    result: StepResult = _mapped(of_objects, lambda _, second: second, *results_of_one_width)
     return state, result
 
 

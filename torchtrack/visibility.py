@@ -119,16 +119,14 @@ def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -
     depth_m, owner, grid = depth_buffer(scene, config.depth_cell_px)
     stream, cell_px = scene.stream_index, config.depth_cell_px
     _, height, width = scene.image_shape
-    limit = contours.pixels.new_tensor([width - 1, height - 1])
-    hidden = ((contours.pixels >= 0) & (contours.pixels <= limit)).all(-1)
-    own_counts = ~_tested_exactly(scene)
-    number = torch.arange(len(stream), device=stream.device)[:, None]
+    u, v = contours.pixels.unbind(-1)
+    inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    sides = torch.stack([contours.pixels + side * contours.normals for side in (0, -cell_px, cell_px)], 1)
+    cell = _cell(sides, grid, cell_px) + (stream * depth_m.shape[1])[:, None, None]
+    other = owner.take(cell) != torch.arange(len(stream), device=stream.device)[:, None, None]
     farthest_m = contours.points_cam[..., 2] - config.depth_margin * scene.diameters_m[:, None]
-    for side in (0, -cell_px, cell_px):
-        cell = _cell(contours.pixels + side * contours.normals, grid, cell_px)
-        other = owner[stream].gather(1, cell) != number
-        hidden = hidden & (farthest_m > depth_m[stream].gather(1, cell)) & (other | own_counts)
-    return hidden
+    behind = (farthest_m[:, None] > depth_m.take(cell)) & (other | ~_tested_exactly(scene)[:, None])
+    return inside & behind.all(1)
 
 
 def _tested_exactly(scene: Scene) -> Tensor:
