@@ -10,8 +10,8 @@ from torch import Tensor
 from torchtrack.camera import Camera, project
 from torchtrack.contours import ContourKind, Contours
 from torchtrack.events import EventBatch
-from torchtrack.io import Trajectory
 from torchtrack.image_motion import MovingObjects
+from torchtrack.io import Trajectory
 from torchtrack.lie import rotation_angle_deg, se3_exp, so3_exp, transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import Observations

@@ -53,8 +53,8 @@ def assert_close(entries, expected):
         (entry["sequence"], entry["object"], entry["status"]) for entry in expected
     ]
     for entry, other in zip(entries, expected, strict=True):
-        assert entry["mean_rotation_deg"] == pytest.approx(other["mean_rotation_deg"], abs=1e-3)
-        assert entry["max_translation_cm"] == pytest.approx(other["max_translation_cm"], abs=1e-3)
+        assert entry["mean_rotation_deg"] == pytest.approx(other["mean_rotation_deg"], abs=0.03)
+        assert entry["max_translation_cm"] == pytest.approx(other["max_translation_cm"], abs=0.02)
 
 
 def test_evaluate_gives_the_same_with_streams(folder, tmp_path, capsys):

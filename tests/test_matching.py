@@ -190,7 +190,9 @@ def test_the_dark_side_does_not_depend_on_the_sign_of_the_normal(dtype):
     for sign in (1, -1):
         contours = contours_at(pixels, sign * normals, dtype=dtype)
         moved, still = (
-            nearest(seen(pixels, polarity=polarity, dtype=dtype), contours, velocity=velocity, believed=(0.0, 0.0), gate_px=5.0, dark_shift_px=shift)[0]
+            nearest(seen(pixels, polarity=polarity, dtype=dtype), contours, velocity=velocity, believed=(0.0, 0.0), gate_px=5.0, dark_shift_px=shift)[
+                0
+            ]
             for shift in (1.0, 0.0)
         )
         shifted.append(moved.targets - still.targets)

@@ -69,12 +69,12 @@ def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: i
     local = torch.where(inside[..., None], centre - low[:, None], 0)
     columns, rows = (int(size) + margin + 1 for size in local.amax((0, 1)).tolist())
     keys = torch.full((batch * rows * columns,), _FAR_STEPS * count, device=device)
-    for radius_px in radii_px:
+    for reach_px in radii_px:
         # Object by object as far as each needs: one that is looked for far away does not make the others pay.
-        row, point = (inside & (radius == radius_px)[:, None]).nonzero().unbind(1)
+        row, point = (inside & (radius == reach_px)[:, None]).nonzero().unbind(1)
         to_centre = cell_px * centre[row, point] - contours.pixels[row, point]
         u, v = local[row, point].long().unbind(1)
-        _write(keys, (row * rows + v) * columns + u, to_centre, point, radius_px, cell_px, columns, count)
+        _write(keys, (row * rows + v) * columns + u, to_centre, point, reach_px, cell_px, columns, count)
     nearest = torch.where(keys < _FAR_STEPS * count, keys % count, -1).view(batch, -1)
     return ContourIndex(low - 0.5, (rows, columns), cell_px, nearest, contours.pixels)
 

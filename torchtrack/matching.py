@@ -179,7 +179,8 @@ def patch(pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
 def on_and_around(offsets: Float[Tensor, "b n"], near: Bool[Tensor, "b n"]) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
     """Which observations are on a contour, and which are so near to one that their share tells: 1 or 0."""
     distance = offsets.abs()
-    return tuple((near & (distance < limit)).to(offsets.dtype) for limit in (_ON_CONTOUR_PX, _SMEAR_PX))
+    on, around = ((near & (distance < limit)).to(offsets.dtype) for limit in (_ON_CONTOUR_PX, _SMEAR_PX))
+    return on, around
 
 
 def patch_sums(cell: Int[Tensor, "b n"], values: Float[Tensor, "b k n"]) -> Float[Tensor, "b k p"]:
@@ -188,9 +189,7 @@ def patch_sums(cell: Int[Tensor, "b n"], values: Float[Tensor, "b k n"]) -> Floa
     return nothing.scatter_add(2, cell[:, None].expand_as(values), values)
 
 
-def match_along_flow(
-    observations: Observations, contours: Contours, objects: MovingObjects, gate_px: float, config: MatchingConfig
-) -> Matches:
+def match_along_flow(observations: Observations, contours: Contours, objects: MovingObjects, gate_px: float, config: MatchingConfig) -> Matches:
     """Match each corner with the contour point nearest to it along the line of its flow, either way (the paper's 3.3).
 
     The paper moves corners along the flow "to locate the edge points"; seen from a pose that is a window old the edge
