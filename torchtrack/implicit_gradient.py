@@ -49,9 +49,10 @@ def with_gradient(problem: PoseProblem, solution: Linearisation, config: SolverC
     if not torch.is_grad_enabled() or not any(value.requires_grad for value in _tensors_of(problem)):
         return solution
     exact = _in_double(problem)
+    counted = _counted(exact)
     found = _Place(solution.T_cam_obj.detach().double(), solution.from_prior.detach().double()[:, 6:])
-    optimum = _optimum(exact, found, config)
-    step, _ = newton_step(exact, optimum.T_cam_obj, optimum.further, config.loss)
+    optimum = _optimum(counted, found, config)
+    step, _ = newton_step(exact, optimum.T_cam_obj, optimum.further, config.loss, counted)
     step = torch.where(torch.isfinite(solution.gradient), step, 0)
     T_cam_obj, from_prior = found.moved(step - step.detach(), exact)
     followed = (from_prior - from_prior.detach()).to(solution.from_prior.dtype)
@@ -59,12 +60,13 @@ def with_gradient(problem: PoseProblem, solution: Linearisation, config: SolverC
 
 
 def newton_step(
-    problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], further: Float[Tensor, "b f"], loss: str
+    problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], further: Float[Tensor, "b f"], loss: str, bent_by: PoseProblem | None = None
 ) -> tuple[Float[Tensor, "b k"], Bool[Tensor, "b"]]:
     """One Newton step from a place, of which the gradient is recorded and the exact Hessian is not; zero where it is not one.
 
     Args:
         further: offset from the prior of what is unknown beside the pose; of no width without.
+        bent_by: the same problem where it has fewer rows, for the Hessian.
 
     Returns:
         The step in the solver's chart, and where the Hessian is positive definite.
@@ -73,7 +75,7 @@ def newton_step(
     nothing = torch.zeros_like(problem.prior_information[..., 0])
     gradient = _gradient_of(problem, place, loss)
     with torch.no_grad():
-        hessian = _rows_of_hessian(gradient, nothing)
+        hessian = _rows_of_hessian(_gradient_of(bent_by or problem, place, loss), nothing)
     step, good = solve_positive(hessian, -gradient(nothing)[..., None])
     return step.squeeze(-1), good
 
@@ -124,3 +126,17 @@ def _in_double(problem: PoseProblem) -> PoseProblem:
 
     window = None if problem.window is None else WindowTerms(**double(problem.window))
     return PoseProblem(**double(problem), window=window)
+
+
+@torch.no_grad()
+def _counted(problem: PoseProblem) -> PoseProblem:
+    """The problem with those observations alone that have a weight, as a constant: the rest neither draws nor bends."""
+    most = int((problem.weights != 0).sum(-1).max())
+    rows = problem.weights.abs().topk(max(most, 1)).indices
+
+    def of_rows(part: PoseProblem | WindowTerms, names: tuple[str, ...]) -> dict[str, Tensor]:
+        values = {name: getattr(part, name) for name in names}
+        return {name: torch.take_along_dim(value, rows if value.dim() == 2 else rows[..., None], 1) for name, value in values.items()}
+
+    window = None if problem.window is None else replace(problem.window, **of_rows(problem.window, ("age_s", "outward")))
+    return replace(problem, **of_rows(problem, ("points_obj", "targets", "directions", "weights")), window=window)
