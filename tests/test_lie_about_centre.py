@@ -109,3 +109,8 @@ def test_cayley_gives_rotations_that_agree_with_exp_to_second_order(batch, dtype
         rotation = lie.cayley(angle * phi)
         assert far_from(rotation @ rotation.transpose(-1, -2), eye) < 5 * TOLERANCE[dtype]
         assert far_from(rotation, lie.so3_exp(angle * phi)) <= angle**3 / 6 + TOLERANCE[dtype]
+
+
+def test_turning_a_rotation_is_the_product_with_cayleys(dtype):
+    rotation, phi = random_pose(5).to(dtype)[:, :3, :3], random_twist(5, rotation_rad=1.0, translation_m=1.0).to(dtype)[:, :3]
+    torch.testing.assert_close(lie.turned(rotation, phi), lie.cayley(phi) @ rotation)

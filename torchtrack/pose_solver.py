@@ -1,11 +1,12 @@
 """From matches to the pose: batched Levenberg-Marquardt on SE(3) (Eq. 12-17). The one solver loop of the package.
 
 The unknown of each object is a rotation about its centre and a move of its centre, in the camera's axes
-(:func:`torchtrack.lie.move_about`). The step is ``Δξ = -(JᵀWJ + Λ + λD)⁻¹ (JᵀWr + Λδ)``: the minus signs of the
+(:func:`torchtrack.lie.turned`). The step is ``Δξ = -(JᵀWJ + Λ + λD)⁻¹ (JᵀWr + Λδ)``: the minus signs of the
 paper's Eq. 16 and 17 cancel, which cannot be meant.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,10 +14,12 @@ from torch import Tensor
 
 from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.lie import cayley, move_about, small_difference_about
+from torchtrack.lie import small_difference_about, turned
 
 # Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
 _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
+# A cost, which is a long sum, is known to this many units of rounding.
+_ROUNDINGS = 8
 
 
 @dataclass(frozen=True)
@@ -117,11 +120,11 @@ def _inside(residuals: Tensor, c: Tensor) -> Tensor:
 class _Rows:
     """A problem laid out for speed: a row per component, so that every operation runs along contiguous observations.
 
-    ``slope`` is the direction times the focal lengths, ``offset`` the target's place along the direction: the residual
-    is ``slope · (x/z, y/z) - offset``.
+    ``arms`` are the points as seen from the object's centre, ``slope`` is the direction times the focal lengths, and
+    ``offset`` the target's place along the direction: the residual is ``slope · (x/z, y/z) - offset``.
     """
 
-    points: Float[Tensor, "b 3 n"]
+    arms: Float[Tensor, "b 3 n"]
     slope: Float[Tensor, "b 2 n"]
     offset: Float[Tensor, "b n"]
 
@@ -131,21 +134,45 @@ def _as_rows(problem: PoseProblem) -> _Rows:
     directions = problem.directions.transpose(1, 2)
     focal, principal = problem.intrinsics[:, :2, None], problem.intrinsics[:, 2:, None]
     offset = ((problem.targets.transpose(1, 2) - principal) * directions).sum(1)
-    return _Rows(problem.points_obj.transpose(1, 2).contiguous(), directions * focal, offset)
+    arms = (problem.points_obj.transpose(1, 2) - problem.centre_obj[..., None]).contiguous()
+    return _Rows(arms, directions * focal, offset)
 
 
-def pose_jacobian(
-    points_cam: Float[Tensor, "b 3 n"], centre_cam: Float[Tensor, "b 3"], gradient: tuple[Float[Tensor, "b n"], ...]
-) -> Float[Tensor, "b 6 n"]:
-    """Columns ``[(P - c) × g, g]`` with ``g = dπᵀ n``: the paper's Eq. 15 as one vector product.
+@dataclass(frozen=True)
+class _Place:
+    """A place in the space of unknowns: the pose as a rotation and the place of the centre, and the offset from the prior."""
 
-    Written out: along this axis the library's vector product takes five times as long.
+    rotation: Float[Tensor, "b 3 3"]
+    centre_cam: Float[Tensor, "b 3 1"]
+    from_prior: Float[Tensor, "b k"]
+
+    @classmethod
+    def of(cls, problem: PoseProblem, T_cam_obj: Tensor, from_prior: Tensor) -> "_Place":
+        """The place of a pose."""
+        rotation = T_cam_obj[:, :3, :3]
+        return cls(rotation, torch.baddbmm(T_cam_obj[:, :3, 3:], rotation, problem.centre_obj[..., None]), from_prior)
+
+    def moved(self, step: Float[Tensor, "b k"]) -> "_Place":
+        """The place that a step leads to: steps add up to the offset from the prior, to second order."""
+        return _Place(turned(self.rotation, step[:, :3]), self.centre_cam + step[:, 3:6, None], self.from_prior + step)
+
+    def pose(self, problem: PoseProblem) -> Float[Tensor, "b 4 4"]:
+        """The pose as a matrix."""
+        translation = torch.baddbmm(self.centre_cam, self.rotation, problem.centre_obj[..., None], alpha=-1)
+        return torch.cat([torch.cat([self.rotation, translation], 2), problem.T_prior[:, 3:]], 1)
+
+
+def pose_jacobian(arms: Float[Tensor, "b 3 n"], gradient: tuple[Float[Tensor, "b n"], ...]) -> Float[Tensor, "b 6 n"]:
+    """Columns ``[(P - c) × g, g]`` with ``g = dπᵀ n``: the paper's Eq. 15 as one vector product, about the object's centre.
+
+    Args:
+        arms: from the centre to the points, in the camera's axes: ``P - c``.
+        gradient: ``g``, by component.
     """
-    arm = points_cam - centre_cam[:, :, None]
     gx, gy, gz = gradient
-    # Repeated, so that the components one and two further on are rows too.
-    arm, gradients = torch.cat([arm, arm], 1), torch.stack([gx, gy, gz, gx, gy], 1)
-    turning = torch.addcmul(arm[:, 1:4] * gradients[:, 2:], arm[:, 2:5], gradients[:, 1:4], value=-1)
+    # Repeated, so that the components one and two further on are rows too: the library's vector product takes five times as long.
+    arms, gradients = torch.cat([arms, arms], 1), torch.stack([gx, gy, gz, gx, gy], 1)
+    turning = torch.addcmul(arms[:, 1:4] * gradients[:, 2:], arms[:, 2:5], gradients[:, 1:4], value=-1)
     return torch.cat([turning, gradients[:, :3]], 1)
 
 
@@ -157,33 +184,33 @@ class _Seen:
     jacobian: Tensor
 
 
-def _see(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor) -> _Seen:
+def _see(problem: PoseProblem, rows: _Rows, place: _Place) -> _Seen:
     """Project the matched points, and take residuals and gradients ``g = dπᵀ n`` of them."""
-    rotation, translation = T_cam_obj[:, :3, :3], T_cam_obj[:, :3, 3:]
-    points_cam = torch.baddbmm(translation, rotation, rows.points)
-    inverse_depth = points_cam[:, 2].clamp(min=MIN_DEPTH_M).reciprocal()
+    arms = torch.bmm(place.rotation, rows.arms)
+    x, y, z = (arms + place.centre_cam).unbind(1)
+    inverse_depth = z.clamp(min=MIN_DEPTH_M).reciprocal()
     gx, gy = (rows.slope * inverse_depth[:, None]).unbind(1)
-    along = torch.addcmul(gx * points_cam[:, 0], gy, points_cam[:, 1])
-    centre_cam = torch.baddbmm(translation, rotation, problem.centre_obj[..., None])[..., 0]
-    jacobian = pose_jacobian(points_cam, centre_cam, (gx, gy, along * -inverse_depth))
+    along = torch.addcmul(gx * x, gy, y)
+    jacobian = pose_jacobian(arms, (gx, gy, along * -inverse_depth))
     if problem.window is None:
         return _Seen(along - rows.offset, jacobian)
     jacobian = torch.cat([jacobian, jacobian * -problem.window.age_s[:, None], problem.window.outward[:, None]], 1)
     # Linear in all that is unknown beside the pose; the targets have been moved with one velocity already.
-    residuals = torch.baddbmm((along - rows.offset)[:, None], from_prior[:, None, 6:], jacobian[:, 6:])
+    residuals = torch.baddbmm((along - rows.offset)[:, None], place.from_prior[:, None, 6:], jacobian[:, 6:])
     residuals = torch.baddbmm(residuals, problem.window.velocity[:, None], jacobian[:, 6:12], alpha=-1)
     return _Seen(residuals[:, 0], jacobian)
 
 
 def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
     """Gradient and Gauss-Newton Hessian of the cost of ``problem`` at a pose."""
-    from_prior = _from_prior(problem, T_cam_obj)
-    return _linearise(problem, _see(problem, _as_rows(problem), T_cam_obj, from_prior), T_cam_obj, from_prior, loss)
+    place = _Place.of(problem, T_cam_obj, _from_prior(problem, T_cam_obj))
+    gradient, hessian = _normal_equations(problem, _see(problem, _as_rows(problem), place), place.from_prior, loss)
+    return Linearisation(T_cam_obj, gradient, hessian, place.from_prior)
 
 
 def robust_cost(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], from_prior: Float[Tensor, "b k"], loss: str) -> Float[Tensor, "b"]:
     """Robust cost of ``problem`` at a pose, and at an offset of all unknowns from the prior (Eq. 12)."""
-    return _cost(problem, _see(problem, _as_rows(problem), T_cam_obj, from_prior), from_prior, loss)
+    return _cost(problem, _see(problem, _as_rows(problem), _Place.of(problem, T_cam_obj, from_prior)), from_prior, loss)
 
 
 def _from_prior(problem: PoseProblem, T_cam_obj: Tensor) -> Tensor:
@@ -199,14 +226,13 @@ def _cost(problem: PoseProblem, seen: _Seen, from_prior: Tensor, loss: str) -> T
     return (value * problem.weights).sum(-1) + 0.5 * (from_prior * pull).sum(-1)
 
 
-def _linearise(problem: PoseProblem, seen: _Seen, T_cam_obj: Tensor, from_prior: Tensor, loss: str) -> Linearisation:
-    """:func:`linearise`, given what is seen at the pose."""
+def _normal_equations(problem: PoseProblem, seen: _Seen, from_prior: Tensor, loss: str) -> tuple[Tensor, Tensor]:
+    """Gradient of the cost, and its Gauss-Newton Hessian."""
     weights = robust_weight(seen.residuals, problem.scale_px, loss) * problem.weights
     weighted = seen.jacobian * weights[:, None]
     pull = problem.prior_information @ from_prior[..., None]
     gradient = torch.baddbmm(pull, weighted, seen.residuals[..., None])[..., 0]
-    hessian = torch.baddbmm(problem.prior_information, weighted, seen.jacobian.transpose(1, 2))
-    return Linearisation(T_cam_obj, gradient, hessian, from_prior)
+    return gradient, torch.baddbmm(problem.prior_information, weighted, seen.jacobian.transpose(1, 2))
 
 
 def solve_positive(matrix: Float[Tensor, "b n n"], right: Float[Tensor, "b n k"]) -> tuple[Float[Tensor, "b n k"], Bool[Tensor, "b"]]:
@@ -226,13 +252,14 @@ def solve_positive(matrix: Float[Tensor, "b n n"], right: Float[Tensor, "b n k"]
     return torch.where(good[:, None, None], solution, 0), good
 
 
-def _damped_step(at: Linearisation, damping: Tensor) -> Tensor:
+def _damped_step(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
     """The Levenberg-Marquardt step, damped along the Hessian's diagonal."""
-    diagonal = at.hessian.diagonal(dim1=-2, dim2=-1)
+    diagonal = hessian.diagonal(dim1=-2, dim2=-1)
     # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is.
     floor = 1e-9 * diagonal[:, :6].amax(-1, keepdim=True) + 1e-12
-    damped = at.hessian + torch.diag_embed(torch.addcmul(floor, diagonal, damping[:, None]))
-    return -solve_positive(damped, at.gradient[..., None])[0][..., 0]
+    damped = hessian.clone()
+    damped.diagonal(dim1=-2, dim2=-1).add_(torch.addcmul(floor, diagonal, damping[:, None]))
+    return -solve_positive(damped, gradient[..., None])[0][..., 0]
 
 
 @torch.no_grad()
@@ -257,30 +284,27 @@ def solve_pose(
     if from_prior is None:
         from_prior = _from_prior(problem, T_start)
     damping = torch.full_like(problem.scale_px, config.damping)
-    at, cost = _look(problem, rows, T_start, from_prior, config)
+    place = _Place.of(problem, T_start, from_prior)
+    equations, cost = _look(problem, rows, place, config)
     for _ in range(config.iterations - 1):
-        next_at, next_cost = _look(problem, rows, *_moved(problem, at, damping), config)
-        better = next_cost <= cost
-        at, cost = _choose(better, next_at, at), torch.where(better, next_cost, cost)
+        next_place = place.moved(_damped_step(*equations, damping))
+        next_equations, next_cost = _look(problem, rows, next_place, config)
+        # Near the optimum, rounding must not decide.
+        better = next_cost <= cost * (1 + _ROUNDINGS * torch.finfo(cost.dtype).eps)
+        place = _Place(*_choose(better, vars(next_place).values(), vars(place).values()))
+        *equations, cost = _choose(better, (*next_equations, next_cost), (*equations, cost))
         damping = torch.where(better, damping * _DAMPING_DECAY, damping.clamp(min=_DAMPING_START) * _DAMPING_GROWTH)
-    T_cam_obj, from_prior = _moved(problem, at, damping)
-    return replace(at, T_cam_obj=T_cam_obj, from_prior=from_prior)
+    found = place.moved(_damped_step(*equations, damping))
+    return Linearisation(found.pose(problem), *equations, found.from_prior)
 
 
-def _look(problem: PoseProblem, rows: _Rows, T_cam_obj: Tensor, from_prior: Tensor, config: SolverConfig) -> tuple[Linearisation, Tensor]:
-    """The problem at a pose, and its cost there, where a step is going to be judged by it."""
-    seen = _see(problem, rows, T_cam_obj, from_prior)
-    cost = _cost(problem, seen, from_prior, config.loss) if config.iterations > 1 else problem.scale_px
-    return _linearise(problem, seen, T_cam_obj, from_prior, config.loss), cost
+def _look(problem: PoseProblem, rows: _Rows, place: _Place, config: SolverConfig) -> tuple[Sequence[Tensor], Tensor]:
+    """The normal equations at a place, and the cost there, where a step is going to be judged by it."""
+    seen = _see(problem, rows, place)
+    cost = _cost(problem, seen, place.from_prior, config.loss) if config.iterations > 1 else problem.scale_px
+    return _normal_equations(problem, seen, place.from_prior, config.loss), cost
 
 
-def _moved(problem: PoseProblem, at: Linearisation, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """The pose that a step leads to, and its offset from the prior: steps add up, to second order."""
-    step = _damped_step(at, damping)
-    return move_about(at.T_cam_obj, cayley(step[:, :3]), step[:, 3:6], problem.centre_obj), at.from_prior + step
-
-
-def _choose(first: Tensor, of_first: Linearisation, of_second: Linearisation) -> Linearisation:
-    """One of two linearisations for each object."""
-    pairs = zip(vars(of_first).values(), vars(of_second).values(), strict=True)
-    return Linearisation(*(torch.where(first.view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in pairs))
+def _choose(first: Tensor, of_first: Iterable[Tensor], of_second: Iterable[Tensor]) -> list[Tensor]:
+    """One of two values for each object."""
+    return [torch.where(first.view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in zip(of_first, of_second, strict=True)]

@@ -84,6 +84,6 @@ class Prediction:
         inverse_depth = points[..., 2].clamp(min=MIN_DEPTH_M).reciprocal()
         slope = normals * self.objects.intrinsics[:, None, :2] * inverse_depth[..., None]
         along = -(slope * points[..., :2]).sum(-1) * inverse_depth
-        jacobian = pose_jacobian(points.transpose(1, 2), self.centre_cam, (*slope.unbind(-1), along))
+        jacobian = pose_jacobian((points - self.centre_cam[:, None]).transpose(1, 2), (*slope.unbind(-1), along))
         variance = (jacobian * (self.covariance[:, :6, :6].to(jacobian.dtype) @ jacobian)).sum(1)
         return ((variance * mask).sum(-1) / mask.sum(-1).clamp(min=1)).sqrt()
