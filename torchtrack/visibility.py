@@ -4,7 +4,7 @@ A model of few faces is tested against each of them, exactly: a coarse buffer wo
 objects show when they turn. Dense meshes, and objects in front of one another, share one depth buffer per stream.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -21,6 +21,8 @@ _ON_FACE = 2e-3
 # Depths are compared in whole micrometres, with the object's number in the low bits.
 _DEPTH_STEPS_PER_M, _OBJECT_BITS = 1e6, 20
 _NOTHING = 2**62
+# So many surface samples for each cell of the square around an object leave no holes: its outline fills half of it, seen from both sides.
+_SAMPLES_PER_CELL = 8
 
 
 @dataclass(frozen=True)
@@ -88,17 +90,34 @@ def depth_buffer(scene: Scene, cell_px: int) -> tuple[Float[Tensor, "s p"], Int[
     grid = (-(-height // cell_px) + 3, -(-width // cell_px) + 3)
     cells, keys = [], []
     for model in scene.models:
-        members = model.members
-        points = transform_points(scene.T_cam_obj[members], model.surface_points.expand(len(members), -1, -1))
-        cell = _cell(project(points, scene.intrinsics[members]), grid, cell_px)
-        depth = (points[..., 2] * _DEPTH_STEPS_PER_M).long()
-        key = (depth << _OBJECT_BITS) + members[:, None]
-        cells.append((cell + scene.stream_index[members, None] * (grid[0] * grid[1])).flatten())
-        keys.append(torch.where(points[..., 2] > MIN_DEPTH_M, key, _NOTHING).flatten())
+        for members, samples in _samples(model, scene, cell_px):
+            points = transform_points(scene.T_cam_obj[members], samples.expand(len(members), -1, -1))
+            cell = _cell(project(points, scene.intrinsics[members]), grid, cell_px)
+            depth = (points[..., 2] * _DEPTH_STEPS_PER_M).long()
+            key = (depth << _OBJECT_BITS) + members[:, None]
+            cells.append((cell + scene.stream_index[members, None] * (grid[0] * grid[1])).flatten())
+            keys.append(torch.where(points[..., 2] > MIN_DEPTH_M, key, _NOTHING).flatten())
     buffer = torch.full((streams * grid[0] * grid[1],), _NOTHING, device=scene.T_cam_obj.device)
     nearest = buffer.scatter_reduce(0, torch.cat(cells), torch.cat(keys), "amin").view(streams, -1)
     depth_m = (nearest >> _OBJECT_BITS).to(scene.T_cam_obj.dtype) / _DEPTH_STEPS_PER_M
     return depth_m, nearest & ((1 << _OBJECT_BITS) - 1), grid
+
+
+def _samples(model: ContourModel, scene: Scene, cell_px: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """The objects that have a model, and its surface samples: every second, fourth and so on for those that are small in the image.
+
+    On a GPU, which would have to be waited for to know their sizes, all samples are taken.
+    """
+    members, points = model.members, model.surface_points
+    if points.device.type != "cpu" or len(points) == 0:
+        yield members, points
+        return
+    depth_m = scene.T_cam_obj[members, 2, 3].clamp(min=MIN_DEPTH_M)
+    size_cells = scene.diameters_m[members] * scene.intrinsics[members, 0] / depth_m / cell_px
+    spare = len(points) / (_SAMPLES_PER_CELL * size_cells.square()).clamp(min=1)
+    halvings = spare.log2().long().clamp(min=0)
+    for times in sorted(set(halvings.tolist())):
+        yield members[halvings == times], points[:: 2**times]
 
 
 def _cell(pixels: Tensor, grid: tuple[int, int], cell_px: int) -> Tensor:
