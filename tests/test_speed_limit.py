@@ -26,10 +26,12 @@ def test_unknown_speed_is_that_of_the_rim():
     torch.testing.assert_close(unknown_speed(COVARIANCE, DIAMETER_M), torch.full((2,), 0.6 * 2**0.5, dtype=torch.float64))
 
 
-def test_a_limit_scales_the_velocity_alone():
-    limited = limit_speed(COVARIANCE, torch.tensor([0.1, torch.inf]), DIAMETER_M)
-    torch.testing.assert_close(unknown_speed(limited, DIAMETER_M), torch.tensor([0.1, 0.6 * 2**0.5], dtype=torch.float64))
-    assert torch.equal(limited[:, :6, :6], COVARIANCE[:, :6, :6])
+def test_a_limit_is_on_what_moves_across_the_image():
+    limited = limit_speed(COVARIANCE, torch.tensor([0.06 * 2**0.5, torch.inf]), DIAMETER_M, torch.tensor([0.5, 0.5]))
+    share = (limited / COVARIANCE.where(COVARIANCE != 0, torch.inf))[0].diagonal().sqrt()
+    # Along the line of sight, five times as much for an object five times as far away as its half width.
+    expected = torch.tensor([1.0] * 6 + [0.1] * 5 + [0.5], dtype=torch.float64)
+    torch.testing.assert_close(share, expected, rtol=1e-5, atol=0)
     assert torch.equal(limited[1], COVARIANCE[1])
     assert bool((torch.linalg.eigvalsh(limited) > 0).all())
 
@@ -54,4 +56,4 @@ def test_an_object_that_has_not_been_found_is_held_back(held_back):
     tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(motion=MotionConfig(speed_from_events=held_back)))
     few = events[torch.arange(len(events)) % 20 == 0]
     state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(few, 1))
-    assert (float(unknown_speed(state.covariance, tracker.diameter_m)) < 0.3) == held_back
+    assert (float(state.covariance[0, 9, 9].sqrt()) < 0.3) == held_back

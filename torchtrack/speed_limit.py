@@ -19,10 +19,16 @@ def unknown_speed(covariance: Float[Tensor, "b 12 12"], diameter_m: Float[Tensor
     return (moving + turning * (0.5 * diameter_m).square()).sqrt()
 
 
-def limit_speed(covariance: Float[Tensor, "b 12 12"], limit_m_s: Float[Tensor, "b"], diameter_m: Float[Tensor, "b"]) -> Float[Tensor, "b 12 12"]:
-    """Covariance where the speed of an object's rim is known to be no larger than a limit (float64)."""
-    scale = (limit_m_s.double() / unknown_speed(covariance, diameter_m)).clamp(max=1)[:, None]
-    both = torch.cat([torch.ones_like(scale).expand(-1, 6), scale.expand(-1, 6)], -1)
+def limit_speed(
+    covariance: Float[Tensor, "b 12 12"], limit_m_s: Float[Tensor, "b"], diameter_m: Float[Tensor, "b"], depth_m: Float[Tensor, "b"]
+) -> Float[Tensor, "b 12 12"]:
+    """Covariance where the speed of an object's rim across the image is known to be no larger than a limit (float64).
+
+    A motion along the line of sight moves the rim in the image by so much less as the object is farther away than wide.
+    """
+    scale = limit_m_s.double() / unknown_speed(covariance, diameter_m)
+    along = scale * 2 * depth_m / diameter_m
+    both = torch.stack([torch.ones_like(scale)] * 6 + [scale] * 5 + [along], -1).clamp(max=1)
     return covariance * both[:, :, None] * both[:, None]
 
 

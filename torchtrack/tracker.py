@@ -272,7 +272,8 @@ class Tracker(nn.Module):
         T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)
         limit_m_s = largest_speed(self.objects, T_cam_obj, seen, window_s[self.stream_index])
         limit_m_s = torch.where(state.usual_share > 0, torch.inf, limit_m_s)
-        return replace(state, covariance=limit_speed(state.covariance, limit_m_s, self.diameter_m))
+        depth_m = lie.transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
+        return replace(state, covariance=limit_speed(state.covariance, limit_m_s, self.diameter_m, depth_m))
 
     def _before_camera(self, T_cam_obj: Tensor) -> tuple[Tensor, Tensor]:
         """The poses with a harmless one in the place of those that are not finite or not before the camera, and which are."""
