@@ -35,6 +35,7 @@ class ContourKind(IntEnum):
     TEXTURE = 2
     SEGMENT = 3
     SPLAT = 4
+    LEARNED = 5
 
 
 @dataclass(frozen=True)
@@ -248,6 +249,11 @@ def reproject(contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics:
     """The same contour points seen from a pose nearby: normals are kept, which turn far less than points move."""
     points_cam = transform_points(T_cam_obj, contours.points_obj)
     return replace(contours, points_cam=points_cam, pixels=project(points_cam, intrinsics))
+
+
+def joined(first: Contours, second: Contours) -> Contours:
+    """Contours of both, for each object."""
+    return Contours(*(torch.cat([getattr(first, name), getattr(second, name)], 1) for name in vars(first)))
 
 
 def mesh_contours(

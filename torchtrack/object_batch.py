@@ -5,13 +5,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import ContourModel, Contours, mesh_contours
+from torchtrack.contours import ContourKind, ContourModel, Contours, assemble, joined, mesh_contours
 from torchtrack.splat import splat_contours
 from torchtrack.visibility import Scene, remove_hidden
+
+
+@dataclass(frozen=True)
+class LearnedPoints:
+    """Contour points that were learned on the surface of each object.
+
+    Args:
+        points_obj: the points (m).
+        tangents_obj: unit directions of the contour there.
+        mask: which of them count.
+    """
+
+    points_obj: Float[Tensor, "b n 3"]
+    tangents_obj: Float[Tensor, "b n 3"]
+    mask: Bool[Tensor, "b n"]
+
+    def contours(self, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
+        """The points as contours at given poses, hidden ones included."""
+        kind = torch.full(self.mask.shape, int(ContourKind.LEARNED), device=self.mask.device)
+        return assemble(self.points_obj, self.tangents_obj, kind, self.mask, T_cam_obj, intrinsics)
 
 
 @dataclass(frozen=True)
@@ -26,6 +46,7 @@ class ObjectBatch:
         stream_index: the stream that each object is seen in.
         image_shape: streams, height and width of the image.
         shared: whether any stream has more than one object.
+        learned: contour points beside those of the models; none when not given.
     """
 
     models: Sequence[ContourModel]
@@ -35,6 +56,7 @@ class ObjectBatch:
     stream_index: Int[Tensor, "b"]
     image_shape: tuple[int, int, int]
     shared: bool
+    learned: LearnedPoints | None = None
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -46,6 +68,12 @@ class ObjectBatch:
         if config.source == "splat":
             return splat_contours(self.models, T_cam_obj, self.intrinsics, config)
         contours = mesh_contours(self.models, T_cam_obj, self.intrinsics, config)
+        if self.learned is not None:
+            contours = joined(contours, self.learned.contours(T_cam_obj, self.intrinsics))
+        return self.visible(contours, T_cam_obj, config)
+
+    def visible(self, contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], config: ContourConfig) -> Contours:
+        """Contours without their hidden parts, where these are to be removed."""
         if not config.remove_hidden:
             return contours
         scene = Scene(self.models, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, self.image_shape, self.shared)
@@ -59,7 +87,8 @@ class ObjectBatch:
         model = copy.copy(has_it)
         model._buffers = {**has_it._buffers, "members": streams}
         intrinsics, centre_obj, diameter_m = (repeat_row(value, number, count) for value in (self.intrinsics, self.centre_obj, self.diameter_m))
-        return ObjectBatch([model], intrinsics, centre_obj, diameter_m, streams, (count, *self.image_size), False)
+        learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))
+        return ObjectBatch([model], intrinsics, centre_obj, diameter_m, streams, (count, *self.image_size), False, learned)
 
 
 def repeat_row(values: Tensor, number: int, count: int) -> Tensor:

@@ -10,7 +10,8 @@ from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import select_ranked, take_points
 from torchtrack.corners import Corners
 
-_GOLDEN_RATIO = 0.6180339887498949
+# Multiples of it fill the unit interval evenly.
+GOLDEN_RATIO = 0.6180339887498949
 # Lots are drawn for a little less than what there is room for, as their number varies.
 _FILL = 0.95
 
@@ -78,7 +79,7 @@ def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Flo
     near = mask & (index.look_up(torch.addcmul(pixels, plane_velocity, events.age_s[..., None])) >= 0)
     number = torch.arange(mask.shape[1], device=mask.device, dtype=torch.float64)
     # Multiples of the golden ratio fill the unit interval evenly, whichever stretch of them is taken.
-    lot = (number * _GOLDEN_RATIO).frac()
+    lot = (number * GOLDEN_RATIO).frac()
     total = near.sum(-1, keepdim=True)
     share = torch.where(total > count, _FILL * count / total, 1.0)
     chosen, exists = select_ranked(near & (lot < share), count)

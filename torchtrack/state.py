@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchtrack.contours import Contours
 from torchtrack.corners import Corners
+from torchtrack.learned_contours import LearnedContours
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class TrackerState:
         usual_share: its running mean.
         t_us: end of the last window of each stream (µs).
         last_event_us: time of the newest event of every sensor pixel (µs).
+        learned: contours learned on the objects; none where that is switched off.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]
@@ -33,6 +35,7 @@ class TrackerState:
     usual_share: Float[Tensor, "b"]
     t_us: Int[Tensor, "s"]
     last_event_us: Int[Tensor, "s h w"]
+    learned: LearnedContours | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,8 @@ def joined(states: Sequence[TrackerState]) -> TrackerState:
 def _mapped(of_objects: Callable[..., Tensor], of_streams: Callable[..., Tensor], *values: Any) -> Any:
     """A dataclass with its tensors made from those of others of its kind: what belongs to objects, and what belongs to streams."""
     if not is_dataclass(values[0]):
-        return of_objects(*values)
+        # What is switched off, or a mere number, is the same for all.
+        return of_objects(*values) if torch.is_tensor(values[0]) else values[0]
     kind: Any = type(values[0])
     made = {}
     for field in fields(kind):

@@ -20,6 +20,7 @@ from torchtrack.errors import ModelError, PoseError
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import AgeAt, Evidence, judged
 from torchtrack.flow import estimate_flow
+from torchtrack.learned_contours import LearnedContours, judge_model
 from torchtrack.motion import fade, initial_covariance, inverse, left_covariance, predict_covariance, with_dropped
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
@@ -27,7 +28,9 @@ from torchtrack.observations import WindowEvents, corner_observations, join, sel
 from torchtrack.pose_solver import Linearisation
 from torchtrack.prediction import Prediction
 from torchtrack.search import Found, judge_fit, search, wanted
+from torchtrack.speed_limit import largest_speed, limit_speed, unknown_speed
 from torchtrack.state import StepResult, TrackerState, choose_rows
+from torchtrack.surface_learning import Surroundings, learn
 from torchtrack.time_surface import at_pixels, empty_last_event, object_regions, time_surface, update_last_event
 from torchtrack.trust import TrustNetwork
 
@@ -90,6 +93,8 @@ class Tracker(nn.Module):
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
         self.register_buffer("far_pose", _far_pose(self.centre_obj))
         self.weigher = TrustNetwork.shipped() if weigher is None and self.config.matching.learned_trust else weigher
+        # On dense meshes no line of sight is followed.
+        self._learns = any(len(model.triangles) for model in self.models)
         self.to(dtype)
 
     @property
@@ -132,7 +137,9 @@ class Tracker(nn.Module):
         covariance = initial_covariance(self.diameter_m, self.config.motion)
         nothing = torch.zeros_like(self.diameter_m)
         last_event_us = empty_last_event(self.streams, *self.image_size, device=T_cam_obj.device)
-        return TrackerState(T_cam_obj.clone(), velocity, covariance, nothing, nothing, times, last_event_us)
+        learning = self.config.learning
+        learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
+        return TrackerState(T_cam_obj.clone(), velocity, covariance, nothing, nothing, times, last_event_us, learned)
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """:meth:`step`, as a layer of a network: what comes in first."""
@@ -154,9 +161,11 @@ class Tracker(nn.Module):
         with torch.autocast(t_us.device.type, enabled=False):
             in_parts = self._to_be_parted(state, events, t_us)
             if bool(in_parts.all()):
-                return self._advance_in_parts(state, events, t_us)
-            whole = self._advance(state, events, t_us)
-            return choose_rows(in_parts, self._advance_in_parts(state, events, t_us), whole) if bool(in_parts.any()) else whole
+                done = self._advance_in_parts(state, events, t_us)
+            else:
+                done = self._advance(state, events, t_us)
+                done = choose_rows(in_parts, self._advance_in_parts(state, events, t_us), done) if bool(in_parts.any()) else done
+            return _counted(done)
 
     def _to_be_parted(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> Tensor:
         """Objects whose window is taken in parts: while a large part of their motion within it is not known.
@@ -167,8 +176,7 @@ class Tracker(nn.Module):
         window = self.config.window
         if window.parts == 1 or not self.config.solver.prior or len(events) < window.parts * _EVENTS_OF_A_PART:
             return torch.zeros_like(self.stream_index, dtype=torch.bool)
-        variance = state.covariance.diagonal(dim1=-2, dim2=-1)[:, 6:].to(self.intrinsics.dtype).unflatten(-1, (2, 3)).mean(-1)
-        unknown_m_s = (variance[:, 1] + variance[:, 0] * (0.5 * self.diameter_m).square()).sqrt()
+        unknown_m_s = unknown_speed(state.covariance, self.diameter_m).to(self.intrinsics.dtype)
         depth_m = lie.transform_points(state.T_cam_obj.to(unknown_m_s.dtype), self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
         window_s = ((t_us - state.t_us) * 1e-6)[self.stream_index]
         unknown_px = unknown_m_s * window_s * self.intrinsics[:, 0] / depth_m
@@ -189,14 +197,14 @@ class Tracker(nn.Module):
         config = self.config
         window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
         last_event_us = update_last_event(state.last_event_us, events) if self._looks_back else state.last_event_us
-        recorded = self._predict(state, window_s)
+        seen = self._seen(events, t_us)
+        recorded = self._predict(self._held_back(state, seen, window_s), window_s)
         prediction = recorded.detached()
-        contours = self._extract(prediction.T_cam_obj)
+        contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         corners = self._corners(contours, last_event_us, t_us, window_s)
         sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
         widening = gate_widening(sigma_px, config)
         index = index_for(contours, self.image_size, config, widening)
-        seen = self._seen(events, t_us)
         observations = corner_observations(corners)
         if config.matching.max_events:
             near = select_events(seen, index, prediction.plane_velocity(seen.pixels), config.matching.max_events)
@@ -207,7 +215,32 @@ class Tracker(nn.Module):
         found = judge_fit(prediction, align(recorded, contours, index, widening, observations, config), config)
         found = self._search(state, recorded, sigma_px, seen, found)
         next_state, result = self._conclude(state, recorded, widening, found, corners, window_s)
+        if state.learned is not None and self._learns:
+            next_state = replace(next_state, learned=self._learn(state.learned, next_state, result, prediction, found, sigma_px, seen, window_s))
         return replace(next_state, t_us=t_us, last_event_us=last_event_us), replace(result, t_us=t_us)
+
+    @torch.no_grad()
+    def _learn(
+        self,
+        learned: LearnedContours,
+        now: TrackerState,
+        result: StepResult,
+        prediction: Prediction,
+        found: Found,
+        sigma_px: Tensor,
+        seen: WindowEvents,
+        window_s: Tensor,
+    ) -> LearnedContours:
+        """What is known after this window of contours that the models lack."""
+        config = self.config.learning
+        velocity = replace(prediction, velocity=now.velocity).contour_velocity(found.fit.contours)
+        learned = judge_model(learned, found, velocity, self.image_size, self.config)
+        if not learned.due(config):
+            return learned
+        trusted = (result.status <= int(quality.Status.UNCERTAIN)) & (sigma_px < config.max_sigma_px)
+        T_cam_obj = now.T_cam_obj.to(self.intrinsics.dtype)
+        around = Surroundings(prediction.objects, T_cam_obj, now.velocity, window_s[self.stream_index], result.contours, trusted)
+        return learn(learned, around, seen, self.config)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""
@@ -224,7 +257,23 @@ class Tracker(nn.Module):
         T_prior = lie.move_about(state.T_cam_obj.to(velocity.dtype), lie.cayley(moved[:, :3]), moved[:, 3:], self.centre_obj)
         covariance = predict_covariance(covariance.detach(), velocity.detach(), dt_s, self.diameter_m, self.config.motion)
         T_prior, usable = self._before_camera(T_prior)
-        return Prediction(self.objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance)
+        return Prediction(self._objects_with(state.learned), T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance)
+
+    def _objects_with(self, learned: LearnedContours | None) -> ObjectBatch:
+        """The objects, with the contours learned on them that count by now."""
+        if learned is None or not self._learns:
+            return self.objects
+        return replace(self.objects, learned=learned.that_count(self.config.learning))
+
+    def _held_back(self, state: TrackerState, seen: WindowEvents, window_s: Tensor) -> TrackerState:
+        """The state, with the speed of objects that were never found yet limited by the events before them."""
+        if not self.config.motion.speed_from_events:
+            return state
+        T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)
+        limit_m_s = largest_speed(self.objects, T_cam_obj, seen, window_s[self.stream_index])
+        limit_m_s = torch.where(state.usual_share > 0, torch.inf, limit_m_s)
+        depth_m = lie.transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
+        return replace(state, covariance=limit_speed(state.covariance, limit_m_s, self.diameter_m, depth_m))
 
     def _before_camera(self, T_cam_obj: Tensor) -> tuple[Tensor, Tensor]:
         """The poses with a harmless one in the place of those that are not finite or not before the camera, and which are."""
@@ -309,7 +358,7 @@ class Tracker(nn.Module):
         contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
         centre_cam = lie.transform_points(T_cam_obj, self.centre_obj[:, None].double())[:, 0]
         result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
-        return TrackerState(T_cam_obj, velocity, covariance, share, usual, state.t_us, state.last_event_us), result
+        return TrackerState(T_cam_obj, velocity, covariance, share, usual, state.t_us, state.last_event_us, state.learned), result
 
     def _updated_motion(
         self, state: TrackerState, prediction: Prediction, solution: Linearisation, failed: Tensor, share: Tensor, window_s: Tensor
@@ -333,6 +382,13 @@ def _far_pose(centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:
     poses = torch.eye(4, dtype=centre_obj.dtype).repeat(len(centre_obj), 1, 1)
     poses[:, :3, 3] = torch.tensor([0, 0, _MAX_DEPTH_M], dtype=centre_obj.dtype) - centre_obj
     return poses
+
+
+def _counted(done: tuple[TrackerState, StepResult]) -> tuple[TrackerState, StepResult]:
+    """A window more was taken, in parts or not."""
+    state, result = done
+    learned = None if state.learned is None else replace(state.learned, windows=state.learned.windows + 1)
+    return replace(state, learned=learned), result
 
 
 def _check_setup(objects: Sequence[ObjectModel], cameras: list[Camera], streams: list[int], config: TrackerConfig) -> None:

@@ -7,6 +7,7 @@ from torchtrack.config.tracker import (
     ContourConfig,
     CornerConfig,
     FlowConfig,
+    LearningConfig,
     MatchingConfig,
     MotionConfig,
     QualityConfig,
@@ -38,6 +39,7 @@ def _paper() -> TrackerConfig:
         ),
         solver=SolverConfig(iterations=5, loss="none", damping=1e-3, prior=False),
         motion=MotionConfig(model="hold", without_events="hold"),
+        learning=LearningConfig(points=0),
         quality=QualityConfig(min_observations=6, min_on_contour=1),
     )
 
@@ -49,6 +51,7 @@ def _lines(loss: Literal["tukey", "none"]) -> TrackerConfig:
         corners=CornerConfig(max_corners=0),
         matching=MatchingConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500),
         solver=SolverConfig(iterations=3, loss=loss, damping=1e-4, prior=False),
+        learning=LearningConfig(points=0),
     )
 
 
@@ -72,6 +75,7 @@ def _nns() -> TrackerConfig:
         corners=CornerConfig(max_corners=400, cell_px=5),
         matching=MatchingConfig(along_flow=False, residual="normal", gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False, polarity=False),
         solver=SolverConfig(iterations=2),
+        learning=LearningConfig(points=0),
         quality=QualityConfig(min_observations=10, min_on_contour=1),
     )
 

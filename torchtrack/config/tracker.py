@@ -128,10 +128,24 @@ class MotionConfig(Settings):
     model: Literal["constant_velocity", "hold"] = Field("constant_velocity", description="Carry the velocity on, or start from the last pose.")
     initial_shift: float = Field(0.005, gt=0, le=1, description="Standard deviation of the initial pose (diameters).")
     initial_speed_m_s: float = Field(0.6, gt=0, description="Standard deviation of the initial speed (m/s).")
+    speed_from_events: bool = Field(True, description="Few events before an object that has not been found yet: its speed cannot be large.")
     acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
     coast_s: float = Field(0.2, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
+
+
+class LearningConfig(Settings):
+    """Contours learned online on the surface of objects whose models have few faces: print that a model does not show."""
+
+    points: int = Field(512, ge=0, le=10_000, description="Learned contour points per object, at most; 0 switches learning off.")
+    events: int = Field(1000, ge=10, le=100_000, description="Events that are learned from in a window, per object.")
+    drafts: int = Field(4096, ge=16, le=100_000, description="Unexplained events that are kept until they make a contour, per object.")
+    trusted_from: float = Field(3.0, ge=1, le=10, description="Evidence from which a learned contour counts: about the windows that confirmed it.")
+    below_share: float = Field(0.6, ge=0, le=1, description="Learned contours count once the model's own explain less than this share of themselves.")
+    max_sigma_px: float = Field(2.0, gt=0, description="Nothing is learned while the standard deviation of the prediction is larger (px).")
+    first_windows: int = Field(20, ge=0, description="The first windows are all learned from.")
+    every: int = Field(10, ge=1, description="After them, one window of this many is.")
 
 
 class SearchConfig(Settings):
@@ -172,5 +186,6 @@ class TrackerConfig(Settings):
     matching: MatchingConfig = MatchingConfig()
     solver: SolverConfig = SolverConfig()
     motion: MotionConfig = MotionConfig()
+    learning: LearningConfig = LearningConfig()
     search: SearchConfig = SearchConfig()
     quality: QualityConfig = QualityConfig()

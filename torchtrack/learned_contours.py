@@ -1,0 +1,95 @@
+"""Contours that an object's model lacks, learned from its events: what is known of them, and whether they are needed.
+
+A border whose colour equals what lies behind it fires nothing, while print on the surface does. Without a contour for it,
+the events of print pull neighbouring contours onto themselves. :mod:`torchtrack.surface_learning` finds such contours.
+They count only for objects whose own contours turn out to explain little of what should be seen of them: what was learned
+holds the errors of the poses it was learned at, and a good model needs none of it.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack import quality
+from torchtrack.config.tracker import LearningConfig, TrackerConfig
+from torchtrack.contours import ContourKind
+from torchtrack.object_batch import LearnedPoints
+from torchtrack.search import Found
+
+# The model's share that is assumed at first, how fast it follows, and how much more of it ends the need of learned contours.
+_FIRST_SHARE, _SHARE_GAIN, _MORE_SHARE = 0.7, 0.2, 0.2
+# A start is in motion where contours are faster than this (px/s) in the first windows.
+_CALM_PX_S, _START_WINDOWS = 100.0, 2
+
+
+@dataclass(frozen=True)
+class LearnedContours:
+    """What was learned of each object.
+
+    Args:
+        drafts_obj: the last unexplained events on its surface, in its frame (m).
+        drafted: how many were ever written; they are written round and round.
+        points_obj: learned contour points (m).
+        tangents_obj: unit directions of the contour there.
+        evidence: how far each is confirmed; zero for none.
+        model_share: share of the model's own moving contours that events explain, its running mean.
+        needed: whether the model's own contours explain too little.
+        windows: windows taken so far.
+    """
+
+    drafts_obj: Float[Tensor, "b r 3"]
+    drafted: Int[Tensor, "b"]
+    points_obj: Float[Tensor, "b n 3"]
+    tangents_obj: Float[Tensor, "b n 3"]
+    evidence: Float[Tensor, "b n"]
+    model_share: Float[Tensor, "b"]
+    needed: Bool[Tensor, "b"]
+    windows: int
+
+    @classmethod
+    def none(cls, batch: int, config: LearningConfig, like: Tensor) -> "LearnedContours":
+        """Nothing learned yet."""
+        drafts, points = like.new_zeros(batch, config.drafts, 3), like.new_zeros(batch, config.points, 3)
+        drafted = torch.zeros(batch, dtype=torch.int64, device=like.device)
+        share = like.new_full((batch,), _FIRST_SHARE)
+        return cls(drafts, drafted, points, points, points[..., 0], share, drafted == 0, 0)
+
+    def points(self, least: float) -> LearnedPoints:
+        """The learned points with at least that evidence."""
+        return LearnedPoints(self.points_obj, self.tangents_obj, self.evidence >= least)
+
+    def that_count(self, config: LearningConfig) -> LearnedPoints:
+        """The points that are confirmed, of objects whose models do not explain their events."""
+        points = self.points(config.trusted_from)
+        return replace(points, mask=points.mask & self.needed[:, None])
+
+    def due(self, config: LearningConfig) -> bool:
+        """Whether this window is learned from: all of the first ones, and then some."""
+        return self.windows < config.first_windows or self.windows % config.every == 0
+
+
+def judge_model(
+    learned: LearnedContours,
+    found: Found,
+    velocity: Float[Tensor, "b m 2"],
+    image_size: tuple[int, int],
+    config: TrackerConfig,
+) -> LearnedContours:
+    """Whether a model's own contours explain what is seen, after a window's fit; ``velocity`` is that of its contours.
+
+    An object that hardly moves at first shows its contours at the very pose that was given: these count at once, until the
+    model's own explain enough. What is learned from a start in motion waits until they are seen to explain too little.
+    """
+    contours, matches = found.fit.contours, found.fit.matches
+    own = contours.kind != int(ContourKind.LEARNED)
+    matches = replace(matches, near=matches.near & own.gather(1, matches.contour))
+    contours = replace(contours, mask=contours.mask & own)
+    share = quality.explained_share(contours, matches, velocity, image_size, config.quality, at_rest=torch.nan)
+    known = torch.isfinite(share) & (found.count > 0)
+    share = torch.where(known, torch.lerp(learned.model_share, share, _SHARE_GAIN), learned.model_share)
+    speed_px_s = (velocity.norm(dim=-1) * contours.mask).sum(-1) / contours.mask.sum(-1).clamp(min=1)
+    in_motion = (speed_px_s > _CALM_PX_S) & (learned.windows < _START_WINDOWS)
+    enough = in_motion | (share > config.learning.below_share + _MORE_SHARE)
+    return replace(learned, model_share=share, needed=(learned.needed & ~enough) | (share < config.learning.below_share))
