@@ -5,7 +5,7 @@ The unknown of each object is a rotation about its centre and a move of its cent
 paper's Eq. 16 and 17 cancel, which cannot be meant.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -285,24 +285,24 @@ def solve_pose(
         from_prior = _from_prior(problem, T_start)
     damping = torch.full_like(problem.scale_px, config.damping)
     place = _Place.of(problem, T_start, from_prior)
-    equations, cost = _look(problem, rows, place, config)
+    gradient, hessian, cost = _look(problem, rows, place, config)
     for _ in range(config.iterations - 1):
-        next_place = place.moved(_damped_step(*equations, damping))
-        next_equations, next_cost = _look(problem, rows, next_place, config)
+        next_place = place.moved(_damped_step(gradient, hessian, damping))
+        *next_equations, next_cost = _look(problem, rows, next_place, config)
         # Near the optimum, rounding must not decide.
         better = next_cost <= cost * (1 + _ROUNDINGS * torch.finfo(cost.dtype).eps)
         place = _Place(*_choose(better, vars(next_place).values(), vars(place).values()))
-        *equations, cost = _choose(better, (*next_equations, next_cost), (*equations, cost))
+        gradient, hessian, cost = _choose(better, (*next_equations, next_cost), (gradient, hessian, cost))
         damping = torch.where(better, damping * _DAMPING_DECAY, damping.clamp(min=_DAMPING_START) * _DAMPING_GROWTH)
-    found = place.moved(_damped_step(*equations, damping))
-    return Linearisation(found.pose(problem), *equations, found.from_prior)
+    found = place.moved(_damped_step(gradient, hessian, damping))
+    return Linearisation(found.pose(problem), gradient, hessian, found.from_prior)
 
 
-def _look(problem: PoseProblem, rows: _Rows, place: _Place, config: SolverConfig) -> tuple[Sequence[Tensor], Tensor]:
-    """The normal equations at a place, and the cost there, where a step is going to be judged by it."""
+def _look(problem: PoseProblem, rows: _Rows, place: _Place, config: SolverConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradient and Hessian at a place, and the cost there, where a step is going to be judged by it."""
     seen = _see(problem, rows, place)
     cost = _cost(problem, seen, place.from_prior, config.loss) if config.iterations > 1 else problem.scale_px
-    return _normal_equations(problem, seen, place.from_prior, config.loss), cost
+    return *_normal_equations(problem, seen, place.from_prior, config.loss), cost
 
 
 def _choose(first: Tensor, of_first: Iterable[Tensor], of_second: Iterable[Tensor]) -> list[Tensor]:

@@ -167,7 +167,7 @@ class QualityConfig(Settings):
     uncertain_below: float = Field(0.4, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is uncertain.")
     lost_below: float = Field(0.2, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is lost.")
     caught_above: float = Field(
-        0.45, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object is found again."
+        0.35, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object is found again."
     )
     min_on_contour: int = Field(3, ge=1, description="Observations on the contours of a patch of the image from which these are explained.")
     min_speed_px_s: float = Field(30.0, ge=0, description="Contours moving slower than this across themselves need not fire (px/s).")
