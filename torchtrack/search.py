@@ -55,6 +55,30 @@ def wanted(share: Float[Tensor, "b"], sigma_px: Float[Tensor, "b"], usual_share:
     return (sigma_px > config.from_sigma_px) | (share < config.dropped_to * usual_share)
 
 
+def search_wanted(
+    prediction: Prediction,
+    sigma_px: Float[Tensor, "b"],
+    last_share: Float[Tensor, "b"],
+    usual_share: Float[Tensor, "b"],
+    events: WindowEvents,
+    found: Found,
+    config: TrackerConfig,
+) -> Found:
+    """Try other poses for the objects that need it, one object after the other.
+
+    Args:
+        last_share: explained in the window before: one bad window alone is no reason.
+    """
+    if config.search.hypotheses == 0 or not config.solver.prior:
+        return found
+    # Without events no pose is better than another.
+    enough = events.mask.sum(-1) >= config.quality.min_observations
+    tried = enough & wanted(torch.maximum(found.share, last_share), sigma_px, usual_share, config.search)
+    for number in tried.nonzero()[:, 0].tolist():
+        found = search(number, prediction, float(sigma_px[number]), events, found, config)
+    return found
+
+
 def search(number: int, prediction: Prediction, sigma_px: float, events: WindowEvents, found: Found, config: TrackerConfig) -> Found:
     """Try other poses for the object ``number``; ``found`` with the best of them in its place, if that is better.
 

@@ -17,10 +17,11 @@ from torchtrack.config.tracker import LearningConfig, TrackerConfig
 from torchtrack.contours import Contours, assemble, joined, select_ranked, take_points
 from torchtrack.image_cells import CellGrid, Lines, cell_of, fit_lines, is_near, point_sums, tallied
 from torchtrack.image_motion import object_plane_velocity, pixel_velocity
-from torchtrack.learned_contours import LearnedContours
+from torchtrack.learned_contours import LearnedContours, judge_model
 from torchtrack.lie import transform_points
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import GOLDEN_RATIO, WindowEvents
+from torchtrack.search import Found
 from torchtrack.surface_rays import surface_points
 
 # Older events are left out where the object has since moved by more than this (px).
@@ -82,6 +83,15 @@ class _Sample:
     pixels: Tensor
     places: Tensor
     mask: Tensor
+
+
+@torch.no_grad()
+def learn_after(learned: LearnedContours, around: Surroundings, found: Found, events: WindowEvents, config: TrackerConfig) -> LearnedContours:
+    """What is known after a window of contours that the models lack; learned from only in the windows that are due."""
+    contours, objects = found.fit.contours, around.objects
+    velocity = pixel_velocity(contours.points_cam, around.velocity, around.centre_cam, objects.intrinsics)
+    learned = judge_model(learned, found, velocity, objects.image_size, config)
+    return learn(learned, around, events, config) if learned.due(config.learning) else learned
 
 
 def learn(learned: LearnedContours, around: Surroundings, events: WindowEvents, config: TrackerConfig) -> LearnedContours:

@@ -13,24 +13,24 @@ from torch import Tensor, nn
 from torchtrack import lie, quality
 from torchtrack.alignment import align, gate_widening, index_for
 from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, stack_tables, undistortion_table
+from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contours import ContourModel, Contours, group_by_model, reproject
+from torchtrack.contours import ContourModel, Contours, group_by_model
 from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import AgeAt, Evidence, judged
 from torchtrack.flow import estimate_flow
-from torchtrack.learned_contours import LearnedContours, judge_model
-from torchtrack.motion import fade, initial_covariance, inverse, left_covariance, predict_covariance, with_dropped
+from torchtrack.learned_contours import LearnedContours
+from torchtrack.motion import initial_covariance, predict_covariance, with_dropped
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import WindowEvents, corner_observations, join, select_events
-from torchtrack.pose_solver import Linearisation
 from torchtrack.prediction import Prediction
-from torchtrack.search import Found, judge_fit, search, wanted
+from torchtrack.search import judge_fit, search_wanted
 from torchtrack.speed_limit import largest_speed, limit_speed, unknown_speed
 from torchtrack.state import StepResult, TrackerState, choose_rows
-from torchtrack.surface_learning import Surroundings, learn
+from torchtrack.surface_learning import Surroundings, learn_after
 from torchtrack.time_surface import at_pixels, empty_last_event, object_regions, time_surface, update_last_event
 from torchtrack.trust import TrustNetwork
 
@@ -40,8 +40,6 @@ _BORDER_PX = 64
 _MAX_DEPTH_M = 1e4
 # Fewer events than this do not make a part of a window.
 _EVENTS_OF_A_PART = 400
-# Share of a new window in the usual quality.
-_USUAL_GAIN = 0.1
 
 
 class Tracker(nn.Module):
@@ -196,9 +194,10 @@ class Tracker(nn.Module):
         """One window, or one part of it."""
         config = self.config
         window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
+        dt_s = window_s[self.stream_index]
         last_event_us = update_last_event(state.last_event_us, events) if self._looks_back else state.last_event_us
         seen = self._seen(events, t_us)
-        recorded = self._predict(self._held_back(state, seen, window_s), window_s)
+        recorded = self._predict(self._held_back(state, seen, dt_s), dt_s)
         prediction = recorded.detached()
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         corners = self._corners(contours, last_event_us, t_us, window_s)
@@ -213,34 +212,13 @@ class Tracker(nn.Module):
             evidence = Evidence(observations, seen, prediction, contours, index, self._event_history(last_event_us, t_us))
             observations = judged(evidence, self.weigher)
         found = judge_fit(prediction, align(recorded, contours, index, widening, observations, config), config)
-        found = self._search(state, recorded, sigma_px, seen, found)
-        next_state, result = self._conclude(state, recorded, widening, found, corners, window_s)
+        found = search_wanted(recorded, sigma_px, state.share, state.usual_share, seen, found, config)
+        next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
         if state.learned is not None and self._learns:
-            next_state = replace(next_state, learned=self._learn(state.learned, next_state, result, prediction, found, sigma_px, seen, window_s))
+            trusted = (result.status <= int(quality.Status.UNCERTAIN)) & (sigma_px < config.learning.max_sigma_px)
+            around = Surroundings(prediction.objects, next_state.T_cam_obj.to(sigma_px.dtype), next_state.velocity, dt_s, result.contours, trusted)
+            next_state = replace(next_state, learned=learn_after(state.learned, around, found, seen, config))
         return replace(next_state, t_us=t_us, last_event_us=last_event_us), replace(result, t_us=t_us)
-
-    @torch.no_grad()
-    def _learn(
-        self,
-        learned: LearnedContours,
-        now: TrackerState,
-        result: StepResult,
-        prediction: Prediction,
-        found: Found,
-        sigma_px: Tensor,
-        seen: WindowEvents,
-        window_s: Tensor,
-    ) -> LearnedContours:
-        """What is known after this window of contours that the models lack."""
-        config = self.config.learning
-        velocity = replace(prediction, velocity=now.velocity).contour_velocity(found.fit.contours)
-        learned = judge_model(learned, found, velocity, self.image_size, self.config)
-        if not learned.due(config):
-            return learned
-        trusted = (result.status <= int(quality.Status.UNCERTAIN)) & (sigma_px < config.max_sigma_px)
-        T_cam_obj = now.T_cam_obj.to(self.intrinsics.dtype)
-        around = Surroundings(prediction.objects, T_cam_obj, now.velocity, window_s[self.stream_index], result.contours, trusted)
-        return learn(learned, around, seen, self.config)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""
@@ -248,9 +226,9 @@ class Tracker(nn.Module):
             return state.t_us.scatter_reduce(0, events.stream_index, events.t_us, "amax")
         return torch.as_tensor(t_end_us, dtype=torch.int64, device=state.t_us.device).expand(self.streams).clone()
 
-    def _predict(self, state: TrackerState, window_s: Tensor) -> Prediction:
+    def _predict(self, state: TrackerState, dt_s: Tensor) -> Prediction:
         """Predicted pose and motion, and how certain they are."""
-        velocity, covariance, dt_s = state.velocity, state.covariance, window_s[self.stream_index]
+        velocity, covariance = state.velocity, state.covariance
         if self.config.motion.model == "hold":
             velocity, covariance = torch.zeros_like(velocity), with_dropped(covariance, velocity)
         moved = velocity * dt_s[:, None]
@@ -265,12 +243,12 @@ class Tracker(nn.Module):
             return self.objects
         return replace(self.objects, learned=learned.that_count(self.config.learning))
 
-    def _held_back(self, state: TrackerState, seen: WindowEvents, window_s: Tensor) -> TrackerState:
+    def _held_back(self, state: TrackerState, seen: WindowEvents, dt_s: Tensor) -> TrackerState:
         """The state, with the speed of objects that were never found yet limited by the events before them."""
         if not self.config.motion.speed_from_events:
             return state
         T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)
-        limit_m_s = largest_speed(self.objects, T_cam_obj, seen, window_s[self.stream_index])
+        limit_m_s = largest_speed(self.objects, T_cam_obj, seen, dt_s)
         limit_m_s = torch.where(state.usual_share > 0, torch.inf, limit_m_s)
         depth_m = lie.transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
         return replace(state, covariance=limit_speed(state.covariance, limit_m_s, self.diameter_m, depth_m))
@@ -281,10 +259,6 @@ class Tracker(nn.Module):
         # A sum is finite only where every entry is.
         usable = (T_cam_obj.sum((1, 2)).abs() < torch.inf) & (depth > MIN_DEPTH_M) & (depth < _MAX_DEPTH_M)
         return torch.where(usable[:, None, None], T_cam_obj, self.far_pose), usable
-
-    def _extract(self, T_cam_obj: Tensor) -> Contours:
-        """Visible contours at a pose."""
-        return self.objects.contours(T_cam_obj, self.config.contours)
 
     def _corners(self, contours: Contours, last_event_us: Tensor, t_us: Tensor, window_s: Tensor) -> Corners:
         """Corners of each object's region and their flow."""
@@ -326,55 +300,6 @@ class Tracker(nn.Module):
             # Without a copy for every object.
             return WindowEvents(*(value.expand(len(self.stream_index), *value.shape[1:]) for value in values))
         return WindowEvents(*(value[self.stream_index] for value in values))
-
-    def _search(self, state: TrackerState, prediction: Prediction, sigma_px: Tensor, seen: WindowEvents, found: Found) -> Found:
-        """Try other poses for the objects that need it, one object after the other."""
-        config = self.config
-        if config.search.hypotheses == 0 or not config.solver.prior:
-            return found
-        # Without events no pose is better than another.
-        enough = seen.mask.sum(-1) >= config.quality.min_observations
-        tried = enough & wanted(torch.maximum(found.share, state.share), sigma_px, state.usual_share, config.search)
-        for number in tried.nonzero()[:, 0].tolist():
-            found = search(number, prediction, float(sigma_px[number]), seen, found, config)
-        return found
-
-    def _conclude(
-        self, state: TrackerState, prediction: Prediction, widening: Tensor, found: Found, corners: Corners, window_s: Tensor
-    ) -> tuple[TrackerState, StepResult]:
-        """Judge every object, go on as predicted where it failed, and make the next state."""
-        config, solution, contours, share = self.config, found.fit.solution, found.fit.contours, found.share
-        T_prior, T_found = prediction.T_cam_obj.double(), solution.T_cam_obj.double()
-        step = lie.small_difference_about(T_prior, T_found, self.centre_obj.double()).to(share.dtype)
-        in_view = quality.visible_share(contours, self.image_size)
-        status = quality.judge(share, found.count, in_view, step, self.diameter_m, config.quality, widening)
-        status = torch.where(prediction.usable, status, int(quality.Status.DIVERGED))
-        failed = status >= int(quality.Status.LOST)
-        T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], T_prior, T_found))
-        held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
-        T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
-        velocity, covariance = self._updated_motion(state, prediction, solution, failed, share, window_s)
-        usual = torch.where(failed, state.usual_share, torch.lerp(state.usual_share, share, _USUAL_GAIN))
-        contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
-        centre_cam = lie.transform_points(T_cam_obj, self.centre_obj[:, None].double())[:, 0]
-        result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
-        return TrackerState(T_cam_obj, velocity, covariance, share, usual, state.t_us, state.last_event_us, state.learned), result
-
-    def _updated_motion(
-        self, state: TrackerState, prediction: Prediction, solution: Linearisation, failed: Tensor, share: Tensor, window_s: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Velocity and covariance after a window: as found, as far as the find is to be trusted."""
-        config, predicted = self.config, prediction.covariance
-        if not config.solver.prior:
-            return torch.zeros_like(state.velocity), predicted
-        posterior = config.solver.observation_px**2 * inverse(solution.hessian.double())[:, :12, :12]
-        trusted = torch.where(failed | ~torch.isfinite(posterior).flatten(1).all(-1), 0, quality.trust(share, config.quality))
-        velocity = prediction.velocity + trusted[:, None] * solution.from_prior[:, 6:12]
-        covariance = torch.where(trusted[:, None, None] > 0, torch.lerp(predicted, posterior, trusted[:, None, None].double()), predicted)
-        faded = fade(velocity, window_s[self.stream_index], failed, config.motion)
-        if config.motion.without_events == "hold":
-            covariance = with_dropped(covariance, velocity - faded)
-        return faded, covariance
 
 
 def _far_pose(centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:

@@ -153,13 +153,13 @@ class EventLineTracker(Tracker):
             weight: information of one event's distance (1/px²).
             apart_px: events with two lines as near as this are left out.
         """
-        T_cam_obj, contours = window.T_start, self._extract(window.T_start)
+        T_cam_obj, contours = window.T_start, self.objects.contours(window.T_start, self.config.contours)
         near = self._events_near(window, events, contours)
         plane = object_plane_velocity(near.pixels, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
         targets = torch.addcmul(near.pixels, plane, near.age_s[..., None])
         for number, gate_px in enumerate(self.config.matching.gates_px):
             if number == 1:
-                contours = self._extract(T_cam_obj)
+                contours = self.objects.contours(T_cam_obj, self.config.contours)
             point, belongs = nearest_lines(targets, contours, gate_px, apart_px)
             motion = take_points(self._contour_velocity(window, contours), point)
             targets = torch.addcmul(near.pixels, motion, near.age_s[..., None])

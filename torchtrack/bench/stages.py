@@ -34,8 +34,8 @@ STAGES: dict[str, tuple[str, ...]] = {
     "reprojection": ("alignment:reproject", "tracker:reproject"),
     "alignment, rest": ("tracker:align",),
     "quality": ("tracker:judge_fit",),
-    "search": ("tracker:Tracker._search",),
-    "conclusion": ("tracker:Tracker._conclude",),
+    "search": ("tracker:search_wanted",),
+    "conclusion": ("tracker:conclude",),
     "rest": ("tracker:Tracker.step",),
 }
 """Functions of each stage, by the module of the package that looks them up."""

@@ -1,0 +1,68 @@
+"""The end of a window: what each object's pose is worth, where it goes on from there, and what is remembered."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchtrack import lie, quality
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.contours import reproject
+from torchtrack.corners import Corners
+from torchtrack.motion import fade, inverse, left_covariance, with_dropped
+from torchtrack.prediction import Prediction
+from torchtrack.search import Found
+from torchtrack.state import StepResult, TrackerState
+
+# Share of a new window in the usual quality.
+_USUAL_GAIN = 0.1
+
+
+def conclude(
+    state: TrackerState,
+    prediction: Prediction,
+    widening: Float[Tensor, "b"],
+    found: Found,
+    corners: Corners,
+    dt_s: Float[Tensor, "b"],
+    config: TrackerConfig,
+) -> tuple[TrackerState, StepResult]:
+    """Judge every object, go on as predicted where it failed, and make the next state.
+
+    Args:
+        state: before the window; its times are those of the state and the result that are returned.
+        widening: of each object's first gate.
+        dt_s: length of the window.
+    """
+    objects, contours, share = prediction.objects, found.fit.contours, found.share
+    T_prior, T_found = prediction.T_cam_obj.double(), found.fit.solution.T_cam_obj.double()
+    step = lie.small_difference_about(T_prior, T_found, objects.centre_obj.double()).to(share.dtype)
+    in_view = quality.visible_share(contours, objects.image_size)
+    status = quality.judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening)
+    status = torch.where(prediction.usable, status, int(quality.Status.DIVERGED))
+    failed = status >= int(quality.Status.LOST)
+    T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], T_prior, T_found))
+    held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
+    T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
+    velocity, covariance = _updated_motion(prediction, found, failed, dt_s, config)
+    usual = torch.where(failed, state.usual_share, torch.lerp(state.usual_share, share, _USUAL_GAIN))
+    contours = reproject(contours, T_cam_obj.to(velocity.dtype), objects.intrinsics)
+    centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
+    result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
+    return TrackerState(T_cam_obj, velocity, covariance, share, usual, state.t_us, state.last_event_us, state.learned), result
+
+
+def _updated_motion(
+    prediction: Prediction, found: Found, failed: Bool[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
+) -> tuple[Float[Tensor, "b 6"], Float[Tensor, "b 12 12"]]:
+    """Velocity and covariance after a window: as found, as far as the find is to be trusted."""
+    predicted, solution = prediction.covariance, found.fit.solution
+    if not config.solver.prior:
+        return torch.zeros_like(prediction.velocity), predicted
+    posterior = config.solver.observation_px**2 * inverse(solution.hessian.double())[:, :12, :12]
+    trusted = torch.where(failed | ~torch.isfinite(posterior).flatten(1).all(-1), 0, quality.trust(found.share, config.quality))
+    velocity = prediction.velocity + trusted[:, None] * solution.from_prior[:, 6:12]
+    covariance = torch.where(trusted[:, None, None] > 0, torch.lerp(predicted, posterior, trusted[:, None, None].double()), predicted)
+    faded = fade(velocity, dt_s, failed, config.motion)
+    if config.motion.without_events == "hold":
+        covariance = with_dropped(covariance, velocity - faded)
+    return faded, covariance
