@@ -108,7 +108,7 @@ def test_an_interrupt_ends_the_processes_and_leaves_nothing_half_written(executo
         assert program.poll() is None, program.stderr.read()
         time.sleep(0.05)
     program.send_signal(signal.SIGINT)
-    _, errors = program.communicate(timeout=60)
+    _, errors = program.communicate(timeout=180)
     assert errors.count("Traceback") == 1 and errors.rstrip().endswith("KeyboardInterrupt")
     assert sorted(tmp_path.iterdir()) == begun
     for path in begun:

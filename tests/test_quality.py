@@ -112,7 +112,8 @@ def test_objects_are_judged_each_for_itself():
 @pytest.mark.parametrize(("widening", "expected"), [(1.0, Status.UNCERTAIN), (1.25, Status.UNCERTAIN), (1.5, Status.LOST), (3.0, Status.LOST)])
 def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(widening, expected):
     """Between lost below 0.2 and caught above 0.45: 0.2625 is needed at 1.25 times the gate, 0.325 at 1.5, and no more than 0.45."""
-    status = judge(*(torch.tensor(value) for value in ([0.3], [100], [1.0])), torch.zeros(1, 6), torch.ones(1), CONFIG, torch.tensor([widening]))
+    config = QualityConfig(lost_below=0.2, caught_above=0.45)
+    status = judge(*(torch.tensor(value) for value in ([0.3], [100], [1.0])), torch.zeros(1, 6), torch.ones(1), config, torch.tensor([widening]))
     assert Status(int(status)) == expected
 
 

@@ -12,6 +12,7 @@ from typing import get_args
 import pytest
 import tyro
 import yaml
+from tiny_sequence import write_tiny_sequence
 
 from torchtrack import cli
 from torchtrack.config.demo import DemoConfig
@@ -217,7 +218,17 @@ def test_pictures_are_few_and_small():
 
 
 def test_length_and_places():
-    assert len(README.splitlines()) <= 400
+    assert len(README.splitlines()) <= 480
     outside_blocks = re.sub(r"^```text.*?^```", "", README, flags=re.MULTILINE | re.DOTALL)
     assert [line for line in outside_blocks.splitlines() if len(line) > 120] == []
     assert re.findall(r"(?<![\w.])/(?:work|home|tmp|root)/", README) == []
+
+
+@pytest.mark.parametrize("code", blocks("python learn"))
+def test_learning_runs(code, tmp_path):
+    (tmp_path / "outputs" / "demo").mkdir(parents=True)
+    write_tiny_sequence(tmp_path / "outputs" / "demo", "demo", ("box", "other"))
+    (tmp_path / "example.py").write_text(code, encoding="utf-8")
+    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"(\d+\.\d+ mm\n){2}", done.stdout) and len(code.splitlines()) < 30

@@ -182,14 +182,14 @@ def test_a_lost_box_is_found_again_and_without_the_search_it_is_not():
 @pytest.mark.parametrize("config", [UNSEARCHED, SEARCHED.model_copy(update={"solver": SEARCHED.solver.model_copy(update={"prior": False})})])
 def test_without_hypotheses_or_a_prior_nothing_is_searched_for(config, monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.tracker.search", lambda number, prediction, sigma, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, seen, found, config: searched.append(number) or found)
     displaced_runs(config, 100.0, count=2)
     assert searched == []
 
 
 def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.tracker.search", lambda number, prediction, sigma, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, seen, found, config: searched.append(number) or found)
     _, events = moving_box(pose(), 10)
     tracker = Tracker([box_model()], SMALL_CAMERA)
     follow(tracker, tracker.init(pose()[None], 0), windows(events, 10))
@@ -220,7 +220,7 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
 @pytest.mark.parametrize(("count", "times"), [(0, 0), (29, 0), (200, 1)])
 def test_without_enough_events_there_is_nothing_to_search_in(count, times, monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.tracker.search", lambda number, prediction, sigma, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, seen, found, config: searched.append(number) or found)
     tracker, state, _, _, _ = started()
     noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
     after, result = tracker.step(replace(state, covariance=1e3 * state.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)

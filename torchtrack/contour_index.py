@@ -63,7 +63,7 @@ def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: i
     middle = torch.tensor([0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)], dtype=contours.pixels.dtype, device=device)
     inside = contours.mask & ((contours.pixels - middle).abs() < middle + radius[:, None, None]).all(-1)
     radii_px = sorted(set(radius.tolist()))
-    margin = _reach(max(radii_px, default=0), cell_px) + 1
+    margin = _reach(max([0, *radii_px]), cell_px) + 1
     centre = (contours.pixels / cell_px).round()
     low = torch.where(inside[..., None], centre, torch.inf).amin(1).clamp(max=_FAR_CELLS) - margin
     local = torch.where(inside[..., None], centre - low[:, None], 0)
@@ -72,6 +72,8 @@ def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: i
     for reach_px in radii_px:
         # Object by object as far as each needs: one that is looked for far away does not make the others pay.
         row, point = (inside & (radius == reach_px)[:, None]).nonzero().unbind(1)
+        if len(row) == 0:
+            continue
         to_centre = cell_px * centre[row, point] - contours.pixels[row, point]
         u, v = local[row, point].long().unbind(1)
         _write(keys, (row * rows + v) * columns + u, to_centre, point, reach_px, cell_px, columns, count)

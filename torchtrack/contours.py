@@ -240,8 +240,9 @@ def image_normals(
     depth = points_cam[..., 2:].clamp(min=MIN_DEPTH_M)
     along = torch.addcmul(tangents_cam[..., :2], points_cam[..., :2] / depth, tangents_cam[..., 2:], value=-1) / depth * intrinsics[:, None, :2]
     u, v = along.unbind(-1)
-    length = torch.hypot(u, v)
-    normals = torch.stack([-v, u], 1) / length.clamp(min=1e-9)[:, None]
+    # Clamped before the root, which has no slope at zero: padding must not spoil gradients.
+    length = (u * u + v * v).clamp(min=1e-18).sqrt()
+    normals = torch.stack([-v, u], 1) / length[:, None]
     return normals.transpose(1, 2), length > _MIN_PX_PER_M
 
 

@@ -243,6 +243,7 @@ class Tracker(nn.Module):
             return self.objects
         return replace(self.objects, learned=learned.that_count(self.config.learning))
 
+    @torch.no_grad()
     def _held_back(self, state: TrackerState, seen: WindowEvents, dt_s: Tensor) -> TrackerState:
         """The state, with the speed of objects that were never found yet limited by the events before them."""
         if not self.config.motion.speed_from_events:

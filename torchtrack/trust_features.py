@@ -26,7 +26,9 @@ _OLDEST_PX = 6.0
 _SLOW_PX_S = 10.0
 # Events this far outside the image are counted too; beyond them a row of nothing (px).
 _BORDER_PX = 8
-FEATURES = len(_ACROSS_PX) * (2 * len(_ALONG_PX) + 1) + len(ContourKind) + 6
+# Kinds of contours that a model has.
+_KINDS = int(ContourKind.SPLAT) + 1
+FEATURES = len(_ACROSS_PX) * (2 * len(_ALONG_PX) + 1) + _KINDS + 6
 """How many numbers describe an observation."""
 
 
@@ -68,7 +70,9 @@ def trust_features(evidence: Evidence) -> Float[Tensor, "b n f"]:
         observations.age_s / evidence.events.age_s.amax(-1, keepdim=True).clamp(min=1e-6),
         frame.exists.to(polarity.dtype),
     ]
-    kinds = one_hot(frame.kind, len(ContourKind)).to(polarity.dtype)
+    # Contours that were learned are print.
+    kind = torch.where(frame.kind == int(ContourKind.LEARNED), int(ContourKind.TEXTURE), frame.kind)
+    kinds = one_hot(kind, _KINDS).to(polarity.dtype)
     return torch.cat([_counts(evidence, frame), _ages(evidence, frame), kinds, torch.stack(single, -1)], -1)
 
 
