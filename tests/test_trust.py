@@ -82,8 +82,8 @@ def test_features_are_numbers_of_about_unit_size(dtype):
 
 def test_features_do_not_hang_on_other_objects():
     alone, both = evidence_of()[0], evidence_of(objects=2)[0]
-    torch.testing.assert_close(trust_features(both)[:1], trust_features(alone), atol=1e-5, rtol=0)
-    torch.testing.assert_close(trust_features(both)[1:], trust_features(alone), atol=1e-5, rtol=0)
+    torch.testing.assert_close(trust_features(both)[:1], trust_features(alone), atol=3e-4, rtol=0)
+    torch.testing.assert_close(trust_features(both)[1:], trust_features(alone), atol=3e-4, rtol=0)
 
 
 def test_events_around_are_counted_by_polarity():

@@ -102,7 +102,13 @@ class _Board:
 
 def _work(function: Callable[[Any, Tell], Any], task: Any, number: int, board: Any) -> Any:
     """What one machine does with one task."""
-    return attempt(function, task, lambda share: board.tell.remote(number, share))
+    import ray
+
+    sent: list[Any] = []
+    result = attempt(function, task, lambda share: sent.append(board.tell.remote(number, share)))
+    # A task is not done before what it told has arrived.
+    ray.get(sent)
+    return result
 
 
 def _outcome(ray: Any, reference: Any) -> Any:
