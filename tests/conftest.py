@@ -31,6 +31,18 @@ def data_dir() -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A folder with a sequence of one object and one of two."""
+    # Not at the top: what it imports must find the hook in place.
+    from tiny_sequence import write_tiny_sequence
+
+    folder = tmp_path_factory.mktemp("sequences")
+    write_tiny_sequence(folder, "one", duration_us=30_000)
+    write_tiny_sequence(folder, "two", labels=("left", "right"), duration_us=20_000)
+    return folder
+
+
 def _devices() -> list[str]:
     return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 

@@ -92,15 +92,6 @@ def test_summary_of_nothing():
     assert math.isnan(metrics.mean_rotation_deg)
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A folder with a sequence of one object and one of two."""
-    folder = tmp_path_factory.mktemp("sequences")
-    write_tiny_sequence(folder, "one", duration_us=30_000)
-    write_tiny_sequence(folder, "two", labels=("left", "right"), duration_us=20_000)
-    return folder
-
-
 def test_evaluate_measures_every_sequence_object_and_method(folder, tmp_path):
     methods = {"default": {}, "short": {"tracker": {"window": {"duration_us": 2500}}}}
     done = []

@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 from conftest import REPOSITORY, needs_ray
-from tiny_sequence import write_tiny_sequence
 
 from torchtrack.cli import main
 from torchtrack.config.evaluate import EvaluateConfig
@@ -17,15 +16,6 @@ from torchtrack.exit_codes import ExitCode
 from torchtrack.sinks.summary import finite
 
 SCENE = "name: a\ncamera: {width: 60, height: 40, fx: 60, fy: 60}\nduration_s: 0.02\nobjects: [{label: cube, shape: cube}]\n"
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A folder with a sequence of one object and one of two."""
-    folder = tmp_path_factory.mktemp("sequences")
-    write_tiny_sequence(folder, "one", duration_us=30_000)
-    write_tiny_sequence(folder, "two", labels=("left", "right"), duration_us=20_000)
-    return folder
 
 
 def test_track_takes_many_sources_at_once(folder, tmp_path, capsys):

@@ -97,8 +97,8 @@ def align(
 
 def _narrowing(widening: Float[Tensor, "b"], rounds: int) -> Iterable[Float[Tensor, "b"]]:
     """How many times wider than configured the gate of every round is: as given at first, not at all at last."""
-    left = torch.linspace(1, 0, rounds, dtype=widening.dtype, device=widening.device)[:, None] if rounds > 1 else widening.new_ones(1, 1)
-    return (widening**left).unbind(0)
+    left = torch.linspace(1, 0, rounds, dtype=widening.dtype, device=widening.device)
+    return (widening ** left[:, None]).unbind(0)
 
 
 def _first_place(begin: Prediction, observations: Observations, config: TrackerConfig) -> Float[Tensor, "b n 2"]:

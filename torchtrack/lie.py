@@ -233,17 +233,19 @@ def cayley(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
     Half the operations of the exponential, and smooth everywhere: the solver's retraction.
     """
-    half = 0.5 * phi
-    skew = hat(half)
-    factor = 2 / (1 + torch.linalg.vecdot(half, half))[..., None, None]
+    skew, factor = _half_turn(phi)
     return torch.eye(3, dtype=phi.dtype, device=phi.device) + factor * (skew + skew @ skew)
+
+
+def _half_turn(phi: Tensor) -> tuple[Tensor, Tensor]:
+    """Cayley's rotation is ``1 + factor (skew + skew²)``: these two."""
+    half = 0.5 * phi
+    return hat(half), 2 / (1 + torch.linalg.vecdot(half, half))[..., None, None]
 
 
 def turned(rotation: Float[Tensor, "b 3 3"], phi: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
     """``cayley(phi) @ rotation``, in fewer operations."""
-    half = 0.5 * phi
-    skew = hat(half)
-    factor = 2 / (1 + torch.linalg.vecdot(half, half))[:, None, None]
+    skew, factor = _half_turn(phi)
     across = torch.bmm(skew, rotation)
     return torch.addcmul(rotation, factor, torch.baddbmm(across, skew, across))
 

@@ -3,15 +3,14 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import select_ranked, take_points
 from torchtrack.corners import Corners
 
-# Multiples of it fill the unit interval evenly.
-GOLDEN_RATIO = 0.6180339887498949
+_GOLDEN_RATIO = 0.6180339887498949
 # Lots are drawn for a little less than what there is room for, as their number varies.
 _FILL = 0.95
 
@@ -77,15 +76,22 @@ def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Flo
     """
     pixels, mask = events.pixels, events.mask
     near = mask & (index.look_up(torch.addcmul(pixels, plane_velocity, events.age_s[..., None])) >= 0)
-    number = torch.arange(mask.shape[1], device=mask.device, dtype=torch.float64)
-    # Multiples of the golden ratio fill the unit interval evenly, whichever stretch of them is taken.
-    lot = (number * GOLDEN_RATIO).frac()
     total = near.sum(-1, keepdim=True)
     share = torch.where(total > count, _FILL * count / total, 1.0)
-    chosen, exists = select_ranked(near & (lot < share), count)
+    chosen, exists = draw(near, share, count)
     values = take_points(torch.cat([pixels.transpose(1, 2), events.age_s[:, None], events.polarity[:, None]], 1).transpose(1, 2), chosen)
     flow = torch.zeros_like(values[..., :2])
     return Observations(values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
+
+
+def draw(candidates: Bool[Tensor, "b e"], share: Float[Tensor, "b 1"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
+    """A share of each row's candidates, spread evenly over them: their indices, at most ``count``, and which of these exist.
+
+    Whether a candidate is drawn hangs on its own number alone.
+    """
+    number = torch.arange(candidates.shape[1], device=candidates.device, dtype=torch.float64)
+    # Multiples of the golden ratio fill the unit interval evenly, whichever stretch of them is taken.
+    return select_ranked(candidates & ((number * _GOLDEN_RATIO).frac() < share), count)
 
 
 def join(first: Observations, second: Observations) -> Observations:

@@ -246,7 +246,8 @@ class Tracker(nn.Module):
     @torch.no_grad()
     def _held_back(self, state: TrackerState, seen: WindowEvents, dt_s: Tensor) -> TrackerState:
         """The state, with the speed of objects that were never found yet limited by the events before them."""
-        if not self.config.motion.speed_from_events:
+        # Most windows are of objects that were found long ago: their events need not be counted.
+        if not self.config.motion.speed_from_events or bool((state.usual_share > 0).all()):
             return state
         T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)
         limit_m_s = largest_speed(self.objects, T_cam_obj, seen, dt_s)
