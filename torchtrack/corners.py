@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig
+from torchtrack.constants import constant
 from torchtrack.filters import corner_response
 from torchtrack.time_surface import Regions, at_pixels
 
@@ -50,39 +51,40 @@ def select_corners(
     response: Float[Tensor, "b h w"], regions: Regions, config: CornerConfig, filter_size_px: int
 ) -> tuple[Int[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
     """The strongest local maxima, at most one per cell: pixels within the region, and which of them are corners."""
-    batch, height, width = response.shape
+    _, height, width = response.shape
     cell = config.cell_px
     rows, columns = height // cell, width // cell
     own = _own_area(response, regions, 2 * (filter_size_px // 2) + _RESPONSE_REACH_PX)
-    cells = own[:, : rows * cell, : columns * cell].reshape(batch, rows, cell, columns, cell).permute(0, 1, 3, 2, 4).flatten(3).flatten(1, 2)
-    score, within = cells.max(-1)
-    count = min(config.max_corners, score.shape[1])
-    best, chosen = score.topk(count)
-    offset = within.gather(1, chosen)
-    v = torch.div(chosen, columns, rounding_mode="floor") * cell + torch.div(offset, cell, rounding_mode="floor")
-    u = chosen % columns * cell + offset % cell
+    # Rows first: along them, what is compared lies side by side in memory.
+    score = own[:, : rows * cell, : columns * cell].unflatten(1, (rows, cell)).amax(2).unflatten(2, (columns, cell)).amax(3).flatten(1)
+    best, chosen = score.topk(min(config.max_corners, score.shape[1]))
+    first_u, first_v = chosen % columns * cell, torch.div(chosen, columns, rounding_mode="floor") * cell
+    step = torch.arange(cell, device=response.device)
+    within = _values_around(own, first_u, first_v, step).argmax(-1)
+    u, v = first_u + within % cell, first_v + torch.div(within, cell, rounding_mode="floor")
     strong = best > config.relative_threshold * best[:, :1]
-    return torch.stack([u, v], -1), strong & (best > 0) & _is_local_maximum(own, u, v, best)
+    # The largest of its 5x5 neighbourhood.
+    largest = best >= _values_around(own, u, v, torch.arange(-2, 3, device=response.device)).amax(-1)
+    return torch.stack([u, v], -1), strong & (best > 0) & largest
 
 
 def _own_area(response: Tensor, regions: Regions, reach: int) -> Tensor:
     """The response, zero where it depends on what lies outside the object's own region."""
     height, width = response.shape[-2:]
-    v = torch.arange(height, device=response.device)[:, None]
-    u = torch.arange(width, device=response.device)
-    last_u, last_v = (regions.extent - reach).unbind(-1)
-    own = (u >= reach) & (v >= reach) & (u < last_u[:, None, None]) & (v < last_v[:, None, None])
-    return torch.where(own, response, response.new_zeros(()))
+    last = (regions.extent - reach)[..., None]
+    u, v = torch.arange(width, device=response.device), torch.arange(height, device=response.device)
+    columns, rows = (u >= reach) & (u < last[:, 0]), (v >= reach) & (v < last[:, 1])
+    return torch.where(rows[:, :, None] & columns[:, None], response, 0)
 
 
-def _is_local_maximum(response: Tensor, u: Tensor, v: Tensor, value: Tensor) -> Tensor:
-    """Whether ``value`` at (u, v) is the largest of its 5x5 neighbourhood."""
+def _values_around(
+    response: Float[Tensor, "b h w"], u: Int[Tensor, "b n"], v: Int[Tensor, "b n"], step: Int[Tensor, "k"]
+) -> Float[Tensor, "b n k*k"]:
+    """Values in the square of steps from each pixel, row by row; at the border, the nearest value stands for what is beyond."""
     height, width = response.shape[-2:]
-    step = torch.arange(-2, 3, device=u.device)
-    rows = (v[..., None, None] + step[:, None]).clamp(0, height - 1)
     columns = (u[..., None, None] + step).clamp(0, width - 1)
-    neighbours = response.flatten(1).gather(1, (rows * width + columns).flatten(1)).view(*u.shape, 25)
-    return value >= neighbours.amax(-1)
+    rows = (v[..., None, None] + step[:, None]).clamp(0, height - 1)
+    return response.flatten(1).gather(1, torch.add(columns, rows, alpha=width).flatten(1)).view(*u.shape, len(step) ** 2)
 
 
 def snap_to_newest(
@@ -94,11 +96,10 @@ def snap_to_newest(
     """
     _, height, width = last_event_us.shape
     step = torch.arange(-radius_px, radius_px + 1, device=sensor_pixels.device)
-    u = (sensor_pixels[..., 0, None, None] + step).clamp(0, width - 1)
-    v = (sensor_pixels[..., 1, None, None] + step[:, None]).clamp(0, height - 1)
-    u, v = (grid.expand(*sensor_pixels.shape[:2], len(step), len(step)).flatten(2) for grid in (u, v))
+    u = (sensor_pixels[..., 0, None] + step.repeat(len(step))).clamp(0, width - 1)
+    v = (sensor_pixels[..., 1, None] + step.repeat_interleave(len(step))).clamp(0, height - 1)
     newest_us, best = at_pixels(last_event_us, stream_index[:, None, None], u, v).max(-1, keepdim=True)
-    return torch.stack([u.gather(-1, best), v.gather(-1, best)], -1).squeeze(-2), newest_us.squeeze(-1)
+    return torch.stack([u, v], -2).gather(-1, best[..., None, :].expand(-1, -1, 2, -1))[..., 0], newest_us[..., 0]
 
 
 def detect_corners(
@@ -121,9 +122,9 @@ def detect_corners(
     local, mask = select_corners(response, regions, config, surface_config.filter_size_px)
     _, height, width = last_event_us.shape
     sensor = local + regions.origin[:, None]
-    limit = torch.tensor([width - 1, height - 1], device=sensor.device)
-    mask = mask & ((sensor >= 0) & (sensor <= limit)).all(-1)
-    sensor, newest_us = snap_to_newest(torch.minimum(sensor.clamp(min=0), limit), last_event_us, regions.stream_index, 1 if config.snap else 0)
+    on_it = torch.minimum(sensor.clamp(min=0), constant((width - 1, height - 1), sensor.dtype, sensor.device))
+    mask = mask & (on_it == sensor).all(-1)
+    sensor, newest_us = snap_to_newest(on_it, last_event_us, regions.stream_index, 1 if config.snap else 0)
     stream = regions.stream_index[:, None]
     age_s = ((t_us[stream] - newest_us).clamp(0, 10**9) * 1e-6).to(surface.dtype)
     if config.fresh_only:

@@ -17,8 +17,8 @@ from torchtrack.config.tracker import SurfaceConfig
 
 _HARRIS_K = 0.04
 _HARRIS_WINDOW_PX, _HARRIS_SIGMA_PX = 7, 1.0
-# Weights of the Sobel operator, normalised to the gradient's scale.
-_SOBEL_SMOOTH, _SOBEL_DIFFERENCE = (0.25, 0.5, 0.25), (-0.5, 0.0, 0.5)
+# Our sums of the Sobel operator are this many times the gradient.
+_SOBEL_SCALE = 8.0
 
 
 def corner_response(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> Float[Tensor, "b h w"]:
@@ -53,18 +53,33 @@ def separable_filter(
     return _weighted_shifts(_weighted_shifts(padded, vertical, -2), horizontal, -1)
 
 
+def _sums_along(image: Tensor, size: int, axis: int) -> Tensor:
+    """Sums of an odd number of neighbours along one axis, put together from sums of 1, 2, 4 and so on."""
+    length = image.shape[axis] - size + 1
+    total, taken = image.narrow(axis, 0, length), 1
+    sums, width = image, 1
+    while 2 * width <= size:
+        begins = sums.shape[axis] - width
+        sums, width = sums.narrow(axis, 0, begins) + sums.narrow(axis, width, begins), 2 * width
+        if size & width:
+            total, taken = total + sums.narrow(axis, taken, length), taken + width
+    return total
+
+
+def box_mean(images: Float[Tensor, "b h w"], size_px: int) -> Float[Tensor, "b h w"]:
+    """Mean over the square around each pixel; beyond its border an image goes on mirrored."""
+    padded = pad(images[:, None], (size_px // 2,) * 4, "reflect")[:, 0]
+    return _sums_along(_sums_along(padded, size_px, -2), size_px, -1) * size_px**-2
+
+
 def sliced_guided_filter(surface: Float[Tensor, "b h w"], size_px: int, eps: float) -> Float[Tensor, "b h w"]:
     """The guided filter of He et al. (2013) with the image as its own guide: smooths, and keeps edges."""
-    box = (1.0 / size_px,) * size_px
-
-    def mean(*images: Tensor) -> tuple[Tensor, ...]:
-        return separable_filter(torch.cat(images), box, box, "reflect").chunk(len(images))
-
-    average, square = mean(surface, surface.square())
-    variance = square - average.square()
+    average, square = box_mean(torch.cat([surface, surface.square()]), size_px).chunk(2)
+    variance = torch.addcmul(square, average, average, value=-1)
     slope = variance / (variance + eps)
-    mean_slope, mean_offset = mean(slope, average - slope * average)
-    return mean_slope * surface + mean_offset
+    offset = torch.addcmul(average, slope, average, value=-1)
+    mean_slope, mean_offset = box_mean(torch.cat([slope, offset]), size_px).chunk(2)
+    return torch.addcmul(mean_offset, mean_slope, surface)
 
 
 @cache
@@ -75,8 +90,22 @@ def _harris_window() -> tuple[float, ...]:
 
 def sliced_harris(image: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
     """Harris response ``det M - k tr² M`` with Sobel gradients and a 7x7 Gaussian window."""
-    du = separable_filter(image, _SOBEL_SMOOTH, _SOBEL_DIFFERENCE, "replicate")
-    dv = separable_filter(image, _SOBEL_DIFFERENCE, _SOBEL_SMOOTH, "replicate")
+    padded = pad(image[:, None], (1, 1, 1, 1), "replicate")[:, 0]
+    du, dv = _step(_smooth(padded, -2), -1), _step(_smooth(padded, -1), -2)
     window = _harris_window()
-    uu, vv, uv = separable_filter(torch.cat([du * du, dv * dv, du * dv]), window, window, "reflect").chunk(3)
-    return uu * vv - uv.square() - _HARRIS_K * (uu + vv).square()
+    scaled = tuple(weight / _SOBEL_SCALE**2 for weight in window)
+    uu, vv, uv = separable_filter(torch.cat([du * du, dv * dv, du * dv]), scaled, window, "reflect").chunk(3)
+    trace = uu + vv
+    return torch.addcmul(torch.addcmul(uu * vv, uv, uv, value=-1), trace, trace, value=-_HARRIS_K)
+
+
+def _smooth(image: Tensor, axis: int) -> Tensor:
+    """Weights 1, 2, 1 along one axis."""
+    length = image.shape[axis] - 2
+    return torch.add(image.narrow(axis, 0, length) + image.narrow(axis, 2, length), image.narrow(axis, 1, length), alpha=2)
+
+
+def _step(image: Tensor, axis: int) -> Tensor:
+    """Difference of the neighbours on either side along one axis."""
+    length = image.shape[axis] - 2
+    return image.narrow(axis, 2, length) - image.narrow(axis, 0, length)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import FlowConfig
+from torchtrack.constants import disc
 from torchtrack.corners import Corners
 from torchtrack.time_surface import at_pixels
 
@@ -34,11 +35,7 @@ def newest_events_around(
         ideal_pixels: undistortion table of each stream.
     """
     _, height, width = last_event_us.shape
-    radius = config.radius_px
-    step = torch.arange(-radius, radius + 1, device=last_event_us.device)
-    dv, du = (grid.flatten() for grid in torch.meshgrid(step, step, indexing="ij"))
-    disc = du.square() + dv.square() <= radius**2
-    du, dv = du[disc], dv[disc]
+    du, dv = disc(config.radius_px, last_event_us.device)
     u = sensor_pixels[..., 0, None] + du
     v = sensor_pixels[..., 1, None] + dv
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
@@ -63,24 +60,24 @@ def irls_flow(
     weight = mask.to(offsets.dtype)
     count = weight.sum(-1)
     # A row per component: sums along a last axis of two are slow.
-    du, dv = (component.contiguous() for component in offsets.unbind(-1))
+    offsets = offsets.transpose(-1, -2).contiguous()
     for _ in range(config.iterations):
-        flow_u, flow_v = _weighted_flow(du, dv, times_s, weight)
-        residual_sq = (du - flow_u * times_s).square() + (dv - flow_v * times_s).square()
-        scale = (residual_sq.sqrt() * weight).sum(-1) / weight.sum(-1).clamp(min=1e-6)
+        flow = _weighted_flow(offsets, times_s, weight)
+        residual_sq = torch.addcmul(offsets, flow, times_s[..., None, :], value=-1).square().sum(-2)
+        scale = torch.linalg.vecdot(residual_sq.sqrt(), weight) / weight.sum(-1).clamp(min=1e-6)
         bound_sq = (config.tuning * scale.clamp(min=_MIN_SCALE_PX)).square()
         weight = (1 - residual_sq / bound_sq[..., None]).clamp(min=0).square() * mask
-    flow = torch.cat(_weighted_flow(du, dv, times_s, weight), -1)
+    flow = _weighted_flow(offsets, times_s, weight)[..., 0]
     lever = (weight * times_s.square()).sum(-1)
     valid = (count >= config.min_events) & (lever > 0) & torch.isfinite(flow).all(-1)
-    return torch.where(valid[..., None], flow, torch.zeros_like(flow)), valid
+    return torch.where(valid[..., None], flow, 0), valid
 
 
-def _weighted_flow(du: Tensor, dv: Tensor, times_s: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Closed-form solution of Eq. 9-11, a component each."""
-    weighted_time = weight * times_s
-    lever = (weighted_time * times_s).sum(-1, keepdim=True).clamp(min=1e-12)
-    return (weighted_time * du).sum(-1, keepdim=True) / lever, (weighted_time * dv).sum(-1, keepdim=True) / lever
+def _weighted_flow(offsets: Float[Tensor, "*b 2 k"], times_s: Float[Tensor, "*b k"], weight: Float[Tensor, "*b k"]) -> Float[Tensor, "*b 2 1"]:
+    """Closed-form solution of Eq. 9-11."""
+    weighted_time = (weight * times_s)[..., None]
+    lever = times_s[..., None, :] @ weighted_time
+    return (offsets @ weighted_time) / lever.clamp(min=1e-12)
 
 
 def estimate_flow(

@@ -15,18 +15,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.constants import constant
 from torchtrack.errors import PoseError
 
 # Below this squared angle the Taylor series are exact to float64 rounding (next terms are O(θ⁶)).
 _SMALL_ANGLE_SQ = 1e-4
+# Skew-symmetric matrices of the three axes, a row each.
+_GENERATORS = ((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0))
 
 
 def hat(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Skew-symmetric matrix of a vector: ``hat(a) @ b == cross(a, b)``."""
-    x, y, z = phi.unbind(-1)
-    minus_x, minus_y, minus_z = (-phi).unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, minus_z, y, z, zero, minus_x, minus_y, x, zero], -1).unflatten(-1, (3, 3))
+    return (phi @ constant(_GENERATORS, phi.dtype, phi.device)).unflatten(-1, (3, 3))
 
 
 def vee(skew: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:

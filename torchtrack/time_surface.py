@@ -19,8 +19,9 @@ _MAX_DECAYS = 16.0
 
 def at_pixels(maps: Shaped[Tensor, "s h w *c"], stream: Int[Tensor, "*#p"], u: Int[Tensor, "*#p"], v: Int[Tensor, "*#p"]) -> Shaped[Tensor, "..."]:
     """``maps[stream, v, u]``, as one selection of rows: several times faster than indexing with three tensors."""
-    _, height, width = maps.shape[:3]
-    row = (stream * height + v) * width + u
+    row = torch.add(u, v, alpha=maps.shape[2])
+    if len(maps) > 1:
+        row = row + stream * (maps.shape[1] * maps.shape[2])
     return maps.flatten(0, 2).index_select(0, row.flatten()).view(*row.shape, *maps.shape[3:])
 
 
@@ -34,8 +35,11 @@ def update_last_event(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -
 
     A maximum, not an assignment: with repeated indices the order of assignment is not defined.
     """
-    _, height, width = last_event_us.shape
-    pixel = (events.stream_index * height + events.y) * width + events.x
+    streams, height, width = last_event_us.shape
+    # In the type of the coordinates, which is narrower than that of an index.
+    pixel = torch.add(events.x, events.y, alpha=width).long()
+    if streams > 1:
+        pixel += events.stream_index * (height * width)
     updated = last_event_us.clone()
     # In place on the copy: out of place, the whole map is copied twice.
     updated.view(-1).scatter_reduce_(0, pixel, events.t_us, "amax")
@@ -91,5 +95,5 @@ def time_surface(
     stream = regions.stream_index[:, None, None]
     newest_us = at_pixels(last_event_us, stream, columns.clamp(0, width - 1)[:, None, :], rows.clamp(0, height - 1)[:, :, None])
     max_age_us = int(_MAX_DECAYS * tau_s * 1e6)
-    age_us = (t_us[stream] - newest_us).clamp(0, max_age_us).to(dtype)
-    return torch.where(inside & (age_us < max_age_us), torch.exp(age_us * (-1e-6 / tau_s)), age_us.new_zeros(()))
+    age_us = (t_us[stream] - newest_us).to(dtype).clamp_(0, max_age_us)
+    return (age_us * (-1e-6 / tau_s)).exp_().mul_(inside & (age_us < max_age_us))

@@ -1,0 +1,30 @@
+"""Small tensors that never change, made once for each type and device.
+
+On a GPU, making a tensor of Python numbers waits until all that was asked of it before is done.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Numbers = tuple[Any, ...]
+"""Numbers, or rows of them."""
+
+
+@lru_cache(maxsize=256)
+def constant(values: Numbers, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A tensor of these numbers; whoever asks for it must not write to it."""
+    # What is made while nothing is recorded could not be used where gradients are.
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=dtype, device=device)
+
+
+@lru_cache(maxsize=64)
+def disc(radius: float | int, device: torch.device) -> Tensor:
+    """Offsets ``[2, d]`` (column, row) of the cells whose middles lie within a radius of one's own, row by row."""
+    reach = int(radius)
+    steps = range(-reach, reach + 1)
+    inside = tuple((column, row) for row in steps for column in steps if row**2 + column**2 <= radius**2)
+    return constant(inside, torch.int64, device).T
