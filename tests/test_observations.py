@@ -145,6 +145,20 @@ def test_joined_observations_are_those_of_both():
     assert both.has_flow.tolist() == [[True, False, False]]
 
 
+def test_what_is_drawn_hangs_on_an_events_own_number_also_where_others_were_left_out():
+    near = torch.rand((1, 4000), generator=generator(7)) < 0.5
+    numbers = torch.arange(4000.0)[None]
+    left = (near | (torch.rand(near.shape, generator=generator(8)) < 0.3))[0].nonzero()[:, 0]
+    all_of_them = WindowEvents(torch.stack([numbers, numbers], -1), numbers, numbers, torch.ones_like(near))
+    some = WindowEvents(*(getattr(all_of_them, name)[:, left] for name in ("pixels", "age_s", "polarity", "mask")), left)
+    share = torch.tensor([[0.1]])
+    chosen, exists = all_of_them.draw(near, share, 300)
+    of_some, some_exist = some.draw(near[:, left], share, 300)
+    assert 100 < int(exists.sum()) < 300
+    assert torch.equal(exists, some_exist)
+    assert torch.equal(chosen[exists], left[of_some[some_exist]])
+
+
 # ---- the events of one object
 
 
@@ -152,7 +166,8 @@ def test_the_events_of_one_object_can_be_repeated():
     values = [torch.rand((3, 5, *shape), generator=generator(k)) for k, shape in enumerate([(2,), (), ()])]
     events = WindowEvents(*values, torch.rand((3, 5), generator=generator(4)) < 0.5)
     repeated = events.of(1).repeated(4)
-    for name, value in vars(events).items():
+    for name in ("pixels", "age_s", "polarity", "mask"):
+        value = getattr(events, name)
         many = getattr(repeated, name)
         assert many.shape == (4, *value.shape[1:])
         assert all(torch.equal(row, value[1]) for row in many)

@@ -60,7 +60,12 @@ class EventBatch:
         return len(self.t_us)
 
     def __getitem__(self, index: slice | Tensor) -> "EventBatch":
-        return EventBatch(self.x[index], self.y[index], self.t_us[index], self.polarity[index], self.stream_index[index])
+        fields = (self.x, self.y, self.t_us, self.polarity, self.stream_index)
+        if isinstance(index, slice):
+            return EventBatch(*(field[index] for field in fields))
+        # Which entries a mask means is found once, and they are selected several times faster than by indexing.
+        chosen = index.nonzero()[:, 0] if index.dtype == torch.bool else index
+        return EventBatch(*(field.index_select(0, chosen) for field in fields))
 
     def to(self, device: torch.device | str) -> "EventBatch":
         """The same events on another device."""

@@ -1,5 +1,6 @@
 """What is matched with contours: the corners, and recent events near the contours."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -47,20 +48,34 @@ class WindowEvents:
         age_s: time from the event to the window's end (s).
         polarity: +1 where the pixel got brighter, -1 where darker.
         mask: which entries exist.
+        number: of each event among all of its window, where some of them were left out.
     """
 
     pixels: Float[Tensor, "b e 2"]
     age_s: Float[Tensor, "b e"]
     polarity: Float[Tensor, "b e"]
     mask: Bool[Tensor, "b e"]
+    number: Int[Tensor, "e"] | None = None
 
     def of(self, number: int) -> "WindowEvents":
         """The events of one object."""
-        return WindowEvents(*(value[number : number + 1] for value in vars(self).values()))
+        return self._with(lambda value: value[number : number + 1])
 
     def repeated(self, count: int) -> "WindowEvents":
         """The events of one object, for ``count`` of its kind."""
-        return WindowEvents(*(value.expand(count, *value.shape[1:]) for value in vars(self).values()))
+        return self._with(lambda value: value.expand(count, *value.shape[1:]))
+
+    def _with(self, rows: Callable[[Tensor], Tensor]) -> "WindowEvents":
+        return WindowEvents(rows(self.pixels), rows(self.age_s), rows(self.polarity), rows(self.mask), self.number)
+
+    def draw(self, candidates: Bool[Tensor, "b e"], share: Float[Tensor, "b 1"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
+        """A share of each row's candidates, spread evenly over them: their indices, at most ``count``, and which of these exist.
+
+        Whether a candidate is drawn hangs on its own number alone.
+        """
+        number = torch.arange(candidates.shape[1], device=candidates.device) if self.number is None else self.number
+        # Multiples of the golden ratio fill the unit interval evenly, whichever stretch of them is taken.
+        return select_ranked(candidates & ((number.double() * _GOLDEN_RATIO).frac() < share), count)
 
 
 def corner_observations(corners: Corners) -> Observations:
@@ -78,20 +93,10 @@ def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Flo
     near = mask & (index.look_up(torch.addcmul(pixels, plane_velocity, events.age_s[..., None])) >= 0)
     total = near.sum(-1, keepdim=True)
     share = torch.where(total > count, _FILL * count / total, 1.0)
-    chosen, exists = draw(near, share, count)
+    chosen, exists = events.draw(near, share, count)
     values = take_points(torch.cat([pixels.transpose(1, 2), events.age_s[:, None], events.polarity[:, None]], 1).transpose(1, 2), chosen)
     flow = torch.zeros_like(values[..., :2])
     return Observations(values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
-
-
-def draw(candidates: Bool[Tensor, "b e"], share: Float[Tensor, "b 1"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
-    """A share of each row's candidates, spread evenly over them: their indices, at most ``count``, and which of these exist.
-
-    Whether a candidate is drawn hangs on its own number alone.
-    """
-    number = torch.arange(candidates.shape[1], device=candidates.device, dtype=torch.float64)
-    # Multiples of the golden ratio fill the unit interval evenly, whichever stretch of them is taken.
-    return select_ranked(candidates & ((number * _GOLDEN_RATIO).frac() < share), count)
 
 
 def join(first: Observations, second: Observations) -> Observations:

@@ -20,7 +20,7 @@ from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.learned_contours import LearnedContours, judge_model
 from torchtrack.lie import transform_points
 from torchtrack.object_batch import ObjectBatch
-from torchtrack.observations import WindowEvents, draw
+from torchtrack.observations import WindowEvents
 from torchtrack.search import Found
 from torchtrack.surface_rays import surface_points
 
@@ -121,7 +121,7 @@ def _sample(around: Surroundings, grid: CellGrid, events: WindowEvents, count: i
     x, y = (events.pixels - grid.middle).unbind(-1)
     near = events.mask & around.learning[:, None] & (x * x + y * y < radius_px[:, None].square())
     near = near & (events.age_s * speed_px_s[:, None] < _LONGEST_WAY_PX)
-    chosen, exists = draw(near, count / near.sum(-1, keepdim=True).clamp(min=count), count)
+    chosen, exists = events.draw(near, count / near.sum(-1, keepdim=True).clamp(min=count), count)
     values = take_points(torch.cat([events.pixels, events.age_s[..., None]], -1), chosen)
     seen_px, age_s = values[..., :2], values[..., 2:]
     pixels = seen_px + object_plane_velocity(seen_px, around.velocity, around.centre_cam, intrinsics) * age_s

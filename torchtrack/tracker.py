@@ -28,6 +28,7 @@ from torchtrack.object_model import ObjectModel
 from torchtrack.observations import WindowEvents, corner_observations, join, select_events
 from torchtrack.prediction import Prediction
 from torchtrack.search import judge_fit, search_wanted
+from torchtrack.sensor_tiles import SensorTiles
 from torchtrack.speed_limit import largest_speed, limit_speed, unknown_speed
 from torchtrack.state import StepResult, TrackerState, choose_rows
 from torchtrack.surface_learning import Surroundings, learn_after
@@ -38,6 +39,8 @@ from torchtrack.trust import TrustNetwork
 _BORDER_PX = 64
 # Nothing that is tracked is farther away (m).
 _MAX_DEPTH_M = 1e4
+# Poses that a search draws lie within this many of its least standard deviations.
+_DRAWN_SIGMAS = 4.0
 # Fewer events than this do not make a part of a window.
 _EVENTS_OF_A_PART = 400
 
@@ -87,6 +90,7 @@ class Tracker(nn.Module):
         self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
         self.register_buffer("ideal_pixels", stack_tables([undistortion_table(c) for c in cameras]))
         self.register_buffer("sensor_pixels", stack_tables([distortion_table(c, _BORDER_PX) for c in cameras]))
+        self.tiles = SensorTiles(self.ideal_pixels[0]) if len(cameras) == 1 else None
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
         self.register_buffer("far_pose", _far_pose(self.centre_obj))
@@ -178,8 +182,11 @@ class Tracker(nn.Module):
         depth_m = lie.transform_points(state.T_cam_obj.to(unknown_m_s.dtype), self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
         window_s = ((t_us - state.t_us) * 1e-6)[self.stream_index]
         unknown_px = unknown_m_s * window_s * self.intrinsics[:, 0] / depth_m
+        unknown = unknown_px > window.max_unknown_px
+        if self.streams == 1:
+            return unknown
         count = torch.bincount(events.stream_index, minlength=self.streams)[self.stream_index]
-        return (unknown_px > window.max_unknown_px) & (count >= window.parts * _EVENTS_OF_A_PART)
+        return unknown & (count >= window.parts * _EVENTS_OF_A_PART)
 
     def _advance_in_parts(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult]:
         """The window as several short ones."""
@@ -196,9 +203,10 @@ class Tracker(nn.Module):
         window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
         dt_s = window_s[self.stream_index]
         last_event_us = update_last_event(state.last_event_us, events) if self._looks_back else state.last_event_us
-        seen = self._seen(events, t_us)
-        recorded = self._predict(self._held_back(state, seen, dt_s), dt_s)
+        recorded = self._predict(self._held_back(state, events, t_us, dt_s), dt_s)
         prediction = recorded.detached()
+        nearby, number = self._near_objects(events, prediction, dt_s)
+        seen = self._seen(nearby, t_us, number)
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         corners = self._corners(contours, last_event_us, t_us, window_s)
         sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
@@ -244,13 +252,13 @@ class Tracker(nn.Module):
         return replace(self.objects, learned=learned.that_count(self.config.learning))
 
     @torch.no_grad()
-    def _held_back(self, state: TrackerState, seen: WindowEvents, dt_s: Tensor) -> TrackerState:
+    def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor) -> TrackerState:
         """The state, with the speed of objects that were never found yet limited by the events before them."""
         # Most windows are of objects that were found long ago: their events need not be counted.
         if not self.config.motion.speed_from_events or bool((state.usual_share > 0).all()):
             return state
         T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)
-        limit_m_s = largest_speed(self.objects, T_cam_obj, seen, dt_s)
+        limit_m_s = largest_speed(self.objects, T_cam_obj, self._seen(events, t_us), dt_s)
         limit_m_s = torch.where(state.usual_share > 0, torch.inf, limit_m_s)
         depth_m = lie.transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
         return replace(state, covariance=limit_speed(state.covariance, limit_m_s, self.diameter_m, depth_m))
@@ -292,16 +300,25 @@ class Tracker(nn.Module):
 
         return age_s
 
-    def _seen(self, events: EventBatch, t_us: Tensor) -> WindowEvents:
+    def _near_objects(self, events: EventBatch, prediction: Prediction, dt_s: Tensor) -> tuple[EventBatch, Tensor | None]:
+        """The events that can have to do with any object, and their numbers, where others were left out.
+
+        A weigher is shown all of them, and a GPU would have to be waited for.
+        """
+        if self.tiles is None or self.weigher is not None or dt_s.device.type != "cpu":
+            return events, None
+        margin_px = max(self.config.matching.max_gate_px, *self.config.matching.gates_px) + _DRAWN_SIGMAS * self.config.search.least_sigma_px
+        return self.tiles.keep(events, self.tiles.near(prediction, dt_s, margin_px))
+
+    def _seen(self, events: EventBatch, t_us: Tensor, number: Tensor | None = None) -> WindowEvents:
         """The window's events as each object's camera saw them."""
         window = pad_streams(events, self.streams, t_us)
         stream = torch.arange(self.streams, device=t_us.device)[:, None]
         pixels = at_pixels(self.ideal_pixels, stream, window.x, window.y).transpose(1, 2).contiguous().transpose(1, 2)
         values = (pixels, window.age_us.to(pixels.dtype) * 1e-6, 2 * window.polarity.to(pixels.dtype) - 1, window.mask)
-        if self.streams == 1:
-            # Without a copy for every object.
-            return WindowEvents(*(value.expand(len(self.stream_index), *value.shape[1:]) for value in values))
-        return WindowEvents(*(value[self.stream_index] for value in values))
+        # Of one stream without a copy for every object.
+        each = [value.expand(len(self.stream_index), *value.shape[1:]) if self.streams == 1 else value[self.stream_index] for value in values]
+        return WindowEvents(each[0], each[1], each[2], each[3], number)
 
 
 def _far_pose(centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:

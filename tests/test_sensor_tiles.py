@@ -1,0 +1,91 @@
+"""Events that are left out because no object can be near them: none that counts, and most of those that do not."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import SMALL_CAMERA, box_model, generator, pose, random_events
+from tracked_boxes import WINDOW_US, follow, merged, moving_box, tracker_of, windows
+
+from torchtrack import Tracker
+from torchtrack.camera import Camera, distort, undistortion_table
+from torchtrack.config.tracker import CornerConfig, TrackerConfig
+from torchtrack.sensor_tiles import SensorTiles
+
+WIDE = Camera(240.0, 240.0, 320.0, 240.0, 640, 480)
+ODD = Camera(240.0, 240.0, 100.0, 70.0, 201, 143, "plumb_bob", (-0.3, 0.1, 0.0, 0.0))
+
+
+def prediction_at(T_cam_obj):
+    tracker = tracker_of()
+    return tracker, tracker._predict(tracker.init(T_cam_obj[None], 0), torch.tensor([0.0]))
+
+
+@pytest.mark.parametrize("camera", [SMALL_CAMERA, ODD])
+def test_every_pixel_lies_within_the_reach_of_its_tile(camera):
+    ideal = undistortion_table(camera)
+    tiles = SensorTiles(ideal)
+    v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    tile = tiles._of(u.int(), v.int())
+    assert int(tile.max()) == len(tiles.middle) - 1
+    away = (ideal - tiles.middle[tile]).norm(dim=-1)
+    assert (away <= tiles.reach_px[tile] + 1e-4).all()
+    assert float(tiles.reach_px.max()) < 24
+
+
+@pytest.mark.parametrize("margin_px", [0.0, 30.0])
+@pytest.mark.parametrize("shift_m", [0.0, 0.1, -0.2])
+def test_what_can_be_seen_of_an_object_is_near(margin_px, shift_m):
+    T_cam_obj = pose(translation=(shift_m, 0.0, 0.5))
+    tracker, prediction = prediction_at(T_cam_obj)
+    near = tracker.tiles.near(prediction, torch.tensor([0.005]), margin_px)
+    pixels = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours).pixels[0]
+    angle = torch.linspace(0, 6.28, 32)
+    around = pixels[:, None] + margin_px * torch.stack([angle.cos(), angle.sin()], -1)
+    u, v = torch.from_numpy(distort(around.flatten(0, 1).numpy(), SMALL_CAMERA)).round().int().unbind(-1)
+    inside = (u >= 0) & (u < SMALL_CAMERA.width) & (v >= 0) & (v < SMALL_CAMERA.height)
+    assert near[tracker.tiles._of(u[inside], v[inside])].all()
+
+
+def test_tiles_far_from_all_objects_are_not_near():
+    tracker, prediction = prediction_at(pose(translation=(0.0, 0.0, 2.0)))
+    near = tracker.tiles.near(prediction, torch.tensor([0.005]), 8.0)
+    assert 0 < int(near.sum()) < len(near) // 2
+
+
+def test_an_object_that_is_not_known_where_to_be_is_near_everywhere():
+    tracker, prediction = prediction_at(pose())
+    prediction.covariance[:] = torch.nan
+    assert tracker.tiles.near(prediction, torch.tensor([0.005]), 0.0).all()
+
+
+def test_kept_events_keep_their_order_and_tell_their_numbers():
+    tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
+    near = torch.rand(len(tiles.middle), generator=generator(3)) < 0.4
+    kept, number = tiles.keep(events, near)
+    assert 0 < len(kept) < 400
+    assert torch.equal(kept.t_us, events.t_us[number])
+    assert near[tiles._of(kept.x, kept.y)].all()
+    assert int(near[tiles._of(events.x, events.y)].sum()) == len(kept)
+
+
+def test_where_most_events_are_near_all_are_kept():
+    tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
+    assert tiles.keep(events, torch.ones(len(tiles.middle), dtype=torch.bool)) == (events, None)
+    none, number = tiles.keep(events, torch.zeros(len(tiles.middle), dtype=torch.bool))
+    assert (len(none), number) == (0, None)
+
+
+def test_a_step_is_the_same_without_the_events_that_are_left_out():
+    """But for the corners, which see the whole sensor."""
+    _, events = moving_box(pose(), 6, camera=WIDE)
+    tracker = Tracker([box_model()], WIDE, TrackerConfig(corners=CornerConfig(max_corners=0)))
+    state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 5))
+    noise = random_events(20_000, width=WIDE.width, height=WIDE.height, duration_us=WINDOW_US)
+    noisy = merged(events, replace(noise, t_us=noise.t_us + 5 * WINDOW_US)).slice_time(5 * WINDOW_US, 6 * WINDOW_US)
+    results = [tracker.step(state, noisy)[1]]
+    dt_s = torch.tensor([1e-6 * WINDOW_US])
+    assert len(tracker._near_objects(noisy, tracker._predict(state, dt_s), dt_s)[0]) < len(noisy) // 2
+    tracker.tiles = None
+    results.append(tracker.step(state, noisy)[1])
+    assert torch.equal(results[0].T_cam_obj, results[1].T_cam_obj)
