@@ -27,13 +27,20 @@ class _Watch(TorchDispatchMode):
         made_here = name == "lift_fresh" and args[0].dim() > 0
         counted = name == "repeat_interleave" and func._overloadname in ("Tensor", "self_Tensor")
         if name in _READS or made_here or counted or (name.startswith("index") and _by_mask(args)):
-            self.found.append(_place(name))
+            _note(self.found, name)
         return func(*args, **(kwargs or {}))
 
 
 def _by_mask(args) -> bool:
     indices = args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else []
     return any(torch.is_tensor(index) and index.dtype == torch.bool for index in indices)
+
+
+def _note(found: list[str], name: str) -> None:
+    """Note an operation, unless it looks at what was asked for early."""
+    place = _place(name)
+    if not place.startswith("readback.py"):
+        found.append(place)
 
 
 def _place(name: str) -> str:
@@ -52,7 +59,7 @@ def host_reads() -> Iterator[list[str]]:
     to_list = torch.Tensor.tolist
 
     def noted(tensor: torch.Tensor):
-        found.append(_place("tolist"))
+        _note(found, "tolist")
         return to_list(tensor)
 
     torch.Tensor.tolist = noted

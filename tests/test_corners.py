@@ -232,7 +232,7 @@ def two_objects(dtype, surface_config=SURFACE):
 
     def corners(pixels):
         mask = torch.ones(pixels.shape[:2], dtype=torch.bool)
-        regions = object_regions(pixels, mask, torch.zeros(len(pixels), dtype=torch.int64), (120, 160), surface_config.margin_px)
+        regions = object_regions(pixels, mask, torch.zeros(len(pixels), dtype=torch.int64), (120, 160), surface_config.margin_px, 256)
         return detect(last, regions, config=CornerConfig(max_corners=400, snap=False), surface_config=surface_config, dtype=dtype)
 
     together = corners(torch.cat([small, large]))
@@ -258,7 +258,7 @@ def test_more_regions_than_are_filtered_at_a_time():
     place = torch.tensor([[30.0, 30.0], [80.0, 60.0]])
     pixels = torch.stack([place + 3 * number for number in range(19)])
     mask = torch.ones(19, 2, dtype=torch.bool)
-    many = detect(last, object_regions(pixels, mask, torch.zeros(19, dtype=torch.int64), (120, 160), 16))
+    many = detect(last, object_regions(pixels, mask, torch.zeros(19, dtype=torch.int64), (120, 160), 16, 256))
     for number in (0, 8, 18):
-        one = detect(last, object_regions(pixels[number : number + 1], mask[:1], torch.tensor([0]), (120, 160), 16))
+        one = detect(last, object_regions(pixels[number : number + 1], mask[:1], torch.tensor([0]), (120, 160), 16, 256))
         assert found(many, number) == found(one)

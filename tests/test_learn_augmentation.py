@@ -4,6 +4,7 @@ import pytest
 import torch
 from helpers import generator, random_events, random_pose
 from pydantic import ValidationError
+from tracked_boxes import tensors_of
 
 from torchtrack.events import EventBatch, check_events
 from torchtrack.learn.augmentation import AugmentationConfig, add_noise, augmented, drop_events, flip_polarity, jitter_pose, stretch_time
@@ -25,7 +26,7 @@ def changed(before, after):
     found = set()
     for name, value in vars(before).items():
         other = getattr(after, name)
-        pairs = zip(vars(value).values(), vars(other).values(), strict=True) if isinstance(value, EventBatch) else [(value, other)]
+        pairs = zip(tensors_of(value), tensors_of(other), strict=True) if isinstance(value, EventBatch) else [(value, other)]
         if not all(torch.equal(torch.as_tensor(a), torch.as_tensor(b)) for a, b in pairs):
             found.add(name)
     return found

@@ -138,7 +138,7 @@ def test_no_window_is_too_long_and_no_decay_too_short(dtype):
 
 def test_a_region_holds_the_contours_and_the_margin():
     pixels = torch.tensor([[[40.2, 30.7], [60.5, 50.1], [55.0, 33.0]]])
-    regions = object_regions(pixels, torch.ones(1, 3, dtype=torch.bool), torch.tensor([0]), (120, 160), margin_px=12)
+    regions = object_regions(pixels, torch.ones(1, 3, dtype=torch.bool), torch.tensor([0]), (120, 160), margin_px=12, largest_px=256)
     (u, v), (width, height) = regions.origin[0].tolist(), regions.extent[0].tolist()
     assert 40 - 12 - 3 <= u <= 40 - 12
     assert 30 - 12 - 3 <= v <= 30 - 12
@@ -150,16 +150,16 @@ def test_a_region_holds_the_contours_and_the_margin():
 def test_masked_and_outside_points_do_not_count():
     pixels = torch.tensor([[[40.0, 30.0], [60.0, 50.0], [-500.0, 7.0], [100.0, 1e6], [100.0, 100.0]]])
     mask = torch.tensor([[True, True, True, True, False]])
-    regions = object_regions(pixels, mask, torch.tensor([0]), (120, 160), 12)
-    expected = object_regions(pixels[:, :2], mask[:, :2], torch.tensor([0]), (120, 160), 12)
+    regions = object_regions(pixels, mask, torch.tensor([0]), (120, 160), 12, 256)
+    expected = object_regions(pixels[:, :2], mask[:, :2], torch.tensor([0]), (120, 160), 12, 256)
     assert torch.equal(regions.origin, expected.origin)
     assert torch.equal(regions.extent, expected.extent)
 
 
 def test_an_object_without_contours_gets_the_smallest_region_and_others_keep_theirs():
     pixels = torch.tensor([[[40.0, 30.0], [60.0, 50.0]], [[torch.nan, 1.0], [1e9, 5.0]]])
-    regions = object_regions(pixels, torch.ones(2, 2, dtype=torch.bool), torch.tensor([0, 0]), (120, 160), 12)
-    alone = object_regions(pixels[:1], torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]), (120, 160), 12)
+    regions = object_regions(pixels, torch.ones(2, 2, dtype=torch.bool), torch.tensor([0, 0]), (120, 160), 12, 256)
+    alone = object_regions(pixels[:1], torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]), (120, 160), 12, 256)
     assert torch.equal(regions.origin[0], alone.origin[0])
     assert torch.equal(regions.extent[0], alone.extent[0])
     assert (regions.extent[1] <= regions.extent[0]).all()
@@ -168,8 +168,8 @@ def test_an_object_without_contours_gets_the_smallest_region_and_others_keep_the
 def test_a_region_does_not_depend_on_the_size_of_the_others():
     small = torch.tensor([[40.0, 30.0], [60.0, 50.0]])
     large = torch.tensor([[10.0, 10.0], [150.0, 110.0]])
-    regions = object_regions(torch.stack([small, large]), torch.ones(2, 2, dtype=torch.bool), torch.tensor([0, 0]), (120, 160), 16)
-    alone = object_regions(small[None], torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]), (120, 160), 16)
+    regions = object_regions(torch.stack([small, large]), torch.ones(2, 2, dtype=torch.bool), torch.tensor([0, 0]), (120, 160), 16, 256)
+    alone = object_regions(small[None], torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]), (120, 160), 16, 256)
     assert torch.equal(regions.origin[:1], alone.origin)
     assert torch.equal(regions.extent[:1], alone.extent)
     assert regions.size > alone.size

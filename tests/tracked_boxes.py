@@ -1,6 +1,6 @@
 """Boxes that are tracked from exact events, for the tests of the tracker."""
 
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 
 import torch
@@ -73,3 +73,27 @@ def started(dtype=torch.float32, config=None, count=5):
 
 def tracker_of(count=1, **kwargs):
     return Tracker([box_model()] * count, SMALL_CAMERA, **kwargs)
+
+
+# ---- scenes: initial poses, stream of each object, cameras, and windows
+
+
+def one_box_scene(count):
+    _, events = moving_box(pose(), count)
+    return [pose()], [0], [SMALL_CAMERA], windows(events, count)
+
+
+def scene_of_one_stream(count):
+    starts = [pose((0.5, 0.6, 0.1), (-0.17, 0.0, 0.5)), pose((0.4, -0.7, 0.3), (0.17, 0.0, 0.5))]
+    both = [moving_box(start, count, WIDE_CAMERA, seed=number)[1] for number, start in enumerate(starts)]
+    return starts, [0, 0], [WIDE_CAMERA], windows(merged(*both), count)
+
+
+def scene_of_streams(count):
+    starts, cameras = [pose(), pose((0.4, -0.7, 0.3))], [SMALL_CAMERA, WIDE_CAMERA]
+    cut = [windows(moving_box(start, count, camera, stream=s)[1], count) for s, (start, camera) in enumerate(zip(starts, cameras, strict=True))]
+    together = [(concatenate([events for events, _ in pair]), torch.tensor([end_us for _, end_us in pair])) for pair in zip(*cut, strict=True)]
+    return starts, [0, 1], cameras, [(replace(events, most_of_one=len(events)), ends) for events, ends in together]
+
+
+SCENES = [one_box_scene, scene_of_one_stream, scene_of_streams]

@@ -16,6 +16,7 @@ from torchtrack.motion import inverse
 from torchtrack.observations import Observations
 from torchtrack.pose_solver import Linearisation, PoseProblem, WindowTerms, solve_pose
 from torchtrack.prediction import Prediction
+from torchtrack.readback import Answer
 
 # The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).
 _INDEX_MARGIN_PX = 2
@@ -45,10 +46,20 @@ def gate_widening(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[
     return (matching.gate_sigmas * sigma_px / first_px).clamp(1, max(matching.max_gate_px / first_px, 1))
 
 
-def index_for(contours: Contours, image_size: tuple[int, int], config: TrackerConfig, widening: Float[Tensor, "b"]) -> ContourIndex:
-    """The index of contours, wide enough for each object's first gate."""
-    radius_px = (widening * max(config.matching.gates_px)).long() + _INDEX_MARGIN_PX
-    return index_contours(contours, image_size, radius_px, config.matching.index_cell_px)
+def index_radius(widening: Float[Tensor, "b"], config: TrackerConfig) -> Answer:
+    """How far contours are to be found for each object's first gate (px)."""
+    return Answer.to((widening * max(config.matching.gates_px)).long() + _INDEX_MARGIN_PX)
+
+
+def index_for(
+    contours: Contours, image_size: tuple[int, int], config: TrackerConfig, widening: Float[Tensor, "b"], radius_px: Answer | None = None
+) -> ContourIndex:
+    """The index of contours, wide enough for each object's first gate.
+
+    Args:
+        radius_px: :func:`index_radius`, where it was asked for ahead.
+    """
+    return index_contours(contours, image_size, radius_px or index_radius(widening, config), config.matching.index_cell_px)
 
 
 def align(

@@ -4,21 +4,26 @@ The index is made once per extraction of contours; when the pose moves by a few 
 instead.
 """
 
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from math import ceil
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack import readback
+from torchtrack.constants import constant
 from torchtrack.contours import Contours
 
 # Squared distances are compared in these fractions of a pixel²; none that counts comes near this many of them.
 _DISTANCE_STEPS, _FAR_STEPS = 16, 2**30
 # From the middle of a cell to its corner, in cells.
 _HALF_DIAGONAL = 0.5**0.5
-# Farther than any cell of an image.
-_FAR_CELLS = 2**20
+# Farther than any cell of an image, and than any contour is looked for (px).
+_FAR_CELLS, _FAR_PX = 2**20, 2.0**12
 
 
 @dataclass(frozen=True)
@@ -26,14 +31,14 @@ class ContourIndex:
     """The nearest contour point of every cell of a region, within a radius.
 
     Args:
-        corner: outer corner (column, row) of the region's first cell; cell (0, 0) is centred at pixel (0, 0).
+        first: the region's first cell (column, row); cell (0, 0) is centred at pixel (0, 0).
         size: rows and columns of the region, whose outermost cells are empty.
         cell_px: side of a cell.
         nearest: contour index per cell, -1 where none is near.
         pixels: where the contour points were when the index was made.
     """
 
-    corner: Float[Tensor, "b 2"]
+    first: Float[Tensor, "b 2"]
     size: tuple[int, int]
     cell_px: int
     nearest: Int[Tensor, "b p"]
@@ -42,43 +47,82 @@ class ContourIndex:
     def look_up(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
         """The contour point nearest to the centre of each pixel's cell, -1 where none is near."""
         rows, columns = self.size
-        # Rounded the same way wherever the region begins: events lie halfway between the centres of two cells.
-        column, row = (pixels / self.cell_px - self.corner[:, None]).floor().unbind(-1)
+        # Whole cells first: rounded the same way wherever the region begins, as events lie halfway between the centres of two cells.
+        column, row = pixels.add(0.5 * self.cell_px).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
         # The region's border is empty: whatever lies outside finds nothing there, nor does what is not a number.
         place = torch.add(column.clamp(0, columns - 1), row.clamp(0, rows - 1), alpha=columns)
         return self.nearest.gather(1, place.nan_to_num_(0.0).long())
 
 
-def index_contours(contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"], cell_px: int) -> ContourIndex:
+def index_contours(
+    contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"] | readback.Answer, cell_px: int
+) -> ContourIndex:
     """Index the visible contour points; those far outside the image (height, width) are left out.
 
-    Every point writes its distance and number to the cells around it, and the least stays.
+    Every point writes its distance and number to the cells around it, and the least stays. The region is as large as the
+    contours need; on a GPU, it is the whole image.
 
     Args:
         radius_px: how far from a contour it is still found; one for all objects, or one for each.
     """
     batch, count, _ = contours.pixels.shape
-    device = contours.pixels.device
-    radius = torch.as_tensor(radius_px, device=device).expand(batch)
-    middle = torch.tensor([0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)], dtype=contours.pixels.dtype, device=device)
+    radius, radii_px = _radii(radius_px, contours)
+    middle = constant((0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)), contours.pixels.dtype, contours.pixels.device)
     inside = contours.mask & ((contours.pixels - middle).abs() < middle + radius[:, None, None]).all(-1)
-    radii_px = sorted(set(radius.tolist()))
-    margin = _reach(max([0, *radii_px]), cell_px) + 1
     centre = (contours.pixels / cell_px).round()
-    low = torch.where(inside[..., None], centre, torch.inf).amin(1).clamp(max=_FAR_CELLS) - margin
-    local = torch.where(inside[..., None], centre - low[:, None], 0)
-    columns, rows = (int(size) + margin + 1 for size in local.amax((0, 1)).tolist())
-    keys = torch.full((batch * rows * columns,), _FAR_STEPS * count, device=device)
-    for reach_px in radii_px:
+    margin = _reach(max([0, *radii_px]), cell_px) + 1
+    low = _first_cells(centre, inside, margin)
+    local = torch.where(inside[..., None], centre - low[:, None], margin)
+    rows, columns = _size(local, image_size, margin, cell_px)
+    keys = torch.full((batch * rows * columns,), _FAR_STEPS * count, device=radius.device)
+    # Points that are not inside are too far from their cells to write anything.
+    to_centre = torch.where(inside[..., None], cell_px * centre - contours.pixels, _FAR_PX)
+    for reach_px, row, point in _points_by_radius(inside, radius, radii_px):
         # Object by object as far as each needs: one that is looked for far away does not make the others pay.
-        row, point = (inside & (radius == reach_px)[:, None]).nonzero().unbind(1)
-        if len(row) == 0:
-            continue
-        to_centre = cell_px * centre[row, point] - contours.pixels[row, point]
         u, v = local[row, point].long().unbind(1)
-        _write(keys, (row * rows + v) * columns + u, to_centre, point, reach_px, cell_px, columns, count)
+        _write(keys, (row * rows + v) * columns + u, to_centre[row, point], point, reach_px, cell_px, columns, count)
     nearest = torch.where(keys < _FAR_STEPS * count, keys % count, -1).view(batch, -1)
-    return ContourIndex(low - 0.5, (rows, columns), cell_px, nearest, contours.pixels)
+    return ContourIndex(low, (rows, columns), cell_px, nearest, contours.pixels)
+
+
+def _radii(radius_px: int | Tensor | readback.Answer, contours: Contours) -> tuple[Tensor, Sequence[int]]:
+    """The radius of each object, as a tensor and as numbers."""
+    if isinstance(radius_px, int):
+        return contours.mask.new_full((len(contours.mask),), radius_px, dtype=torch.int64), [radius_px] * len(contours.mask)
+    answer = radius_px if isinstance(radius_px, readback.Answer) else readback.Answer.to(radius_px)
+    return answer.on_device, answer.numbers()
+
+
+def _first_cells(centre: Float[Tensor, "b m 2"], inside: Bool[Tensor, "b m"], margin: int) -> Float[Tensor, "b 2"]:
+    """First cell (column, row) of each object's region, ``margin`` cells before its points."""
+    if readback.read_at_once(centre):
+        return torch.where(inside[..., None], centre, torch.inf).amin(1).clamp(max=_FAR_CELLS) - margin
+    # What is farther from the image than its radius, less than a margin, is not inside.
+    return constant((1 - 2 * margin,) * 2, centre.dtype, centre.device).expand(len(centre), 2)
+
+
+def _size(local: Float[Tensor, "b m 2"], image_size: tuple[int, int], margin: int, cell_px: int) -> tuple[int, int]:
+    """Rows and columns that hold the cells of all objects' points, with a margin."""
+    if readback.read_at_once(local):
+        columns, rows = local.amax((0, 1)).tolist()
+        return int(rows) + margin + 1, int(columns) + margin + 1
+    rows, columns = (ceil((side - 1) / cell_px) + 4 * margin - 1 for side in image_size)
+    return rows, columns
+
+
+def _points_by_radius(inside: Tensor, radius: Tensor, radii_px: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """For each radius, the objects and numbers of the points that are to be found within it; on a GPU, also of those that are not inside."""
+    if readback.read_at_once(inside):
+        for reach_px in sorted(set(radii_px)):
+            row, point = (inside & (radius == reach_px)[:, None]).nonzero().unbind(1)
+            if len(row):
+                yield reach_px, row, point
+        return
+    begin, order = 0, radius.argsort()
+    for reach_px, objects in sorted(Counter(radii_px).items()):
+        row, point = torch.meshgrid(order[begin : begin + objects], torch.arange(inside.shape[1], device=order.device), indexing="ij")
+        yield reach_px, row.flatten(), point.flatten()
+        begin += objects
 
 
 def _write(keys: Tensor, cell: Tensor, to_centre: Tensor, point: Tensor, radius_px: int, cell_px: int, columns: int, count: int) -> None:
@@ -88,7 +132,7 @@ def _write(keys: Tensor, cell: Tensor, to_centre: Tensor, point: Tensor, radius_
         cell: of each point.
         to_centre: way from each point to the centre of its cell (px).
     """
-    disc = to_centre.new_tensor(_disc(radius_px / cell_px))
+    disc = constant(_disc(radius_px / cell_px), to_centre.dtype, to_centre.device)
     steps = _DISTANCE_STEPS * _squared_distances(to_centre, cell_px * disc)
     key = torch.add(point[:, None], steps.long(), alpha=count).masked_fill_(steps > _DISTANCE_STEPS * radius_px**2, _FAR_STEPS * count)
     around = torch.add(disc[:, 0], disc[:, 1], alpha=columns).long()

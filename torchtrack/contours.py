@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchtrack import readback
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.lie import transform_points
@@ -207,7 +208,7 @@ def _texture_points(model: ContourModel, T_cam_obj: Tensor) -> tuple[Tensor, Ten
     """Points, tangents, kinds and mask of the texture that looks at the camera."""
     facing = _texture_mask(model, T_cam_obj)
     # On a GPU, which would have to be waited for to know how many there are, all keep their places.
-    count = int(facing.sum(1).amax()) if facing.device.type == "cpu" else facing.shape[1]
+    count = int(facing.sum(1).amax()) if readback.read_at_once(facing) else facing.shape[1]
     chosen, mask = select_ranked(facing, count)
     points, tangents = (values.T[:, chosen].permute(1, 2, 0) for values in (model.texture_points, model.texture_tangents))
     return points, tangents, torch.full_like(chosen, int(ContourKind.TEXTURE)), mask

@@ -44,6 +44,8 @@ class Corners:
 
 def _response(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> Float[Tensor, "b h w"]:
     """Harris response of the filtered surface, a few regions at a time."""
+    if surface.device.type != "cpu":
+        return corner_response(surface, config)
     return torch.cat([corner_response(part, config) for part in surface.split(_CHUNK)])
 
 

@@ -5,13 +5,14 @@ Conventions, stated once: times are integer microseconds (int64) at every bounda
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from torchtrack import readback
 from torchtrack.errors import EventDataError
 
 
@@ -24,6 +25,8 @@ class EventBatch:
         t_us: times in microseconds, int64.
         polarity: bool, ``True`` where the pixel got brighter.
         stream_index: which stream each event belongs to, int64, not decreasing.
+        most_of_one: no stream has more of the events than this; noted by :meth:`to` on the way to a GPU, where counting them
+            would take a wait.
     """
 
     x: Int[Tensor, "e"]
@@ -31,6 +34,7 @@ class EventBatch:
     t_us: Int[Tensor, "e"]
     polarity: Bool[Tensor, "e"]
     stream_index: Int[Tensor, "e"]
+    most_of_one: int | None = field(default=None, kw_only=True)
 
     @classmethod
     def from_numpy(cls, x: np.ndarray, y: np.ndarray, t_us: np.ndarray, polarity: np.ndarray, stream: int = 0) -> "EventBatch":
@@ -62,18 +66,21 @@ class EventBatch:
     def __getitem__(self, index: slice | Tensor) -> "EventBatch":
         fields = (self.x, self.y, self.t_us, self.polarity, self.stream_index)
         if isinstance(index, slice):
-            return EventBatch(*(field[index] for field in fields))
+            return EventBatch(*(values[index] for values in fields), most_of_one=self.most_of_one)
         # Which entries a mask means is found once, and they are selected several times faster than by indexing.
         chosen = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-        return EventBatch(*(field.index_select(0, chosen) for field in fields))
+        return EventBatch(*(values.index_select(0, chosen) for values in fields), most_of_one=self.most_of_one)
 
     def to(self, device: torch.device | str) -> "EventBatch":
         """The same events on another device."""
-        return EventBatch(*(field.to(device) for field in (self.x, self.y, self.t_us, self.polarity, self.stream_index)))
+        most = self.most_of_one
+        if most is None and torch.device(device).type != "cpu" and readback.read_at_once(self.stream_index):
+            most = int(self.stream_index.unique_consecutive(return_counts=True)[1].max()) if len(self) else 0
+        return EventBatch(*(values.to(device) for values in (self.x, self.y, self.t_us, self.polarity, self.stream_index)), most_of_one=most)
 
     def of_stream(self, stream: int) -> "EventBatch":
         """The same events, all said to be of one stream."""
-        return replace(self, stream_index=torch.full_like(self.stream_index, stream))
+        return replace(self, stream_index=torch.full_like(self.stream_index, stream), most_of_one=None)
 
     def slice_time(self, t_start_us: int, t_end_us: int) -> "EventBatch":
         """Events with ``t_start_us < t <= t_end_us``, of a batch of one stream."""
@@ -235,6 +242,11 @@ def _check_streams_in_order(stream_index: Int[Tensor, "e"]) -> None:
         )
 
 
+def stream_bounds(events: EventBatch, streams: int) -> Int[Tensor, "_"]:
+    """Where each of the ``streams`` begins among the events, and where the last one ends."""
+    return torch.searchsorted(events.stream_index, torch.arange(streams + 1, device=events.stream_index.device))
+
+
 def pad_streams(events: EventBatch, streams: int, t_end_us: Int[Tensor, "s"]) -> PaddedEvents:
     """Ragged events as one padded row per stream, with ages at ``t_end_us``.
 
@@ -245,11 +257,11 @@ def pad_streams(events: EventBatch, streams: int, t_end_us: Int[Tensor, "s"]) ->
         # Nothing to pad: the events are the row.
         mask = torch.ones_like(events.polarity)[None]
         return PaddedEvents(events.x.long()[None], events.y.long()[None], t_end_us[:, None] - events.t_us, events.polarity[None], mask)
-    if streams > 1 and events.stream_index.device.type == "cpu":
+    if streams > 1 and readback.read_at_once(events.stream_index):
         _check_streams_in_order(events.stream_index)
-    bounds = torch.searchsorted(events.stream_index, torch.arange(streams + 1, device=events.stream_index.device))
+    bounds = stream_bounds(events, streams)
     counts = torch.diff(bounds)
-    column = torch.arange(max(int(counts.max()), 1), device=bounds.device)
+    column = torch.arange(max(_most_of_one(events, counts), 1), device=bounds.device)
     mask = column < counts[:, None]
     index = torch.where(mask, bounds[:-1, None] + column, 0)
     if len(events) == 0:
@@ -258,3 +270,12 @@ def pad_streams(events: EventBatch, streams: int, t_end_us: Int[Tensor, "s"]) ->
     age_us = torch.where(mask, t_end_us[:, None] - events.t_us[index], 0)
     x, y = (torch.where(mask, field[index], 0).long() for field in (events.x, events.y))
     return PaddedEvents(x, y, age_us, events.polarity[index] & mask, mask)
+
+
+def _most_of_one(events: EventBatch, counts: Int[Tensor, "s"]) -> int:
+    """Places that the fullest stream needs; on a GPU what is known of it without a wait, where anything is."""
+    if len(events) == 0:
+        return 0
+    if events.most_of_one is None or readback.read_at_once(counts):
+        return int(counts.max())
+    return min(events.most_of_one, len(events))

@@ -1,10 +1,13 @@
 """An object's part of the image as a square of cells, in which points are counted and lines among them are found."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from torchtrack.constants import constant
 
 # Cells a side of the square, and those that an object's diameter takes at most.
 _SIDE, _DIAMETER = 256, 240.0
@@ -50,10 +53,15 @@ def tallied(places: Float[Tensor, "b n 2"], values: Float[Tensor, "b k n"]) -> F
 
 def disc(radius: int, like: Tensor) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:
     """Offsets (column, row) of the cells within a radius."""
-    step = range(-radius, radius + 1)
-    inside = [(x, y) for y in step for x in step if x * x + y * y <= radius * radius + 1]
-    column, row = like.new_tensor(inside).unbind(-1)
+    column, row = constant(_disc(radius), like.dtype, like.device).unbind(-1)
     return column, row
+
+
+@cache
+def _disc(radius: int) -> tuple[tuple[int, int], ...]:
+    """The same as numbers."""
+    step = range(-radius, radius + 1)
+    return tuple((x, y) for y in step for x in step if x * x + y * y <= radius * radius + 1)
 
 
 def is_near(marked: Float[Tensor, "b c"], places: Float[Tensor, "b n 2"], radius: int) -> Bool[Tensor, "b n"]:

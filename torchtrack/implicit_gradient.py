@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchtrack import readback
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.lie import cayley, move_about, small_difference_about
 from torchtrack.pose_solver import Linearisation, PoseProblem, WindowTerms, robust_cost, solve_positive
@@ -131,7 +132,9 @@ def _in_double(problem: PoseProblem) -> PoseProblem:
 @torch.no_grad()
 def _counted(problem: PoseProblem) -> PoseProblem:
     """The problem with those observations alone that have a weight, as a constant: the rest neither draws nor bends."""
-    most = int((problem.weights != 0).sum(-1).max())
+    counted = problem.weights != 0
+    # On a GPU, which would have to be waited for to know how many these are, all of them.
+    most = int(counted.sum(-1).max()) if readback.read_at_once(counted) else counted.shape[1]
     rows = problem.weights.abs().topk(max(most, 1)).indices
 
     def of_rows(part: PoseProblem | WindowTerms, names: tuple[str, ...]) -> dict[str, Tensor]:

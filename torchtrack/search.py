@@ -55,6 +55,15 @@ def wanted(share: Float[Tensor, "b"], sigma_px: Float[Tensor, "b"], usual_share:
     return (sigma_px > config.from_sigma_px) | (share < config.dropped_to * usual_share)
 
 
+def may_be_wanted(
+    sigma_px: Float[Tensor, "b"], last_share: Float[Tensor, "b"], usual_share: Float[Tensor, "b"], config: TrackerConfig
+) -> Bool[Tensor, "b"]:
+    """Which objects :func:`search_wanted` can turn out to search for, as far as is known before the window is aligned."""
+    if config.search.hypotheses == 0 or not config.solver.prior:
+        return torch.zeros_like(last_share, dtype=torch.bool)
+    return wanted(last_share, sigma_px, usual_share, config.search)
+
+
 def search_wanted(
     prediction: Prediction,
     sigma_px: Float[Tensor, "b"],

@@ -6,6 +6,7 @@ should fire and does not: what moves before the object, and the shading that wan
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +15,7 @@ from torch.nn.functional import normalize
 
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
+from torchtrack.constants import constant
 from torchtrack.contours import Contours, assemble, joined, take_points
 from torchtrack.image_cells import CellGrid, Lines, cell_of, fit_lines, is_near, point_sums, tallied
 from torchtrack.image_motion import object_plane_velocity, pixel_velocity
@@ -134,7 +136,8 @@ def _weighed(evidence: Tensor, known: Contours, around: Surroundings, grid: Cell
     place = grid.place(known.pixels)
 
     def count(sides: tuple[float, float]) -> Tensor:
-        along, side = (value[:, None] for value in torch.cartesian_prod(evidence.new_tensor(_ALONG_CELLS), evidence.new_tensor(sides)).unbind(-1))
+        looked_at = constant(tuple(product(_ALONG_CELLS, sides)), evidence.dtype, evidence.device)
+        along, side = (value[:, None] for value in looked_at.unbind(-1))
         normal_x, normal_y = (value[:, None] for value in known.normals.unbind(-1))
         x = place[:, None, :, 0] + along * normal_y + side * normal_x
         y = place[:, None, :, 1] - along * normal_x + side * normal_y

@@ -9,12 +9,16 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from torchtrack import readback
+from torchtrack.constants import constant
 from torchtrack.events import EventBatch
 
 # Time of a pixel that never fired: far in the past, and its age still fits int64 microseconds.
 NEVER_US = -(2**62)
 # Ages are clamped to this many decay constants: exp(-16) is zero to 1e-7, and exp of large negative numbers is slow.
 _MAX_DECAYS = 16.0
+# Origins on a grid keep a subsampled filter's phase independent of the other objects' regions (px).
+_GRID_PX = 4
 
 
 def at_pixels(maps: Shaped[Tensor, "s h w *c"], stream: Int[Tensor, "*#p"], u: Int[Tensor, "*#p"], v: Int[Tensor, "*#p"]) -> Shaped[Tensor, "..."]:
@@ -64,24 +68,38 @@ class Regions:
 
 
 def object_regions(
-    pixels: Float[Tensor, "b m 2"], mask: Bool[Tensor, "b m"], stream_index: Int[Tensor, "b"], sensor_size: tuple[int, int], margin_px: int
+    pixels: Float[Tensor, "b m 2"],
+    mask: Bool[Tensor, "b m"],
+    stream_index: Int[Tensor, "b"],
+    sensor_size: tuple[int, int],
+    margin_px: int,
+    largest_px: int,
 ) -> Regions:
     """Rectangles around the contours ``pixels`` (sensor px) with a margin, clipped to the sensor of (height, width).
 
     Objects without a contour in the image get the smallest rectangle, at the origin.
+
+    Args:
+        largest_px: on a GPU, the side of all rectangles, where that is smaller than the sensor: their size cannot hang on
+            what is seen. Of a larger object, the middle is taken.
     """
-    limit = torch.tensor([sensor_size[1] - 1, sensor_size[0] - 1], device=pixels.device)
+    limit = constant((sensor_size[1] - 1, sensor_size[0] - 1), pixels.dtype, pixels.device)
     inside = (mask & ((pixels >= 0) & (pixels <= limit)).all(-1))[..., None]
     low = torch.where(inside, pixels, torch.inf).amin(1)
     high = torch.where(inside, pixels, -torch.inf).amax(1)
     empty = ~inside.any(1)
     low = torch.where(empty, torch.zeros_like(low), low).floor().long() - margin_px
     high = torch.where(empty, torch.zeros_like(high), high).ceil().long() + margin_px
-    # Origins on a grid of 4 px keep a subsampled filter's phase independent of the other objects' regions.
-    low = torch.div(low, 4, rounding_mode="floor") * 4
+    low = torch.div(low, _GRID_PX, rounding_mode="floor") * _GRID_PX
     extent = high - low + 1
-    width, height = (-(-extent.amax(0) // 16) * 16).tolist()
-    return Regions(low, extent, (height, width), stream_index)
+    if readback.read_at_once(extent):
+        width, height = (-(-extent.amax(0) // 16) * 16).tolist()
+        return Regions(low, extent, (height, width), stream_index)
+    height, width = (-(-min(side + 2 * margin_px + _GRID_PX, largest_px) // 16) * 16 for side in sensor_size)
+    room = constant((width, height), extent.dtype, extent.device)
+    too_large = (extent - room).clamp(min=0)
+    low = low + torch.div(too_large, 2 * _GRID_PX, rounding_mode="floor") * _GRID_PX
+    return Regions(low, torch.minimum(extent, room), (height, width), stream_index)
 
 
 def time_surface(

@@ -10,15 +10,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchtrack import lie, quality
-from torchtrack.alignment import align, gate_widening, index_for
+from torchtrack import lie, quality, readback
+from torchtrack.alignment import align, gate_widening, index_for, index_radius
 from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.constants import constant
 from torchtrack.contours import ContourModel, Contours, group_by_model
 from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.errors import ModelError, PoseError
-from torchtrack.events import EventBatch, pad_streams
+from torchtrack.events import EventBatch, pad_streams, stream_bounds
 from torchtrack.evidence import AgeAt, Evidence, judged
 from torchtrack.flow import estimate_flow
 from torchtrack.learned_contours import LearnedContours
@@ -27,7 +28,7 @@ from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import WindowEvents, corner_observations, join, select_events
 from torchtrack.prediction import Prediction
-from torchtrack.search import judge_fit, search_wanted
+from torchtrack.search import judge_fit, may_be_wanted, search_wanted
 from torchtrack.sensor_tiles import SensorTiles
 from torchtrack.speed_limit import largest_speed, limit_speed, unknown_speed
 from torchtrack.state import StepResult, TrackerState, choose_rows
@@ -162,12 +163,11 @@ class Tracker(nn.Module):
         t_us = self._window_end(state, events, t_end_us)
         with torch.autocast(t_us.device.type, enabled=False):
             in_parts = self._to_be_parted(state, events, t_us)
-            if bool(in_parts.all()):
-                done = self._advance_in_parts(state, events, t_us)
-            else:
-                done = self._advance(state, events, t_us)
-                done = choose_rows(in_parts, self._advance_in_parts(state, events, t_us), done) if bool(in_parts.any()) else done
-            return _counted(done)
+            parted = readback.Answer.to(in_parts)
+            if readback.read_at_once(in_parts) and bool(in_parts.all()):
+                return _counted(self._advance_in_parts(state, events, t_us))
+            done = self._advance(state, events, t_us)
+            return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us), done) if parted.any() else done)
 
     def _to_be_parted(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> Tensor:
         """Objects whose window is taken in parts: while a large part of their motion within it is not known.
@@ -185,7 +185,7 @@ class Tracker(nn.Module):
         unknown = unknown_px > window.max_unknown_px
         if self.streams == 1:
             return unknown
-        count = torch.bincount(events.stream_index, minlength=self.streams)[self.stream_index]
+        count = torch.diff(stream_bounds(events, self.streams))[self.stream_index]
         return unknown & (count >= window.parts * _EVENTS_OF_A_PART)
 
     def _advance_in_parts(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult]:
@@ -208,10 +208,12 @@ class Tracker(nn.Module):
         nearby, number = self._near_objects(events, prediction, dt_s)
         seen = self._seen(nearby, t_us, number)
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
-        corners = self._corners(contours, last_event_us, t_us, window_s)
         sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
         widening = gate_widening(sigma_px, config)
-        index = index_for(contours, self.image_size, config, widening)
+        radius_px = index_radius(widening, config)
+        in_doubt = readback.Answer.to(may_be_wanted(sigma_px, state.share, state.usual_share, config))
+        corners = self._corners(contours, last_event_us, t_us, window_s)
+        index = index_for(contours, self.image_size, config, widening, radius_px)
         observations = corner_observations(corners)
         if config.matching.max_events:
             near = select_events(seen, index, prediction.plane_velocity(seen.pixels), config.matching.max_events)
@@ -220,7 +222,8 @@ class Tracker(nn.Module):
             evidence = Evidence(observations, seen, prediction, contours, index, self._event_history(last_event_us, t_us))
             observations = judged(evidence, self.weigher)
         found = judge_fit(prediction, align(recorded, contours, index, widening, observations, config), config)
-        found = search_wanted(recorded, sigma_px, state.share, state.usual_share, seen, found, config)
+        if in_doubt.any():
+            found = search_wanted(recorded, sigma_px, state.share, state.usual_share, seen, found, config)
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
         if state.learned is not None and self._learns:
             trusted = (result.status <= int(quality.Status.UNCERTAIN)) & (sigma_px < config.learning.max_sigma_px)
@@ -232,6 +235,8 @@ class Tracker(nn.Module):
         """End of the window of each stream (µs)."""
         if t_end_us is None:
             return state.t_us.scatter_reduce(0, events.stream_index, events.t_us, "amax")
+        if isinstance(t_end_us, int):
+            return torch.full_like(state.t_us, t_end_us)
         return torch.as_tensor(t_end_us, dtype=torch.int64, device=state.t_us.device).expand(self.streams).clone()
 
     def _predict(self, state: TrackerState, dt_s: Tensor) -> Prediction:
@@ -254,12 +259,13 @@ class Tracker(nn.Module):
     @torch.no_grad()
     def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor) -> TrackerState:
         """The state, with the speed of objects that were never found yet limited by the events before them."""
-        # Most windows are of objects that were found long ago: their events need not be counted.
-        if not self.config.motion.speed_from_events or bool((state.usual_share > 0).all()):
+        # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.
+        found = state.usual_share > 0
+        if not self.config.motion.speed_from_events or (readback.read_at_once(found) and bool(found.all())):
             return state
         T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)
         limit_m_s = largest_speed(self.objects, T_cam_obj, self._seen(events, t_us), dt_s)
-        limit_m_s = torch.where(state.usual_share > 0, torch.inf, limit_m_s)
+        limit_m_s = torch.where(found, torch.inf, limit_m_s)
         depth_m = lie.transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
         return replace(state, covariance=limit_speed(state.covariance, limit_m_s, self.diameter_m, depth_m))
 
@@ -276,7 +282,8 @@ class Tracker(nn.Module):
         if config.corners.max_corners == 0:
             return no_corners(contours.pixels)
         sensor = self._on_sensor(contours.pixels)
-        regions = object_regions(sensor, contours.mask, self.stream_index, self.image_size, config.surface.margin_px)
+        margin_px, largest_px = config.surface.margin_px, config.surface.max_region_px
+        regions = object_regions(sensor, contours.mask, self.stream_index, self.image_size, margin_px, largest_px)
         surface = time_surface(last_event_us, t_us, regions, config.surface.tau_s, self.intrinsics.dtype)
         corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config.surface, config.corners)
         return estimate_flow(corners, last_event_us, t_us, self.stream_index, self.ideal_pixels, config.flow)
@@ -285,7 +292,7 @@ class Tracker(nn.Module):
         """Where the lens puts ideal pixels."""
         height, width = self.sensor_pixels.shape[1:3]
         # Clamped before the conversion: a far-off pixel does not fit an integer.
-        limit = self.intrinsics.new_tensor([width - 1, height - 1])
+        limit = constant((width - 1, height - 1), self.intrinsics.dtype, self.intrinsics.device)
         u, v = torch.minimum((pixels + _BORDER_PX).clamp(min=0), limit).round().long().unbind(-1)
         return at_pixels(self.sensor_pixels, self.stream_index[:, None], u, v)
 
@@ -293,7 +300,7 @@ class Tracker(nn.Module):
         """How long ago anything happened at a pixel, for a weigher."""
 
         def age_s(pixels: Tensor) -> Tensor:
-            limit = pixels.new_tensor([self.image_size[1] - 1, self.image_size[0] - 1])
+            limit = constant((self.image_size[1] - 1, self.image_size[0] - 1), pixels.dtype, pixels.device)
             u, v = torch.minimum(self._on_sensor(pixels).round().clamp(min=0), limit).long().unbind(-1)
             age_us = t_us[self.stream_index, None] - at_pixels(last_event_us, self.stream_index[:, None], u, v)
             return age_us.to(pixels.dtype) * 1e-6
@@ -305,7 +312,7 @@ class Tracker(nn.Module):
 
         A weigher is shown all of them, and a GPU would have to be waited for.
         """
-        if self.tiles is None or self.weigher is not None or dt_s.device.type != "cpu":
+        if self.tiles is None or self.weigher is not None or not readback.read_at_once(dt_s):
             return events, None
         margin_px = max(self.config.matching.max_gate_px, *self.config.matching.gates_px) + _DRAWN_SIGMAS * self.config.search.least_sigma_px
         return self.tiles.keep(events, self.tiles.near(prediction, dt_s, margin_px))

@@ -8,12 +8,14 @@ and better with every round. Trust that fell with the distance would hold a pose
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import one_hot, softsign
 
+from torchtrack.constants import constant
 from torchtrack.contours import ContourKind, take_points
 from torchtrack.evidence import Evidence
 
@@ -52,7 +54,7 @@ class _Frame:
 
     def around(self, centre: Float[Tensor, "b n 2"], along_px: tuple[float, ...]) -> tuple[Float[Tensor, "b n p"], Float[Tensor, "b n p"]]:
         """Columns and rows of the places of a patch around each centre."""
-        across, along = torch.cartesian_prod(centre.new_tensor(_ACROSS_PX), centre.new_tensor(along_px)).T
+        across, along = constant(tuple(product(_ACROSS_PX, along_px)), centre.dtype, centre.device).T
         (u, v), (nu, nv) = centre[..., None].unbind(-2), self.normal[..., None].unbind(-2)
         return u + across * nu - along * nv, v + across * nv + along * nu
 

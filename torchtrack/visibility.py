@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack import readback
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contours import ContourModel, Contours
@@ -90,34 +91,37 @@ def depth_buffer(scene: Scene, cell_px: int) -> tuple[Float[Tensor, "s p"], Int[
     grid = (-(-height // cell_px) + 3, -(-width // cell_px) + 3)
     cells, keys = [], []
     for model in scene.models:
-        for members, samples in _samples(model, scene, cell_px):
+        for members, samples, taken in _samples(model, scene, cell_px):
             points = transform_points(scene.T_cam_obj[members], samples.expand(len(members), -1, -1))
             cell = _cell(project(points, scene.intrinsics[members]), grid, cell_px)
             depth = (points[..., 2] * _DEPTH_STEPS_PER_M).long()
             key = (depth << _OBJECT_BITS) + members[:, None]
             cells.append((cell + scene.stream_index[members, None] * (grid[0] * grid[1])).flatten())
-            keys.append(torch.where(points[..., 2] > MIN_DEPTH_M, key, _NOTHING).flatten())
+            keys.append(torch.where((points[..., 2] > MIN_DEPTH_M) & taken, key, _NOTHING).flatten())
     buffer = torch.full((streams * grid[0] * grid[1],), _NOTHING, device=scene.T_cam_obj.device)
     nearest = buffer.scatter_reduce(0, torch.cat(cells), torch.cat(keys), "amin").view(streams, -1)
     depth_m = (nearest >> _OBJECT_BITS).to(scene.T_cam_obj.dtype) / _DEPTH_STEPS_PER_M
     return depth_m, nearest & ((1 << _OBJECT_BITS) - 1), grid
 
 
-def _samples(model: ContourModel, scene: Scene, cell_px: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """The objects that have a model, and its surface samples: every second, fourth and so on for those that are small in the image.
+def _samples(model: ContourModel, scene: Scene, cell_px: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """The objects that have a model, its surface samples, and which of them count.
 
-    On a GPU, which would have to be waited for to know their sizes, all samples are taken.
+    Of objects that are small in the image, every second, fourth and so on does. On a GPU, which would have to be waited for to know
+    how small they are, the others are carried along.
     """
     members, points = model.members, model.surface_points
-    if points.device.type != "cpu" or len(points) == 0:
-        yield members, points
-        return
     depth_m = scene.T_cam_obj[members, 2, 3].clamp(min=MIN_DEPTH_M)
     size_cells = scene.diameters_m[members] * scene.intrinsics[members, 0] / depth_m / cell_px
     spare = len(points) / (_SAMPLES_PER_CELL * size_cells.square()).clamp(min=1)
     halvings = spare.log2().long().clamp(min=0)
+    if not readback.read_at_once(halvings):
+        number = torch.arange(len(points), device=points.device)
+        yield members, points, number & ((1 << halvings) - 1)[:, None] == 0
+        return
+    all_of_them = torch.ones(1, 1, dtype=torch.bool, device=points.device)
     for times in sorted(set(halvings.tolist())):
-        yield members[halvings == times], points[:: 2**times]
+        yield members[halvings == times], points[:: 2**times], all_of_them
 
 
 def _cell(pixels: Tensor, grid: tuple[int, int], cell_px: int) -> Tensor:

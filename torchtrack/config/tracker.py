@@ -23,6 +23,9 @@ class SurfaceConfig(Settings):
 
     tau_s: float = Field(0.03, gt=0, le=10, description="Decay constant τ (s).")
     margin_px: int = Field(12, ge=12, le=128, description="Border around an object's contours that its region includes (px).")
+    max_region_px: int = Field(
+        256, ge=64, le=4096, description="Side of all regions on a GPU, which takes one size for all: of larger objects, the middle (px)."
+    )
     filters: Literal["sliced", "kornia"] = Field("sliced", description="kornia's guided filter and Harris response, or our faster equal of them.")
     filter_size_px: int = Field(5, ge=3, le=31, description="Side of the guided filter's window (px, odd).")
     filter_eps: float = Field(0.01, gt=0, description="Regularisation of the guided filter, in squared intensity.")

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 from torch import Generator
 
 from torchtrack.config.settings import Settings
-from torchtrack.events import EventBatch
+from torchtrack.events import EventBatch, concatenate
 from torchtrack.learn.samples import Sample
 from torchtrack.lie import se3_exp, se3_inverse
 
@@ -55,8 +55,8 @@ def add_noise(sample: Sample, rate_hz: float, width: int, height: int, generator
 
     t_us = first_us + 1 + drawn(max(last_us - first_us, 1), torch.int64)
     noise = EventBatch(drawn(width), drawn(height), t_us, drawn(2).bool(), torch.zeros(count, dtype=torch.int64))
-    both = {name: torch.cat([value, getattr(noise, name)]) for name, value in vars(sample.events.of_stream(0)).items()}
-    return replace(sample, events=EventBatch(**both)[both["t_us"].sort(stable=True).indices])
+    both = concatenate([sample.events.of_stream(0), noise])
+    return replace(sample, events=both[both.t_us.sort(stable=True).indices])
 
 
 def stretch_time(sample: Sample, factor: float) -> Sample:

@@ -1,0 +1,62 @@
+"""Values that are read back from a GPU, which make the CPU wait for it, and how the tracker goes without.
+
+On the CPU a value is there once it is computed: sizes are exact, and a decision is taken where it comes up. A GPU works off
+a queue, and to read a value from it is to wait until the queue is empty, with nothing new in it. There, sizes are bounds
+that the settings and the image give, and what must be decided is asked for early (:class:`Answer`): its copy is begun in
+the middle of a window's work, and looked at once much more has been queued behind it.
+
+So the queue does not run dry, though the CPU is never a whole window ahead, and every decision is the one that the CPU
+takes. The flag of the window before would be there already, but objects would be searched for a window late. To
+``torch.cuda.set_sync_debug_mode`` an answer is no synchronisation: it reports what waits for all that is queued.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+def read_at_once(values: Tensor) -> bool:
+    """Whether values can be read, and shapes hang on them, at no cost: on the CPU."""
+    return values.device.type == "cpu"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Values on their way to the CPU, where decisions are taken.
+
+    Args:
+        on_device: the values.
+        copy: the same on the CPU, once ``arrived``.
+        arrived: when the copy is there; none where nothing had to be copied.
+    """
+
+    on_device: Tensor
+    copy: Tensor
+    arrived: torch.cuda.Event | None
+
+    @classmethod
+    def to(cls, values: Tensor) -> "Answer":
+        """Begin to copy values; from the CPU they need not be."""
+        values = values.detach()
+        if values.device.type != "cuda":
+            return cls(values, values, None)
+        copy = values.to("cpu", non_blocking=True)
+        arrived = torch.cuda.Event()
+        arrived.record(torch.cuda.current_stream(values.device))
+        return cls(values, copy, arrived)
+
+    def any(self) -> bool:
+        """Whether any of the values is true."""
+        return bool(self._there().any())
+
+    def numbers(self) -> Sequence[int]:
+        """The values."""
+        return self._there().tolist()
+
+    def _there(self) -> Tensor:
+        """The copy, once it has arrived."""
+        if self.arrived is not None:
+            self.arrived.synchronize()
+        return self.copy
