@@ -13,6 +13,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 # In inference mode some operations arrive here whole, and else as what they are made of.
 _READS = ("item", "_local_scalar_dense", "is_nonzero", "equal", "nonzero", "masked_select", "bincount", "_unique2", "unique_dim")
+# These ask whether they succeeded.
+_CHECKED = ("_linalg_check_errors", "linalg_cholesky", "linalg_solve", "linalg_inv")
 
 
 class _Watch(TorchDispatchMode):
@@ -26,7 +28,7 @@ class _Watch(TorchDispatchMode):
         name = func._schema.name.removeprefix("aten::")
         made_here = name == "lift_fresh" and args[0].dim() > 0
         counted = name == "repeat_interleave" and func._overloadname in ("Tensor", "self_Tensor")
-        if name in _READS or made_here or counted or (name.startswith("index") and _by_mask(args)):
+        if name in _READS + _CHECKED or made_here or counted or (name.startswith("index") and _by_mask(args)):
             _note(self.found, name)
         return func(*args, **(kwargs or {}))
 

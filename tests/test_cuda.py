@@ -7,9 +7,12 @@ from host_reads import host_reads
 from tracked_boxes import SCENES, follow
 
 from torchtrack import Tracker, readback
+from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.quality import Status
 
 COUNT = 8
+# All objects are searched for in all windows.
+SEARCHED = TrackerConfig(search=SearchConfig(from_sigma_px=1e-3, hypotheses=4, drawn=50))
 
 
 @pytest.fixture
@@ -32,10 +35,10 @@ def on_device(stream_windows, device):
     return [(events.to(device), torch.as_tensor(end_us, device=device).view(-1)) for events, end_us in stream_windows]
 
 
-def set_up(scene, device, dtype=torch.float32):
+def set_up(scene, device, config=None):
     """A tracker of a scene, the state that it begins with, and the windows."""
     starts, stream_index, cameras, stream_windows = scene(COUNT)
-    tracker = Tracker([box_model()] * len(starts), cameras, stream_index=stream_index, dtype=dtype).to(device)
+    tracker = Tracker([box_model()] * len(starts), cameras, config, stream_index).to(device)
     return tracker, tracker.init(torch.stack(starts), 0), on_device(stream_windows, device)
 
 
@@ -80,6 +83,9 @@ def test_the_gpu_finds_the_poses_of_the_cpu(cuda, scene):
         lambda x: torch.bincount(x.long()),
         lambda x: torch.equal(x, x),
         lambda x: x.repeat_interleave(x.long()),
+        lambda x: torch.linalg.cholesky(torch.diag(x)),
+        lambda x: torch.linalg.solve(torch.diag(x), x),
+        lambda x: torch.linalg.inv(torch.diag(x)),
     ],
 )
 def test_what_waits_is_found(wait, mode):
@@ -100,10 +106,11 @@ def test_what_does_not_wait_is_not_found(mode):
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_steady_tracking_reads_nothing_back(monkeypatch, scene):
+@pytest.mark.parametrize("config", [None, SEARCHED], ids=["steady", "searched"])
+def test_a_step_reads_nothing_back(monkeypatch, scene, config):
     """On the CPU, where it can be watched, as it is done on a GPU; but for what is asked for early and looked at late."""
     monkeypatch.setattr(readback, "read_at_once", lambda values: False)
-    tracker, state, ready = set_up(scene, torch.device("cpu"))
+    tracker, state, ready = set_up(scene, torch.device("cpu"), config)
     with torch.inference_mode():
         state, _ = follow(tracker, state, ready[:-1])
         with host_reads() as found:

@@ -86,6 +86,7 @@ class ContourModel(nn.Module):
     def __init__(self, model: ObjectModel, members: Sequence[int], config: ContourConfig) -> None:
         """Take what ``config`` switches on from ``model``, which the objects numbered ``members`` have."""
         super().__init__()
+        self.numbers = tuple(members)
         self.register_buffer("members", torch.tensor(members))
         segments = model.segments if config.segments else model.segments[:0]
         points = torch.cat([model.edge_points, segments])

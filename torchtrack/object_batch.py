@@ -82,10 +82,10 @@ class ObjectBatch:
     def copies(self, number: int, count: int) -> "ObjectBatch":
         """One object many times, each in a stream of its own: copies do not hide one another."""
         streams = torch.arange(count, device=self.stream_index.device)
-        has_it = next(model for model in self.models if bool((model.members == number).any()))
+        has_it = next(model for model in self.models if number in model.numbers)
         # A shallow copy shares all tensors but the list of members.
         model = copy.copy(has_it)
-        model._buffers = {**has_it._buffers, "members": streams}
+        model.numbers, model._buffers = tuple(range(count)), {**has_it._buffers, "members": streams}
         intrinsics, centre_obj, diameter_m = (repeat_row(value, number, count) for value in (self.intrinsics, self.centre_obj, self.diameter_m))
         learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))
         return ObjectBatch([model], intrinsics, centre_obj, diameter_m, streams, (count, *self.image_size), False, learned)

@@ -10,8 +10,8 @@ takes. The flag of the window before would be there already, but objects would b
 ``torch.cuda.set_sync_debug_mode`` an answer is no synchronisation: it reports what waits for all that is queued.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -51,7 +51,7 @@ class Answer:
         """Whether any of the values is true."""
         return bool(self._there().any())
 
-    def numbers(self) -> Sequence[int]:
+    def numbers(self) -> list[Any]:
         """The values."""
         return self._there().tolist()
 

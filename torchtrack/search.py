@@ -5,20 +5,23 @@ than beside them; the most promising are aligned as one batch, and the one that 
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import quality
+from torchtrack import quality, readback
 from torchtrack.alignment import Fit, align, index_for
 from torchtrack.camera import project
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.constants import constant
 from torchtrack.contours import Contours
 from torchtrack.lie import retract_about, transform_points
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.pose_solver import Linearisation
 from torchtrack.prediction import Prediction
+from torchtrack.readback import Answer
 
 # Events beside a contour are counted this far from it (px), and more than this many of them in one place say no more.
 _BESIDE_PX, _ENOUGH_EVENTS = 4.0, 3.0
@@ -83,8 +86,10 @@ def search_wanted(
     # Without events no pose is better than another.
     enough = events.mask.sum(-1) >= config.quality.min_observations
     tried = enough & wanted(torch.maximum(found.share, last_share), sigma_px, usual_share, config.search)
-    for number in tried.nonzero()[:, 0].tolist():
-        found = search(number, prediction, float(sigma_px[number]), events, found, config)
+    answers = Answer.to(tried), Answer.to(sigma_px)
+    for number, (is_tried, own_sigma_px) in enumerate(zip(*(answer.numbers() for answer in answers), strict=True)):
+        if is_tried:
+            found = search(number, prediction, own_sigma_px, events, found, config)
     return found
 
 
@@ -106,9 +111,10 @@ def search(number: int, prediction: Prediction, sigma_px: float, events: WindowE
     offsets = offsets[marks.topk(min(count, len(marks))).indices]
     tried = _align_all(prediction.copies(number, len(offsets)), offsets, seen, config)
     share = torch.where(tried.count >= config.quality.min_observations, tried.share, 0)
-    best = int(share.argmax())
-    mine = found.share[number] if found.count[number] >= config.quality.min_observations else 0.0
-    return _replaced(found, number, tried, best) if share[best] > mine + settings.margin else found
+    best = share.argmax()[None]
+    mine = torch.where(found.count[number] >= config.quality.min_observations, found.share[number], 0.0)
+    better = share.index_select(0, best) > mine + settings.margin
+    return found if readback.read_at_once(better) and not bool(better) else _replaced(found, number, tried, best, better)
 
 
 def draw_offsets(covariance: Float[Tensor, "12 12"], count: int) -> Float[Tensor, "n 13"]:
@@ -116,13 +122,20 @@ def draw_offsets(covariance: Float[Tensor, "12 12"], count: int) -> Float[Tensor
 
     The sequence is the same every time: a search can be repeated.
     """
-    even = torch.quasirandom.SobolEngine(6, scramble=False).draw(count + 1)[1:].to(covariance)
-    normal = torch.erfinv(2 * even - 1) * 2**0.5
-    normal[0] = 0
-    pose = normal @ torch.linalg.cholesky(covariance[:6, :6]).T
+    pose = _normal(count, covariance.dtype, covariance.device) @ torch.linalg.cholesky_ex(covariance[:6, :6]).L.T
     # A pose that is off implies a velocity that was.
-    velocity = pose @ torch.linalg.solve(covariance[:6, :6], covariance[:6, 6:])
+    velocity = pose @ torch.linalg.solve_ex(covariance[:6, :6], covariance[:6, 6:]).result
     return torch.nn.functional.pad(torch.cat([pose, velocity], -1), (0, 1))
+
+
+@lru_cache(maxsize=8)
+def _normal(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "n 6"]:
+    """Normally distributed numbers, spread evenly; the first are none."""
+    with torch.inference_mode(mode=False):
+        even = torch.quasirandom.SobolEngine(6, scramble=False).draw(count + 1)[1:].to(device, dtype)
+        normal = torch.erfinv(2 * even - 1) * 2**0.5
+        normal[0] = 0
+        return normal
 
 
 def event_density(pixels: Float[Tensor, "1 e 2"], mask: Bool[Tensor, "1 e"], image_size: tuple[int, int]) -> Float[Tensor, "h w"]:
@@ -148,18 +161,27 @@ def mark(
         prediction: of the one object.
         contours: of all objects, of which this is ``number``.
     """
-    visible = contours.mask[number].nonzero()[:, 0]
-    visible = visible[:: max(len(visible) // _MARKED_POINTS, 1)]
-    points, normals = contours.points_obj[number, visible], contours.normals[number, visible]
+    chosen, exists = _marked_points(contours.mask[number])
+    points, normals = contours.points_obj[number, chosen], contours.normals[number, chosen]
     count, objects = len(offsets), prediction.objects
     poses = retract_about(prediction.T_cam_obj.expand(count, 4, 4), offsets[:, :6], objects.centre_obj.expand(count, 3))
     pixels = project(transform_points(poses, points.expand(count, -1, -1)), objects.intrinsics.expand(count, 4))
-    limit = pixels.new_tensor([density.shape[1] - 1, density.shape[0] - 1])
+    limit = constant((density.shape[1] - 1, density.shape[0] - 1), pixels.dtype, pixels.device)
     total = pixels.new_zeros(count)
     for side_px, weight in ((0.0, 1.0), (_BESIDE_PX, -0.5), (-_BESIDE_PX, -0.5)):
         u, v = torch.minimum(((pixels + side_px * normals).round() + _BORDER_PX).clamp(min=0), limit).long().unbind(-1)
-        total = total + weight * density.flatten()[v * density.shape[1] + u].clamp(max=_ENOUGH_EVENTS).sum(-1)
+        total = total + weight * (density.flatten()[v * density.shape[1] + u].clamp(max=_ENOUGH_EVENTS) * exists).sum(-1)
     return total
+
+
+def _marked_points(visible: Bool[Tensor, "m"]) -> tuple[Int[Tensor, "k"], Bool[Tensor, "k"]]:
+    """Every so manieth of the visible points, fewer than twice those that poses are marked by, and which of them exist."""
+    cumulative = visible.cumsum(0)
+    step = torch.div(cumulative[-1:], _MARKED_POINTS, rounding_mode="floor").clamp(min=1)
+    rank = torch.arange(2 * _MARKED_POINTS - 1, device=visible.device) * step
+    chosen, exists = torch.searchsorted(cumulative, rank + 1).clamp(max=len(visible) - 1), rank < cumulative[-1:]
+    # On a GPU, which would have to be waited for to know how many they are, all keep their places.
+    return (chosen[exists], exists[exists]) if readback.read_at_once(exists) else (chosen, exists)
 
 
 def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: TrackerConfig) -> Found:
@@ -173,12 +195,12 @@ def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: 
     return judge_fit(copies, align(copies, contours, index, tight, observations, config, offsets), config)
 
 
-def _replaced(found: Found, number: int, other: Found, row: int) -> Found:
-    """``found`` with one object's poses, contours and quality from another."""
+def _replaced(found: Found, number: int, other: Found, row: Int[Tensor, "1"], better: Bool[Tensor, "1"]) -> Found:
+    """``found`` with one object's poses, contours and quality from a row of another, where that is better."""
 
     def put(mine: Tensor, theirs: Tensor) -> Tensor:
         value = mine.clone()
-        value[number] = theirs[row]
+        value[number] = torch.where(better.view([1] * mine.dim()), theirs.index_select(0, row), mine[number : number + 1])[0]
         return value
 
     mine, theirs = found.fit, other.fit
