@@ -28,3 +28,8 @@ def disc(radius: float | int, device: torch.device) -> Tensor:
     steps = range(-reach, reach + 1)
     inside = tuple((column, row) for row in steps for column in steps if row**2 + column**2 <= radius**2)
     return constant(inside, torch.int64, device).T
+
+
+def one(like: Tensor) -> Tensor:
+    """A single 1 of the type and on the device of ``like``: what is added to a tensor takes a third of what a Python number does."""
+    return constant((1.0,), like.dtype, like.device)

@@ -18,8 +18,10 @@ from torchtrack import readback
 from torchtrack.constants import constant
 from torchtrack.contours import Contours
 
-# Squared distances are compared in these fractions of a pixel²; none that counts comes near this many of them.
-_DISTANCE_STEPS, _FAR_STEPS = 16, 2**30
+# Squared distances are compared in these fractions of a pixel².
+_DISTANCE_STEPS = 16
+# Points whose distances are written at once: larger temporaries page-fault on the CPU.
+_CHUNK = 2048
 # From the middle of a cell to its corner, in cells.
 _HALF_DIAGONAL = 0.5**0.5
 # Farther than any cell of an image, and than any contour is looked for (px).
@@ -74,14 +76,20 @@ def index_contours(
     low = _first_cells(centre, inside, margin)
     local = torch.where(inside[..., None], centre - low[:, None], margin)
     rows, columns = _size(local, image_size, margin, cell_px)
-    keys = torch.full((batch * rows * columns,), _FAR_STEPS * count, device=radius.device)
+    # Distance and number of a point in one integer, as narrow as will do.
+    dtype = torch.int32 if _DISTANCE_STEPS * (max([0, *radii_px]) + 4 * cell_px) ** 2 * count < 2**31 else torch.int64
+    nothing = torch.iinfo(dtype).max
+    keys = torch.full((batch * rows * columns,), nothing, dtype=dtype, device=radius.device)
     # Points that are not inside are too far from their cells to write anything.
     to_centre = torch.where(inside[..., None], cell_px * centre - contours.pixels, _FAR_PX)
     for reach_px, row, point in _points_by_radius(inside, radius, radii_px):
         # Object by object as far as each needs: one that is looked for far away does not make the others pay.
         u, v = local[row, point].long().unbind(1)
-        _write(keys, (row * rows + v) * columns + u, to_centre[row, point], point, reach_px, cell_px, columns, count)
-    nearest = torch.where(keys < _FAR_STEPS * count, keys % count, -1).view(batch, -1)
+        cell, at_once = (row * rows + v) * columns + u, _CHUNK if readback.read_at_once(row) else len(row)
+        parts = zip(cell.split(at_once), to_centre[row, point].split(at_once), point.to(dtype).split(at_once), strict=True)
+        for of_part in parts:
+            _write(keys, of_part, reach_px, cell_px, columns, count)
+    nearest = torch.where(keys < nothing, keys % count, -1).long().view(batch, -1)
     return ContourIndex(low, (rows, columns), cell_px, nearest, contours.pixels)
 
 
@@ -125,16 +133,16 @@ def _points_by_radius(inside: Tensor, radius: Tensor, radii_px: Sequence[int]) -
         begin += objects
 
 
-def _write(keys: Tensor, cell: Tensor, to_centre: Tensor, point: Tensor, radius_px: int, cell_px: int, columns: int, count: int) -> None:
+def _write(keys: Tensor, points: tuple[Tensor, Tensor, Tensor], radius_px: int, cell_px: int, columns: int, count: int) -> None:
     """Write the distances and numbers of points into the cells around theirs, where they are less than what stands there.
 
     Args:
-        cell: of each point.
-        to_centre: way from each point to the centre of its cell (px).
+        points: the cell of each, the way from each to the centre of its cell (px), and its number.
     """
+    cell, to_centre, number = points
     disc = constant(_disc(radius_px / cell_px), to_centre.dtype, to_centre.device)
-    steps = _DISTANCE_STEPS * _squared_distances(to_centre, cell_px * disc)
-    key = torch.add(point[:, None], steps.long(), alpha=count).masked_fill_(steps > _DISTANCE_STEPS * radius_px**2, _FAR_STEPS * count)
+    steps = _squared_distances(to_centre, cell_px * disc).mul_(_DISTANCE_STEPS)
+    key = steps.to(keys.dtype).mul_(count).add_(number[:, None]).masked_fill_(steps > _DISTANCE_STEPS * radius_px**2, torch.iinfo(keys.dtype).max)
     around = torch.add(disc[:, 0], disc[:, 1], alpha=columns).long()
     keys.scatter_reduce_(0, (cell[:, None] + around).flatten(), key.flatten(), "amin")
 
@@ -156,4 +164,4 @@ def _squared_distances(to_centre: Float[Tensor, "p 2"], offsets: Float[Tensor, "
     """``|c + o|²`` of every ``c`` and every offset ``o``, as one matrix product."""
     point_part = torch.cat([to_centre.square().sum(-1, keepdim=True), torch.ones_like(to_centre[:, :1]), 2 * to_centre], -1)
     offset_part = torch.cat([torch.ones_like(offsets[:, :1]), offsets.square().sum(-1, keepdim=True), offsets], -1)
-    return (point_part @ offset_part.T).clamp(min=0)
+    return point_part @ offset_part.T

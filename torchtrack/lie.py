@@ -233,21 +233,21 @@ def cayley(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
     Half the operations of the exponential, and smooth everywhere: the solver's retraction.
     """
-    skew, factor = _half_turn(phi)
-    return torch.eye(3, dtype=phi.dtype, device=phi.device) + factor * (skew + skew @ skew)
+    skew, factor = _skew_and_factor(phi)
+    return torch.eye(3, dtype=phi.dtype, device=phi.device) + 8 * factor * (skew + skew @ skew)
 
 
-def _half_turn(phi: Tensor) -> tuple[Tensor, Tensor]:
-    """Cayley's rotation is ``1 + factor (skew + skew²)``: these two."""
-    half = 0.5 * phi
-    return hat(half), 2 / (1 + torch.linalg.vecdot(half, half))[..., None, None]
+def _skew_and_factor(phi: Tensor) -> tuple[Tensor, Tensor]:
+    """Cayley's rotation is ``1 + 8 factor (skew + skew²)``: these two."""
+    four = constant((4.0,), phi.dtype, phi.device)
+    return hat(0.5 * phi), (four + torch.linalg.vecdot(phi, phi)[..., None]).reciprocal()[..., None]
 
 
 def turned(rotation: Float[Tensor, "b 3 3"], phi: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
     """``cayley(phi) @ rotation``, in fewer operations."""
-    skew, factor = _half_turn(phi)
+    skew, factor = _skew_and_factor(phi)
     across = torch.bmm(skew, rotation)
-    return torch.addcmul(rotation, factor, torch.baddbmm(across, skew, across))
+    return torch.addcmul(rotation, factor, torch.baddbmm(across, skew, across), value=8)
 
 
 def difference_about(T_from: Float[Tensor, "*b 4 4"], T_to: Float[Tensor, "*b 4 4"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6"]:

@@ -54,8 +54,11 @@ class SensorTiles(nn.Module):
         # No point of a sphere is farther from its middle in the image: by the derivative of x/z along any way in it.
         slant = (1 + (x * x + y * y) / (z * z)).sqrt()
         radius_px = objects.intrinsics[:, :2].amax(1) * slant * radius_m / (z - radius_m).clamp(min=MIN_DEPTH_M)
-        middle = project(prediction.centre_cam[:, None], objects.intrinsics)
-        away_px = (self.middle - middle).norm(dim=-1) - self.reach_px
+        u, v = (
+            tiles - objects_at
+            for tiles, objects_at in zip(self.middle.T, project(prediction.centre_cam[:, None], objects.intrinsics).unbind(-1), strict=True)
+        )
+        away_px = (u * u + v * v).sqrt() - self.reach_px
         # Written so that what is not a number is near.
         return ~(away_px > radius_px[:, None] + (margin_px + _SLACK_PX)).all(0)
 
