@@ -17,7 +17,7 @@ def numbered(near, count):
     pixels = torch.stack([torch.where(near, 80.0, 10.0), torch.full_like(number, 60.0)], -1)
     lines = contours_at(upright_line(80.0).pixels.expand(len(near), -1, -1))
     index = index_contours(lines, IMAGE_SIZE, 5, 1)
-    events = WindowEvents(pixels, number, torch.ones_like(number), torch.ones_like(near))
+    events = WindowEvents(pixels, number, number, torch.ones_like(number), torch.ones_like(near))
     chosen = select_events(events, index, torch.zeros_like(pixels), count)
     assert chosen.pixels.shape == (len(near), count, 2)
     return [row[mask].long().tolist() for row, mask in zip(chosen.age_s, chosen.mask, strict=True)]
@@ -36,7 +36,7 @@ def choose(pixels, contours, *, age_s=0.0, velocity=(0.0, 0.0), count=100, mask=
     observations = seen(pixels, age_s=age_s, mask=mask, polarity=1.0)
     speed = torch.tensor(velocity, dtype=torch.float64).expand_as(observations.pixels)
     index = index_contours(contours, IMAGE_SIZE, 5, 1)
-    events = WindowEvents(observations.pixels, observations.age_s, observations.polarity, observations.mask)
+    events = WindowEvents(observations.pixels, observations.age_s, observations.into_burst_s, observations.polarity, observations.mask)
     return select_events(events, index, speed, count)
 
 
@@ -123,11 +123,12 @@ def test_values_go_with_their_events(dtype):
     place = torch.stack([torch.full((400,), 80.0, dtype=dtype), torch.linspace(20, 119, 400, dtype=dtype)], -1)[None]
     age_s, polarity = torch.linspace(0, 5e-3, 400, dtype=dtype)[None], torch.where(torch.arange(400) % 2 == 0, 1, -1).to(dtype)[None]
     index = index_contours(upright_line(80.0, dtype), IMAGE_SIZE, 5, 1)
-    events = WindowEvents(place, age_s, polarity, torch.ones(1, 400, dtype=torch.bool))
+    events = WindowEvents(place, age_s, 2 * age_s, polarity, torch.ones(1, 400, dtype=torch.bool))
     chosen = select_events(events, index, torch.zeros_like(place), 50)
     number = ((chosen.pixels[0, :, 1] - 20) / 99 * 399).round().long()[chosen.mask[0]]
     assert len(number) > 40
-    for found, given in ((chosen.pixels, place), (chosen.age_s, age_s), (chosen.polarity, polarity)):
+    pairs = ((chosen.pixels, place), (chosen.age_s, age_s), (chosen.into_burst_s, 2 * age_s), (chosen.polarity, polarity))
+    for found, given in pairs:
         assert torch.equal(found[0][chosen.mask[0]], given[0][number])
     assert chosen.pixels.dtype == chosen.flow.dtype == dtype
     assert not chosen.has_flow.any()
@@ -149,8 +150,8 @@ def test_what_is_drawn_hangs_on_an_events_own_number_also_where_others_were_left
     near = torch.rand((1, 4000), generator=generator(7)) < 0.5
     numbers = torch.arange(4000.0)[None]
     left = (near | (torch.rand(near.shape, generator=generator(8)) < 0.3))[0].nonzero()[:, 0]
-    all_of_them = WindowEvents(torch.stack([numbers, numbers], -1), numbers, numbers, torch.ones_like(near))
-    some = WindowEvents(*(getattr(all_of_them, name)[:, left] for name in ("pixels", "age_s", "polarity", "mask")), left)
+    all_of_them = WindowEvents(torch.stack([numbers, numbers], -1), numbers, numbers, numbers, torch.ones_like(near))
+    some = WindowEvents(*(getattr(all_of_them, name)[:, left] for name in ("pixels", "age_s", "into_burst_s", "polarity", "mask")), left)
     share = torch.tensor([[0.1]])
     chosen, exists = all_of_them.draw(near, share, 300)
     of_some, some_exist = some.draw(near[:, left], share, 300)
@@ -163,10 +164,10 @@ def test_what_is_drawn_hangs_on_an_events_own_number_also_where_others_were_left
 
 
 def test_the_events_of_one_object_can_be_repeated():
-    values = [torch.rand((3, 5, *shape), generator=generator(k)) for k, shape in enumerate([(2,), (), ()])]
+    values = [torch.rand((3, 5, *shape), generator=generator(k)) for k, shape in enumerate([(2,), (), (), ()])]
     events = WindowEvents(*values, torch.rand((3, 5), generator=generator(4)) < 0.5)
     repeated = events.of(1).repeated(4)
-    for name in ("pixels", "age_s", "polarity", "mask"):
+    for name in ("pixels", "age_s", "into_burst_s", "polarity", "mask"):
         value = getattr(events, name)
         many = getattr(repeated, name)
         assert many.shape == (4, *value.shape[1:])

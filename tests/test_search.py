@@ -10,7 +10,7 @@ from tracked_boxes import WINDOW_US, follow, moving_box, poses_of, started, tens
 from torchtrack import Tracker
 from torchtrack.alignment import align, gate_widening, index_for
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
-from torchtrack.events import concatenate
+from torchtrack.events import concatenate, pad_streams
 from torchtrack.lie import retract_about
 from torchtrack.observations import select_events
 from torchtrack.quality import Status
@@ -96,7 +96,7 @@ def in_motion(config=None, displaced=None, dtype=torch.float32):
     tracker, state, _, (events, end_us), trajectory = started(dtype, config)
     if displaced is not None:
         state = replace(state, T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()))
-    prediction, seen = tracker._predict(state, torch.tensor([5e-3], dtype=dtype)), tracker._seen(events, torch.tensor([end_us]))
+    prediction, seen = tracker._predict(state, torch.tensor([5e-3], dtype=dtype)), tracker._seen(pad_streams(events, 1, torch.tensor([end_us])))
     contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
     tight = gate_widening(torch.zeros(1, dtype=dtype), tracker.config)
     index = index_for(contours, IMAGE_SIZE, tracker.config, tight)

@@ -160,16 +160,13 @@ def _problem(
         scale_px=gate_px,
         T_prior=prediction.T_cam_obj,
         prior_information=information,
-        window=_window_terms(rows, observations, offset, config) if config.solver.prior else None,
+        window=_window_terms(rows, offset, config) if config.solver.prior else None,
     )
 
 
-def _window_terms(rows: Matches, observations: Observations, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
+def _window_terms(rows: Matches, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
     """What observations tell beside the pose: of the velocity by their ages, and of how far limbs stand out."""
-    age_s, outward = observations.age_s, rows.limb
-    if config.matching.residual == "point":
-        # Two rows for each observation where both of its coordinates count.
-        age_s = age_s.repeat(1, 2)
+    age_s, outward = rows.age_s, rows.limb
     if config.matching.residual != "normal":
         outward = torch.zeros_like(outward)
     if not config.solver.velocity_in_window:

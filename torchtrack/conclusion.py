@@ -1,5 +1,7 @@
 """The end of a window: what each object's pose is worth, where it goes on from there, and what is remembered."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -48,7 +50,7 @@ def conclude(
     contours = reproject(contours, T_cam_obj.to(velocity.dtype), objects.intrinsics)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
-    return TrackerState(T_cam_obj, velocity, covariance, share, usual, state.t_us, state.last_event_us, state.learned), result
+    return replace(state, T_cam_obj=T_cam_obj, velocity=velocity, covariance=covariance, share=share, usual_share=usual), result
 
 
 def _updated_motion(

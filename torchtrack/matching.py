@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.bursts import without_tail
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import ContourKind, Contours, take_points
@@ -32,6 +33,7 @@ class Matches:
         contour: index of the contour point; 0 where there is none.
         mask: which observations are matched.
         weights: how far each match is to be trusted, 0 to 1.
+        age_s: time from when the contour passed to the window's end (s).
         points_obj: the contour point in the object's frame (m).
         targets: ideal pixels of the observations, moved to the window's end.
         directions: unit directions along which the distance counts.
@@ -43,6 +45,7 @@ class Matches:
     contour: Int[Tensor, "b n"]
     mask: Bool[Tensor, "b n"]
     weights: Float[Tensor, "b n"]
+    age_s: Float[Tensor, "b n"]
     points_obj: Float[Tensor, "b n 3"]
     targets: Float[Tensor, "b n 2"]
     directions: Float[Tensor, "b n 2"]
@@ -104,15 +107,17 @@ def match_nearest(
     contour = found.clamp(min=0)
     points_obj, normals, indexed, limb, oriented = table.take(contour)
     pixels, velocity = objects.show(points_obj)
-    dark = observations.polarity * _leading((normals * velocity).sum(-1))
-    carried = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
+    crossing_px_s = (normals * velocity).sum(-1)
+    dark = observations.polarity * _leading(crossing_px_s)
+    age_s = without_tail(observations.age_s, observations.into_burst_s, crossing_px_s, config.burst_px)
+    carried = torch.addcmul(observations.pixels, velocity, age_s[..., None])
     targets = torch.addcmul(carried, normals, (dark * (1 - limb))[..., None], value=-config.dark_shift_px)
     difference = pixels - targets
     near = observations.mask & (found >= 0)
     matched = near & (difference.square().sum(-1) < (gate_px * wider)[:, None].square())
     offsets = (difference * normals).sum(-1) / wider[:, None]
     weights = _weights(offsets, targets, near, dark * oriented, config)
-    matches = Matches(contour, matched, weights, points_obj, targets, normals, offsets, near, limb)
+    matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)
 
@@ -210,7 +215,7 @@ def match_along_flow(observations: Observations, contours: Contours, objects: Mo
     mask = observations.mask & observations.has_flow & torch.isfinite(distance)
     offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
     limb = (contours.kind == int(ContourKind.LIMB)).gather(1, contour).to(offsets.dtype)
-    return Matches(contour, mask, torch.ones_like(offsets), points_obj, targets, directions, offsets, mask, limb)
+    return Matches(contour, mask, torch.ones_like(offsets), observations.age_s, points_obj, targets, directions, offsets, mask, limb)
 
 
 def both_coordinates(matches: Matches) -> Matches:

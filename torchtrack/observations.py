@@ -23,6 +23,7 @@ class Observations:
     Args:
         pixels: ideal pixels at the time of the event.
         age_s: time from the event to the window's end (s).
+        into_burst_s: time from the first event of its burst to the event (s); zero where there is none.
         polarity: +1 where the pixel got brighter, -1 where darker, 0 where unknown.
         mask: which entries exist.
         flow: velocity (px/s); zero where there is none.
@@ -32,6 +33,7 @@ class Observations:
 
     pixels: Float[Tensor, "b n 2"]
     age_s: Float[Tensor, "b n"]
+    into_burst_s: Float[Tensor, "b n"]
     polarity: Float[Tensor, "b n"]
     mask: Bool[Tensor, "b n"]
     flow: Float[Tensor, "b n 2"]
@@ -46,6 +48,7 @@ class WindowEvents:
     Args:
         pixels: ideal pixels.
         age_s: time from the event to the window's end (s).
+        into_burst_s: time from the first event of its burst to the event (s).
         polarity: +1 where the pixel got brighter, -1 where darker.
         mask: which entries exist.
         number: of each event among all of its window, where some of them were left out.
@@ -53,6 +56,7 @@ class WindowEvents:
 
     pixels: Float[Tensor, "b e 2"]
     age_s: Float[Tensor, "b e"]
+    into_burst_s: Float[Tensor, "b e"]
     polarity: Float[Tensor, "b e"]
     mask: Bool[Tensor, "b e"]
     number: Int[Tensor, "e"] | None = None
@@ -66,7 +70,8 @@ class WindowEvents:
         return self._with(lambda value: value.expand(count, *value.shape[1:]))
 
     def _with(self, rows: Callable[[Tensor], Tensor]) -> "WindowEvents":
-        return WindowEvents(rows(self.pixels), rows(self.age_s), rows(self.polarity), rows(self.mask), self.number)
+        values = {name: rows(value) for name, value in vars(self).items() if name != "number"}
+        return WindowEvents(**values, number=self.number)
 
     def draw(self, candidates: Bool[Tensor, "b e"], share: Float[Tensor, "b 1"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
         """A share of each row's candidates, spread evenly over them: their indices, at most ``count``, and which of these exist.
@@ -80,7 +85,8 @@ class WindowEvents:
 
 def corner_observations(corners: Corners) -> Observations:
     """The corners as observations; their polarity is not known."""
-    return Observations(corners.pixels, corners.age_s, torch.zeros_like(corners.age_s), corners.mask, corners.flow, corners.has_flow)
+    unknown = torch.zeros_like(corners.age_s)
+    return Observations(corners.pixels, corners.age_s, unknown, unknown, corners.mask, corners.flow, corners.has_flow)
 
 
 def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Float[Tensor, "b e 2"], count: int) -> Observations:
@@ -94,9 +100,10 @@ def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Flo
     total = near.sum(-1, keepdim=True)
     share = torch.where(total > count, _FILL * count / total, 1.0)
     chosen, exists = events.draw(near, share, count)
-    values = take_points(torch.cat([pixels.transpose(1, 2), events.age_s[:, None], events.polarity[:, None]], 1).transpose(1, 2), chosen)
+    rows = [pixels.transpose(1, 2), events.age_s[:, None], events.into_burst_s[:, None], events.polarity[:, None]]
+    values = take_points(torch.cat(rows, 1).transpose(1, 2), chosen)
     flow = torch.zeros_like(values[..., :2])
-    return Observations(values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
+    return Observations(values[..., :2], values[..., 2], values[..., 3], values[..., 4], exists, flow, torch.zeros_like(exists))
 
 
 def join(first: Observations, second: Observations) -> Observations:

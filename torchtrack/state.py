@@ -25,6 +25,7 @@ class TrackerState:
         usual_share: its running mean.
         t_us: end of the last window of each stream (µs).
         last_event_us: time of the newest event of every sensor pixel (µs).
+        burst_age_us: how long ago the newest burst of every sensor pixel and polarity began (µs).
         learned: contours learned on the objects; none where that is switched off.
     """
 
@@ -35,6 +36,7 @@ class TrackerState:
     usual_share: Float[Tensor, "b"]
     t_us: Int[Tensor, "s"]
     last_event_us: Int[Tensor, "s h w"]
+    burst_age_us: Int[Tensor, "s 2 h w"]
     learned: LearnedContours | None = None
 
 
@@ -65,7 +67,7 @@ class StepResult:
 
 S = TypeVar("S", TrackerState, StepResult)
 # What belongs to streams; everything else belongs to objects.
-_OF_STREAMS = ("t_us", "last_event_us")
+_OF_STREAMS = ("t_us", "last_event_us", "burst_age_us")
 
 
 def choose_rows(

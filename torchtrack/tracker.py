@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torchtrack import lie, quality, readback
 from torchtrack.alignment import align, gate_widening, index_for, index_radius
+from torchtrack.bursts import no_bursts, update_bursts
 from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
@@ -19,7 +20,7 @@ from torchtrack.constants import constant
 from torchtrack.contours import ContourModel, Contours, group_by_model
 from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.errors import ModelError, PoseError
-from torchtrack.events import EventBatch, pad_streams, stream_bounds
+from torchtrack.events import EventBatch, PaddedEvents, pad_streams, stream_bounds
 from torchtrack.evidence import AgeAt, Evidence, judged
 from torchtrack.flow import estimate_flow
 from torchtrack.learned_contours import LearnedContours
@@ -139,10 +140,10 @@ class Tracker(nn.Module):
         velocity = torch.zeros(len(T_cam_obj), 6, dtype=self.intrinsics.dtype, device=T_cam_obj.device)
         covariance = initial_covariance(self.diameter_m, self.config.motion)
         nothing = torch.zeros_like(self.diameter_m)
-        last_event_us = empty_last_event(self.streams, *self.image_size, device=T_cam_obj.device)
+        last_event_us, burst_age_us = (empty(self.streams, *self.image_size, T_cam_obj.device) for empty in (empty_last_event, no_bursts))
         learning = self.config.learning
         learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
-        return TrackerState(T_cam_obj.clone(), velocity, covariance, nothing, nothing, times, last_event_us, learned)
+        return TrackerState(T_cam_obj.clone(), velocity, covariance, nothing, nothing, times, last_event_us, burst_age_us, learned)
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """:meth:`step`, as a layer of a network: what comes in first."""
@@ -206,7 +207,9 @@ class Tracker(nn.Module):
         recorded = self._predict(self._held_back(state, events, t_us, dt_s), dt_s)
         prediction = recorded.detached()
         nearby, number = self._near_objects(events, prediction, dt_s)
-        seen = self._seen(nearby, t_us, number)
+        window = pad_streams(nearby, self.streams, t_us)
+        burst_age_us, into_burst_us = update_bursts(state.burst_age_us, t_us - state.t_us, window, config.matching.burst_us)
+        seen = self._seen(window, into_burst_us, number)
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
         widening = gate_widening(sigma_px, config)
@@ -229,7 +232,7 @@ class Tracker(nn.Module):
             trusted = (result.status <= int(quality.Status.UNCERTAIN)) & (sigma_px < config.learning.max_sigma_px)
             around = Surroundings(prediction.objects, next_state.T_cam_obj.to(sigma_px.dtype), next_state.velocity, dt_s, result.contours, trusted)
             next_state = replace(next_state, learned=learn_after(state.learned, around, found, seen, config))
-        return replace(next_state, t_us=t_us, last_event_us=last_event_us), replace(result, t_us=t_us)
+        return replace(next_state, t_us=t_us, last_event_us=last_event_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""
@@ -264,7 +267,7 @@ class Tracker(nn.Module):
         if not self.config.motion.speed_from_events or (readback.read_at_once(found) and bool(found.all())):
             return state
         T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)
-        limit_m_s = largest_speed(self.objects, T_cam_obj, self._seen(events, t_us), dt_s)
+        limit_m_s = largest_speed(self.objects, T_cam_obj, self._seen(pad_streams(events, self.streams, t_us)), dt_s)
         limit_m_s = torch.where(found, torch.inf, limit_m_s)
         depth_m = lie.transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
         return replace(state, covariance=limit_speed(state.covariance, limit_m_s, self.diameter_m, depth_m))
@@ -317,15 +320,16 @@ class Tracker(nn.Module):
         margin_px = max(self.config.matching.max_gate_px, *self.config.matching.gates_px) + _DRAWN_SIGMAS * self.config.search.least_sigma_px
         return self.tiles.keep(events, self.tiles.near(prediction, dt_s, margin_px))
 
-    def _seen(self, events: EventBatch, t_us: Tensor, number: Tensor | None = None) -> WindowEvents:
+    def _seen(self, window: PaddedEvents, into_burst_us: Tensor | None = None, number: Tensor | None = None) -> WindowEvents:
         """The window's events as each object's camera saw them."""
-        window = pad_streams(events, self.streams, t_us)
-        stream = torch.arange(self.streams, device=t_us.device)[:, None]
+        stream = torch.arange(self.streams, device=window.x.device)[:, None]
         pixels = at_pixels(self.ideal_pixels, stream, window.x, window.y).transpose(1, 2).contiguous().transpose(1, 2)
-        values = (pixels, window.age_us.to(pixels.dtype) * 1e-6, 2 * window.polarity.to(pixels.dtype) - 1, window.mask)
+        age_s = window.age_us.to(pixels.dtype) * 1e-6
+        into_burst_s = torch.zeros_like(age_s) if into_burst_us is None else into_burst_us.to(pixels.dtype) * 1e-6
+        values = (pixels, age_s, into_burst_s, 2 * window.polarity.to(pixels.dtype) - 1, window.mask)
         # Of one stream without a copy for every object.
         each = [value.expand(len(self.stream_index), *value.shape[1:]) if self.streams == 1 else value[self.stream_index] for value in values]
-        return WindowEvents(each[0], each[1], each[2], each[3], number)
+        return WindowEvents(each[0], each[1], each[2], each[3], each[4], number)
 
 
 def _far_pose(centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:

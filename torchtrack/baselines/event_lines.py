@@ -19,7 +19,7 @@ from torchtrack.contour_index import index_contours
 from torchtrack.contours import Contours, reproject, select_ranked, take_points
 from torchtrack.corners import no_corners
 from torchtrack.errors import ModelError
-from torchtrack.events import EventBatch
+from torchtrack.events import EventBatch, pad_streams
 from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.matching import Matches
 from torchtrack.motion import left_covariance
@@ -133,7 +133,7 @@ class EventLineTracker(Tracker):
 
     def _events_near(self, window: Window, events: EventBatch, contours: Contours) -> LineEvents:
         """Events that lie near each object's lines once moved to the window's end, spread evenly in time."""
-        seen = self._seen(events, window.t_us)
+        seen = self._seen(pad_streams(events, self.streams, window.t_us))
         pixels, age_s = seen.pixels, seen.age_s
         velocity = object_plane_velocity(pixels, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
         matching = self.config.matching
@@ -169,6 +169,7 @@ class EventLineTracker(Tracker):
                 contour=point,
                 mask=matched,
                 weights=matched * weight,
+                age_s=near.age_s,
                 points_obj=take_points(contours.points_obj, point),
                 targets=targets,
                 directions=take_points(contours.normals, point),

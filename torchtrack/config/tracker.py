@@ -102,6 +102,10 @@ class MatchingConfig(Settings):
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
+    burst_px: float = Field(
+        1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow circuits fire on (px)."
+    )
+    burst_us: int = Field(10_000, ge=0, le=30_000, description="A burst is what a pixel fires of one polarity in this time (µs); 0 for no bursts.")
     learned_trust: bool = Field(False, description="Trust observations as a small network has learned from the events around them.")
     max_events: int = Field(1000, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 

@@ -1,0 +1,115 @@
+"""Bursts: which events belong to one, how far into it each comes, and what that does to their ages."""
+
+import pytest
+import torch
+from helpers import generator, seen, upright_line
+from test_matching import nearest
+
+from torchtrack.bursts import LONG_AGO_US, no_bursts, update_bursts, without_tail
+from torchtrack.events import EventBatch, PaddedEvents, concatenate, pad_streams
+
+LONGEST_US = 10_000
+
+
+def batch(*events, stream=0):
+    """Events ``(t_us, x, y, polarity)``."""
+    t, x, y, p = (torch.tensor(column, dtype=torch.int64) for column in zip(*events, strict=True))
+    return EventBatch(x.int(), y.int(), t, p.bool(), torch.full_like(t, stream))
+
+
+def update(ages, events, elapsed_us, end_us):
+    streams = len(ages)
+    ends = torch.full((streams,), end_us)
+    return update_bursts(ages, torch.full((streams,), elapsed_us), pad_streams(events, streams, ends), LONGEST_US)
+
+
+def test_events_of_a_pixel_and_polarity_are_one_burst():
+    ages, into = update(no_bursts(1, 4, 6), batch((1000, 2, 1, 1), (1500, 2, 1, 1), (3000, 2, 1, 1), (3500, 3, 1, 1), (4000, 2, 1, 0)), 5000, 5000)
+    assert into.tolist() == [[0, 500, 2000, 0, 0]]
+    assert int(ages[0, 1, 1, 2]) == 4000
+    assert int(ages[0, 1, 1, 3]) == 1500
+    assert int(ages[0, 0, 1, 2]) == 1000
+
+
+def test_a_burst_goes_on_from_window_to_window():
+    ages, _ = update(no_bursts(1, 4, 6), batch((1000, 2, 1, 1)), 5000, 5000)
+    ages, into = update(ages, batch((6000, 2, 1, 1)), 5000, 10_000)
+    assert into.tolist() == [[5000]]
+    assert int(ages[0, 1, 1, 2]) == 9000
+
+
+def test_after_its_longest_time_the_next_event_begins_another():
+    ages, _ = update(no_bursts(1, 4, 6), batch((1000, 2, 1, 1)), 5000, 5000)
+    ages, _ = update(ages, EventBatch.empty(), 5000, 10_000)
+    ages, into = update(ages, batch((10_900, 2, 1, 1), (11_000, 2, 1, 1), (12_000, 2, 1, 1)), 5000, 15_000)
+    # The first is 9.9 ms into the old burst; the second begins a new one.
+    assert into.tolist() == [[9900, 0, 1000]]
+    assert int(ages[0, 1, 1, 2]) == 4000
+
+
+@pytest.mark.parametrize("windows", [1, 2, 5])
+def test_bursts_are_those_of_the_events_one_by_one(windows):
+    make, count, length_us = generator(3), 3000, 40_000
+    t = torch.randint(1, length_us, (count,), generator=make).sort().values
+    x, y, p = (torch.randint(0, high, (count,), generator=make) for high in (6, 4, 2))
+    start, expected = {}, []
+    for now, *pixel in zip(t.tolist(), x.tolist(), y.tolist(), p.tolist(), strict=True):
+        if now - start.get(tuple(pixel), -(10**9)) >= LONGEST_US:
+            start[tuple(pixel)] = now
+        expected.append(now - start[tuple(pixel)])
+    ages, found = no_bursts(1, 4, 6), []
+    step = length_us // windows // 8
+    for end in range(step, length_us + step, step):
+        inside = (t > end - step) & (t <= end)
+        events = batch(*zip(t[inside].tolist(), x[inside].tolist(), y[inside].tolist(), p[inside].tolist(), strict=True))
+        ages, into = update(ages, events, step, end)
+        found += into[0].tolist()
+    assert found == expected
+
+
+def test_streams_are_apart_and_padding_is_no_event():
+    events = concatenate([batch((1000, 0, 0, 0), (2000, 0, 0, 0)), batch((3000, 0, 0, 0), stream=1)])
+    ages, into = update(no_bursts(2, 2, 2), events, 5000, 5000)
+    assert into[0].tolist() == [0, 1000] and int(into[1, 0]) == 0
+    assert ages[:, 0, 0, 0].tolist() == [4000, 2000]
+    assert (ages.flatten(1)[:, 1:] == LONG_AGO_US).all()
+
+
+def test_the_old_map_is_left_as_it_was_and_ages_do_not_overflow():
+    before = no_bursts(1, 2, 2)
+    ages, _ = update(before, batch((1000, 0, 0, 0)), 5000, 5000)
+    assert (before == LONG_AGO_US).all()
+    for elapsed_us in (5000, 30_000, 10_000_000):
+        ages, _ = update(ages, EventBatch.empty(), elapsed_us, elapsed_us)
+        assert (ages > 0).all() and (ages <= LONG_AGO_US).all()
+    assert (ages == LONG_AGO_US).all()
+
+
+def test_in_windows_longer_than_ages_are_kept_events_still_get_numbers():
+    ages, into = update(no_bursts(1, 2, 2), batch((1000, 0, 0, 0), (990_000, 0, 0, 0)), 1_000_000, 1_000_000)
+    assert (into >= 0).all() and (into <= LONG_AGO_US).all()
+    assert (ages >= 0).all()
+
+
+def test_only_late_events_are_dated_back():
+    age, into = torch.full((1, 4), 2e-3), torch.tensor([[0.0, 1e-3, 2e-3, 5e-3]])
+    ages = without_tail(age, into, torch.tensor([[500.0, 500.0, -1000.0, 1000.0]]), 1.0)
+    torch.testing.assert_close(ages, torch.tensor([[2e-3, 2e-3, 3e-3, 6e-3]]))
+    assert torch.equal(without_tail(age, into, torch.zeros(1, 4), 1.0), age)
+
+
+def test_the_tail_of_a_slow_circuit_is_matched_where_its_edge_has_gone():
+    line = upright_line(80.0)
+    speed_px_s, into_s = 500.0, 6e-3
+    # An event now, 3 px behind the edge, of a burst that began when the edge came.
+    late = seen([[[80.0 - speed_px_s * into_s, 60.0]]], into_burst_s=into_s)
+    found, _ = nearest(late, line, velocity=(speed_px_s, 0.0))
+    assert abs(float(found.offsets)) == pytest.approx(1.0, abs=0.3)
+    assert float(found.age_s) == pytest.approx(into_s - 1.0 / speed_px_s)
+
+
+def test_padded_events_of_nothing():
+    nothing = torch.zeros(1, 1, dtype=torch.int64)
+    none = PaddedEvents(nothing, nothing, nothing, nothing.bool(), nothing.bool())
+    ages, into = update_bursts(no_bursts(1, 2, 2), torch.tensor([5000]), none, LONGEST_US)
+    assert (ages == LONG_AGO_US).all() and not into[none.mask].any()

@@ -1,0 +1,59 @@
+"""Bursts: an edge that passes a pixel fires it several times, for the longer the slower the sensor's circuit is.
+
+Where the edge is blurred, its events are spread evenly around the moment when it passes. Real circuits go on firing long
+after that, above all where it got dark. How far into its burst an event comes tells the two apart.
+"""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchtrack.events import PaddedEvents
+
+# Ages (µs) are kept in 16 bits; it does not matter by how much longer ago a burst began.
+LONG_AGO_US = 32_000
+
+
+def no_bursts(streams: int, height: int, width: int, device: torch.device | str | None = None) -> Int[Tensor, "s 2 h w"]:
+    """The map of the bursts' ages (µs) before any event."""
+    return torch.full((streams, 2, height, width), LONG_AGO_US, dtype=torch.int16, device=device)
+
+
+def update_bursts(
+    burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int
+) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
+    """Ages of the newest burst of every pixel and polarity at a window's end (µs), and how far into its burst each event is (µs).
+
+    What one pixel fires of one polarity within ``longest_us`` is one burst; the next event after that begins another.
+
+    Args:
+        burst_age_us: at the end of the window before; left as it was.
+        elapsed_us: length of the window of each stream.
+        events: of the window.
+        longest_us: less than :data:`LONG_AGO_US`.
+
+    Of padding, the second result says nothing.
+    """
+    _, _, height, width = burst_age_us.shape
+    elapsed_us = elapsed_us.clamp(max=LONG_AGO_US).to(torch.int16)[:, None, None, None]
+    ages = torch.minimum(burst_age_us, LONG_AGO_US - elapsed_us).add_(elapsed_us)
+    flat = ages.flatten(1)
+    place = (events.polarity * height + events.y) * width + events.x
+    age_us = events.age_us.clamp(max=LONG_AGO_US).to(torch.int16)
+    before_us = flat.gather(1, place)
+    begins = events.mask & (before_us - age_us >= longest_us)
+    # Of several events of a pixel that would begin a burst the oldest does.
+    flat.scatter_reduce_(1, place, torch.where(begins, -1, before_us), "amin")
+    flat.scatter_reduce_(1, place, torch.where(begins, age_us, -1), "amax")
+    return ages, torch.where(begins, flat.gather(1, place), before_us) - age_us
+
+
+def without_tail(
+    age_s: Float[Tensor, "b n"], into_burst_s: Float[Tensor, "b n"], crossing_px_s: Float[Tensor, "b n"], longest_px: float
+) -> Float[Tensor, "b n"]:
+    """Ages of events (s), the late ones of a burst counted from when their edge had moved on by ``longest_px``.
+
+    Args:
+        crossing_px_s: how fast the edge moves across itself.
+    """
+    return age_s + (into_burst_s - longest_px / crossing_px_s.abs().clamp(min=1e-3)).clamp(min=0)
