@@ -16,8 +16,9 @@ Numbers = tuple[Any, ...]
 @lru_cache(maxsize=256)
 def constant(values: Numbers, dtype: torch.dtype, device: torch.device) -> Tensor:
     """A tensor of these numbers; whoever asks for it must not write to it."""
-    # What is made while nothing is recorded could not be used where gradients are.
-    with torch.inference_mode(False):
+    # What is made while nothing is recorded could not be used where gradients are, nor what is made within a
+    # transform of torch.func outside of it; PyTorch has no public name for leaving one.
+    with torch.inference_mode(False), torch._C._DisableFuncTorch():
         return torch.tensor(values, dtype=dtype, device=device)
 
 
