@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import IMAGE_SIZE, box_model, contours_at, generator, random_events
-from tracked_boxes import SCENES, follow
+from tracked_boxes import SCENES, assert_same, follow, started
 
 from torchtrack import Tracker, readback, tracker
 from torchtrack.config.tracker import CornerConfig, SearchConfig, SurfaceConfig, TrackerConfig, WindowConfig
@@ -177,3 +177,41 @@ def test_a_tracker_that_reads_nothing_finds_the_same(nothing_is_read, monkeypatc
         torch.testing.assert_close(other.quality, one.quality, rtol=0, atol=1e-9)
         assert torch.equal(other.status, one.status)
         assert torch.equal(other.observation_count, one.observation_count)
+
+
+# ---- steady steps
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("reading", [True, False])
+def test_a_steady_step_is_a_step(nothing_is_read, scene, reading):
+    starts, stream_index, cameras, cut = scene(COUNT)
+    boxes = Tracker([box_model()] * len(starts), cameras, stream_index=stream_index)
+    with torch.inference_mode():
+        state, _ = follow(boxes, boxes.init(torch.stack(starts), 0), cut[:-1])
+        if not reading:
+            nothing_is_read()
+        *steady, wrong = boxes.steady_step(state, *cut[-1])
+        assert not wrong
+        for one, other in zip(steady, boxes.step(state, *cut[-1]), strict=True):
+            assert_same(one, other)
+
+
+@pytest.mark.parametrize("reading", [True, False])
+@pytest.mark.parametrize("reason", ["in parts", "searched", "far away", "lost"])
+def test_a_steady_step_says_when_it_does_not_hold(nothing_is_read, monkeypatch, reason, reading):
+    # Made before anything is patched: other tests share it.
+    boxes, state, _, window, _ = started()
+    monkeypatch.setattr(tracker, "_EVENTS_OF_A_PART", 20)
+    *_, wrong = boxes.steady_step(state, *window)
+    assert not wrong
+    if not reading:
+        nothing_is_read()
+    uncertain = state.covariance.clone()
+    if reason == "in parts":
+        uncertain[:, 6:, 6:] += torch.eye(6) * 4.0
+    elif reason in ("searched", "far away"):
+        uncertain[:, :6, :6] += torch.eye(6) * (0.05 if reason == "searched" else 0.005) ** 2
+    last_share = torch.zeros(1) if reason == "lost" else state.share
+    *_, wrong = boxes.steady_step(replace(state, covariance=uncertain, share=last_share), *window)
+    assert wrong

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -46,9 +46,14 @@ def gate_widening(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[
     return (matching.gate_sigmas * sigma_px / first_px).clamp(1, max(matching.max_gate_px / first_px, 1))
 
 
-def index_radius(widening: Float[Tensor, "b"], config: TrackerConfig) -> Answer:
+def index_radius(widening: Float[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:
     """How far contours are to be found for each object's first gate (px)."""
-    return Answer.to((widening * max(config.matching.gates_px)).long() + _INDEX_MARGIN_PX)
+    return (widening * max(config.matching.gates_px)).long() + _INDEX_MARGIN_PX
+
+
+def usual_index_radius(config: TrackerConfig) -> int:
+    """The same for an object whose first gate is as configured."""
+    return int(max(config.matching.gates_px)) + _INDEX_MARGIN_PX
 
 
 def index_for(
@@ -59,7 +64,7 @@ def index_for(
     Args:
         radius_px: :func:`index_radius`, where it was asked for ahead.
     """
-    return index_contours(contours, image_size, radius_px or index_radius(widening, config), config.matching.index_cell_px)
+    return index_contours(contours, image_size, radius_px or Answer.to(index_radius(widening, config)), config.matching.index_cell_px)
 
 
 def align(
@@ -90,7 +95,7 @@ def align(
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, _narrowing(widening, len(matching.gates_px)), strict=True)):
         if number and number in config.contours.refresh_rounds:
             contours = objects.contours(begin.T_cam_obj, config.contours)
-            table = ContourTable.of(contours, index_for(contours, objects.image_size, config, widening))
+            table = ContourTable.of(contours, index_for(contours, objects.image_size, config, widening, index.radius_px))
             place = _first_place(begin, observations, config)
         moving = begin.moving(compensated=matching.motion_compensation)
         if matching.along_flow:

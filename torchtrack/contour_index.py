@@ -38,6 +38,7 @@ class ContourIndex:
         cell_px: side of a cell.
         nearest: contour index per cell, -1 where none is near.
         pixels: where the contour points were when the index was made.
+        radius_px: how far from a contour it is found.
     """
 
     first: Float[Tensor, "b 2"]
@@ -45,6 +46,7 @@ class ContourIndex:
     cell_px: int
     nearest: Int[Tensor, "b p"]
     pixels: Float[Tensor, "b m 2"]
+    radius_px: readback.Answer
 
     def look_up(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
         """The contour point nearest to the centre of each pixel's cell, -1 where none is near."""
@@ -68,7 +70,8 @@ def index_contours(
         radius_px: how far from a contour it is still found; one for all objects, or one for each.
     """
     batch, count, _ = contours.pixels.shape
-    radius, radii_px = _radii(radius_px, contours)
+    answer = _radii(radius_px, contours)
+    radius, radii_px = answer.on_device, answer.numbers()
     middle = constant((0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)), contours.pixels.dtype, contours.pixels.device)
     inside = contours.mask & ((contours.pixels - middle).abs() < middle + radius[:, None, None]).all(-1)
     centre = (contours.pixels / cell_px).round()
@@ -90,15 +93,15 @@ def index_contours(
         for of_part in parts:
             _write(keys, of_part, reach_px, cell_px, columns, count)
     nearest = torch.where(keys < nothing, keys % count, -1).long().view(batch, -1)
-    return ContourIndex(low, (rows, columns), cell_px, nearest, contours.pixels)
+    return ContourIndex(low, (rows, columns), cell_px, nearest, contours.pixels, answer)
 
 
-def _radii(radius_px: int | Tensor | readback.Answer, contours: Contours) -> tuple[Tensor, Sequence[int]]:
-    """The radius of each object, as a tensor and as numbers."""
+def _radii(radius_px: int | Tensor | readback.Answer, contours: Contours) -> readback.Answer:
+    """The radius of each object."""
     if isinstance(radius_px, int):
-        return contours.mask.new_full((len(contours.mask),), radius_px, dtype=torch.int64), [radius_px] * len(contours.mask)
-    answer = radius_px if isinstance(radius_px, readback.Answer) else readback.Answer.to(radius_px)
-    return answer.on_device, answer.numbers()
+        count = len(contours.mask)
+        return readback.Answer(torch.full((count,), radius_px, device=contours.mask.device), torch.full((count,), radius_px), None)
+    return radius_px if isinstance(radius_px, readback.Answer) else readback.Answer.to(radius_px)
 
 
 def _first_cells(centre: Float[Tensor, "b m 2"], inside: Bool[Tensor, "b m"], margin: int) -> Float[Tensor, "b 2"]:

@@ -60,3 +60,27 @@ class Answer:
         if self.arrived is not None:
             self.arrived.synchronize()
         return self.copy
+
+
+class Questions:
+    """How a step asks for what it has to decide."""
+
+    def ask(self, values: Tensor, usual: int) -> Answer:
+        """Begin to ask for values, which in a steady window are all ``usual``."""
+        return Answer.to(values)
+
+
+class Assumptions(Questions):
+    """All is taken to be as usual, where nothing can be asked for: within a CUDA graph."""
+
+    def __init__(self) -> None:
+        self._wrong: list[Tensor] = []
+
+    def ask(self, values: Tensor, usual: int) -> Answer:
+        """The usual answer; whether it is the right one is noted."""
+        self._wrong.append((values.detach() != usual).any())
+        return Answer(torch.full_like(values, usual), torch.full(values.shape, usual), None)
+
+    def wrong(self) -> Tensor:
+        """Whether any answer so far was not the right one."""
+        return torch.stack(self._wrong).any()

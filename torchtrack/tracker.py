@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchtrack import lie, quality, readback
-from torchtrack.alignment import align, gate_widening, index_for, index_radius
+from torchtrack.alignment import align, gate_widening, index_for, index_radius, usual_index_radius
 from torchtrack.bursts import no_bursts, update_bursts
 from torchtrack.camera import MIN_DEPTH_M, Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.conclusion import conclude
@@ -45,6 +45,7 @@ _MAX_DEPTH_M = 1e4
 _DRAWN_SIGMAS = 4.0
 # Fewer events than this do not make a part of a window.
 _EVENTS_OF_A_PART = 400
+_QUESTIONS = readback.Questions()
 
 
 class Tracker(nn.Module):
@@ -170,6 +171,23 @@ class Tracker(nn.Module):
             done = self._advance(state, events, t_us)
             return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us), done) if parted.any() else done)
 
+    def steady_step(
+        self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"]
+    ) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
+        """:meth:`step` where nothing has to be decided, so that a CUDA graph can hold it.
+
+        No object is searched for or looked for farther away than as configured, and no window is taken in parts. A graph is of
+        as many events as it is captured with, and learns contours or not as the window's number then says.
+
+        Returns:
+            State, result, and whether any of this was called for: then they do not hold, and :meth:`step` is to take the window.
+        """
+        t_us, assumptions = self._window_end(state, events, t_end_us), readback.Assumptions()
+        with torch.autocast(t_us.device.type, enabled=False):
+            assumptions.ask(self._to_be_parted(state, events, t_us), False)
+            done = _counted(self._advance(state, events, t_us, assumptions))
+        return *done, assumptions.wrong()
+
     def _to_be_parted(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> Tensor:
         """Objects whose window is taken in parts: while a large part of their motion within it is not known.
 
@@ -198,7 +216,9 @@ class Tracker(nn.Module):
             events = events[~early]
         return self._advance(state, events, t_us)
 
-    def _advance(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult]:
+    def _advance(
+        self, state: TrackerState, events: EventBatch, t_us: Tensor, questions: readback.Questions = _QUESTIONS
+    ) -> tuple[TrackerState, StepResult]:
         """One window, or one part of it."""
         config = self.config
         window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
@@ -213,8 +233,8 @@ class Tracker(nn.Module):
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
         widening = gate_widening(sigma_px, config)
-        radius_px = index_radius(widening, config)
-        in_doubt = readback.Answer.to(may_be_wanted(sigma_px, state.share, state.usual_share, config))
+        radius_px = questions.ask(index_radius(widening, config), usual_index_radius(config))
+        in_doubt = questions.ask(may_be_wanted(sigma_px, state.share, state.usual_share, config), False)
         corners = self._corners(contours, last_event_us, t_us, window_s)
         index = index_for(contours, self.image_size, config, widening, radius_px)
         observations = corner_observations(corners)
