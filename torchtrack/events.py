@@ -73,10 +73,11 @@ class EventBatch:
 
     def to(self, device: torch.device | str) -> "EventBatch":
         """The same events on another device."""
-        most = self.most_of_one
-        if most is None and torch.device(device).type != "cpu" and readback.read_at_once(self.stream_index):
-            most = int(self.stream_index.unique_consecutive(return_counts=True)[1].max()) if len(self) else 0
-        return EventBatch(*(values.to(device) for values in (self.x, self.y, self.t_us, self.polarity, self.stream_index)), most_of_one=most)
+        fields, to_gpu, most = (self.x, self.y, self.t_us, self.polarity, self.stream_index), torch.device(device).type != "cpu", self.most_of_one
+        if most is None and to_gpu and readback.read_at_once(self.stream_index):
+            most = _events_of_fullest(self.stream_index)
+        # On the way to a GPU, values are read before this returns, but without a wait for all that is queued there.
+        return EventBatch(*(values.to(device, non_blocking=to_gpu) for values in fields), most_of_one=most)
 
     def of_stream(self, stream: int) -> "EventBatch":
         """The same events, all said to be of one stream."""
@@ -87,6 +88,13 @@ class EventBatch:
         bounds = torch.tensor([t_start_us, t_end_us], dtype=torch.int64, device=self.t_us.device)
         first, last = torch.searchsorted(self.t_us, bounds, right=True).tolist()
         return self[first:last]
+
+
+def _events_of_fullest(stream_index: Int[Tensor, "e"]) -> int:
+    """How many events the stream with the most of them has."""
+    if len(stream_index) == 0 or int(stream_index[0]) == int(stream_index[-1]):
+        return len(stream_index)
+    return int(stream_index.unique_consecutive(return_counts=True)[1].max())
 
 
 def _integer_tensor(values: np.ndarray, dtype: type[np.signedinteger], name: str) -> Tensor:
