@@ -80,9 +80,8 @@ def index_contours(
     local = torch.where(inside[..., None], centre - low[:, None], margin)
     rows, columns = _size(local, image_size, margin, cell_px)
     # Distance and number of a point in one integer, as narrow as will do.
-    dtype = torch.int32 if _DISTANCE_STEPS * (max([0, *radii_px]) + 4 * cell_px) ** 2 * count < 2**31 else torch.int64
-    nothing = torch.iinfo(dtype).max
-    keys = torch.full((batch * rows * columns,), nothing, dtype=dtype, device=radius.device)
+    dtype = torch.int32 if _DISTANCE_STEPS * (max([0, *radii_px]) + 1) ** 2 * count < 2**31 else torch.int64
+    keys = torch.full((batch * rows * columns,), torch.iinfo(dtype).max, dtype=dtype, device=radius.device)
     # Points that are not inside are too far from their cells to write anything.
     to_centre = torch.where(inside[..., None], cell_px * centre - contours.pixels, _FAR_PX)
     for reach_px, row, point in _points_by_radius(inside, radius, radii_px):
@@ -92,7 +91,8 @@ def index_contours(
         parts = zip(cell.split(at_once), to_centre[row, point].split(at_once), point.to(dtype).split(at_once), strict=True)
         for of_part in parts:
             _write(keys, of_part, reach_px, cell_px, columns, count)
-    nearest = torch.where(keys < nothing, keys % count, -1).long().view(batch, -1)
+    keys = keys.view(batch, -1)
+    nearest = torch.where(keys < ((_DISTANCE_STEPS * radius.square() + 1) * count)[:, None], keys % count, -1).long()
     return ContourIndex(low, (rows, columns), cell_px, nearest, contours.pixels, answer)
 
 
@@ -144,8 +144,9 @@ def _write(keys: Tensor, points: tuple[Tensor, Tensor, Tensor], radius_px: int, 
     """
     cell, to_centre, number = points
     disc = constant(_disc(radius_px / cell_px), to_centre.dtype, to_centre.device)
-    steps = _squared_distances(to_centre, cell_px * disc).mul_(_DISTANCE_STEPS)
-    key = steps.to(keys.dtype).mul_(count).add_(number[:, None]).masked_fill_(steps > _DISTANCE_STEPS * radius_px**2, torch.iinfo(keys.dtype).max)
+    steps = _squared_distances(_DISTANCE_STEPS**0.5 * to_centre, _DISTANCE_STEPS**0.5 * cell_px * disc)
+    # What is farther than the radius need not be told apart, and must fit.
+    key = steps.clamp_(0, _DISTANCE_STEPS * radius_px**2 + 1).to(keys.dtype).mul_(count).add_(number[:, None])
     around = torch.add(disc[:, 0], disc[:, 1], alpha=columns).long()
     keys.scatter_reduce_(0, (cell[:, None] + around).flatten(), key.flatten(), "amin")
 
