@@ -1,5 +1,6 @@
 """Contours at a pose: which edges are drawn, how evenly, with which normals; limbs, texture, segments, batches."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -142,11 +143,35 @@ def test_pixels_are_the_projections_of_the_points(dtype):
     assert contours.pixels.dtype == dtype
 
 
-@pytest.mark.parametrize("count", [16, 100, 800])
+@pytest.mark.parametrize("count", [16, 100, 300])
 def test_as_many_points_as_asked_for(count):
     contours = contours_of(box_model(), pose()[None], ContourConfig(max_edge_points=count, remove_hidden=False))
     assert contours.mask.shape == (1, count)
     assert contours.mask.all()
+
+
+def test_any_number_of_points_may_be_asked_for():
+    contours = contours_of(box_model(), pose()[None], ContourConfig(max_edge_points=3000, spacing_px=0, remove_hidden=False))
+    assert int(contours.mask.sum()) == 3000
+
+
+def test_texture_points_are_thinned_where_they_would_lie_closer():
+    near, far = (contours_of(cube_with_prints(), pose(translation=(0.0, 0.0, depth_m))[None]) for depth_m in (0.3, 6.0))
+    counts = [int((contours.mask & (contours.kind == int(ContourKind.TEXTURE))).sum()) for contours in (near, far)]
+    assert 0 < 3 * counts[1] < counts[0]
+
+
+def test_points_lie_no_closer_than_a_pixel_and_as_each_object_needs():
+    near, far = pose()[None], pose(translation=(0.0, 0.0, 2.0))[None]
+    both = contours_of(box_model(), torch.cat([near, far]), ContourConfig(spacing_px=1, remove_hidden=False))
+    counts = both.mask.sum(1)
+    assert counts[0] == both.mask.shape[1] < CONFIG.max_edge_points
+    assert 3 * counts[1] < counts[0]
+    for number, T in enumerate((near, far)):
+        alone = contours_of(box_model(), T, ContourConfig(spacing_px=1, remove_hidden=False))
+        torch.testing.assert_close(both.pixels[number][both.mask[number]], alone.pixels[0][alone.mask[0]], rtol=0, atol=1e-3)
+        steps = torch.diff(alone.pixels[0], dim=0).norm(dim=-1)
+        assert 0.9 < float(steps.median()) <= 1.001
 
 
 # ---- smooth bodies
@@ -220,14 +245,14 @@ def test_segments_are_drawn_from_every_side(turn):
     model = ObjectModel.from_polylines([[[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]], [[0.0, 0.02, 0.0], [0.03, 0.04, 0.01]]])
     T = pose((0.1, turn, 0.2))
     points, _, _, kind = visible(contours_of(model, T[None]))
-    assert len(points) == CONFIG.max_edge_points
     assert (kind == int(ContourKind.SEGMENT)).all()
     first = (points[:, 1:].abs() < 1e-9).all(-1)
     lengths = []
     for segment in model.segments.double():
         start, end = project((segment @ T[:3, :3].T + T[:3, 3])[None], INTRINSICS[None])[0]
         lengths.append(float((end - start).norm()))
-    assert float(first.double().mean()) == pytest.approx(lengths[0] / sum(lengths), abs=0.01)
+    assert len(points) == math.ceil(sum(lengths) / CONFIG.spacing_px)
+    assert float(first.double().mean()) == pytest.approx(lengths[0] / sum(lengths), abs=1 / sum(lengths))
 
 
 def test_segments_can_be_switched_off():

@@ -122,7 +122,7 @@ def test_no_more_is_learned_than_there_is_room_for(points):
     assert state.learned.drafts_obj.shape == (1, 500, 3)
     assert int((state.learned.evidence > 0).sum()) == points or points == 300
     assert bool(torch.isfinite(state.learned.points_obj).all())
-    assert results[-1].contours.mask.shape == (1, ContourConfig().max_edge_points + points)
+    assert int((results[-1].contours.kind == int(ContourKind.LEARNED)).sum()) in (0, points)
 
 
 def test_learned_points_are_apart():
@@ -188,7 +188,7 @@ def test_nothing_is_learned_on_dense_meshes():
     tracker = Tracker([plate_model()], PLATE_CAMERA, TrackerConfig(contours=ContourConfig(exact_faces=0)))
     state, results = follow(tracker, tracker.init(PLATE_POSE[None], 0), windows(events, 2))
     assert not bool(state.learned.drafted.any())
-    assert results[-1].contours.mask.shape[1] == ContourConfig().max_edge_points
+    assert not bool((results[-1].contours.kind == int(ContourKind.LEARNED)).any())
 
 
 def test_a_search_takes_what_was_learned_along():

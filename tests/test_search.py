@@ -138,7 +138,7 @@ def test_a_displaced_box_is_found_again_by_the_search(dtype):
     assert float(degrees) < 1.0
     assert float(millimetres) < 3.0
     assert float(better.share) > float(before.share) + tracker.config.search.margin
-    assert better.fit.contours.pixels.shape == before.fit.contours.pixels.shape
+    assert better.fit.contours.pixels.shape[1] >= before.fit.contours.pixels.shape[1]
 
 
 def test_what_is_no_better_by_the_margin_is_left():
@@ -155,14 +155,14 @@ def test_a_search_leaves_what_it_was_given_as_it_was():
     assert all(torch.equal(now, then) for now, then in zip(tensors_of(found), before, strict=True))
 
 
-def displaced_runs(config, covariance_scale, count=10):
+def displaced_runs(config, covariance_scale, count=10, displaced=DISPLACED):
     """Runs on from full motion with the pose displaced and its covariance scaled; results, and the true pose at their end."""
     tracker = Tracker([box_model()], SMALL_CAMERA, config)
     trajectory, events = moving_box(pose(), count + 5)
     state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 5))
     state = replace(
         state,
-        T_cam_obj=retract_about(state.T_cam_obj, DISPLACED, tracker.centre_obj.double()),
+        T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()),
         covariance=covariance_scale * state.covariance,
     )
     _, results = follow(tracker, state, windows(events, count, 5 * WINDOW_US))
@@ -170,8 +170,9 @@ def displaced_runs(config, covariance_scale, count=10):
 
 
 def test_a_lost_box_is_found_again_and_without_the_search_it_is_not():
-    with_search, T_true = displaced_runs(SEARCHED, 1.0)
-    without, _ = displaced_runs(UNSEARCHED, 1.0)
+    # A little nearer, and it may come back by itself.
+    with_search, T_true = displaced_runs(SEARCHED, 1.0, displaced=1.15 * DISPLACED)
+    without, _ = displaced_runs(UNSEARCHED, 1.0, displaced=1.15 * DISPLACED)
     degrees, millimetres = pose_errors(with_search[-1].T_cam_obj, T_true)
     assert float(degrees) < 1.2
     assert float(millimetres) < 2.0
@@ -213,7 +214,9 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
         assert torch.equal(poses_of(runs["with"], number), poses_of(runs["without"], number))
         for ours, theirs in zip(runs["with"], runs["without"], strict=True):
             assert torch.equal(ours.covariance[number], theirs.covariance[number])
-            assert torch.equal(ours.contours.pixels[number], theirs.contours.pixels[number])
+            # There are as many places as the object with the most contours needs, and rounding hangs on how many there are.
+            pixels = [contours.pixels[number][contours.mask[number]] for contours in (ours.contours, theirs.contours)]
+            torch.testing.assert_close(*pixels, rtol=0, atol=1e-4)
     assert not torch.equal(poses_of(runs["with"], 1), poses_of(runs["without"], 1))
 
 

@@ -85,7 +85,7 @@ def test_what_hides_behind_the_objects_own_faces_is_what_rays_say(seed, dtype):
         assert kept[~possible].all()
         hidden, shown = hidden + certain.sum(), shown + (~possible).sum()
     assert hidden > 30
-    assert shown > 1000
+    assert shown > 800
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -118,7 +118,7 @@ def test_a_part_in_front_hides_the_part_behind(exact_faces):
     config = ContourConfig(exact_faces=exact_faces)
     before, after = extracted([model], pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.5))[None], config=config)
     front = before.points_obj[..., 2] < 0
-    assert int((before.mask & ~front).sum()) > 100
+    assert int((before.mask & ~front).sum()) > 80
     assert not (after.mask & ~front).any()
     assert (after.mask & front).any()
 
@@ -231,7 +231,9 @@ def test_a_batch_of_streams_is_its_elements(dtype):
     for stream in range(3):
         members = [number for number in range(4) if streams[number] == stream]
         _, alone = extracted([models[number] for number in members], T[members], dtype=dtype)
-        assert torch.equal(together.mask[members], alone.mask)
+        width = alone.mask.shape[1]
+        assert torch.equal(together.mask[members, :width], alone.mask)
+        assert not together.mask[members, width:].any()
 
 
 # ---- the buffer

@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from torchtrack import readback
@@ -103,6 +105,7 @@ class ContourModel(nn.Module):
         spread = torch.linspace(0, max(len(model.texture_points) - 1, 0), texture_count).long()
         for name in ("texture_points", "texture_tangents", "texture_normals"):
             self.register_buffer(name, getattr(model, name)[spread].clone())
+        self.texture_spacing_m = _spacing(self.texture_points)
         self.register_buffer("surface_points", model.surface_points.clone())
         exact = len(model.triangles) <= config.exact_faces
         triangles = model.triangles if exact else model.triangles[:0]
@@ -131,6 +134,14 @@ def _normals(triangles: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3"]:
     """Unit normals."""
     first, second, third = triangles.unbind(1)
     return torch.nn.functional.normalize(torch.linalg.cross(second - first, third - first, dim=-1), dim=-1)
+
+
+def _spacing(points: Float[Tensor, "n 3"]) -> float:
+    """Distance of most points from the one nearest to them (m)."""
+    if len(points) < 2:
+        return 0.0
+    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=2)
+    return float(np.median(distances[:, 1]))
 
 
 def group_by_model(models: Sequence[ObjectModel], config: ContourConfig) -> list[ContourModel]:
@@ -164,7 +175,7 @@ def take_points(values: Float[Tensor, "b n k"], index: Int[Tensor, "b m"]) -> Fl
 
 def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points (object frame), tangents, kinds and mask on the active edges, spread evenly in the image."""
-    batch, count = len(T_cam_obj), config.max_edge_points
+    batch = len(T_cam_obj)
     camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])
     active = model.active_edges(camera_obj[..., 0], config.occluding)
     ends, edges = model.edge_ends.expand(batch, -1, -1, -1), model.edges.expand(batch, -1, -1)
@@ -174,7 +185,11 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     lengths, start_z, end_z = _lengths_px(ends, T_cam_obj, intrinsics)
     lengths = lengths * active
     cumulative = lengths.cumsum(-1)
-    target = (torch.arange(count, device=lengths.device, dtype=lengths.dtype) + 0.5) / count * cumulative[:, -1:]
+    total = cumulative[:, -1:]
+    counts = (total / config.spacing_px).ceil().nan_to_num(0.0).clamp(max=config.max_edge_points)
+    count = max(int(counts.amax()), 1) if readback.read_at_once(counts) else config.max_edge_points
+    number = torch.arange(count, device=lengths.device, dtype=lengths.dtype)
+    target = (number + 0.5) / counts.clamp(min=1) * total
     edge = torch.searchsorted(cumulative, target).clamp(max=lengths.shape[1] - 1)[:, None]
     until, length, z0, z1 = torch.stack([cumulative, lengths, start_z, end_z], 1).gather(2, edge.expand(-1, 4, -1)).unbind(1)
     along = 1 - (until - target) / length.clamp(min=1e-9)
@@ -185,8 +200,7 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     # The normal in the image is to point out of the object: tangents turn with it on their right.
     side = (turning * (points - camera_obj)).sum(1, keepdim=True)
     tangents = torch.where(side > 0, direction, -direction)
-    mask = (cumulative[:, -1:] > 0).expand(-1, count)
-    return points.transpose(1, 2), tangents.transpose(1, 2), kind[:, 0].long(), mask
+    return points.transpose(1, 2), tangents.transpose(1, 2), kind[:, 0].long(), number < counts
 
 
 def _lengths_px(ends: Float[Tensor, "b e 2 3"], T_cam_obj: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -205,9 +219,13 @@ def _texture_mask(model: ContourModel, T_cam_obj: Tensor) -> Tensor:
     return (normals * points).sum(-1) < -_MIN_TEXTURE_COSINE * points.square().sum(-1).sqrt()
 
 
-def _texture_points(model: ContourModel, T_cam_obj: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points, tangents, kinds and mask of the texture that looks at the camera."""
-    facing = _texture_mask(model, T_cam_obj)
+    spacing_px = model.texture_spacing_m * intrinsics[:, 0] / T_cam_obj[:, 2, 3].clamp(min=MIN_DEPTH_M)
+    # Every second, third and so on, where they lie closer than need be.
+    every = (config.spacing_px / spacing_px).floor().clamp(1, len(model.texture_points)).long()
+    number = torch.arange(len(model.texture_points), device=every.device)
+    facing = _texture_mask(model, T_cam_obj) & (number % every[:, None] == 0)
     # On a GPU, which would have to be waited for to know how many there are, all keep their places.
     count = int(facing.sum(1).amax()) if readback.read_at_once(facing) else facing.shape[1]
     chosen, mask = select_ranked(facing, count)
@@ -221,7 +239,7 @@ def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, 
     if len(model.edge_ends):
         parts.append(_edge_points(model, T_cam_obj, intrinsics, config))
     if len(model.texture_points):
-        parts.append(_texture_points(model, T_cam_obj))
+        parts.append(_texture_points(model, T_cam_obj, intrinsics, config))
     if len(parts) == 2:
         return parts[1]
     points, tangents, kind, mask = (torch.cat(column, 1) for column in zip(*parts, strict=True))

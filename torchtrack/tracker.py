@@ -277,7 +277,10 @@ class Tracker(nn.Module):
         """The objects, with the contours learned on them that count by now."""
         if learned is None or not self._learns:
             return self.objects
-        return replace(self.objects, learned=learned.that_count(self.config.learning))
+        counting = learned.that_count(self.config.learning)
+        if readback.read_at_once(counting.mask) and not bool(counting.mask.any()):
+            return self.objects
+        return replace(self.objects, learned=counting)
 
     @torch.no_grad()
     def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor) -> TrackerState:

@@ -71,6 +71,7 @@ class ContourConfig(Settings):
     segments: bool = Field(True, description="Segments of a polyline model.")
     max_edge_points: int = Field(800, ge=16, le=10_000, description="Points sampled on occluding contours, creases and segments.")
     max_texture_points: int = Field(4000, ge=0, le=20_000, description="Points of texture edges.")
+    spacing_px: float = Field(0.5, ge=0, description="Contour points no closer than this in the image: events lie on whole pixels (px).")
     remove_hidden: bool = Field(True, description="Remove contours behind a surface of any object of the stream.")
     exact_faces: int = Field(512, ge=0, le=5000, description="Models of up to this many faces hide their own contours exactly, face by face.")
     depth_cell_px: int = Field(4, ge=1, le=16, description="Cell of the depth buffer (px).")
