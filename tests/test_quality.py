@@ -60,7 +60,7 @@ def test_a_good_pose_is_tracking():
     [
         ({"quality": 0.39}, Status.UNCERTAIN),
         ({"quality": 0.4}, Status.TRACKING),
-        ({"quality": 0.19}, Status.LOST),
+        ({"quality": 0.09}, Status.LOST),
         ({"quality": 0.2}, Status.UNCERTAIN),
         ({"quality": 0.0}, Status.LOST),
         ({"count": 29}, Status.TOO_FEW_EVENTS),

@@ -14,13 +14,16 @@ from torchtrack.events import concatenate, pad_streams
 from torchtrack.lie import retract_about
 from torchtrack.observations import select_events
 from torchtrack.quality import Status
-from torchtrack.search import draw_offsets, event_density, judge_fit, mark, search, wanted
+from torchtrack.search import Doubt, draw_offsets, event_density, judge_fit, mark, may_be_wanted, search
 
 SEARCHED = TrackerConfig()
 UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
 IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
 # Ten degrees and some millimetres: edges are several pixels off, farther than the tight gate reaches.
 DISPLACED = torch.tensor([[0.09, -0.06, 0.12, 0.008, -0.006, 0.0]], dtype=torch.float64)
+
+
+MARGIN = torch.tensor(0.1)
 
 
 def random_covariance(seed=0, scale=1e-4):
@@ -35,7 +38,16 @@ def test_uncertain_objects_and_those_explained_worse_than_usual_are_searched_for
     config = SearchConfig(from_sigma_px=4.0, dropped_to=0.8)
     share, usual = torch.tensor([0.9, 0.71, 0.73, 0.9, 0.0]), torch.tensor([0.9, 0.9, 0.9, 0.9, 0.0])
     sigma_px = torch.tensor([1.0, 1.0, 1.0, 4.1, 1.0])
-    assert wanted(share, sigma_px, usual, config).tolist() == [False, True, False, True, False]
+    starting = torch.zeros(5, dtype=torch.bool)
+    assert Doubt(sigma_px, share, usual, starting).asks(share, config).tolist() == [False, True, False, True, False]
+
+
+@pytest.mark.parametrize("at_start", [True, False])
+def test_objects_whose_motion_is_not_known_are_searched_for(at_start):
+    starting, usual = torch.tensor([True, False]), torch.full((2,), 0.9)
+    doubt = Doubt(torch.ones(2), usual, usual, starting)
+    config = TrackerConfig(search=SearchConfig(at_start=at_start))
+    assert doubt.asks(usual, config.search).tolist() == may_be_wanted(doubt, config).tolist() == [at_start, False]
 
 
 # ---- what is drawn
@@ -132,7 +144,7 @@ def test_a_displaced_box_is_found_again_by_the_search(dtype):
     tracker, prediction, seen, found, T_true = in_motion(displaced=DISPLACED, dtype=dtype)
     sigma = torch.tensor([0.1] * 3 + [0.01] * 3 + [1.0] * 3 + [0.1] * 3, dtype=torch.float64)
     prediction = replace(prediction, covariance=torch.diag_embed(sigma.square())[None])
-    before, better = found, search(0, prediction, 8.0, seen, found, tracker.config)
+    before, better = found, search(0, prediction, 8.0, MARGIN, seen, found, tracker.config)
     degrees, millimetres = pose_errors(better.fit.solution.T_cam_obj.double(), T_true)
     assert float(pose_errors(before.fit.solution.T_cam_obj.double(), T_true)[0]) > 3
     assert float(degrees) < 1.0
@@ -144,14 +156,14 @@ def test_a_displaced_box_is_found_again_by_the_search(dtype):
 def test_what_is_no_better_by_the_margin_is_left():
     tracker, prediction, seen, found, _ = in_motion()
     assert float(found.share) > 0.7
-    assert search(0, prediction, 1.0, seen, found, tracker.config) is found
+    assert search(0, prediction, 1.0, MARGIN, seen, found, tracker.config) is found
 
 
 def test_a_search_leaves_what_it_was_given_as_it_was():
     tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
     prediction = replace(prediction, covariance=1e2 * prediction.covariance)
     before = [tensor.clone() for tensor in tensors_of(found)]
-    search(0, prediction, 8.0, seen, found, tracker.config)
+    search(0, prediction, 8.0, MARGIN, seen, found, tracker.config)
     assert all(torch.equal(now, then) for now, then in zip(tensors_of(found), before, strict=True))
 
 
@@ -183,14 +195,14 @@ def test_a_lost_box_is_found_again_and_without_the_search_it_is_not():
 @pytest.mark.parametrize("config", [UNSEARCHED, SEARCHED.model_copy(update={"solver": SEARCHED.solver.model_copy(update={"prior": False})})])
 def test_without_hypotheses_or_a_prior_nothing_is_searched_for(config, monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, margin, seen, found, config: searched.append(number) or found)
     displaced_runs(config, 100.0, count=2)
     assert searched == []
 
 
 def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, margin, seen, found, config: searched.append(number) or found)
     _, events = moving_box(pose(), 10)
     tracker = Tracker([box_model()], SMALL_CAMERA)
     follow(tracker, tracker.init(pose()[None], 0), windows(events, 10))
@@ -223,7 +235,7 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
 @pytest.mark.parametrize(("count", "times"), [(0, 0), (29, 0), (200, 1)])
 def test_without_enough_events_there_is_nothing_to_search_in(count, times, monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, margin, seen, found, config: searched.append(number) or found)
     tracker, state, _, _, _ = started()
     noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
     after, result = tracker.step(replace(state, covariance=1e3 * state.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)

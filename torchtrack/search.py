@@ -53,51 +53,58 @@ def judge_fit(prediction: Prediction, fit: Fit, config: TrackerConfig) -> Found:
     return Found(fit, share, fit.matches.mask.sum(-1))
 
 
-def wanted(share: Float[Tensor, "b"], sigma_px: Float[Tensor, "b"], usual_share: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
-    """Which objects are to be searched for: uncertain ones, and those whose explained share stays below the usual."""
-    return (sigma_px > config.from_sigma_px) | (share < config.dropped_to * usual_share)
-
-
-def may_be_wanted(
-    sigma_px: Float[Tensor, "b"], last_share: Float[Tensor, "b"], usual_share: Float[Tensor, "b"], config: TrackerConfig
-) -> Bool[Tensor, "b"]:
-    """Which objects :func:`search_wanted` can turn out to search for, as far as is known before the window is aligned."""
-    if config.search.hypotheses == 0 or not config.solver.prior:
-        return torch.zeros_like(last_share, dtype=torch.bool)
-    return wanted(last_share, sigma_px, usual_share, config.search)
-
-
-def search_wanted(
-    prediction: Prediction,
-    sigma_px: Float[Tensor, "b"],
-    last_share: Float[Tensor, "b"],
-    usual_share: Float[Tensor, "b"],
-    events: WindowEvents,
-    found: Found,
-    config: TrackerConfig,
-) -> Found:
-    """Try other poses for the objects that need it, one object after the other.
+@dataclass(frozen=True)
+class Doubt:
+    """What speaks for trying other poses, before a window is aligned.
 
     Args:
+        sigma_px: standard deviation of each object's prediction in the image.
         last_share: explained in the window before: one bad window alone is no reason.
+        usual_share: explained as a rule.
+        starting: objects whose motion is not known yet.
     """
+
+    sigma_px: Float[Tensor, "b"]
+    last_share: Float[Tensor, "b"]
+    usual_share: Float[Tensor, "b"]
+    starting: Bool[Tensor, "b"]
+
+    def asks(self, share: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+        """Which objects are to be searched for: uncertain ones, and those whose explained share stays below the usual."""
+        starting = self.starting if config.at_start else torch.zeros_like(self.starting)
+        return starting | (self.sigma_px > config.from_sigma_px) | (share < config.dropped_to * self.usual_share)
+
+
+def may_be_wanted(doubt: Doubt, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Which objects :func:`search_wanted` can turn out to search for, as far as is known before the window is aligned."""
+    if config.search.hypotheses == 0 or not config.solver.prior:
+        return torch.zeros_like(doubt.starting)
+    return doubt.asks(doubt.last_share, config.search)
+
+
+def search_wanted(prediction: Prediction, doubt: Doubt, events: WindowEvents, found: Found, config: TrackerConfig) -> Found:
+    """Try other poses for the objects that need it, one object after the other."""
     if config.search.hypotheses == 0 or not config.solver.prior:
         return found
     # Without events no pose is better than another.
     enough = events.mask.sum(-1) >= config.quality.min_observations
-    tried = enough & wanted(torch.maximum(found.share, last_share), sigma_px, usual_share, config.search)
-    answers = Answer.to(tried), Answer.to(sigma_px)
+    tried = enough & doubt.asks(torch.maximum(found.share, doubt.last_share), config.search)
+    margin = torch.where(doubt.starting, config.search.start_margin, config.search.margin)
+    answers = Answer.to(tried), Answer.to(doubt.sigma_px)
     for number, (is_tried, own_sigma_px) in enumerate(zip(*(answer.numbers() for answer in answers), strict=True)):
         if is_tried:
-            found = search(number, prediction, own_sigma_px, events, found, config)
+            found = search(number, prediction, own_sigma_px, margin[number], events, found, config)
     return found
 
 
-def search(number: int, prediction: Prediction, sigma_px: float, events: WindowEvents, found: Found, config: TrackerConfig) -> Found:
+def search(
+    number: int, prediction: Prediction, sigma_px: float, margin: Float[Tensor, ""], events: WindowEvents, found: Found, config: TrackerConfig
+) -> Found:
     """Try other poses for the object ``number``; ``found`` with the best of them in its place, if that is better.
 
     Args:
         sigma_px: standard deviation of the object's prediction in the image.
+        margin: by how much another pose must explain more.
         events: of all objects.
     """
     settings, count = config.search, config.search.hypotheses
@@ -113,7 +120,7 @@ def search(number: int, prediction: Prediction, sigma_px: float, events: WindowE
     share = torch.where(tried.count >= config.quality.min_observations, tried.share, 0)
     best = share.argmax()[None]
     mine = torch.where(found.count[number] >= config.quality.min_observations, found.share[number], 0.0)
-    better = share.index_select(0, best) > mine + settings.margin
+    better = share.index_select(0, best) > mine + margin
     return found if readback.read_at_once(better) and not bool(better) else _replaced(found, number, tried, best, better)
 
 

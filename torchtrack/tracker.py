@@ -29,7 +29,7 @@ from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import WindowEvents, corner_observations, join, select_events
 from torchtrack.prediction import Prediction
-from torchtrack.search import judge_fit, may_be_wanted, search_wanted
+from torchtrack.search import Doubt, judge_fit, may_be_wanted, search_wanted
 from torchtrack.sensor_tiles import SensorTiles
 from torchtrack.speed_limit import largest_speed, limit_speed, unknown_speed
 from torchtrack.state import StepResult, TrackerState, choose_rows
@@ -167,9 +167,9 @@ class Tracker(nn.Module):
             in_parts = self._to_be_parted(state, events, t_us)
             parted = readback.Answer.to(in_parts)
             if readback.read_at_once(in_parts) and bool(in_parts.all()):
-                return _counted(self._advance_in_parts(state, events, t_us))
+                return _counted(self._advance_in_parts(state, events, t_us, in_parts))
             done = self._advance(state, events, t_us)
-            return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us), done) if parted.any() else done)
+            return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us, in_parts), done) if parted.any() else done)
 
     def steady_step(
         self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"]
@@ -185,7 +185,7 @@ class Tracker(nn.Module):
         t_us, assumptions = self._window_end(state, events, t_end_us), readback.Assumptions()
         with torch.autocast(t_us.device.type, enabled=False):
             assumptions.ask(self._to_be_parted(state, events, t_us), False)
-            done = _counted(self._advance(state, events, t_us, assumptions))
+            done = _counted(self._advance(state, events, t_us, questions=assumptions))
         return *done, assumptions.wrong()
 
     def _to_be_parted(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> Tensor:
@@ -207,17 +207,22 @@ class Tracker(nn.Module):
         count = torch.diff(stream_bounds(events, self.streams))[self.stream_index]
         return unknown & (count >= window.parts * _EVENTS_OF_A_PART)
 
-    def _advance_in_parts(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult]:
-        """The window as several short ones."""
+    def _advance_in_parts(self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor) -> tuple[TrackerState, StepResult]:
+        """The window as several short ones, with a search for objects that are ``starting``."""
         for left in range(self.config.window.parts, 1, -1):
             until_us = state.t_us + (t_us - state.t_us) // left
             early = events.t_us <= until_us[events.stream_index]
-            state, _ = self._advance(state, events[early], until_us)
+            state, _ = self._advance(state, events[early], until_us, starting)
             events = events[~early]
-        return self._advance(state, events, t_us)
+        return self._advance(state, events, t_us, starting)
 
     def _advance(
-        self, state: TrackerState, events: EventBatch, t_us: Tensor, questions: readback.Questions = _QUESTIONS
+        self,
+        state: TrackerState,
+        events: EventBatch,
+        t_us: Tensor,
+        starting: Tensor | None = None,
+        questions: readback.Questions = _QUESTIONS,
     ) -> tuple[TrackerState, StepResult]:
         """One window, or one part of it."""
         config = self.config
@@ -234,7 +239,10 @@ class Tracker(nn.Module):
         sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
         widening = gate_widening(sigma_px, config)
         radius_px = questions.ask(index_radius(widening, config), usual_index_radius(config))
-        in_doubt = questions.ask(may_be_wanted(sigma_px, state.share, state.usual_share, config), False)
+        doubt = Doubt(
+            sigma_px, state.share, state.usual_share, torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
+        )
+        in_doubt = questions.ask(may_be_wanted(doubt, config), False)
         corners = self._corners(contours, last_event_us, t_us, window_s)
         index = index_for(contours, self.image_size, config, widening, radius_px)
         observations = corner_observations(corners)
@@ -246,7 +254,7 @@ class Tracker(nn.Module):
             observations = judged(evidence, self.weigher)
         found = judge_fit(prediction, align(recorded, contours, index, widening, observations, config), config)
         if in_doubt.any():
-            found = search_wanted(recorded, sigma_px, state.share, state.usual_share, seen, found, config)
+            found = search_wanted(recorded, doubt, seen, found, config)
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
         if state.learned is not None and self._learns:
             trusted = (result.status <= int(quality.Status.UNCERTAIN)) & (sigma_px < config.learning.max_sigma_px)

@@ -164,6 +164,8 @@ class SearchConfig(Settings):
     from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
     dropped_to: float = Field(0.8, ge=0, le=1, description="Share of the usual quality below which others are tried.")
     least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
+    at_start: bool = Field(True, description="Others are also tried while an object's motion is not known: dense print fits many.")
+    start_margin: float = Field(0.02, ge=0, le=1, description="By how much the quality of another pose must be better then.")
     margin: float = Field(0.1, ge=0, le=1, description="By how much the quality of another pose must be better.")
 
 
@@ -173,7 +175,7 @@ class QualityConfig(Settings):
     min_observations: int = Field(30, ge=6, description="Fewer matched observations: the pose is not updated.")
     min_visible_share: float = Field(0.2, ge=0, le=1, description="A smaller share of the contour inside the image: out of view.")
     uncertain_below: float = Field(0.4, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is uncertain.")
-    lost_below: float = Field(0.2, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is lost.")
+    lost_below: float = Field(0.1, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is lost.")
     caught_above: float = Field(
         0.35, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object is found again."
     )
