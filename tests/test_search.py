@@ -108,7 +108,8 @@ def in_motion(config=None, displaced=None, dtype=torch.float32):
     tracker, state, _, (events, end_us), trajectory = started(dtype, config)
     if displaced is not None:
         state = replace(state, T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()))
-    prediction, seen = tracker._predict(state, torch.tensor([5e-3], dtype=dtype)), tracker._seen(pad_streams(events, 1, torch.tensor([end_us])))
+    prediction = tracker._predict(state, torch.tensor([5e-3], dtype=dtype))
+    seen = tracker.sensors.seen(pad_streams(events, 1, torch.tensor([end_us])))
     contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
     tight = gate_widening(torch.zeros(1, dtype=dtype), tracker.config)
     index = index_for(contours, IMAGE_SIZE, tracker.config, tight)

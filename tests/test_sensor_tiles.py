@@ -85,7 +85,7 @@ def test_a_step_is_the_same_without_the_events_that_are_left_out():
     noisy = merged(events, replace(noise, t_us=noise.t_us + 5 * WINDOW_US)).slice_time(5 * WINDOW_US, 6 * WINDOW_US)
     results = [tracker.step(state, noisy)[1]]
     dt_s = torch.tensor([1e-6 * WINDOW_US])
-    assert len(tracker._near_objects(noisy, tracker._predict(state, dt_s), dt_s)[0]) < len(noisy) // 2
+    assert len(tracker.sensors.near_objects(noisy, tracker._predict(state, dt_s), dt_s, tracker.config)[0]) < len(noisy) // 2
     tracker.tiles = None
     results.append(tracker.step(state, noisy)[1])
     assert torch.equal(results[0].T_cam_obj, results[1].T_cam_obj)

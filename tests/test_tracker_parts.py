@@ -7,8 +7,7 @@ import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors
 from tracked_boxes import assert_same, follow, moving_box, poses_of, started, windows
 
-import torchtrack.tracker
-from torchtrack import Tracker
+from torchtrack import Tracker, window_parts
 from torchtrack.config.tracker import TrackerConfig, WindowConfig
 from torchtrack.events import concatenate
 from torchtrack.state import choose_rows
@@ -19,7 +18,7 @@ FAST = {"move": (2.0, 1.0, 0.1), "turn": (1.5, -1.0, 2.0)}
 @pytest.fixture(autouse=True)
 def few_events_make_a_part(monkeypatch):
     """The boxes of the tests fire far less than a real object does."""
-    monkeypatch.setattr(torchtrack.tracker, "_EVENTS_OF_A_PART", 40)
+    monkeypatch.setattr(window_parts, "_EVENTS_OF_A_PART", 40)
 
 
 def in_parts(parts):

@@ -14,6 +14,8 @@ from torchtrack.lie import retract_about, transform_points
 from torchtrack.object_batch import ObjectBatch, repeat_row
 from torchtrack.pose_solver import pose_jacobian
 
+# Nothing that is tracked is farther away (m).
+_MAX_DEPTH_M = 1e4
 # Contour points that the uncertainty is looked at, at most.
 _LOOKED_AT = 64
 
@@ -87,3 +89,20 @@ class Prediction:
         jacobian = pose_jacobian((points - self.centre_cam[:, None]).transpose(1, 2), (*slope.unbind(-1), along))
         variance = (jacobian * (self.covariance[:, :6, :6].to(jacobian.dtype) @ jacobian)).sum(1)
         return ((variance * mask).sum(-1) / mask.sum(-1).clamp(min=1)).sqrt()
+
+
+def far_pose(centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:
+    """A pose of each object with its centre far before the camera."""
+    poses = torch.eye(4, dtype=centre_obj.dtype).repeat(len(centre_obj), 1, 1)
+    poses[:, :3, 3] = torch.tensor([0, 0, _MAX_DEPTH_M], dtype=centre_obj.dtype) - centre_obj
+    return poses
+
+
+def before_camera(
+    T_cam_obj: Float[Tensor, "b 4 4"], centre_obj: Float[Tensor, "b 3"], harmless: Float[Tensor, "b 4 4"]
+) -> tuple[Float[Tensor, "b 4 4"], Bool[Tensor, "b"]]:
+    """The poses with a harmless one in the place of those that are not finite or not before the camera, and which are."""
+    depth = transform_points(T_cam_obj, centre_obj[:, None])[:, 0, 2]
+    # A sum is finite only where every entry is.
+    usable = (T_cam_obj.sum((1, 2)).abs() < torch.inf) & (depth > MIN_DEPTH_M) & (depth < _MAX_DEPTH_M)
+    return torch.where(usable[:, None, None], T_cam_obj, harmless), usable

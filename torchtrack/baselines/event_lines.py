@@ -133,7 +133,7 @@ class EventLineTracker(Tracker):
 
     def _events_near(self, window: Window, events: EventBatch, contours: Contours) -> LineEvents:
         """Events that lie near each object's lines once moved to the window's end, spread evenly in time."""
-        seen = self._seen(pad_streams(events, self.streams, window.t_us))
+        seen = self.sensors.seen(pad_streams(events, self.streams, window.t_us))
         pixels, age_s = seen.pixels, seen.age_s
         velocity = object_plane_velocity(pixels, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
         matching = self.config.matching

@@ -1,0 +1,128 @@
+"""From events to what each object's camera saw: the window's events and corners with their flow, in ideal pixels.
+
+What is remembered of the past are maps over the sensor; the lens is undone with tables, once per event.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchtrack import readback
+from torchtrack.bursts import update_bursts
+from torchtrack.camera import Camera, distortion_table, stack_tables, undistortion_table
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.constants import constant
+from torchtrack.contours import Contours
+from torchtrack.corners import Corners, detect_corners, no_corners
+from torchtrack.events import EventBatch, PaddedEvents, pad_streams
+from torchtrack.evidence import AgeAt
+from torchtrack.flow import estimate_flow
+from torchtrack.observations import WindowEvents
+from torchtrack.prediction import Prediction
+from torchtrack.sensor_tiles import SensorTiles
+from torchtrack.state import TrackerState
+from torchtrack.time_surface import at_pixels, object_regions, time_surface
+
+# Contours this far outside the image still find their place on a distorted sensor (px).
+_BORDER_PX = 64
+# Poses that a search draws lie within this many of its least standard deviations.
+_DRAWN_SIGMAS = 4.0
+
+
+def sensor_tables(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "s h w 2"], Float[Tensor, "s bh bw 2"]]:
+    """The tables that :class:`Sensors` looks up: ideal pixels of the sensor's, and sensor pixels of ideal ones."""
+    return stack_tables([undistortion_table(c) for c in cameras]), stack_tables([distortion_table(c, _BORDER_PX) for c in cameras])
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """The sensor of each stream, and which of them each object is seen by.
+
+    Args:
+        ideal_pixels: ideal pixel (u, v) of every sensor pixel.
+        sensor_pixels: sensor pixel of every ideal pixel, with a border; both from :func:`sensor_tables`.
+        stream_index: the stream that each object is seen in.
+        tiles: of the sensor, where there is one stream alone.
+    """
+
+    ideal_pixels: Float[Tensor, "s h w 2"]
+    sensor_pixels: Float[Tensor, "s bh bw 2"]
+    stream_index: Int[Tensor, "b"]
+    tiles: SensorTiles | None
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Height and width of the largest sensor."""
+        return self.ideal_pixels.shape[1], self.ideal_pixels.shape[2]
+
+    def near_objects(
+        self, events: EventBatch, prediction: Prediction, window_s: Float[Tensor, "b"], config: TrackerConfig
+    ) -> tuple[EventBatch, Int[Tensor, "e"] | None]:
+        """The events that can have to do with any object, and their numbers, where others were left out.
+
+        A GPU would have to be waited for: there, all are kept.
+        """
+        if self.tiles is None or not readback.read_at_once(window_s):
+            return events, None
+        margin_px = max(config.matching.max_gate_px, *config.matching.gates_px) + _DRAWN_SIGMAS * config.search.least_sigma_px
+        return self.tiles.keep(events, self.tiles.near(prediction, window_s, margin_px))
+
+    def window_events(
+        self, events: EventBatch, number: Int[Tensor, "e"] | None, state: TrackerState, t_us: Int[Tensor, "s"], longest_us: int
+    ) -> tuple[WindowEvents, Int[Tensor, "s 2 h w"]]:
+        """The events of the window after ``state`` as each object's camera saw them, and the bursts' ages after it (µs).
+
+        Args:
+            number: of each event among all of its window, where some of them were left out.
+            t_us: end of the window of each stream.
+            longest_us: how long a pixel's events are of one burst.
+        """
+        window = pad_streams(events, len(self.ideal_pixels), t_us)
+        burst_age_us, into_burst_us = update_bursts(state.burst_age_us, t_us - state.t_us, window, longest_us)
+        return self.seen(window, into_burst_us, number), burst_age_us
+
+    def seen(self, window: PaddedEvents, into_burst_us: Int[Tensor, "s e"] | None = None, number: Int[Tensor, "e"] | None = None) -> WindowEvents:
+        """A window's events as each object's camera saw them; of bursts nothing is said where nothing is given."""
+        streams = len(self.ideal_pixels)
+        stream = torch.arange(streams, device=window.x.device)[:, None]
+        pixels = at_pixels(self.ideal_pixels, stream, window.x, window.y).transpose(1, 2).contiguous().transpose(1, 2)
+        age_s = window.age_us.to(pixels.dtype) * 1e-6
+        into_burst_s = torch.zeros_like(age_s) if into_burst_us is None else into_burst_us.to(pixels.dtype) * 1e-6
+        values = (pixels, age_s, into_burst_s, 2 * window.polarity.to(pixels.dtype) - 1, window.mask)
+        # Of one stream without a copy for every object.
+        each = [value.expand(len(self.stream_index), *value.shape[1:]) if streams == 1 else value[self.stream_index] for value in values]
+        return WindowEvents(each[0], each[1], each[2], each[3], each[4], number)
+
+    def corners(
+        self, contours: Contours, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], window_s: Float[Tensor, "s"], config: TrackerConfig
+    ) -> Corners:
+        """Corners of the time surface around each object's contours, and their flow."""
+        if config.corners.max_corners == 0:
+            return no_corners(contours.pixels)
+        margin_px, largest_px = config.surface.margin_px, config.surface.max_region_px
+        regions = object_regions(self.on_sensor(contours.pixels), contours.mask, self.stream_index, self.image_size, margin_px, largest_px)
+        surface = time_surface(last_event_us, t_us, regions, config.surface.tau_s, self.ideal_pixels.dtype)
+        corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config.surface, config.corners)
+        return estimate_flow(corners, last_event_us, t_us, self.stream_index, self.ideal_pixels, config.flow)
+
+    def on_sensor(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
+        """Where the lens puts ideal pixels."""
+        height, width = self.sensor_pixels.shape[1:3]
+        # Clamped before the conversion: a far-off pixel does not fit an integer.
+        limit = constant((width - 1, height - 1), pixels.dtype, pixels.device)
+        u, v = torch.minimum((pixels + _BORDER_PX).clamp(min=0), limit).round().long().unbind(-1)
+        return at_pixels(self.sensor_pixels, self.stream_index[:, None], u, v)
+
+    def history(self, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"]) -> AgeAt:
+        """How long ago anything happened at a pixel."""
+
+        def age_s(pixels: Tensor) -> Tensor:
+            limit = constant((self.image_size[1] - 1, self.image_size[0] - 1), pixels.dtype, pixels.device)
+            u, v = torch.minimum(self.on_sensor(pixels).round().clamp(min=0), limit).long().unbind(-1)
+            age_us = t_us[self.stream_index, None] - at_pixels(last_event_us, self.stream_index[:, None], u, v)
+            return age_us.to(pixels.dtype) * 1e-6
+
+        return age_s

@@ -1,0 +1,43 @@
+"""Which windows are taken in parts: an object that has just been found may move by more than any gate in a whole one.
+
+Its velocity is learned in short steps first, where there are events enough for them.
+"""
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from torchtrack.camera import MIN_DEPTH_M
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.events import EventBatch, stream_bounds
+from torchtrack.lie import transform_points
+from torchtrack.object_batch import ObjectBatch
+from torchtrack.speed_limit import unknown_speed
+from torchtrack.state import TrackerState
+
+# Fewer events than this do not make a part of a window.
+_EVENTS_OF_A_PART = 400
+
+
+def to_be_parted(state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], objects: ObjectBatch, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Objects whose window is taken in parts: while a large part of their motion within it is not known.
+
+    Each object is asked for itself: its neighbours do not matter.
+
+    Args:
+        state: before the window.
+        events: of the window.
+        t_us: its end.
+    """
+    window, streams = config.window, objects.image_shape[0]
+    if window.parts == 1 or not config.solver.prior or len(events) < window.parts * _EVENTS_OF_A_PART:
+        return torch.zeros_like(objects.stream_index, dtype=torch.bool)
+    unknown_m_s = unknown_speed(state.covariance, objects.diameter_m).to(objects.intrinsics.dtype)
+    depth_m = transform_points(state.T_cam_obj.to(unknown_m_s.dtype), objects.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
+    window_s = ((t_us - state.t_us) * 1e-6)[objects.stream_index]
+    unknown_px = unknown_m_s * window_s * objects.intrinsics[:, 0] / depth_m
+    unknown = unknown_px > window.max_unknown_px
+    if streams == 1:
+        return unknown
+    count = torch.diff(stream_bounds(events, streams))[objects.stream_index]
+    return unknown & (count >= window.parts * _EVENTS_OF_A_PART)
