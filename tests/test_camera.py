@@ -13,7 +13,6 @@ from torchtrack.camera import (
     distort,
     distortion_table,
     project,
-    projection_gradient,
     stack_tables,
     undistort,
     undistortion_table,
@@ -67,14 +66,6 @@ def test_points_behind_the_camera_are_finite_with_finite_gradients(depth, dtype)
     pixels.sum().backward()
     assert bool(torch.isfinite(pixels).all())
     assert bool(torch.isfinite(points.grad).all())
-
-
-def test_projection_gradient_is_the_derivative():
-    points = points_in_front(2).requires_grad_()
-    normals = torch.nn.functional.normalize(torch.randn(2, 20, 2, generator=generator(1), dtype=torch.float64), dim=-1)
-    intrinsics = PINHOLE.intrinsics(torch.float64).expand(2, 4)
-    (project(points, intrinsics) * normals).sum().backward()
-    torch.testing.assert_close(projection_gradient(points.detach(), normals, intrinsics), points.grad)
 
 
 def test_projection_is_differentiable_in_points_and_calibration():

@@ -108,13 +108,6 @@ def test_inverse(batch, dtype):
     assert far_from(T @ lie.se3_inverse(T), eye) < 5 * TOLERANCE[dtype]
 
 
-@pytest.mark.parametrize("batch", BATCHES)
-def test_adjoint_moves_twists_between_frames(batch):
-    T, xi = random_pose(*batch), random_twist(*batch, seed=1)
-    moved = (lie.se3_adjoint(T) @ xi[..., None]).squeeze(-1)
-    assert far_from(T @ lie.se3_exp(xi) @ lie.se3_inverse(T), lie.se3_exp(moved)) < 1e-13
-
-
 def test_transform_points_is_the_homogeneous_product():
     T, points = random_pose(3), torch.randn(3, 10, 3, generator=generator(), dtype=torch.float64)
     homogeneous = torch.cat([points, torch.ones(3, 10, 1, dtype=torch.float64)], -1)

@@ -99,19 +99,6 @@ def project(points_cam: Float[Tensor, "*b n 3"], intrinsics: Float[Tensor, "*b 4
     return points_cam[..., :2] * inverse_depth * intrinsics[..., None, :2] + intrinsics[..., None, 2:]
 
 
-def projection_gradient(
-    points_cam: Float[Tensor, "*b n 3"], directions: Float[Tensor, "*b n 2"], intrinsics: Float[Tensor, "*b 4"]
-) -> Float[Tensor, "*b n 3"]:
-    """Gradient of ``n · project(P)`` with respect to ``P``: ``dπᵀ n``, in px/m.
-
-    With the left perturbation of :mod:`torchtrack.lie`, its row of the pose Jacobian is ``[P × g, g]``.
-    """
-    inverse_depth = points_cam[..., 2:].clamp(min=MIN_DEPTH_M).reciprocal()
-    scaled = directions * intrinsics[..., None, :2] * inverse_depth
-    depth_part = -(scaled * points_cam[..., :2]).sum(-1, keepdim=True) * inverse_depth
-    return torch.cat([scaled, depth_part], -1)
-
-
 def distort(pixels: np.ndarray, camera: Camera) -> np.ndarray:
     """Sensor pixels of ideal pixels ``[n, 2]``."""
     pixels = np.asarray(pixels, dtype=np.float64)

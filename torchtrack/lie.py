@@ -145,14 +145,6 @@ def se3_inverse(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     return _assemble(rotation_t, -(rotation_t @ T[..., :3, 3:]).squeeze(-1))
 
 
-def se3_adjoint(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6 6"]:
-    """Adjoint: ``T exp(ξ^) T⁻¹ = exp((Ad_T ξ)^)``, for twists ``[φ, ρ]``."""
-    rotation = T[..., :3, :3]
-    top = torch.cat([rotation, torch.zeros_like(rotation)], -1)
-    bottom = torch.cat([hat(T[..., :3, 3]) @ rotation, rotation], -1)
-    return torch.cat([top, bottom], -2)
-
-
 def transform_points(T_a_b: Float[Tensor, "*b 4 4"], points_b: Float[Tensor, "*b n 3"]) -> Float[Tensor, "*b n 3"]:
     """Points of frame b, seen in frame a.
 

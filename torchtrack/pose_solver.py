@@ -211,13 +211,6 @@ def _see(problem: PoseProblem, rows: _Rows, place: _Place) -> _Seen:
     return _Seen(residuals[:, 0], torch.cat([jacobian, further, residuals, rows.padding], 1))
 
 
-def linearise(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], loss: str) -> Linearisation:
-    """Gradient and Gauss-Newton Hessian of the cost of ``problem`` at a pose."""
-    place = _Place.of(problem, T_cam_obj, _from_prior(problem, T_cam_obj))
-    gradient, hessian, _ = _look(problem, _as_rows(problem), place, loss, judged=False)
-    return Linearisation(T_cam_obj, gradient, hessian, place.from_prior)
-
-
 def robust_cost(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], from_prior: Float[Tensor, "b k"], loss: str) -> Float[Tensor, "b"]:
     """Robust cost of ``problem`` at a pose, and at an offset of all unknowns from the prior (Eq. 12)."""
     seen = _see(problem, _as_rows(problem), _Place.of(problem, T_cam_obj, from_prior))
