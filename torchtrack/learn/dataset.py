@@ -83,16 +83,31 @@ def _velocity(truth: Trajectory, t_us: torch.Tensor) -> torch.Tensor:
     return se3_log(truth.at(after) @ se3_inverse(truth.at(before))) / (1e-6 * (after - before).double())[:, None]
 
 
-def _sample(sequence: Sequence, numbers: tuple[int, int], events: EventBatch, start_us: int, config: ClipConfig) -> Sample:
-    """The sample that begins at a time, of events around it."""
-    truth = _truth(sequence, numbers[1])
-    t_us = start_us + config.window_us * torch.arange(config.windows + 1)
-    T_cam_obj = truth.at(t_us)
-    inside = events.slice_time(start_us - config.past_us, start_us + config.length_us)
-    return Sample(*numbers, inside, t_us, T_cam_obj, _velocity(truth, t_us), T_cam_obj[0].clone())
+class _Recordings:
+    """What both ways to draw samples share: the sequences, and how samples are cut from them and varied."""
+
+    def __init__(self, sources: Many[Source], config: ClipConfig | None, augmentation: AugmentationConfig | None, seed: int) -> None:
+        self.sequences = [opened(source) for source in sources]
+        self.config, self.augmentation, self.seed, self.epoch = config or ClipConfig(), augmentation, seed, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Draw and vary samples otherwise than in other epochs; before workers are started."""
+        self.epoch = epoch
+
+    def _sample(self, number: int, obj: int, events: EventBatch, start_us: int, generator: torch.Generator) -> Sample:
+        """The sample of one object that begins at a time, of events around it."""
+        sequence, config = self.sequences[number], self.config
+        truth = _truth(sequence, obj)
+        t_us = start_us + config.window_us * torch.arange(config.windows + 1)
+        T_cam_obj = truth.at(t_us)
+        inside = events.slice_time(start_us - config.past_us, start_us + config.length_us)
+        sample = Sample(number, obj, inside, t_us, T_cam_obj, _velocity(truth, t_us), T_cam_obj[0].clone())
+        if self.augmentation is None:
+            return sample
+        return augmented(sample, self.augmentation, sequence.camera.width, sequence.camera.height, generator)
 
 
-class WindowDataset(Dataset[Sample]):
+class WindowDataset(_Recordings, Dataset[Sample]):
     """Samples of all objects of all sequences, by number.
 
     The events of the last few sequences that were asked for are held in memory, in each worker: draw batches from one
@@ -117,8 +132,8 @@ class WindowDataset(Dataset[Sample]):
         seed: int = 0,
         held: int = 1,
     ) -> None:
-        self.sequences = [opened(source) for source in sources]
-        self.config, self.augmentation, self.seed, self.epoch, self.held = config or ClipConfig(), augmentation, seed, 0, held
+        super().__init__(sources, config, augmentation, seed)
+        self.held = held
         self.places = [
             (number, obj, start_us)
             for number, sequence in enumerate(self.sequences)
@@ -138,20 +153,12 @@ class WindowDataset(Dataset[Sample]):
     def _read(self, number: int) -> EventBatch:
         return concatenate(self.sequences[number].events.chunks())
 
-    def set_epoch(self, epoch: int) -> None:
-        """Vary samples otherwise than in other epochs; before workers are started."""
-        self.epoch = epoch
-
     def __len__(self) -> int:
         return len(self.places)
 
     def __getitem__(self, index: int) -> Sample:
         number, obj, start_us = self.places[index]
-        sequence = self.sequences[number]
-        sample = _sample(sequence, (number, obj), self._events(number), start_us, self.config)
-        if self.augmentation is None:
-            return sample
-        return augmented(sample, self.augmentation, sequence.camera.width, sequence.camera.height, _generator(self.seed, self.epoch, index))
+        return self._sample(number, obj, self._events(number), start_us, _generator(self.seed, self.epoch, index))
 
 
 class SequenceBatches(Sampler[list[int]]):
@@ -187,7 +194,7 @@ class SequenceBatches(Sampler[list[int]]):
                 yield [indices[k] for k in order[first : first + self.batch_size]]
 
 
-class WindowStream(IterableDataset[Sample]):
+class WindowStream(_Recordings, IterableDataset[Sample]):
     """Samples in the order of time, streamed from disk in constant memory; each worker reads sequences of its own.
 
     Args:
@@ -211,16 +218,12 @@ class WindowStream(IterableDataset[Sample]):
         seed: int = 0,
         shuffle: bool = False,
     ) -> None:
-        self.sequences = [opened(source) for source in sources]
-        self.config, self.augmentation, self.seed, self.epoch, self.shuffle = config or ClipConfig(), augmentation, seed, 0, shuffle
+        super().__init__(sources, config, augmentation, seed)
+        self.shuffle = shuffle
         if self.config.every_us is not None:
             raise ValueError("every_us: a stream gives every window once; use WindowDataset for samples that overlap or leave gaps.")
         truths = [_truth(sequence, obj) for sequence in self.sequences for obj in range(len(sequence.objects))]
         _check_any(sum(len(_starts_us(truth, self.config)) for truth in truths), self.config)
-
-    def set_epoch(self, epoch: int) -> None:
-        """Draw another order, and vary samples otherwise, than in other epochs; before workers are started."""
-        self.epoch = epoch
 
     def __iter__(self) -> Iterator[Sample]:
         worker = get_worker_info()
@@ -242,10 +245,7 @@ class WindowStream(IterableDataset[Sample]):
             events = concatenate([past, window.events])
             for obj, truth in enumerate(truths):
                 if truth.t_us[0] <= window.t_start_us and window.t_end_us <= truth.t_us[-1]:
-                    sample = _sample(sequence, (number, obj), events, window.t_start_us, config)
-                    if self.augmentation is not None:
-                        sample = augmented(sample, self.augmentation, sequence.camera.width, sequence.camera.height, generator)
-                    yield sample
+                    yield self._sample(number, obj, events, window.t_start_us, generator)
             past = events.slice_time(window.t_end_us - config.past_us, window.t_end_us)
 
 
