@@ -16,7 +16,7 @@ from torchtrack.sim.meshes import make_mesh
 from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
 from torchtrack.sim.simulation import render_frames
 from torchtrack.sim.suite import scenes_of
-from torchtrack.sim.world import make_world, motions_of
+from torchtrack.sim.world import make_world
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "simulate"
 SMALL = CameraConfig(width=120, height=90, fx=130.0, fy=130.0)
@@ -43,7 +43,7 @@ def distance_to_edges_px(config, events):
     """Distance of each event from the nearest edge of the one convex object, at the true pose of the event's time."""
     mesh = make_mesh(config.objects[0].shape)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    T = motions_of(config)[0].pose(events.t_us.double() * 1e-6)
+    T = make_world(config).objects[0].pose(events.t_us.double() * 1e-6)
     camera = config.camera.build()
     centres = transform_points(T, torch.from_numpy(np.array(mesh.triangles_center)).expand(len(T), -1, -1))
     normals = torch.from_numpy(np.array(mesh.face_normals)) @ T[:, :3, :3].mT

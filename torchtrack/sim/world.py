@@ -17,7 +17,7 @@ from torchtrack.errors import ConfigError
 from torchtrack.sim.lens import ideal_camera
 from torchtrack.sim.render import Scenery
 from torchtrack.sim.scenes import Model, ObjectConfig, SceneConfig
-from torchtrack.sim.trajectory import Motion, make_motion
+from torchtrack.sim.trajectory import make_motion
 
 # Speeds are looked up this often in a scene when the largest one is sought.
 _SPEED_SAMPLES = 1000
@@ -166,8 +166,3 @@ def make_world(config: SceneConfig, models: Sequence[Model] | None = None) -> Wo
     items: tuple[ObjectConfig, ...] = (*config.objects, *config.occluders)
     models = models or [item.build() for item in items]
     return World(config, [torch.cat([outer_points(part) for part in model]) for model in models])
-
-
-def motions_of(config: SceneConfig) -> list[Motion]:
-    """The motion of every object, in the world."""
-    return make_world(config).objects
