@@ -11,6 +11,7 @@ from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, generator, pose, ran
 from torchtrack.camera import project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contours import ContourKind, ContourModel, group_by_model, image_normals, mesh_contours, reproject, select_ranked, take_points
+from torchtrack.lie import transform_points
 from torchtrack.object_model import ObjectModel
 
 CONFIG = ContourConfig(remove_hidden=False)
@@ -382,3 +383,18 @@ def test_points_are_taken_row_by_row(batch):
     values = torch.rand((batch, 20, 3), generator=generator())
     index = torch.randint(20, (batch, 7), generator=generator())
     assert torch.equal(take_points(values, index), values.gather(1, index[..., None].expand(-1, -1, 3)))
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.3, -0.4, 0.2), (-0.5, 0.3, 2.0), (0.2, 0.6, -3.0)])
+def test_normals_of_print_point_to_its_darker_side(turn):
+    """A card before the camera, dark on the left and bright on the right."""
+    corners = torch.tensor([[-1, -1, 0], [0, -1, 0], [0, 1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]) * 0.05
+    faces = [[0, 2, 1], [0, 3, 2], [1, 5, 4], [1, 2, 5]]
+    shades = [[20, 20, 20, 255]] * 2 + [[230, 230, 230, 255]] * 2
+    model = ObjectModel.from_mesh(trimesh.Trimesh(corners.numpy(), faces, face_colors=shades, process=False))
+    T = pose(turn)
+    points, pixels, normals, kind = visible(contours_of(model, T[None]))
+    darker = project(transform_points(T, points - torch.tensor([1e-3, 0.0, 0.0], dtype=torch.float64))[None], INTRINSICS[None])[0]
+    printed = kind == int(ContourKind.TEXTURE)
+    assert int(printed.sum()) > 20
+    assert (((darker - pixels) * normals).sum(-1)[printed] > 0).all()

@@ -71,17 +71,17 @@ class ContourTable:
         """The table of contours and their index.
 
         Limbs of smooth surfaces are no step, as their shading fades towards them. The normals of the mesh's own edges
-        are oriented: they point outwards.
+        are oriented: they point outwards. Those of print point to its darker side.
         """
-        limb = contours.kind == int(ContourKind.LIMB)
-        marks = torch.stack([limb, limb | (contours.kind == int(ContourKind.CREASE))], -1).to(contours.pixels.dtype)
+        limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
+        marks = torch.stack([limb, limb | crease, texture], -1).to(contours.pixels.dtype)
         values = (contours.points_obj, contours.normals, index.pixels, marks)
         return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index)
 
-    def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Of given contour points: places on the object, normals, pixels when indexed, whether a limb, whether oriented."""
+    def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Of given contour points: places on the object, normals, pixels when indexed, whether a limb, whether oriented, whether print."""
         taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
-        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 2), -1)
+        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 3), -1)
         return points_obj, normals, indexed, *marks.unbind(-1)
 
 
@@ -105,7 +105,7 @@ def match_nearest(
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
     found = table.index.look_up(place)
     contour = found.clamp(min=0)
-    points_obj, normals, indexed, limb, oriented = table.take(contour)
+    points_obj, normals, indexed, limb, oriented, printed = table.take(contour)
     pixels, velocity = objects.show(points_obj)
     crossing_px_s = (normals * velocity).sum(-1)
     dark = observations.polarity * _leading(crossing_px_s)
@@ -117,6 +117,8 @@ def match_nearest(
     matched = near & (difference.square().sum(-1) < (gate_px * wider)[:, None].square())
     offsets = (difference * normals).sum(-1) / wider[:, None]
     weights = _weights(offsets, targets, near, dark * oriented, config)
+    if config.print_polarity:
+        weights = weights * _agreeing(dark * printed, config)
     matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)
@@ -167,7 +169,11 @@ def polarity_agreement(
         dark: +1 where the polarity says that the contour's outer side is the darker one, -1 the inner one, 0 unknown.
         votes: sum of the same over the observations on the contour, of which there are ``voters``.
     """
-    agreement = dark * votes / (voters + 2)
+    return _agreeing(dark * votes / (voters + 2), config)
+
+
+def _agreeing(agreement: Tensor, config: MatchingConfig) -> Tensor:
+    """Trust in events whose polarity is what it should be, 1, or the opposite, -1, as far as that is known."""
     return (1 + config.polarity_gain * agreement).clamp(config.least_agreement, 1)
 
 

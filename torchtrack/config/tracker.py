@@ -98,6 +98,7 @@ class MatchingConfig(Settings):
     gathered_share: float = Field(0.6, gt=0, le=1, description="Share of observations on the contour at which a patch counts in full.")
     least_trust: float = Field(0.02, ge=0, le=1, description="What a smeared patch still counts.")
     polarity: bool = Field(True, description="Trust events less whose polarity is not that of most others on the contour around them.")
+    print_polarity: bool = Field(True, description="Trust events on print less whose polarity is not that of its darker side.")
     polarity_gain: float = Field(1.5, ge=0, description="How fast trust falls with the majority of the others.")
     least_agreement: float = Field(0.05, ge=0, le=1, description="What an event of the wrong polarity still counts.")
     dark_shift_px: float = Field(
