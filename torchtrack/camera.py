@@ -148,7 +148,7 @@ def distortion_table(camera: Camera, border_px: int) -> Float[Tensor, "h w 2"]:
     return torch.from_numpy(sensor.reshape(*u.shape, 2).astype(np.float32))
 
 
-def stack_tables(tables: list[Float[Tensor, "_ _ 2"]]) -> Float[Tensor, "s h w 2"]:
-    """Tables of cameras of different sizes as one tensor; what lies outside a smaller sensor is never looked up."""
+def stack_tables(tables: list[Float[Tensor, "_ _ 2"]], beyond_px: int = 0) -> Float[Tensor, "s h w 2"]:
+    """Tables of cameras of different sizes as one tensor, with ``beyond_px`` wherever a smaller one has no entry."""
     height, width = max(t.shape[0] for t in tables), max(t.shape[1] for t in tables)
-    return torch.stack([torch.nn.functional.pad(t, (0, 0, 0, width - t.shape[1], 0, height - t.shape[0])) for t in tables])
+    return torch.stack([torch.nn.functional.pad(t, (0, 0, 0, width - t.shape[1], 0, height - t.shape[0]), value=beyond_px) for t in tables])

@@ -34,7 +34,9 @@ _DRAWN_SIGMAS = 4.0
 
 def sensor_tables(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "s h w 2"], Float[Tensor, "s bh bw 2"]]:
     """The tables that :class:`Sensors` looks up: ideal pixels of the sensor's, and sensor pixels of ideal ones."""
-    return stack_tables([undistortion_table(c) for c in cameras]), stack_tables([distortion_table(c, _BORDER_PX) for c in cameras])
+    ideal_pixels = stack_tables([undistortion_table(c) for c in cameras])
+    # What lies beyond a smaller sensor lies outside it on the sensor too.
+    return ideal_pixels, stack_tables([distortion_table(c, _BORDER_PX) for c in cameras], beyond_px=-_BORDER_PX)
 
 
 @dataclass(frozen=True)
