@@ -19,6 +19,8 @@ from torchtrack.lie import transform_points
 
 # A point this far behind a face's plane is behind it, not on it (diameters).
 _ON_FACE = 2e-3
+# Tests of points against triangles that are made at once: larger temporaries page-fault on the CPU.
+_MOST_TESTS = 2**19
 # Depths are compared in whole micrometres, with the object's number in the low bits.
 _DEPTH_STEPS_PER_M, _OBJECT_BITS = 1e6, 20
 _NOTHING = 2**62
@@ -62,24 +64,41 @@ def hidden_by_faces(
     plane = (normals_cam * triangles_cam[:, :, 0]).sum(-1)
     away = plane.sign()[..., None] * normals_cam
     tests = torch.cat([sides * turn, away[:, :, None]], 2).flatten(1, 2)
+    behind_m = (plane.abs() + tolerance_m[:, None])[..., None]
+    at_once = max(_MOST_TESTS // (tests.shape[1] * points_cam.shape[1] + 1), 1) if readback.read_at_once(points_cam) else len(points_cam)
+    parts = zip(tests.split(at_once), points_cam.split(at_once), behind_m.split(at_once), strict=True)
+    return torch.cat([_hidden_by(*part) for part in parts])
+
+
+def _hidden_by(tests: Float[Tensor, "b t 3"], points_cam: Float[Tensor, "b m 3"], behind_m: Float[Tensor, "b f 1"]) -> Bool[Tensor, "b m"]:
+    """Which points pass all four tests of one of the triangles: they lie within its edges, and behind its plane."""
     values = torch.bmm(tests, points_cam.transpose(1, 2)).unflatten(1, (-1, 4))
-    behind = values[:, :, 3] > (plane.abs() + tolerance_m[:, None])[..., None]
-    return ((values[:, :, :3].amin(2) > 0) & behind).any(1)
+    return ((values[:, :, :3].amin(2) > 0) & (values[:, :, 3] > behind_m)).any(1)
 
 
-def _hidden_by_self(scene: Scene, points_cam: Tensor) -> Tensor:
+def _hidden_by_self(scene: Scene, contours: Contours) -> Tensor:
     """Points of objects with few faces that these hide."""
-    hidden = torch.zeros(points_cam.shape[:2], dtype=torch.bool, device=points_cam.device)
+    hidden = torch.zeros_like(contours.mask)
     for model in scene.models:
         if len(model.triangles):
             # All objects, where all have the model: a list of them would be looked up.
             members = slice(None) if len(scene.models) == 1 else model.members
             T_cam_obj = scene.T_cam_obj[members]
+            places = _places_in_use(contours.mask[members]) if len(scene.models) > 1 else contours.mask.shape[1]
             corners = model.triangles.flatten(0, 1).expand(len(T_cam_obj), -1, -1)
             triangles = transform_points(T_cam_obj, corners).unflatten(1, (-1, 3))
             normals = model.triangle_normals @ T_cam_obj[:, :3, :3].transpose(1, 2)
-            hidden[members] = hidden_by_faces(points_cam[members], triangles, normals, _ON_FACE * scene.diameters_m[members])
+            points_cam = contours.points_cam[members][:, :places]
+            hidden[members, :places] = hidden_by_faces(points_cam, triangles, normals, _ON_FACE * scene.diameters_m[members])
     return hidden
+
+
+def _places_in_use(mask: Bool[Tensor, "b m"]) -> int:
+    """How many places there are up to the last one with a point: others have more contours. On a GPU, which would have to be waited for, all."""
+    if not readback.read_at_once(mask):
+        return mask.shape[1]
+    used = mask.any(0).nonzero()
+    return int(used[-1]) + 1 if len(used) else 0
 
 
 def depth_buffer(scene: Scene, cell_px: int) -> tuple[Float[Tensor, "s p"], Int[Tensor, "s p"], tuple[int, int]]:
@@ -162,7 +181,7 @@ def _tested_exactly(scene: Scene) -> Tensor:
 
 def remove_hidden(contours: Contours, scene: Scene, config: ContourConfig) -> Contours:
     """Contours without the points that the object itself or another one of its stream hides."""
-    hidden = _hidden_by_self(scene, contours.points_cam)
+    hidden = _hidden_by_self(scene, contours)
     needs_buffer = scene.shared or any(len(model.triangles) == 0 for model in scene.models)
     if needs_buffer:
         hidden = hidden | _hidden_in_buffer(scene, contours, config)
