@@ -91,6 +91,17 @@ def test_in_windows_longer_than_ages_are_kept_events_still_get_numbers():
     assert (ages >= 0).all()
 
 
+def test_no_event_of_a_long_window_is_farther_into_its_burst_than_a_burst_is_long():
+    _, into = update(no_bursts(1, 2, 2), batch((1000, 0, 0, 0), (3000, 0, 0, 0), (15_000, 0, 0, 0), (16_000, 0, 0, 0)), 20_000, 20_000)
+    assert into.tolist() == [[0, 2000, 0, 0]]
+
+
+def test_where_bursts_have_no_length_there_are_none():
+    events = pad_streams(batch((1000, 0, 0, 0), (2000, 0, 0, 0), (4000, 0, 0, 0)), 1, torch.tensor([5000]))
+    _, into = update_bursts(no_bursts(1, 2, 2), torch.tensor([5000]), events, 0)
+    assert not into.any()
+
+
 def test_only_late_events_are_dated_back():
     age, into = torch.full((1, 4), 2e-3), torch.tensor([[0.0, 1e-3, 2e-3, 5e-3]])
     ages = without_tail(age, into, torch.tensor([[500.0, 500.0, -1000.0, 1000.0]]), 1.0)

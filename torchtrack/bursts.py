@@ -24,7 +24,8 @@ def update_bursts(
 ) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
     """Ages of the newest burst of every pixel and polarity at a window's end (µs), and how far into its burst each event is (µs).
 
-    What one pixel fires of one polarity within ``longest_us`` is one burst; the next event after that begins another.
+    What one pixel fires of one polarity within ``longest_us`` is one burst; the next event after that begins another. In a
+    window that is longer, bursts that follow the first of a pixel are not told from one another: each event begins its own.
 
     Args:
         burst_age_us: at the end of the window before; left as it was.
@@ -45,7 +46,8 @@ def update_bursts(
     # Of several events of a pixel that would begin a burst the oldest does.
     flat.scatter_reduce_(1, place, torch.where(begins, -1, before_us), "amin")
     flat.scatter_reduce_(1, place, torch.where(begins, age_us, -1), "amax")
-    return ages, torch.where(begins, flat.gather(1, place), before_us) - age_us
+    into_us = torch.where(begins, flat.gather(1, place), before_us) - age_us
+    return ages, torch.where(into_us < longest_us, into_us, 0)
 
 
 def without_tail(

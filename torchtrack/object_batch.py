@@ -8,8 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contours import ContourKind, ContourModel, Contours, assemble, joined, mesh_contours
+from torchtrack.lie import transform_points
 from torchtrack.splat import splat_contours
 from torchtrack.visibility import Scene, remove_hidden
 
@@ -62,6 +64,10 @@ class ObjectBatch:
     def image_size(self) -> tuple[int, int]:
         """Height and width of the image."""
         return self.image_shape[1:]
+
+    def depth_m(self, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b"]:
+        """Depth of each object's centre, at least what the camera can see (m)."""
+        return transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
 
     def contours(self, T_cam_obj: Float[Tensor, "b 4 4"], config: ContourConfig) -> Contours:
         """Visible contours at given poses."""

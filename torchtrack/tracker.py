@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchtrack import lie, quality, readback
 from torchtrack.alignment import align, gate_widening, index_for, index_radius, usual_index_radius
 from torchtrack.bursts import no_bursts
-from torchtrack.camera import MIN_DEPTH_M, Camera
+from torchtrack.camera import Camera
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import ContourModel, group_by_model
@@ -271,8 +271,7 @@ class Tracker(nn.Module):
         T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)
         limit_m_s = largest_speed(self.objects, T_cam_obj, self.sensors.seen(pad_streams(events, self.streams, t_us)), dt_s)
         limit_m_s = torch.where(found, torch.inf, limit_m_s)
-        depth_m = lie.transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
-        return replace(state, covariance=limit_speed(state.covariance, limit_m_s, self.diameter_m, depth_m))
+        return replace(state, covariance=limit_speed(state.covariance, limit_m_s, self.diameter_m, self.objects.depth_m(T_cam_obj)))
 
 
 def _counted(done: tuple[TrackerState, StepResult]) -> tuple[TrackerState, StepResult]:

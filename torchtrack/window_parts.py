@@ -7,10 +7,8 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.events import EventBatch, stream_bounds
-from torchtrack.lie import transform_points
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.speed_limit import unknown_speed
 from torchtrack.state import TrackerState
@@ -33,7 +31,7 @@ def to_be_parted(state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]
     if window.parts == 1 or not config.solver.prior or len(events) < window.parts * _EVENTS_OF_A_PART:
         return torch.zeros_like(objects.stream_index, dtype=torch.bool)
     unknown_m_s = unknown_speed(state.covariance, objects.diameter_m).to(objects.intrinsics.dtype)
-    depth_m = transform_points(state.T_cam_obj.to(unknown_m_s.dtype), objects.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
+    depth_m = objects.depth_m(state.T_cam_obj.to(unknown_m_s.dtype))
     window_s = ((t_us - state.t_us) * 1e-6)[objects.stream_index]
     unknown_px = unknown_m_s * window_s * objects.intrinsics[:, 0] / depth_m
     unknown = unknown_px > window.max_unknown_px
