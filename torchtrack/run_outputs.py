@@ -40,7 +40,7 @@ class RunOutputs:
         self.session = session or open_session(config)
         self._config, self._interrupt, self._further = config, interrupt, sinks
         self._keep_up = self.session.keep_up(config.tracker.window)
-        self._record = Record(self.session.ground_truth)
+        self._record = Record(self.session.ground_truth, self.session.models)
         self._begun = time.perf_counter()
         # The files, and within them the sinks that write them; both open with the first step.
         self._files, self._writing = ExitStack(), ExitStack()

@@ -1,6 +1,5 @@
 """Many sequences under many methods: run, measure, compare."""
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,7 +22,7 @@ from torchtrack.executor.tasks import without_errors
 from torchtrack.quality import Status
 from torchtrack.session import Session, open_session
 from torchtrack.sim.suite import Told
-from torchtrack.sinks.record import Record
+from torchtrack.sinks.record import ObjectRecord, Record
 from torchtrack.stepping import Step, cut_windows
 from torchtrack.streams import follow
 from torchtrack.threads import threads
@@ -141,7 +140,7 @@ class _Measurement:
         reasons = [unsuitable(job.config.preset, model) for model in session.models]
         self._left_out = [NotApplicable(session.name, label, job.method, why) for label, why in zip(session.labels, reasons, strict=True) if why]
         self.session = _only(session, [number for number, reason in enumerate(reasons) if reason is None])
-        self._record, self._job, self._limits = Record(self.session.ground_truth), job, limits
+        self._record, self._job, self._limits = Record(self.session.ground_truth, self.session.models), job, limits
 
     def windows(self) -> Iterator[EventWindow]:
         """The windows of the sequence."""
@@ -154,16 +153,17 @@ class _Measurement:
     def finish(self) -> list[ObjectResult | NotApplicable]:
         """What was measured of each object."""
         by_label = zip(self.session.labels, self._record.objects, strict=True)
-        return [*(self._result(label, of.errors, of.statuses) for label, of in by_label if of.errors is not None), *self._left_out]
+        return [*(self._result(label, of, of.errors) for label, of in by_label if of.errors is not None), *self._left_out]
 
     def close(self) -> None:
         """Nothing is open."""
 
-    def _result(self, label: str, errors: PoseErrors, statuses: Counter[int]) -> ObjectResult:
-        status = {Status(number).name: count for number, count in sorted(statuses.items())}
+    def _result(self, label: str, of_object: ObjectRecord, errors: PoseErrors) -> ObjectResult:
+        status = {Status(number).name: count for number, count in sorted(of_object.statuses.items())}
         seconds = self._record.step_seconds
         median_step_ms = 1e3 * sorted(seconds)[len(seconds) // 2]
-        return ObjectResult(self.session.name, label, self._job.method, errors, summarise(errors, *self._limits), status, median_step_ms)
+        metrics, unseen_turns = summarise(errors, *self._limits), of_object.axis is not None
+        return ObjectResult(self.session.name, label, self._job.method, errors, metrics, status, median_step_ms, unseen_turns)
 
 
 def _only(session: Session, numbers: Sequence[int]) -> Session:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchtrack.io import Trajectory
 from torchtrack.lie import rotation_angle_deg
+from torchtrack.object_model.symmetry import RevolutionAxis
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,17 @@ class PoseErrors:
     translation_cm: Float[Tensor, "p"]
 
 
-def pose_errors(t_us: Int[Tensor, "p"], T_cam_obj: Float[Tensor, "p 4 4"], truth: Trajectory) -> PoseErrors:
-    """Errors at the times ``t_us``, with the truth interpolated on SE(3); times that the truth does not cover are left out."""
+def pose_errors(t_us: Int[Tensor, "p"], T_cam_obj: Float[Tensor, "p 4 4"], truth: Trajectory, axis: RevolutionAxis | None = None) -> PoseErrors:
+    """Errors at the times ``t_us``, with the truth interpolated on SE(3); times that the truth does not cover are left out.
+
+    A turn about the ``axis`` of a surface of revolution is no error, since nothing shows it: of all poses that look the
+    same, the one nearest to the truth is compared (as in Hodan et al., "BOP: benchmark for 6D object pose estimation", 2018).
+    """
     covered = (t_us >= truth.t_us[0]) & (t_us <= truth.t_us[-1])
     t_us, estimated = t_us[covered], T_cam_obj[covered].double()
     true = truth.at(t_us)
+    if axis is not None:
+        estimated = axis.turned_to_match(estimated, true)
     return PoseErrors(
         t_us,
         rotation_angle_deg(estimated[:, :3, :3], true[:, :3, :3]),

@@ -22,6 +22,7 @@ _LOST_MARK, _LOST_SHARE = "†", 0.1
 _NOTES = (
     "Published figures are the paper's own, on its own data; the others are this package's, on its own sequences.",
     f"{_LOST_MARK} lost in {100 * _LOST_SHARE:.0f} % of the windows or more. - not made for such objects. Bold: the best of each kind.",
+    "Of surfaces of revolution, such as a vase, turns about the axis do not count as errors in ours: nothing shows them.",
 )
 # Conditions of simulated sequences are part of a cell's name; real ones have one cell, and the condition says its kind.
 _REAL_TABLE = 3

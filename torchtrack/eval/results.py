@@ -13,7 +13,10 @@ from torchtrack.sinks.summary import finite
 
 @dataclass(frozen=True)
 class ObjectResult:
-    """Errors of one object in one sequence under one method, its windows by status, and how long a step took."""
+    """Errors of one object in one sequence under one method, its windows by status, and how long a step took.
+
+    ``unseen_turns`` tells of surfaces of revolution, whose turns about their axis are no errors.
+    """
 
     sequence: str
     object: str
@@ -22,11 +25,14 @@ class ObjectResult:
     metrics: Metrics
     status: dict[str, int]
     median_step_ms: float
+    unseen_turns: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """One entry of ``metrics.json``."""
         names = {"sequence": self.sequence, "object": self.object, "method": self.method}
-        return finite({**names, **self.metrics.as_dict(), "status": self.status, "median_step_ms": self.median_step_ms})
+        return finite(
+            {**names, **self.metrics.as_dict(), "status": self.status, "median_step_ms": self.median_step_ms, "unseen_turns": self.unseen_turns}
+        )
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,17 @@ from torch import Tensor
 from torchtrack.eval.metrics import PoseErrors, pose_errors
 from torchtrack.io import Trajectory
 from torchtrack.lie import so3_log
+from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axis
 from torchtrack.stepping import Step
 
 
 class ObjectRecord:
     """Status counts, qualities, the rotation so far, and the errors of one object."""
 
-    def __init__(self, truth: Trajectory | None) -> None:
-        """``truth`` is None where it is not known."""
-        self.truth = truth
+    def __init__(self, truth: Trajectory | None, axis: RevolutionAxis | None = None) -> None:
+        """``truth`` is None where it is not known, ``axis`` where a turn about any shows."""
+        self.truth, self.axis = truth, axis
         self.statuses: Counter[int] = Counter()
         self.quality_sum = 0.0
         # Sum of the rotations between windows (rad, camera axes): full turns count.
@@ -37,7 +39,7 @@ class ObjectRecord:
         self._last_rotation = rotation
         self._newest = ()
         if self.truth is not None:
-            self._add_errors(pose_errors(t_us, T_cam_obj[None], self.truth))
+            self._add_errors(pose_errors(t_us, T_cam_obj[None], self.truth, self.axis))
 
     def _add_errors(self, errors: PoseErrors) -> None:
         for t_us, rotation, translation in zip(errors.t_us.tolist(), errors.rotation_deg.tolist(), errors.translation_cm.tolist(), strict=True):
@@ -66,9 +68,10 @@ class ObjectRecord:
 class Record:
     """The sink that everything in a summary comes from."""
 
-    def __init__(self, truth: Sequence[Trajectory | None]) -> None:
-        """``truth`` has one entry per object."""
-        self.objects = [ObjectRecord(of_object) for of_object in truth]
+    def __init__(self, truth: Sequence[Trajectory | None], models: Sequence[ObjectModel]) -> None:
+        """``truth`` and ``models`` have one entry per object."""
+        axes = [revolution_axis(model) if of_object is not None else None for model, of_object in zip(models, truth, strict=True)]
+        self.objects = [ObjectRecord(*of_object) for of_object in zip(truth, axes, strict=True)]
         self.step_seconds = array("d")
         self.event_count = 0
         self.first_us: int | None = None

@@ -25,6 +25,7 @@ class ObjectSummary:
         mean_quality: mean over all windows, 0 to 1.
         angular_velocity_rad_s: mean over the run, camera axes.
         errors: against ground truth; None where it is not known.
+        unseen_turns: whether the object is a surface of revolution, whose turns about its axis are no errors.
         more: what other sinks have to say, by name.
     """
 
@@ -32,6 +33,7 @@ class ObjectSummary:
     mean_quality: float
     angular_velocity_rad_s: tuple[float, ...]
     errors: Metrics | None
+    unseen_turns: bool = False
     more: dict[str, Any] = field(default_factory=dict)
 
 
@@ -110,6 +112,7 @@ def _summarise_object(record: ObjectRecord, duration_s: float, more: dict[str, A
         mean_quality=record.quality_sum / windows,
         angular_velocity_rad_s=tuple((record.turned / duration_s).tolist()),
         errors=summarise(record.errors) if record.errors is not None else None,
+        unseen_turns=record.axis is not None,
         more=more,
     )
 

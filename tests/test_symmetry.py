@@ -1,0 +1,95 @@
+import math
+
+import pytest
+import torch
+import trimesh
+from helpers import random_pose
+
+from torchtrack.eval.metrics import pose_errors
+from torchtrack.io import Trajectory
+from torchtrack.lie import se3_exp, so3_exp
+from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axis
+from torchtrack.sim.curved import vase
+
+SEEN_AXIS = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def axis_of(mesh, **options):
+    return revolution_axis(ObjectModel.from_mesh(mesh, **options))
+
+
+TURNED_SHAPES = {
+    "cylinder": trimesh.creation.cylinder(0.03, 0.1, sections=32),
+    "cone": trimesh.creation.cone(0.03, 0.1),
+    "capsule": trimesh.creation.capsule(0.1, 0.03),
+    "ring": trimesh.creation.annulus(0.02, 0.03, 0.01),
+    "torus": trimesh.creation.torus(0.05, 0.01),
+}
+
+
+@pytest.mark.parametrize("name", TURNED_SHAPES)
+def test_axis_of_a_turned_shape_wherever_it_lies(name):
+    moved = TURNED_SHAPES[name].copy()
+    T = se3_exp(torch.tensor([0.4, -0.9, 0.3, 0.2, -0.1, 0.3], dtype=torch.float64))
+    moved.apply_transform(T.numpy())
+    axis = axis_of(moved)
+    assert axis is not None
+    direction = T[:3, :3] @ SEEN_AXIS
+    assert abs(float(axis.direction_obj @ direction)) == pytest.approx(1, abs=1e-6)
+    assert float(torch.linalg.cross(axis.point_obj - T[:3, 3], direction).norm()) < 1e-5
+
+
+def with_handle():
+    body, handle = trimesh.creation.cylinder(0.03, 0.1, sections=48), trimesh.creation.box((0.02, 0.005, 0.03))
+    handle.apply_translation((0.038, 0, 0))
+    return trimesh.util.concatenate([body, handle])
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        trimesh.creation.box((0.1, 0.1, 0.02)),
+        trimesh.creation.cylinder(0.03, 0.1, sections=6),
+        trimesh.creation.icosphere(subdivisions=3, radius=0.05),
+        with_handle(),
+    ],
+    ids=["box", "hexagonal prism", "ball", "with a handle"],
+)
+def test_other_shapes_have_none(mesh):
+    assert axis_of(mesh) is None
+
+
+def test_print_shows_turns():
+    can = trimesh.creation.cylinder(0.03, 0.1, sections=32)
+    colours = [[255, 255, 255, 255] if x > 0 else [20, 20, 20, 255] for x in can.triangles_center[:, 0]]
+    can.visual = trimesh.visual.ColorVisuals(can, face_colors=colours)
+    assert axis_of(can) is None
+
+
+def test_polylines_have_none():
+    assert revolution_axis(ObjectModel.from_polylines([[[0.0, 0, 0], [0.1, 0, 0]]])) is None
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 2)])
+def test_turns_about_the_axis_are_undone_and_others_stay(shape):
+    axis = RevolutionAxis(torch.tensor([0.01, -0.02, 0.0], dtype=torch.float64), SEEN_AXIS)
+    T_true = random_pose(*shape)
+    for angle in (1e-4, 2.0, math.pi, -3.0):
+        tilt, turn = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
+        tilt[:3, :3] = so3_exp(torch.tensor([0.0, 0.05, 0.0], dtype=torch.float64))
+        turn[:3, :3] = so3_exp(angle * SEEN_AXIS)
+        turn[:3, 3] = axis.point_obj - turn[:3, :3] @ axis.point_obj
+        assert torch.allclose(axis.turned_to_match(T_true @ turn, T_true), T_true, atol=1e-9)
+        assert torch.allclose(axis.turned_to_match(T_true @ tilt @ turn, T_true), T_true @ tilt, atol=1e-9)
+
+
+def test_errors_of_a_vase_do_not_count_its_turns_but_its_tilts():
+    model = ObjectModel.from_mesh(vase())
+    axis, t_us, T = revolution_axis(model), torch.arange(4) * 1000, random_pose(4)
+    turned, tilted = T.clone(), T.clone()
+    turned[:, :3, :3] = T[:, :3, :3] @ so3_exp(torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64))
+    tilted[:, :3, :3] = T[:, :3, :3] @ so3_exp(torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64))
+    assert float(pose_errors(t_us, turned, Trajectory(t_us, T), axis).rotation_deg.max()) < 1e-4
+    assert float(pose_errors(t_us, turned, Trajectory(t_us, T)).rotation_deg.min()) == pytest.approx(math.degrees(2.0))
+    assert float(pose_errors(t_us, tilted, Trajectory(t_us, T), axis).rotation_deg.min()) == pytest.approx(math.degrees(0.1))

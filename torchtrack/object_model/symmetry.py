@@ -1,0 +1,69 @@
+"""Surfaces of revolution, such as bottles and bowls: turned about their axis they look the same."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.lie import quaternion_from_rotation, so3_exp
+from torchtrack.object_model.model import ObjectModel
+
+# A turn by one radian may move the surface along its normals by this share of its distance from the axis: what a circle
+# of 24 corners does. All but this share of the surface has to keep to it: a small handle makes a turn visible.
+_SLIP, _KEEPING = 0.14, 0.995
+# A ball, which can be turned about every axis, has none: any other turn moves a surface of unit diameter by this much more (squared).
+_DISTINCT = 1e-4
+
+
+@dataclass(frozen=True)
+class RevolutionAxis:
+    """The axis of a surface of revolution.
+
+    Args:
+        point_obj: a point on it (m).
+        direction_obj: its unit direction.
+    """
+
+    point_obj: Float[Tensor, "3"]
+    direction_obj: Float[Tensor, "3"]
+
+    def turned_to_match(self, T_cam_obj: Float[Tensor, "*b 4 4"], T_true: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+        """The poses turned about the axis so that their rotations come nearest to the true ones."""
+        quaternion = quaternion_from_rotation(T_cam_obj[..., :3, :3].mT @ T_true[..., :3, :3])
+        # The twist of swing and twist.
+        angle = 2 * torch.atan2(quaternion[..., :3] @ self.direction_obj, quaternion[..., 3])
+        turn = torch.eye(4, dtype=T_cam_obj.dtype).expand(T_cam_obj.shape).clone()
+        turn[..., :3, :3] = so3_exp(angle[..., None] * self.direction_obj)
+        turn[..., :3, 3] = self.point_obj - turn[..., :3, :3] @ self.point_obj
+        return T_cam_obj @ turn
+
+
+def revolution_axis(model: ObjectModel) -> RevolutionAxis | None:
+    """The axis that the object can be turned about unseen; None for any other shape, for printed ones, polylines and balls.
+
+    The axis goes through the middle of the surface. A turn about it moves every point along the surface, ``n · (a × p) = 0``:
+    ``a`` is the smallest eigenvector of these normal equations (Gelfand and Guibas, "Shape segmentation using local slippage
+    analysis", 2004).
+    """
+    if len(model.triangles) == 0 or len(model.texture_points):
+        return None
+    corners, normals, area = _corners(model.triangles.double())
+    middle = area @ corners
+    points = (corners - middle) / model.diameter_m
+    slips = torch.linalg.cross(points, normals)
+    values, axes = torch.linalg.eigh(slips.mT @ (area[:, None] * slips))
+    direction = axes[:, 0]
+    arm = torch.linalg.cross(direction.expand_as(points), points).norm(dim=-1)
+    keeps = (slips @ direction).abs() <= _SLIP * arm + 1e-6
+    if values[1] < values[0] + _DISTINCT or (area * keeps).sum() < _KEEPING:
+        return None
+    return RevolutionAxis(middle, direction)
+
+
+def _corners(triangles: Float[Tensor, "f 3 3"]) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"], Float[Tensor, "p"]]:
+    """Corners of triangles, the unit normals there, and the share of the area that each stands for."""
+    cross = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    twice_area = cross.norm(dim=-1)
+    normals, area = cross / twice_area[:, None].clamp(min=1e-30), twice_area / (3 * twice_area.sum())
+    return triangles.flatten(0, 1), normals.repeat_interleave(3, 0), area.repeat_interleave(3)
