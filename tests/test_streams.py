@@ -46,10 +46,18 @@ def assert_same_runs(together, alone):
     np.testing.assert_allclose(values, expected, rtol=0, atol=5e-4)
 
 
-METHODS = [{}, {"tracker": {"window": {"mode": "count", "count": 300}}}, {"preset": "line"}, {"preset": "nns"}]
+ADAPTIVE = {"mode": "adaptive", "motion_px": 0.2, "shortest_us": 1000}
+METHODS = [
+    {},
+    {"tracker": {"window": {"mode": "count", "count": 300}}},
+    {"tracker": {"window": ADAPTIVE}},
+    {"preset": "line", "tracker": {"window": ADAPTIVE}},
+    {"preset": "line"},
+    {"preset": "nns"},
+]
 
 
-@pytest.mark.parametrize("settings", METHODS, ids=["default", "count", "line", "nns"])
+@pytest.mark.parametrize("settings", METHODS, ids=["default", "count", "adaptive", "adaptive_line", "line", "nns"])
 def test_streams_are_tracked_as_each_alone_until_each_ends(paths, tmp_path, settings):
     starts_us = (None, 7_000, 3_300)
     for path, start_us in zip(paths, starts_us, strict=True):
@@ -93,8 +101,8 @@ class Counting:
         self.broken_after, self.full_after = broken_after, full_after
         self.steps, self.closed = [], False
 
-    def windows(self):
-        for number, window in enumerate(cut_windows(self.session.chunks(), RunConfig(source="none.npz").tracker.window, self.session.start_us)):
+    def windows(self, length):
+        for number, window in enumerate(cut_windows(self.session.chunks(), self.session.start_us, length)):
             if number == self.broken_after:
                 raise EventDataError("time goes back")
             yield window

@@ -4,7 +4,7 @@ Conventions, stated once: times are integer microseconds (int64) at every bounda
 ``t_start_us < t <= t_end_us``, so an event at a window's end belongs to it; polarity is ``True`` where it got brighter.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -152,33 +152,41 @@ class EventWindow:
     t_end_us: int
 
 
-def windows_by_time(chunks: Iterable[EventBatch], duration_us: int, t_start_us: int | None = None) -> Iterator[EventWindow]:
-    """Cut a stream into windows of equal duration, in constant memory; windows without events are yielded too.
+def windows_by_time(chunks: Iterable[EventBatch], duration_us: int | Callable[[], int], t_start_us: int | None = None) -> Iterator[EventWindow]:
+    """Cut a stream into windows of given durations, in constant memory; windows without events are yielded too.
 
     Args:
         chunks: the events of one stream in time order, cut anywhere.
-        duration_us: length of a window.
+        duration_us: length of a window; or what is asked for that of the next one, once the last one was taken.
         t_start_us: where the first window starts; just before the first event when not given.
     """
-    if duration_us < 1:
+    if not callable(duration_us) and duration_us < 1:
         raise EventDataError(f"a window must last at least 1 µs, got {duration_us}.")
-    pending = EventBatch.empty()
+    pending, end_us = EventBatch.empty(), None
     for chunk in chunks:
         if len(chunk) == 0:
             continue
         if t_start_us is None:
             t_start_us = int(chunk.t_us[0]) - 1
+        if end_us is None:
+            end_us = t_start_us + _next(duration_us)
         pending = concatenate([pending, chunk]) if len(pending) else chunk
-        # A window is complete only once an event after its end has been seen.
         newest_us = int(pending.t_us[-1])
-        ends = range(t_start_us + duration_us, newest_us, duration_us)
-        cuts = torch.searchsorted(pending.t_us, torch.tensor([t_start_us, *ends], dtype=torch.int64), right=True).tolist()
-        for end_us, first, last in zip(ends, cuts, cuts[1:], strict=False):
-            yield EventWindow(pending[first:last], end_us - duration_us, end_us)
-        t_start_us += duration_us * len(ends)
-        pending = pending[cuts[-1] :]
-    if len(pending) and t_start_us is not None:
-        yield EventWindow(pending, t_start_us, t_start_us + duration_us)
+        # Only what is after the start counts; later on, nothing else is left.
+        pending = pending[int(torch.searchsorted(pending.t_us, t_start_us, right=True)) :]
+        # A window is complete only once an event after its end has been seen.
+        while end_us < newest_us:
+            cut = int(torch.searchsorted(pending.t_us, end_us, right=True))
+            yield EventWindow(pending[:cut], t_start_us, end_us)
+            pending, t_start_us = pending[cut:], end_us
+            end_us = t_start_us + _next(duration_us)
+    if len(pending) and t_start_us is not None and end_us is not None:
+        yield EventWindow(pending, t_start_us, end_us)
+
+
+def _next(duration_us: int | Callable[[], int]) -> int:
+    """The duration of the next window."""
+    return duration_us() if callable(duration_us) else duration_us
 
 
 def windows_by_count(chunks: Iterable[EventBatch], count: int, max_age_us: int | None = None, t_start_us: int | None = None) -> Iterator[EventWindow]:

@@ -13,6 +13,7 @@ from torchtrack.config.run import RunConfig
 from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
 from torchtrack.events import EventWindow
 from torchtrack.interrupt import Interrupt
+from torchtrack.io.keep_up import KeepUp
 from torchtrack.session import Session, open_session
 from torchtrack.sinks import Sink
 from torchtrack.sinks.alignment import AlignmentRecord
@@ -22,6 +23,7 @@ from torchtrack.sinks.poses import PoseFiles
 from torchtrack.sinks.record import Record
 from torchtrack.sinks.summary import RunSummary, summarise_run
 from torchtrack.stepping import Step, cut_windows
+from torchtrack.window_length import WindowLength
 
 OUTPUT_FILES = ("trajectory_*.tum", "poses.csv", "config.yaml", "summary.json", "overlay*.mp4", "overlay*.png")
 
@@ -39,7 +41,7 @@ class RunOutputs:
     def __init__(self, config: RunConfig, interrupt: Interrupt, sinks: Sequence[Sink] = (), session: Session | None = None) -> None:
         self.session = session or open_session(config)
         self._config, self._interrupt, self._further = config, interrupt, sinks
-        self._keep_up = self.session.keep_up(config.tracker.window)
+        self._keep_up: KeepUp | None = None
         self._record = Record(self.session.ground_truth, self.session.models)
         self._begun = time.perf_counter()
         # The files, and within them the sinks that write them; both open with the first step.
@@ -47,11 +49,11 @@ class RunOutputs:
         self._folder: Path | None = None
         self._sinks: list[Sink] = []
 
-    def windows(self) -> Iterator[EventWindow]:
+    def windows(self, length: WindowLength) -> Iterator[EventWindow]:
         """The windows of the session; a live one drops those that come too fast, and ends at an interrupt."""
-        if self._keep_up:
-            return self._keep_up.until(lambda: self._interrupt.requested)
-        return cut_windows(self.session.chunks(), self._config.tracker.window, self.session.start_us)
+        windows = cut_windows(self.session.chunks(), self.session.start_us, length)
+        self._keep_up = self.session.keep_up(windows)
+        return self._keep_up.until(lambda: self._interrupt.requested) if self._keep_up else windows
 
     def add(self, step: Step) -> None:
         """Write one step."""

@@ -11,9 +11,8 @@ from torch import Tensor
 from torchtrack.camera import Camera
 from torchtrack.config.events import EventsConfig
 from torchtrack.config.run import CameraConfig, ObjectConfig, PoseConfig, RunConfig
-from torchtrack.config.tracker import WindowConfig
 from torchtrack.errors import ConfigError, EventDataError
-from torchtrack.events import EventBatch
+from torchtrack.events import EventBatch, EventWindow
 from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence, read_trajectory
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS
 from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, Region, downscaled_camera, find_hot_pixels, region_camera
@@ -21,7 +20,7 @@ from torchtrack.io.keep_up import KeepUp
 from torchtrack.io.live import LiveSource, open_live
 from torchtrack.lie import check_pose, rotation_from_quaternion
 from torchtrack.object_model import ObjectModel
-from torchtrack.stepping import clipped, cut_windows
+from torchtrack.stepping import clipped
 
 
 @dataclass(frozen=True)
@@ -56,11 +55,9 @@ class Session:
         """The events after the start and up to the end."""
         return clipped(self.events.chunks(), self.start_us, self.end_us)
 
-    def keep_up(self, config: WindowConfig) -> KeepUp | None:
-        """The windows of a live source, which drops those that come too fast; None for a file."""
-        if self.live is None:
-            return None
-        return KeepUp(cut_windows(self.chunks(), config, self.start_us), self.live_windows, self.live.stop)
+    def keep_up(self, windows: Iterator[EventWindow]) -> KeepUp | None:
+        """The ``windows`` of a live source, less those that come too fast; None for a file."""
+        return None if self.live is None else KeepUp(windows, self.live_windows, self.live.stop)
 
     @property
     def known_duration_s(self) -> float | None:

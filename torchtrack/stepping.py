@@ -1,7 +1,7 @@
 """The loop itself: a stream cut into windows, one tracker step each, in constant memory."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +14,7 @@ from torchtrack.events import EventBatch, EventWindow, windows_by_count, windows
 from torchtrack.io import EventSource
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracker import Tracker
+from torchtrack.window_length import WindowLength, tell_lengths
 
 
 @dataclass(frozen=True)
@@ -26,30 +27,34 @@ class Step:
     seconds: float
 
 
-def cut_windows(chunks: Iterable[EventBatch], config: WindowConfig, t_start_us: int) -> Iterator[EventWindow]:
-    """The windows of a stream, by time or by count as configured."""
-    if config.mode == "time":
-        return windows_by_time(chunks, config.duration_us, t_start_us)
-    return windows_by_count(chunks, config.count, config.max_age_us, t_start_us)
+def cut_windows(chunks: Iterable[EventBatch], t_start_us: int, length: WindowLength) -> Iterator[EventWindow]:
+    """The windows of a stream, by count, or by time as ``length`` says at the start of each one."""
+    config = length.config
+    if config.mode == "count":
+        return windows_by_count(chunks, config.count, config.max_age_us, t_start_us)
+    return windows_by_time(chunks, length, t_start_us)
 
 
-def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState) -> Iterator[Step]:
-    """One step per window; nothing is recorded for gradients."""
+def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState, length: WindowLength) -> Iterator[Step]:
+    """One step per window, which says how long the next one is to last; nothing is recorded for gradients."""
     for window in windows:
-        state, result, seconds = timed_step(tracker, state, window.events, window.t_end_us)
+        state, result, seconds = timed_step(tracker, state, window.events, window.t_end_us, [length])
         yield Step(window, state, result, seconds)
 
 
-def timed_step(tracker: Tracker, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, float]:
-    """State and result of one window, and how long that took (s)."""
+def timed_step(
+    tracker: Tracker, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"], lengths: Sequence[WindowLength]
+) -> tuple[TrackerState, StepResult, float]:
+    """State and result of one window, and how long that took (s); each stream is told how long its next one is to last."""
     device = state.T_cam_obj.device
     begun = time.perf_counter()
     with torch.inference_mode():
-        state, result = tracker.step(state, events.to(device), t_end_us)
+        next_state, result = tracker.step(state, events.to(device), t_end_us)
+        tell_lengths(lengths, tracker, state, result)
         if device.type == "cuda":
             # Work on the GPU is queued: without waiting, the time measured is that of queueing.
             torch.cuda.synchronize(device)
-    return state, result, time.perf_counter() - begun
+    return next_state, result, time.perf_counter() - begun
 
 
 def track(
@@ -68,8 +73,8 @@ def track(
     """
     start_us = int(state.t_us[0])
     chunks = source.chunks() if isinstance(source, EventSource) else source
-    seen = False
-    for step in steps(cut_windows(clipped(chunks, start_us), window or tracker.config.window, start_us), tracker, state):
+    seen, length = False, WindowLength(window or tracker.config.window)
+    for step in steps(cut_windows(clipped(chunks, start_us), start_us, length), tracker, state, length):
         seen = True
         yield step.result
     if not seen:

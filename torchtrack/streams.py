@@ -19,6 +19,7 @@ from torchtrack.session import Session
 from torchtrack.state import TrackerState, joined, take_part
 from torchtrack.stepping import Step, timed_step
 from torchtrack.tracker import Tracker
+from torchtrack.window_length import WindowLength
 
 R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
@@ -33,8 +34,8 @@ class Follower(Protocol[R_co]):
         """What is tracked."""
         ...
 
-    def windows(self) -> Iterator[EventWindow]:
-        """The windows of the session."""
+    def windows(self, length: WindowLength) -> Iterator[EventWindow]:
+        """The windows of the session, as long as ``length`` says."""
         ...
 
     def add(self, step: Step) -> None:
@@ -118,6 +119,7 @@ class _Stream:
     number: int
     session: Session
     windows: Iterator[EventWindow]
+    length: WindowLength
     state: TrackerState
 
 
@@ -139,8 +141,8 @@ def _steps(followers: Mapping[int, Follower[R]], config: TrackingConfig) -> Iter
         except TorchtrackError as error:
             yield number, Ended(error)
         else:
-            size = (session.camera.width, session.camera.height)
-            batches.setdefault(size, []).append(_Stream(number, session, follower.windows(), state))
+            size, length = (session.camera.width, session.camera.height), WindowLength(config.tracker.window)
+            batches.setdefault(size, []).append(_Stream(number, session, follower.windows(length), length, state))
     for streams in batches.values():
         yield from _one_batch(streams, config)
 
@@ -160,7 +162,7 @@ def _one_batch(streams: Sequence[_Stream], config: TrackingConfig) -> Iterator[t
             state, rows = joined([stream.state for stream in streams]), _rows([len(stream.session.models) for stream in streams])
         events = concatenate(window.events.of_stream(place) for place, (_, window) in enumerate(due))
         t_end_us = torch.tensor([window.t_end_us for _, window in due], device=config.device)
-        state, result, seconds = timed_step(tracker, state, events, t_end_us)
+        state, result, seconds = timed_step(tracker, state, events, t_end_us, [stream.length for stream in streams])
         for (stream, window), own in zip(due, rows, strict=True):
             stream.state = take_part(state, *own)
             yield stream.number, Step(window, stream.state, take_part(result, *own), seconds / len(due))

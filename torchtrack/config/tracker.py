@@ -10,12 +10,25 @@ from torchtrack.config.settings import Settings
 class WindowConfig(Settings):
     """How the stream is cut into windows, one pose each."""
 
-    mode: Literal["time", "count"] = Field("time", description="Windows of equal duration, or of an equal number of events.")
-    duration_us: int = Field(5_000, ge=100, le=1_000_000, description="Length of a window in mode 'time' (µs).")
+    mode: Literal["time", "count", "adaptive"] = Field(
+        "time", description="Windows of equal duration, of an equal number of events, or as long as the fastest object takes to move on."
+    )
+    duration_us: int = Field(
+        5_000, ge=100, le=1_000_000, description="Length of a window in mode 'time'; in mode 'adaptive', while a motion is not known (µs)."
+    )
+    motion_px: float = Field(2.0, gt=0, description="In mode 'adaptive', a window is closed once contours should have moved on this far (px).")
+    shortest_us: int = Field(4_000, ge=100, description="Least length of a window in mode 'adaptive' (µs).")
+    longest_us: int = Field(10_000, ge=100, le=1_000_000, description="Greatest length of a window in mode 'adaptive' (µs).")
     count: int = Field(5_000, ge=10, description="Events of a window in mode 'count'.")
     parts: int = Field(4, ge=1, le=100, description="Parts in which a window is taken while an object's motion is not known; 1 for never.")
     max_unknown_px: float = Field(2.0, gt=0, description="Unknown part of a motion in a window from which it is taken in parts (px).")
     max_age_us: int = Field(20_000, ge=100, description="In mode 'count', a window is closed after this long (µs) with fewer events.")
+
+    @model_validator(mode="after")
+    def _lengths_in_order(self) -> "WindowConfig":
+        if self.longest_us < self.shortest_us:
+            raise ValueError(f"longest_us ({self.longest_us}) must not be less than shortest_us ({self.shortest_us})")
+        return self
 
 
 class SurfaceConfig(Settings):

@@ -26,6 +26,7 @@ from torchtrack.sinks.record import ObjectRecord, Record
 from torchtrack.stepping import Step, cut_windows
 from torchtrack.streams import follow
 from torchtrack.threads import threads
+from torchtrack.window_length import WindowLength
 
 
 @dataclass(frozen=True)
@@ -142,9 +143,9 @@ class _Measurement:
         self.session = _only(session, [number for number, reason in enumerate(reasons) if reason is None])
         self._record, self._job, self._limits = Record(self.session.ground_truth, self.session.models), job, limits
 
-    def windows(self) -> Iterator[EventWindow]:
+    def windows(self, length: WindowLength) -> Iterator[EventWindow]:
         """The windows of the sequence."""
-        return cut_windows(self.session.chunks(), self._job.config.tracker.window, self.session.start_us)
+        return cut_windows(self.session.chunks(), self.session.start_us, length)
 
     def add(self, step: Step) -> None:
         """Remember one step."""
