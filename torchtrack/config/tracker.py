@@ -18,7 +18,7 @@ class WindowConfig(Settings):
     )
     motion_px: float = Field(2.0, gt=0, description="In mode 'adaptive', a window is closed once contours should have moved on this far (px).")
     shortest_us: int = Field(4_000, ge=100, description="Least length of a window in mode 'adaptive' (µs).")
-    longest_us: int = Field(10_000, ge=100, le=1_000_000, description="Greatest length of a window in mode 'adaptive' (µs).")
+    longest_us: int = Field(7_500, ge=100, le=1_000_000, description="Greatest length of a window in mode 'adaptive' (µs).")
     count: int = Field(5_000, ge=10, description="Events of a window in mode 'count'.")
     parts: int = Field(4, ge=1, le=100, description="Parts in which a window is taken while an object's motion is not known; 1 for never.")
     max_unknown_px: float = Field(2.0, gt=0, description="Unknown part of a motion in a window from which it is taken in parts (px).")
