@@ -21,6 +21,7 @@ from tracked_boxes import (
 from torchtrack import Tracker, preset
 from torchtrack.camera import project
 from torchtrack.config.tracker import (
+    FlowConfig,
     MotionConfig,
     QualityConfig,
     TrackerConfig,
@@ -141,10 +142,18 @@ def test_results_have_their_shapes_and_types(dtype):
     assert torch.equal(state.T_cam_obj, result.T_cam_obj)
     assert int(result.observation_count) > 30
     assert result.corners.mask.any()
-    assert result.corners.has_flow.any()
     assert (torch.linalg.eigvalsh(result.covariance[0]) > 0).all()
     assert (torch.linalg.eigvalsh(state.covariance[0]) > 0).all()
     assert float(result.covariance[0].diagonal()[:3].sqrt().max()) < 0.01
+
+
+def test_flow_that_matching_makes_no_use_of_is_estimated_where_it_is_asked_for():
+    tracker, state, result, window, _ = started()
+    assert not result.corners.has_flow.any()
+    asked = tracker_of(config=TrackerConfig(flow=FlowConfig(always=True)))
+    without, with_flow = (each.step(state, *window)[1] for each in (tracker, asked))
+    assert with_flow.corners.has_flow.any()
+    assert torch.equal(with_flow.T_cam_obj, without.T_cam_obj)
 
 
 def test_contours_are_those_of_the_pose(dtype):

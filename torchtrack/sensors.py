@@ -101,13 +101,15 @@ class Sensors:
     def corners(
         self, contours: Contours, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], window_s: Float[Tensor, "s"], config: TrackerConfig
     ) -> Corners:
-        """Corners of the time surface around each object's contours, and their flow."""
+        """Corners of the time surface around each object's contours, with their flow where it is made use of."""
         if config.corners.max_corners == 0:
             return no_corners(contours.pixels)
         margin_px, largest_px = config.surface.margin_px, config.surface.max_region_px
         regions = object_regions(self.on_sensor(contours.pixels), contours.mask, self.stream_index, self.image_size, margin_px, largest_px)
         surface = time_surface(last_event_us, t_us, regions, config.surface.tau_s, self.ideal_pixels.dtype)
         corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config.surface, config.corners)
+        if not (config.flow.always or config.matching.along_flow):
+            return corners
         return estimate_flow(corners, last_event_us, t_us, self.stream_index, self.ideal_pixels, config.flow)
 
     def on_sensor(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:

@@ -65,6 +65,7 @@ class CornerConfig(Settings):
 class FlowConfig(Settings):
     """Event flow of each corner (Eq. 6-11)."""
 
+    always: bool = Field(False, description="Estimate it also where corners are not matched along it, which needs none.")
     radius_px: int = Field(5, ge=1, le=20, description="Events within this distance of the corner take part (px).")
     span_s: float = Field(0.02, gt=0, le=1, description="Events up to this old take part (s).")
     iterations: int = Field(3, ge=1, le=50, description="Reweightings.")
