@@ -6,6 +6,7 @@ They count only for objects whose own contours turn out to explain little of wha
 holds the errors of the poses it was learned at, and a good model needs none of it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from torchtrack import quality
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
-from torchtrack.contours import ContourKind
+from torchtrack.contours import ContourKind, Contours
 from torchtrack.object_batch import LearnedPoints
 from torchtrack.search import Found
 
@@ -73,24 +74,42 @@ class LearnedContours:
 def judge_model(
     learned: LearnedContours,
     found: Found,
-    velocity: Float[Tensor, "b m 2"],
+    velocity: Callable[[Contours], Tensor],
     image_size: tuple[int, int],
     config: TrackerConfig,
+    *,
+    any_count: bool,
 ) -> LearnedContours:
-    """Whether a model's own contours explain what is seen, after a window's fit; ``velocity`` is that of its contours.
+    """Whether a model's own contours explain what is seen, after a window's fit.
 
     An object that hardly moves at first shows its contours at the very pose that was given: these count at once, until the
     model's own explain enough. What is learned from a start in motion waits until they are seen to explain too little.
+
+    Args:
+        velocity: gives the image velocity of contours (px/s).
+        any_count: whether any learned contours were among those of the fit.
     """
+    contours = found.fit.contours
+    share = _share_of_own(found, velocity(contours), image_size, config) if any_count else found.measured
+    known = torch.isfinite(share) & (found.count > 0)
+    share = torch.where(known, torch.lerp(learned.model_share, share, _SHARE_GAIN), learned.model_share)
+    enough = share > config.learning.below_share + _MORE_SHARE
+    if learned.windows < _START_WINDOWS:
+        enough = enough | _in_motion(contours, velocity(contours))
+    return replace(learned, model_share=share, needed=(learned.needed & ~enough) | (share < config.learning.below_share))
+
+
+def _share_of_own(found: Found, velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: TrackerConfig) -> Float[Tensor, "b"]:
+    """Share of the moving contours of the model itself that events explain; not a number where hardly any move."""
     contours, matches = found.fit.contours, found.fit.matches
     own = contours.kind != int(ContourKind.LEARNED)
     matches = replace(matches, near=matches.near & own.gather(1, matches.contour))
-    contours = replace(contours, mask=contours.mask & own)
-    share = quality.explained_share(contours, matches, velocity, image_size, config.quality, at_rest=torch.nan)
-    known = torch.isfinite(share) & (found.count > 0)
-    share = torch.where(known, torch.lerp(learned.model_share, share, _SHARE_GAIN), learned.model_share)
+    return quality.measured_share(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config.quality)
+
+
+def _in_motion(contours: Contours, velocity: Float[Tensor, "b m 2"]) -> Bool[Tensor, "b"]:
+    """Which objects' contours move."""
     u, v = velocity.unbind(-1)
-    speed_px_s = ((u * u + v * v).sqrt() * contours.mask).sum(-1) / contours.mask.sum(-1).clamp(min=1)
-    in_motion = (speed_px_s > _CALM_PX_S) & (learned.windows < _START_WINDOWS)
-    enough = in_motion | (share > config.learning.below_share + _MORE_SHARE)
-    return replace(learned, model_share=share, needed=(learned.needed & ~enough) | (share < config.learning.below_share))
+    own = contours.mask & (contours.kind != int(ContourKind.LEARNED))
+    speed_px_s = ((u * u + v * v).sqrt() * own).sum(-1) / own.sum(-1).clamp(min=1)
+    return speed_px_s > _CALM_PX_S

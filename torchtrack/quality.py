@@ -31,18 +31,19 @@ class Status(IntEnum):
 
 
 def explained_share(
-    contours: Contours,
-    matches: Matches,
-    contour_velocity: Float[Tensor, "b m 2"],
-    image_size: tuple[int, int],
-    config: QualityConfig,
-    at_rest: float = 1.0,
+    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: QualityConfig
 ) -> Float[Tensor, "b"]:
-    """Of the visible contour that should fire given its motion, the share with observations on it.
+    """:func:`measured_share`; where hardly anything moves, nothing speaks against the pose: all is explained."""
+    return measured_share(contours, matches, contour_velocity, image_size, config).nan_to_num(1.0)
+
+
+def measured_share(
+    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: QualityConfig
+) -> Float[Tensor, "b"]:
+    """Of the visible contour that should fire given its motion, the share with observations on it; not a number where hardly any moves.
 
     A patch of the image explains its contours when most of the observations near them are on them: a few of those that
-    chance scatters around a contour always are. Where hardly
-    anything moves, nothing speaks against the pose: its share is ``at_rest``.
+    chance scatters around a contour always are.
     """
     counts = patch_sums(patch(matches.targets), torch.stack(on_and_around(matches.offsets, matches.near), 1))
     on, near = counts.gather(2, patch(contours.pixels)[:, None].expand(-1, 2, -1)).unbind(1)
@@ -51,7 +52,7 @@ def explained_share(
     moving = contours.mask & _inside(contours.pixels, image_size) & (speed > config.min_speed_px_s)
     total = moving.sum(-1)
     share = (moving & explained).sum(-1) / total.clamp(min=1)
-    return torch.where(total < _MIN_MOVING_POINTS, at_rest, share).to(contours.pixels.dtype)
+    return torch.where(total < _MIN_MOVING_POINTS, torch.nan, share).to(contours.pixels.dtype)
 
 
 def _inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:

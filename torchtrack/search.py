@@ -5,7 +5,7 @@ than beside them; the most promising are aligned as one batch, and the one that 
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -37,20 +37,25 @@ class Found:
 
     Args:
         fit: poses, and what they stand on.
-        share: share of the moving contour that events explain.
+        measured: share of the moving contour that events explain; not a number where hardly anything moves.
         count: matched observations.
     """
 
     fit: Fit
-    share: Float[Tensor, "b"]
+    measured: Float[Tensor, "b"]
     count: Int[Tensor, "b"]
+
+    @cached_property
+    def share(self) -> Float[Tensor, "b"]:
+        """Share of the moving contour that events explain; where hardly anything moves, nothing speaks against the pose."""
+        return self.measured.nan_to_num(1.0)
 
 
 def judge_fit(prediction: Prediction, fit: Fit, config: TrackerConfig) -> Found:
     """A fit with its quality; without enough observations it explains nothing."""
     velocity = prediction.contour_velocity(fit.contours)
-    share = quality.explained_share(fit.contours, fit.matches, velocity, prediction.objects.image_size, config.quality)
-    return Found(fit, share, fit.matches.mask.sum(-1))
+    measured = quality.measured_share(fit.contours, fit.matches, velocity, prediction.objects.image_size, config.quality)
+    return Found(fit, measured, fit.matches.mask.sum(-1))
 
 
 @dataclass(frozen=True)
@@ -215,4 +220,4 @@ def _replaced(found: Found, number: int, other: Found, row: Int[Tensor, "1"], be
     count = max(mine.contours.mask.shape[1], theirs.contours.mask.shape[1])
     own, others = mine.contours.widened(count), theirs.contours.widened(count)
     contours = Contours(*(put(value, getattr(others, name)) for name, value in vars(own).items()))
-    return Found(Fit(solution, contours, mine.matches), put(found.share, other.share), put(found.count, other.count))
+    return Found(Fit(solution, contours, mine.matches), put(found.measured, other.measured), put(found.count, other.count))

@@ -71,6 +71,10 @@ class Surroundings:
         """Centre of each object in the camera's frame (m)."""
         return transform_points(self.T_cam_obj, self.objects.centre_obj[:, None])[:, 0]
 
+    def contour_velocity(self, contours: Contours) -> Float[Tensor, "b m 2"]:
+        """Image velocity of contours (px/s)."""
+        return pixel_velocity(contours.points_cam, self.velocity, self.centre_cam, self.objects.intrinsics)
+
     def to_object(self, vectors_cam: Tensor) -> Tensor:
         """Directions in the camera's frame, in the object's."""
         return vectors_cam @ self.T_cam_obj[:, :3, :3]
@@ -90,9 +94,8 @@ class _Sample:
 @torch.no_grad()
 def learn_after(learned: LearnedContours, around: Surroundings, found: Found, events: WindowEvents, config: TrackerConfig) -> LearnedContours:
     """What is known after a window of contours that the models lack; learned from only in the windows that are due."""
-    contours, objects = found.fit.contours, around.objects
-    velocity = pixel_velocity(contours.points_cam, around.velocity, around.centre_cam, objects.intrinsics)
-    learned = judge_model(learned, found, velocity, objects.image_size, config)
+    objects = around.objects
+    learned = judge_model(learned, found, around.contour_velocity, objects.image_size, config, any_count=objects.learned is not None)
     return learn(learned, around, events, config) if learned.due(config.learning) else learned
 
 
@@ -144,8 +147,7 @@ def _weighed(evidence: Tensor, known: Contours, around: Surroundings, grid: Cell
         return events.gather(1, cell_of(x, y).flatten(1)).view(x.shape).sum(1)
 
     on, beside = count(_ON_CELLS), count(_BESIDE_CELLS)
-    velocity = pixel_velocity(known.points_cam, around.velocity, around.centre_cam, around.objects.intrinsics)
-    way_px = (known.normals * velocity).sum(-1).abs() * around.window_s[:, None]
+    way_px = (known.normals * around.contour_velocity(known)).sum(-1).abs() * around.window_s[:, None]
     silent = torch.where(way_px > _LEAST_WAY_PX, -_SILENT, 0.0)
     change = torch.where(on + beside == 0, silent, torch.where(on > _ON_TO_BESIDE * beside, 1.0, -1.0))
     return torch.where(known.mask & around.learning[:, None], (evidence + change).clamp(0, _MOST_EVIDENCE), evidence)
