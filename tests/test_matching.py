@@ -249,7 +249,7 @@ def test_events_of_a_moving_box_are_all_matched_within_a_pixel():
 
 def trust(offsets, targets, near, config):
     """The concentration around observations with given offsets from their contours."""
-    cell, counted = patch(targets), torch.stack(on_and_around(offsets, near), 1)
+    cell, counted = patch(targets), on_and_around(offsets, near)
     on, around = patch_sums(cell, counted).gather(2, cell[:, None].expand(-1, 2, -1)).unbind(1)
     return concentration(on, around, config)
 

@@ -17,7 +17,7 @@ def agreement(dark, *, offsets=0.0, near=True, place=50.0, config=CONFIG):
     dark = torch.as_tensor(dark, dtype=torch.float64)[None]
     offsets, near = torch.as_tensor(offsets, dtype=torch.float64).expand(dark.shape), torch.as_tensor(near).expand(dark.shape)
     targets = torch.as_tensor(place, dtype=torch.float64).expand(dark.shape)[..., None].expand(*dark.shape, 2)
-    cell, (on, _) = patch(targets), on_and_around(offsets, near)
+    cell, on = patch(targets), on_and_around(offsets, near)[:, 0]
     votes, voters = patch_sums(cell, torch.stack([on * dark, on], 1)).gather(2, cell[:, None].expand(-1, 2, -1)).unbind(1)
     return polarity_agreement(dark, votes, voters, config)[0]
 

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchtrack.constants import constant
 from torchtrack.events import PaddedEvents
 
 # Ages (µs) are kept in 16 bits; it does not matter by how much longer ago a burst began.
@@ -58,4 +59,5 @@ def without_tail(
     Args:
         crossing_px_s: how fast the edge moves across itself.
     """
-    return age_s + (into_burst_s - longest_px / crossing_px_s.abs().clamp(min=1e-3)).clamp(min=0)
+    longest = constant((longest_px,), age_s.dtype, age_s.device)
+    return age_s + torch.addcdiv(into_burst_s, longest, crossing_px_s.abs().clamp_(min=1e-3), value=-1).clamp_(min=0)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.camera import MIN_DEPTH_M, project
+from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.lie import hat, transform_points
 
 
@@ -50,8 +50,12 @@ class MovingObjects:
 
     def show(self, points_obj: Float[Tensor, "b n 3"]) -> tuple[Float[Tensor, "b n 2"], Float[Tensor, "b n 2"]]:
         """Pixels of points of the objects, and their velocities (px/s)."""
-        points_cam = transform_points(self.T_cam_obj, points_obj)
-        return project(points_cam, self.intrinsics), pixel_velocity(points_cam, self.velocity, self.centre_cam, self.intrinsics)
+        turning, drift = _turning_and_drift(self.velocity, self.centre_cam)
+        points_cam = transform_points(self.T_cam_obj, points_obj).transpose(1, 2)
+        inverse_depth = points_cam[:, 2:].clamp(min=MIN_DEPTH_M).reciprocal()
+        ray = points_cam[:, :2] * inverse_depth
+        pixels = torch.addcmul(self.intrinsics[:, 2:, None], ray, self.intrinsics[:, :2, None])
+        return pixels.transpose(1, 2), _across_the_ray(ray, torch.baddbmm(drift, turning, points_cam) * inverse_depth, self.intrinsics)
 
 
 def object_plane_velocity(

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.linalg import vecdot
 
 from torchtrack.bursts import without_tail
 from torchtrack.config.tracker import MatchingConfig
+from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import ContourKind, Contours, take_points
 from torchtrack.image_motion import MovingObjects
@@ -74,14 +76,14 @@ class ContourTable:
         are oriented: they point outwards. Those of print point to its darker side.
         """
         limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
-        marks = torch.stack([limb, limb | crease, texture], -1).to(contours.pixels.dtype)
+        marks = torch.stack([limb, ~limb, limb | crease, texture], -1).to(contours.pixels.dtype)
         values = (contours.points_obj, contours.normals, index.pixels, marks)
         return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index)
 
-    def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Of given contour points: places on the object, normals, pixels when indexed, whether a limb, whether oriented, whether print."""
+    def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Of contour points: places on the object, normals, pixels when indexed, whether a limb, whether a step, whether oriented, whether print."""
         taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
-        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 3), -1)
+        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 4), -1)
         return points_obj, normals, indexed, *marks.unbind(-1)
 
 
@@ -104,18 +106,17 @@ def match_nearest(
     """
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
     found = table.index.look_up(place)
-    contour = found.clamp(min=0)
-    points_obj, normals, indexed, limb, oriented, printed = table.take(contour)
+    points_obj, normals, indexed, limb, step, oriented, printed = table.take(contour := found.clamp(min=0))
     pixels, velocity = objects.show(points_obj)
-    crossing_px_s = (normals * velocity).sum(-1)
+    crossing_px_s = vecdot(normals, velocity)
     dark = observations.polarity * _leading(crossing_px_s)
     age_s = without_tail(observations.age_s, observations.into_burst_s, crossing_px_s, config.burst_px)
     carried = torch.addcmul(observations.pixels, velocity, age_s[..., None])
-    targets = torch.addcmul(carried, normals, (dark * (1 - limb))[..., None], value=-config.dark_shift_px)
+    targets = torch.addcmul(carried, normals, (dark * step)[..., None], value=-config.dark_shift_px)
     difference = pixels - targets
     near = observations.mask & (found >= 0)
-    matched = near & (difference.square().sum(-1) < (gate_px * wider)[:, None].square())
-    offsets = (difference * normals).sum(-1) / wider[:, None]
+    matched = near & (vecdot(difference, difference) < (gate_px * wider)[:, None].square())
+    offsets = vecdot(difference, normals) / wider[:, None]
     weights = _weights(offsets, targets, near, dark * oriented, config)
     if config.print_polarity:
         weights = weights * _agreeing(dark * printed, config)
@@ -126,23 +127,18 @@ def match_nearest(
 
 def _leading(speed_px_s: Tensor) -> Tensor:
     """Whether a contour moves along its normal or against it: 1 or -1, and less where it is slow."""
-    return speed_px_s / (speed_px_s.abs() + _SLOW_PX_S)
+    return speed_px_s / (speed_px_s.abs() + constant((_SLOW_PX_S,), speed_px_s.dtype, speed_px_s.device))
 
 
 def _weights(offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, config: MatchingConfig) -> Tensor:
     """How far each observation is to be trusted, by those around it."""
-    weights = torch.ones_like(offsets)
     if not (config.concentration or config.polarity):
-        return weights
-    cell = patch(targets)
-    on, around = on_and_around(offsets, near)
-    counts = patch_sums(cell, torch.stack([on, around, on * dark], 1)).gather(2, cell[:, None].expand(-1, 3, -1))
-    on_count, near_count, votes = counts.unbind(1)
-    if config.concentration:
-        weights = concentration(on_count, near_count, config)
-    if config.polarity:
-        weights = weights * polarity_agreement(dark, votes, on_count, config)
-    return weights
+        return torch.ones_like(offsets)
+    cell, on_and_near = patch(targets), on_and_around(offsets, near)
+    values = torch.cat([on_and_near, on_and_near[:, :1] * dark[:, None]], 1)
+    on_count, near_count, votes = patch_sums(cell, values).gather(2, cell[:, None].expand(-1, 3, -1)).unbind(1)
+    weights = concentration(on_count, near_count, config) if config.concentration else torch.ones_like(offsets)
+    return weights * polarity_agreement(dark, votes, on_count, config) if config.polarity else weights
 
 
 def concentration(on_count: Float[Tensor, "b n"], near_count: Float[Tensor, "b n"], config: MatchingConfig) -> Float[Tensor, "b n"]:
@@ -153,8 +149,9 @@ def concentration(on_count: Float[Tensor, "b n"], near_count: Float[Tensor, "b n
     of the observations near a contour that are on it. No patch counts for nothing: one that is off the contour as a whole
     must still pull a pose back that has begun to slip.
     """
-    share = (on_count + 1) / (near_count + 2)
-    return ((share - config.smeared_share) / (config.gathered_share - config.smeared_share)).clamp(config.least_trust, 1)
+    share, gain = (on_count + one(on_count)) / (near_count + _two(near_count)), 1 / (config.gathered_share - config.smeared_share)
+    smeared = constant((-config.smeared_share * gain,), share.dtype, share.device)
+    return torch.add(smeared, share, alpha=gain).clamp_(config.least_trust, 1)
 
 
 def polarity_agreement(
@@ -169,12 +166,16 @@ def polarity_agreement(
         dark: +1 where the polarity says that the contour's outer side is the darker one, -1 the inner one, 0 unknown.
         votes: sum of the same over the observations on the contour, of which there are ``voters``.
     """
-    return _agreeing(dark * votes / (voters + 2), config)
+    return _agreeing(dark * votes / (voters + _two(voters)), config)
 
 
 def _agreeing(agreement: Tensor, config: MatchingConfig) -> Tensor:
     """Trust in events whose polarity is what it should be, 1, or the opposite, -1, as far as that is known."""
-    return (1 + config.polarity_gain * agreement).clamp(config.least_agreement, 1)
+    return torch.add(one(agreement), agreement, alpha=config.polarity_gain).clamp_(config.least_agreement, 1)
+
+
+def _two(like: Tensor) -> Tensor:
+    return constant((2.0,), like.dtype, like.device)
 
 
 def patch(pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
@@ -187,11 +188,10 @@ def patch(pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
     return torch.add(u, v, alpha=_PATCHES)
 
 
-def on_and_around(offsets: Float[Tensor, "b n"], near: Bool[Tensor, "b n"]) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
+def on_and_around(offsets: Float[Tensor, "b n"], near: Bool[Tensor, "b n"]) -> Float[Tensor, "b 2 n"]:
     """Which observations are on a contour, and which are so near to one that their share tells: 1 or 0."""
-    distance = offsets.abs()
-    on, around = ((near & (distance < limit)).to(offsets.dtype) for limit in (_ON_CONTOUR_PX, _SMEAR_PX))
-    return on, around
+    limits = constant(((_ON_CONTOUR_PX,), (_SMEAR_PX,)), offsets.dtype, offsets.device)
+    return (near[:, None] & (offsets.abs()[:, None] < limits)).to(offsets.dtype)
 
 
 def patch_sums(cell: Int[Tensor, "b n"], values: Float[Tensor, "b k n"]) -> Float[Tensor, "b k p"]:

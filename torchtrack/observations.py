@@ -109,4 +109,11 @@ def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Flo
 def join(first: Observations, second: Observations) -> Observations:
     """Observations of both, for each object; none has been judged yet."""
     names = [name for name in vars(first) if name != "trust"]
-    return Observations(*(torch.cat([getattr(first, name), getattr(second, name)], 1) for name in names))
+    return Observations(*(_one_after_the_other(getattr(first, name), getattr(second, name)) for name in names))
+
+
+def _one_after_the_other(first: Tensor, second: Tensor) -> Tensor:
+    """Both, along the second dimension; in memory, coordinates are rows."""
+    if first.dim() == 2:
+        return torch.cat([first, second], 1)
+    return torch.cat([first.transpose(1, 2), second.transpose(1, 2)], 2).transpose(1, 2)
