@@ -36,13 +36,12 @@ def conclude(
         dt_s: length of the window.
     """
     objects, contours, share = prediction.objects, found.fit.contours, found.share
-    T_prior, T_found = prediction.T_cam_obj.double(), found.fit.solution.T_cam_obj.double()
-    step = lie.small_difference_about(T_prior, T_found, objects.centre_obj.double()).to(share.dtype)
+    solution = found.fit.solution
     in_view = quality.visible_share(contours, objects.image_size)
-    status = quality.judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening)
+    status = quality.judge(share, found.count, in_view, solution.from_prior[:, :6], objects.diameter_m, config.quality, widening)
     status = torch.where(prediction.usable, status, int(quality.Status.DIVERGED))
     failed = status >= int(quality.Status.LOST)
-    T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], T_prior, T_found))
+    T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
     velocity, covariance = _updated_motion(prediction, found, failed, dt_s, config)
@@ -61,7 +60,9 @@ def _updated_motion(
     if not config.solver.prior:
         return torch.zeros_like(prediction.velocity), predicted
     posterior = config.solver.observation_px**2 * inverse(solution.hessian.double())[:, :12, :12]
-    trusted = torch.where(failed | ~torch.isfinite(posterior).flatten(1).all(-1), 0, quality.trust(found.share, config.quality))
+    # A sum is finite only where every entry is.
+    known = posterior.sum((1, 2)).abs() < torch.inf
+    trusted = quality.trust(found.share, config.quality) * (known & ~failed)
     velocity = prediction.velocity + trusted[:, None] * solution.from_prior[:, 6:12]
     covariance = torch.where(trusted[:, None, None] > 0, torch.lerp(predicted, posterior, trusted[:, None, None].double()), predicted)
     faded = fade(velocity, dt_s, failed, config.motion)

@@ -61,16 +61,17 @@ def inverse(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:
     Taken with a unit diagonal: rotations and translations, poses and velocities differ by many orders of magnitude.
     """
     scale = matrices.diagonal(dim1=-2, dim2=-1).clamp(min=1e-30).rsqrt()
-    factor, info = torch.linalg.cholesky_ex(matrices * scale[:, :, None] * scale[:, None])
+    scales = scale[:, :, None] * scale[:, None]
+    factor, info = torch.linalg.cholesky_ex(matrices * scales)
+    good, unknown = (info == 0)[:, None, None], torch.full_like(scale, torch.inf).diag_embed()
     eye = torch.eye(matrices.shape[-1], dtype=matrices.dtype, device=matrices.device).expand_as(matrices)
-    good = (info == 0)[:, None, None]
-    result = torch.cholesky_solve(eye, torch.where(good, factor, eye)) * scale[:, :, None] * scale[:, None]
-    return torch.where(good, result, torch.where(eye > 0, torch.inf, 0.0))
+    return torch.where(good, torch.cholesky_solve(eye, torch.where(good, factor, eye)) * scales, unknown)
 
 
 def left_covariance(covariance: Float[Tensor, "b 6 6"], centre_cam: Float[Tensor, "b 3"]) -> Float[Tensor, "b 6 6"]:
     """Covariance of the left perturbation ``[φ, ρ]`` of a pose, from that of a turn about its centre: ``ρ_left = ρ - φ × c``."""
-    unknown = torch.isinf(covariance).any(-1).any(-1)[:, None, None]
+    # A sum is finite only where every entry is.
+    unknown = ~(covariance.sum((1, 2)).abs() < torch.inf)[:, None, None]
     to_left = torch.eye(6, dtype=covariance.dtype, device=covariance.device).repeat(len(covariance), 1, 1)
     to_left[:, 3:, :3] = hat(centre_cam)
     known = to_left @ torch.where(unknown, 0.0, covariance) @ to_left.transpose(1, 2)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import QualityConfig
+from torchtrack.constants import constant
 from torchtrack.contours import Contours
 from torchtrack.matching import Matches, on_and_around, patch, patch_sums
 
@@ -20,7 +21,7 @@ _MIN_MOVING_POINTS = 16
 
 
 class Status(IntEnum):
-    """What a pose is worth."""
+    """What a pose is worth, in the order of gravity."""
 
     TRACKING = 0
     UNCERTAIN = 1
@@ -88,17 +89,15 @@ def judge(
 ) -> Int[Tensor, "b"]:
     """The :class:`Status` of each object, the gravest reason first; ``widening`` is of each object's first gate."""
     lost_below = config.lost_below if widening is None else needed_share(widening, config)
-    turned = step_from_prediction[:, :3].norm(dim=-1)
-    moved = step_from_prediction[:, 3:].norm(dim=-1) / diameters_m
-    diverged = ~(turned < config.max_step_rotation_rad) | ~(moved < config.max_step_translation)
-    status = torch.full_like(observation_count, int(Status.TRACKING))
-    reasons: list[tuple[Status, Bool[Tensor, "b"]]] = [
-        (Status.UNCERTAIN, quality < config.uncertain_below),
-        (Status.LOST, quality < lost_below),
-        (Status.TOO_FEW_EVENTS, observation_count < config.min_observations),
-        (Status.OUT_OF_VIEW, in_view < config.min_visible_share),
-        (Status.DIVERGED, diverged),
-    ]
-    for reason, holds in reasons:
-        status = torch.where(holds, int(reason), status)
-    return status
+    turned, moved = step_from_prediction.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
+    reasons: dict[Status, Bool[Tensor, "b"]] = {
+        Status.UNCERTAIN: quality < config.uncertain_below,
+        Status.LOST: quality < lost_below,
+        Status.TOO_FEW_EVENTS: observation_count < config.min_observations,
+        Status.OUT_OF_VIEW: in_view < config.min_visible_share,
+        # Written so that what is not a number has diverged.
+        Status.DIVERGED: ~((turned < config.max_step_rotation_rad) & (moved < config.max_step_translation * diameters_m)),
+    }
+    # Statuses are in the order of their gravity.
+    numbers = constant(tuple((int(status),) for status in reasons), torch.int64, quality.device)
+    return (torch.stack(list(reasons.values())) * numbers).amax(0)
