@@ -20,6 +20,8 @@ from torchtrack.config.tracker import ContourConfig
 from torchtrack.lie import transform_points
 from torchtrack.object_model import ObjectModel
 
+# Of a model with no more edges than this, all are looked at.
+_FEW_EDGES = 512
 # Active edges beyond this many are thinned evenly before they are projected.
 _MAX_ACTIVE_EDGES = 8192
 # Tangents that the image shows shorter than this (px/m) have no direction in it.
@@ -179,8 +181,9 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])
     active = model.active_edges(camera_obj[..., 0], config.occluding)
     ends, edges = model.edge_ends.expand(batch, -1, -1, -1), model.edges.expand(batch, -1, -1)
-    if active.shape[1] > _MAX_ACTIVE_EDGES:
-        chosen, active = select_ranked(active, _MAX_ACTIVE_EDGES)
+    places = _places_for(active)
+    if places < active.shape[1]:
+        chosen, active = select_ranked(active, places)
         ends, edges = model.edge_ends[chosen], model.edges[:, chosen].transpose(0, 1)
     lengths, start_z, end_z = _lengths_px(ends, T_cam_obj, intrinsics)
     lengths = lengths * active
@@ -201,6 +204,14 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     side = (turning * (points - camera_obj)).sum(1, keepdim=True)
     tangents = torch.where(side > 0, direction, -direction)
     return points.transpose(1, 2), tangents.transpose(1, 2), kind[:, 0].long(), number < counts
+
+
+def _places_for(active: Bool[Tensor, "b e"]) -> int:
+    """Places for the active edges of each object: of many edges, few are. On a GPU, which would have to be waited for, as many as there may be."""
+    edges = active.shape[1]
+    if edges <= _FEW_EDGES or not readback.read_at_once(active):
+        return min(edges, _MAX_ACTIVE_EDGES)
+    return min(max(int(active.sum(1).amax()), 1), _MAX_ACTIVE_EDGES)
 
 
 def _lengths_px(ends: Float[Tensor, "b e 2 3"], T_cam_obj: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
