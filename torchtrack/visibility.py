@@ -64,16 +64,16 @@ def hidden_by_faces(
     plane = (normals_cam * triangles_cam[:, :, 0]).sum(-1)
     away = plane.sign()[..., None] * normals_cam
     tests = torch.cat([sides * turn, away[:, :, None]], 2).flatten(1, 2)
-    behind_m = (plane.abs() + tolerance_m[:, None])[..., None]
+    limits = torch.nn.functional.pad(-(plane.abs() + tolerance_m[:, None])[..., None], (3, 0)).flatten(1, 2)[..., None]
     at_once = max(_MOST_TESTS // (tests.shape[1] * points_cam.shape[1] + 1), 1) if readback.read_at_once(points_cam) else len(points_cam)
-    parts = zip(tests.split(at_once), points_cam.split(at_once), behind_m.split(at_once), strict=True)
+    parts = zip(tests.split(at_once), points_cam.split(at_once), limits.split(at_once), strict=True)
     return torch.cat([_hidden_by(*part) for part in parts])
 
 
-def _hidden_by(tests: Float[Tensor, "b t 3"], points_cam: Float[Tensor, "b m 3"], behind_m: Float[Tensor, "b f 1"]) -> Bool[Tensor, "b m"]:
-    """Which points pass all four tests of one of the triangles: they lie within its edges, and behind its plane."""
-    values = torch.bmm(tests, points_cam.transpose(1, 2)).unflatten(1, (-1, 4))
-    return ((values[:, :, :3].amin(2) > 0) & (values[:, :, 3] > behind_m)).any(1)
+def _hidden_by(tests: Float[Tensor, "b t 3"], points_cam: Float[Tensor, "b m 3"], limits: Float[Tensor, "b t 1"]) -> Bool[Tensor, "b m"]:
+    """Which points pass all four tests of one of the triangles: they lie within its edges, and behind its plane by its limit."""
+    values = torch.baddbmm(limits, tests, points_cam.transpose(1, 2)).unflatten(1, (-1, 4))
+    return (values.amin(2) > 0).any(1)
 
 
 def _hidden_by_self(scene: Scene, contours: Contours) -> Tensor:
