@@ -151,7 +151,7 @@ def test_what_is_drawn_hangs_on_an_events_own_number_also_where_others_were_left
     numbers = torch.arange(4000.0)[None]
     left = (near | (torch.rand(near.shape, generator=generator(8)) < 0.3))[0].nonzero()[:, 0]
     all_of_them = WindowEvents(torch.stack([numbers, numbers], -1), numbers, numbers, numbers, torch.ones_like(near))
-    some = WindowEvents(*(getattr(all_of_them, name)[:, left] for name in ("pixels", "age_s", "into_burst_s", "polarity", "mask")), left)
+    some = WindowEvents(*(getattr(all_of_them, name)[:, left] for name in ("pixels", "age_s", "into_burst_s", "polarity", "mask")), left[None])
     share = torch.tensor([[0.1]])
     chosen, exists = all_of_them.draw(near, share, 300)
     of_some, some_exist = some.draw(near[:, left], share, 300)
@@ -161,6 +161,20 @@ def test_what_is_drawn_hangs_on_an_events_own_number_also_where_others_were_left
 
 
 # ---- the events of one object
+
+
+def test_each_object_can_have_events_of_its_own():
+    values = [torch.rand((2, 9, *shape), generator=generator(k)) for k, shape in enumerate([(2,), (), (), ()])]
+    mask = torch.ones(2, 9, dtype=torch.bool)
+    mask[1, 5] = False
+    chosen, exists = torch.tensor([[1, 4, 0], [2, 5, 8]]), torch.tensor([[True, True, False], [True, True, True]])
+    own = WindowEvents(*values, mask).only(chosen, exists)
+    assert own.mask.tolist() == [[True, True, False], [True, False, True]]
+    assert torch.equal(own.number, chosen)
+    for name, value in zip(("pixels", "age_s", "into_burst_s", "polarity"), values, strict=True):
+        assert torch.equal(getattr(own, name), torch.stack([value[number, chosen[number]] for number in range(2)]))
+    again = own.only(torch.tensor([[1], [2]]), torch.ones(2, 1, dtype=torch.bool))
+    assert again.number.tolist() == [[4], [8]]
 
 
 def test_the_events_of_one_object_can_be_repeated():

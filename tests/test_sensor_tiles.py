@@ -10,7 +10,7 @@ from tracked_boxes import WINDOW_US, follow, merged, moving_box, tracker_of, win
 from torchtrack import Tracker
 from torchtrack.camera import Camera, distort, undistortion_table
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
-from torchtrack.sensor_tiles import SensorTiles
+from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
 
 WIDE = Camera(240.0, 240.0, 320.0, 240.0, 640, 480)
 ODD = Camera(240.0, 240.0, 100.0, 70.0, 201, 143, "plumb_bob", (-0.3, 0.1, 0.0, 0.0))
@@ -44,13 +44,13 @@ def test_what_can_be_seen_of_an_object_is_near(margin_px, shift_m):
     around = pixels[:, None] + margin_px * torch.stack([angle.cos(), angle.sin()], -1)
     u, v = torch.from_numpy(distort(around.flatten(0, 1).numpy(), SMALL_CAMERA)).round().int().unbind(-1)
     inside = (u >= 0) & (u < SMALL_CAMERA.width) & (v >= 0) & (v < SMALL_CAMERA.height)
-    assert near[tracker.tiles._of(u[inside], v[inside])].all()
+    assert near[0, tracker.tiles._of(u[inside], v[inside])].all()
 
 
 def test_tiles_far_from_all_objects_are_not_near():
     tracker, prediction = prediction_at(pose(translation=(0.0, 0.0, 2.0)))
     near = tracker.tiles.near(prediction, torch.tensor([0.005]), 8.0)
-    assert 0 < int(near.sum()) < len(near) // 2
+    assert 0 < int(near.sum()) < near.shape[1] // 2
 
 
 def test_an_object_that_is_not_known_where_to_be_is_near_everywhere():
@@ -61,19 +61,31 @@ def test_an_object_that_is_not_known_where_to_be_is_near_everywhere():
 
 def test_kept_events_keep_their_order_and_tell_their_numbers():
     tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
-    near = torch.rand(len(tiles.middle), generator=generator(3)) < 0.4
-    kept, number = tiles.keep(events, near)
+    near = torch.rand((1, len(tiles.middle)), generator=generator(3)) < 0.4
+    found = tiles.keep(events, near)
+    kept = found.events
     assert 0 < len(kept) < 400
-    assert torch.equal(kept.t_us, events.t_us[number])
-    assert near[tiles._of(kept.x, kept.y)].all()
-    assert int(near[tiles._of(events.x, events.y)].sum()) == len(kept)
+    assert torch.equal(kept.t_us, events.t_us[found.number])
+    assert near[0, tiles._of(kept.x, kept.y)].all()
+    assert int(near[0, tiles._of(events.x, events.y)].sum()) == len(kept)
+    assert found.of_each is None
+
+
+@pytest.mark.parametrize("share", [0.2, 0.6])
+def test_of_several_objects_it_is_known_which_events_are_near_each(share):
+    tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
+    near = torch.rand((3, len(tiles.middle)), generator=generator(4)) < share
+    found = tiles.keep(events, near)
+    assert (found.number is None) == (len(found.events) == len(events)) == (share > 0.5)
+    for chosen, exists, row in zip(*found.of_each, near, strict=True):
+        assert torch.equal(chosen[exists], row[tiles._of(found.events.x, found.events.y)].nonzero()[:, 0])
 
 
 def test_where_most_events_are_near_all_are_kept():
     tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
-    assert tiles.keep(events, torch.ones(len(tiles.middle), dtype=torch.bool)) == (events, None)
-    none, number = tiles.keep(events, torch.zeros(len(tiles.middle), dtype=torch.bool))
-    assert (len(none), number) == (0, None)
+    assert tiles.keep(events, torch.ones(1, len(tiles.middle), dtype=torch.bool)) == NearbyEvents(events)
+    none = tiles.keep(events, torch.zeros(2, len(tiles.middle), dtype=torch.bool))
+    assert (len(none.events), none.number, none.of_each) == (0, None, None)
 
 
 def test_a_step_is_the_same_without_the_events_that_are_left_out():
@@ -85,7 +97,7 @@ def test_a_step_is_the_same_without_the_events_that_are_left_out():
     noisy = merged(events, replace(noise, t_us=noise.t_us + 5 * WINDOW_US)).slice_time(5 * WINDOW_US, 6 * WINDOW_US)
     results = [tracker.step(state, noisy)[1]]
     dt_s = torch.tensor([1e-6 * WINDOW_US])
-    assert len(tracker.sensors.near_objects(noisy, tracker._predict(state, dt_s), dt_s, tracker.config)[0]) < len(noisy) // 2
+    assert len(tracker.sensors.near_objects(noisy, tracker._predict(state, dt_s), dt_s, tracker.config).events) < len(noisy) // 2
     tracker.tiles = None
     results.append(tracker.step(state, noisy)[1])
     assert torch.equal(results[0].T_cam_obj, results[1].T_cam_obj)

@@ -1,7 +1,7 @@
 """What is matched with contours: the corners, and recent events near the contours."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -59,7 +59,7 @@ class WindowEvents:
     into_burst_s: Float[Tensor, "b e"]
     polarity: Float[Tensor, "b e"]
     mask: Bool[Tensor, "b e"]
-    number: Int[Tensor, "e"] | None = None
+    number: Int[Tensor, "b e"] | None = None
 
     def of(self, number: int) -> "WindowEvents":
         """The events of one object."""
@@ -69,9 +69,13 @@ class WindowEvents:
         """The events of one object, for ``count`` of its kind."""
         return self._with(lambda value: value.expand(count, *value.shape[1:]))
 
+    def only(self, chosen: Int[Tensor, "b c"], exists: Bool[Tensor, "b c"]) -> "WindowEvents":
+        """Some events of each object: their indices, and which of these exist."""
+        events = self._with(lambda value: take_points(value, chosen) if value.dim() == 3 else value.gather(1, chosen))
+        return replace(events, mask=events.mask & exists, number=chosen if events.number is None else events.number)
+
     def _with(self, rows: Callable[[Tensor], Tensor]) -> "WindowEvents":
-        values = {name: rows(value) for name, value in vars(self).items() if name != "number"}
-        return WindowEvents(**values, number=self.number)
+        return WindowEvents(*(None if value is None else rows(value) for value in vars(self).values()))
 
     def draw(self, candidates: Bool[Tensor, "b e"], share: Float[Tensor, "b 1"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
         """A share of each row's candidates, spread evenly over them: their indices, at most ``count``, and which of these exist.

@@ -3,6 +3,8 @@
 The sensor is laid out in tiles of whole pixels. One look at each event's tile, in integers, tells whether any object can be there.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,6 +22,21 @@ _SIGMAS = 4.0
 _SLACK_PX = 4.0
 # Where more than this share of the events is near objects, leaving the others out is not worth the copy.
 _MOST_KEPT = 0.8
+
+
+@dataclass(frozen=True)
+class NearbyEvents:
+    """The events of a window that can have to do with any object.
+
+    Args:
+        events: the events.
+        number: of each among all of the window, where some were left out.
+        of_each: indices of those that can have to do with each object, padded, and which of these exist; all where not given.
+    """
+
+    events: EventBatch
+    number: Int[Tensor, "e"] | None = None
+    of_each: tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]] | None = None
 
 
 class SensorTiles(nn.Module):
@@ -44,8 +61,8 @@ class SensorTiles(nn.Module):
         """The tile of each pixel."""
         return torch.add(x >> _TILE_BITS, y >> _TILE_BITS, alpha=self.columns).long()
 
-    def near(self, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "t"]:
-        """Tiles that anything can be seen in, within a window before ``prediction``, that is no farther than a margin from an object."""
+    def near(self, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
+        """Tiles that anything can be seen in, within a window before ``prediction``, that is no farther than a margin from each object."""
         objects, (turning, speed_m_s) = prediction.objects, prediction.velocity.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
         turned, moved, *_ = prediction.covariance.diagonal(dim1=-2, dim2=-1).unflatten(1, (4, 3)).amax(-1).sqrt().to(turning.dtype).unbind(1)
         rim_m = 0.5 * objects.diameter_m
@@ -60,13 +77,27 @@ class SensorTiles(nn.Module):
         )
         away_px = (u * u + v * v).sqrt() - self.reach_px
         # Written so that what is not a number is near.
-        return ~(away_px > radius_px[:, None] + (margin_px + _SLACK_PX)).all(0)
+        return ~(away_px > radius_px[:, None] + (margin_px + _SLACK_PX))
 
-    def keep(self, events: EventBatch, near: Bool[Tensor, "t"]) -> tuple[EventBatch, Int[Tensor, "e"] | None]:
-        """The events in some tiles and their numbers; all of them, and no numbers, where these are most of them."""
+    def keep(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> NearbyEvents:
+        """The events in tiles near any object, or all of them where these are most."""
+        tile, near_each = self._of(events.x, events.y).numpy(), near.numpy()
         # NumPy finds them several times faster.
-        kept = torch.from_numpy(np.flatnonzero(near.index_select(0, self._of(events.x, events.y)).numpy()))
+        kept = np.flatnonzero(near_each.any(0)[tile])
+        if len(kept) == 0:
+            # Padding, which stands for no event at all, has no number and is near nothing.
+            return NearbyEvents(EventBatch.empty())
         if len(kept) > _MOST_KEPT * len(events):
-            return events, None
-        # Padding, which stands for no event at all, has no number.
-        return events[kept], kept if len(kept) else None
+            return NearbyEvents(events, None, _of_each(near_each, tile))
+        number = torch.from_numpy(kept)
+        return NearbyEvents(events[number], number, _of_each(near_each, tile[kept]))
+
+
+def _of_each(near: np.ndarray, tile: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]] | None:
+    """The events near each object, where there are several, by the tiles near it and those of the events."""
+    if len(near) == 1:
+        return None
+    own = [np.flatnonzero(row[tile]) for row in near]
+    count = torch.tensor([len(events) for events in own])
+    exists = torch.arange(max(int(count.max()), 1)) < count[:, None]
+    return torch.zeros_like(exists, dtype=torch.int64).masked_scatter_(exists, torch.from_numpy(np.concatenate(own))), exists

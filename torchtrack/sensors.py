@@ -22,7 +22,7 @@ from torchtrack.evidence import AgeAt
 from torchtrack.flow import estimate_flow
 from torchtrack.observations import WindowEvents
 from torchtrack.prediction import Prediction
-from torchtrack.sensor_tiles import SensorTiles
+from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
 from torchtrack.state import TrackerState
 from torchtrack.time_surface import at_pixels, object_regions, time_surface
 
@@ -60,31 +60,27 @@ class Sensors:
         """Height and width of the largest sensor."""
         return self.ideal_pixels.shape[1], self.ideal_pixels.shape[2]
 
-    def near_objects(
-        self, events: EventBatch, prediction: Prediction, window_s: Float[Tensor, "b"], config: TrackerConfig
-    ) -> tuple[EventBatch, Int[Tensor, "e"] | None]:
-        """The events that can have to do with any object, and their numbers, where others were left out.
-
-        A GPU would have to be waited for: there, all are kept.
-        """
+    def near_objects(self, events: EventBatch, prediction: Prediction, window_s: Float[Tensor, "b"], config: TrackerConfig) -> NearbyEvents:
+        """The events that can have to do with the objects. A GPU would have to be waited for: there, all are kept."""
         if self.tiles is None or not readback.read_at_once(window_s):
-            return events, None
+            return NearbyEvents(events)
         margin_px = max(config.matching.max_gate_px, *config.matching.gates_px) + _DRAWN_SIGMAS * config.search.least_sigma_px
         return self.tiles.keep(events, self.tiles.near(prediction, window_s, margin_px))
 
     def window_events(
-        self, events: EventBatch, number: Int[Tensor, "e"] | None, state: TrackerState, t_us: Int[Tensor, "s"], longest_us: int
+        self, nearby: NearbyEvents, state: TrackerState, t_us: Int[Tensor, "s"], longest_us: int
     ) -> tuple[WindowEvents, Int[Tensor, "s 2 h w"]]:
         """The events of the window after ``state`` as each object's camera saw them, and the bursts' ages after it (µs).
 
         Args:
-            number: of each event among all of its window, where some of them were left out.
+            nearby: the events that count.
             t_us: end of the window of each stream.
             longest_us: how long a pixel's events are of one burst.
         """
-        window = pad_streams(events, len(self.ideal_pixels), t_us)
+        window = pad_streams(nearby.events, len(self.ideal_pixels), t_us)
         burst_age_us, into_burst_us = update_bursts(state.burst_age_us, t_us - state.t_us, window, longest_us)
-        return self.seen(window, into_burst_us, number), burst_age_us
+        seen = self.seen(window, into_burst_us, nearby.number)
+        return seen if nearby.of_each is None else seen.only(*nearby.of_each), burst_age_us
 
     def seen(self, window: PaddedEvents, into_burst_us: Int[Tensor, "s e"] | None = None, number: Int[Tensor, "e"] | None = None) -> WindowEvents:
         """A window's events as each object's camera saw them; of bursts nothing is said where nothing is given."""
@@ -96,7 +92,7 @@ class Sensors:
         values = (pixels, age_s, into_burst_s, 2 * window.polarity.to(pixels.dtype) - 1, window.mask)
         # Of one stream without a copy for every object.
         each = [value.expand(len(self.stream_index), *value.shape[1:]) if streams == 1 else value[self.stream_index] for value in values]
-        return WindowEvents(each[0], each[1], each[2], each[3], each[4], number)
+        return WindowEvents(each[0], each[1], each[2], each[3], each[4], None if number is None else number.expand_as(each[1]))
 
     def corners(
         self, contours: Contours, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], window_s: Float[Tensor, "s"], config: TrackerConfig

@@ -26,7 +26,7 @@ from torchtrack.object_model import ObjectModel
 from torchtrack.observations import corner_observations, join, select_events
 from torchtrack.prediction import Prediction, before_camera, far_pose
 from torchtrack.search import Doubt, judge_fit, may_be_wanted, search_wanted
-from torchtrack.sensor_tiles import SensorTiles
+from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
 from torchtrack.sensors import Sensors, sensor_tables
 from torchtrack.setup_check import check_setup, check_start
 from torchtrack.speed_limit import largest_speed, limit_speed
@@ -204,8 +204,8 @@ class Tracker(nn.Module):
         recorded = self._predict(self._held_back(state, events, t_us, dt_s), dt_s)
         prediction = recorded.detached()
         # A weigher is shown all events.
-        nearby = (events, None) if self.weigher is not None else sensors.near_objects(events, prediction, dt_s, config)
-        seen, burst_age_us = sensors.window_events(*nearby, state, t_us, config.matching.burst_us)
+        nearby = NearbyEvents(events) if self.weigher is not None else sensors.near_objects(events, prediction, dt_s, config)
+        seen, burst_age_us = sensors.window_events(nearby, state, t_us, config.matching.burst_us)
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
         starting = torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
