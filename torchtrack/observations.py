@@ -75,7 +75,8 @@ class WindowEvents:
         return replace(events, mask=events.mask & exists, number=chosen if events.number is None else events.number)
 
     def _with(self, rows: Callable[[Tensor], Tensor]) -> "WindowEvents":
-        return WindowEvents(*(None if value is None else rows(value) for value in vars(self).values()))
+        values = {name: rows(value) for name, value in vars(self).items() if value is not None}
+        return WindowEvents(**values)
 
     def draw(self, candidates: Bool[Tensor, "b e"], share: Float[Tensor, "b 1"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
         """A share of each row's candidates, spread evenly over them: their indices, at most ``count``, and which of these exist.

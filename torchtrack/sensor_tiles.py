@@ -83,7 +83,7 @@ class SensorTiles(nn.Module):
         """The events in tiles near any object, or all of them where these are most."""
         tile, near_each = self._of(events.x, events.y).numpy(), near.numpy()
         # NumPy finds them several times faster.
-        kept = np.flatnonzero(near_each.any(0)[tile])
+        kept = np.flatnonzero(near.any(0).numpy()[tile])
         if len(kept) == 0:
             # Padding, which stands for no event at all, has no number and is near nothing.
             return NearbyEvents(EventBatch.empty())
