@@ -134,6 +134,19 @@ def test_trust_rises_from_lost_to_certain():
     assert step.tolist() == [0, 1]
 
 
+def test_more_is_asked_of_finds_in_many_places_by_what_is_usual():
+    config = QualityConfig(lost_below=0.1, uncertain_below=0.4, certain_at=0.75)
+    share, usual, widening = torch.tensor([0.4, 0.4, 0.6, 0.4]), torch.tensor([0.8, 0.8, 0.8, 0.2]), torch.tensor([1.0, 2.0, 3.0, 2.0])
+    assert trust(share, config, usual, widening).tolist() == pytest.approx([1.0, 0.6, 1.0, 1.0])
+
+
+def test_an_uncertain_object_may_be_found_farther_away():
+    step = torch.zeros(2, 6)
+    step[:, 0] = 0.8
+    status = judge(torch.ones(2), torch.full((2,), 100), torch.ones(2), step, torch.ones(2), QualityConfig(), torch.tensor([1.0, 2.0]))
+    assert status.tolist() == [Status.DIVERGED, Status.TRACKING]
+
+
 # ---- the explained share
 
 

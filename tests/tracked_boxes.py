@@ -7,12 +7,16 @@ import torch
 from helpers import SMALL_CAMERA, box_model, drifting, edge_events, pose
 
 from torchtrack import Tracker
+from torchtrack.alignment import align, gate_widening, index_for
 from torchtrack.camera import Camera
 from torchtrack.config.tracker import (
     MotionConfig,
     TrackerConfig,
 )
-from torchtrack.events import concatenate
+from torchtrack.events import concatenate, pad_streams
+from torchtrack.lie import retract_about
+from torchtrack.observations import select_events
+from torchtrack.search import judge_fit
 
 WINDOW_US = 5_000
 WIDE_CAMERA = Camera(fx=250.0, fy=250.0, cx=159.5, cy=74.5, width=320, height=150)
@@ -69,6 +73,21 @@ def started(dtype=torch.float32, config=None, count=5):
     tracker = Tracker([box_model()], SMALL_CAMERA, config, dtype=dtype)
     state, results = follow(tracker, tracker.init(pose()[None], 0), windows(events, count))
     return tracker, state, results[-1], windows(events, count + 1)[-1], trajectory
+
+
+def in_motion(config=None, displaced=None, dtype=torch.float32):
+    """A box in full motion, whose pose may be displaced: tracker, prediction, events, found alone, and the true pose."""
+    tracker, state, _, (events, end_us), trajectory = started(dtype, config)
+    if displaced is not None:
+        state = replace(state, T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()))
+    prediction = tracker._predict(state, torch.tensor([5e-3], dtype=dtype))
+    seen = tracker.sensors.seen(pad_streams(events, 1, torch.tensor([end_us])))
+    contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
+    tight = gate_widening(torch.zeros(1, dtype=dtype), tracker.config)
+    index = index_for(contours, tracker.image_size, tracker.config, tight)
+    observations = select_events(seen, index, prediction.plane_velocity(seen.pixels), 1000)
+    found = judge_fit(prediction, align(prediction, contours, index, tight, observations, tracker.config), tracker.config, torch.ones(1, dtype=dtype))
+    return tracker, prediction, seen, found, trajectory.at(torch.tensor([end_us]))
 
 
 def tracker_of(count=1, **kwargs):

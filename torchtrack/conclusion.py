@@ -44,7 +44,8 @@ def conclude(
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
-    velocity, covariance = _updated_motion(prediction, found, failed, dt_s, config)
+    trusted = torch.where(failed, 0, quality.trust(share, config.quality, state.usual_share, widening))
+    velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
     usual = torch.where(failed, state.usual_share, torch.lerp(state.usual_share, share, _USUAL_GAIN))
     contours = reproject(contours, T_cam_obj.to(velocity.dtype), objects.intrinsics)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
@@ -53,7 +54,7 @@ def conclude(
 
 
 def _updated_motion(
-    prediction: Prediction, found: Found, failed: Bool[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
+    prediction: Prediction, found: Found, failed: Bool[Tensor, "b"], trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> tuple[Float[Tensor, "b 6"], Float[Tensor, "b 12 12"]]:
     """Velocity and covariance after a window: as found, as far as the find is to be trusted."""
     predicted, solution = prediction.covariance, found.fit.solution
@@ -61,8 +62,7 @@ def _updated_motion(
         return torch.zeros_like(prediction.velocity), predicted
     posterior = config.solver.observation_px**2 * inverse(solution.hessian.double())[:, :12, :12]
     # A sum is finite only where every entry is.
-    known = posterior.sum((1, 2)).abs() < torch.inf
-    trusted = quality.trust(found.share, config.quality) * (known & ~failed)
+    trusted = trusted * (posterior.sum((1, 2)).abs() < torch.inf)
     velocity = prediction.velocity + trusted[:, None] * solution.from_prior[:, 6:12]
     covariance = torch.where(trusted[:, None, None] > 0, torch.lerp(predicted, posterior, trusted[:, None, None].double()), predicted)
     faded = fade(velocity, dt_s, failed, config.motion)

@@ -65,6 +65,10 @@ class Contours:
     pixels: Float[Tensor, "b m 2"]
     normals: Float[Tensor, "b m 2"]
 
+    def of(self, number: int) -> "Contours":
+        """Those of one object."""
+        return Contours(*(value[number : number + 1] for value in vars(self).values()))
+
     def widened(self, count: int) -> "Contours":
         """The same with at least ``count`` places for the points of each object."""
         return Contours(*(_widened(value, count) for value in vars(self).values()))

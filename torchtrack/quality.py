@@ -73,9 +73,17 @@ def needed_share(widening: Float[Tensor, "b"], config: QualityConfig) -> Float[T
     return config.lost_below + (max(config.caught_above, config.lost_below) - config.lost_below) * (widening - 1).clamp(0, 1)
 
 
-def trust(share: Float[Tensor, "b"], config: QualityConfig) -> Float[Tensor, "b"]:
-    """How far a pose that was found counts against the prediction: nothing where it is lost, fully once it is certain."""
-    return ((share - config.lost_below) / max(config.uncertain_below - config.lost_below, 1e-6)).clamp(0, 1)
+def trust(
+    share: Float[Tensor, "b"], config: QualityConfig, usual_share: Float[Tensor, "b"] | None = None, widening: Float[Tensor, "b"] | None = None
+) -> Float[Tensor, "b"]:
+    """How far a pose that was found counts against the prediction: nothing where it is lost, fully once it is certain.
+
+    Of an object that was looked for in many places (``widening``) near to its usual share is asked: chance explains some.
+    """
+    full = torch.full_like(share, config.uncertain_below)
+    if usual_share is not None and widening is not None:
+        full = torch.maximum(full, config.certain_at * usual_share * (widening - 1).clamp(0, 1))
+    return ((share - config.lost_below) / (full - config.lost_below).clamp(min=1e-6)).clamp(0, 1)
 
 
 def judge(
@@ -87,12 +95,15 @@ def judge(
     config: QualityConfig,
     widening: Float[Tensor, "b"] | None = None,
 ) -> Int[Tensor, "b"]:
-    """The :class:`Status` of each object, the gravest reason first; ``widening`` is of each object's first gate."""
-    lost_below = config.lost_below if widening is None else needed_share(widening, config)
-    turned, moved = step_from_prediction.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
+    """The :class:`Status` of each object, the gravest reason first.
+
+    ``widening`` is of each object's first gate: an uncertain one may be found so much farther away.
+    """
+    widening = torch.ones_like(quality) if widening is None else widening
+    turned, moved = (step_from_prediction.unflatten(1, (2, 3)).norm(dim=-1) / widening[:, None]).unbind(1)
     reasons: dict[Status, Bool[Tensor, "b"]] = {
         Status.UNCERTAIN: quality < config.uncertain_below,
-        Status.LOST: quality < lost_below,
+        Status.LOST: quality < needed_share(widening, config),
         Status.TOO_FEW_EVENTS: observation_count < config.min_observations,
         Status.OUT_OF_VIEW: in_view < config.min_visible_share,
         # Written so that what is not a number has diverged.

@@ -25,7 +25,7 @@ from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import corner_observations, join, select_events
 from torchtrack.prediction import Prediction, before_camera, far_pose
-from torchtrack.search import Doubt, judge_fit, may_be_wanted, search_wanted
+from torchtrack.search import Doubt, explained_at_rest, judge_fit, may_be_wanted, search_is_due, search_wanted
 from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
 from torchtrack.sensors import Sensors, sensor_tables
 from torchtrack.setup_check import check_setup, check_start
@@ -209,7 +209,7 @@ class Tracker(nn.Module):
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
         starting = torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
-        doubt = Doubt(sigma_px, state.share, state.usual_share, starting)
+        doubt = Doubt(sigma_px, state.share, state.usual_share, starting, search_is_due(state.t_us, t_us, config.search)[self.stream_index])
         widening = gate_widening(sigma_px, config)
         # Asked for here: a GPU answers while corners are looked for.
         radius_px = questions.ask(index_radius(widening, config), usual_index_radius(config))
@@ -223,7 +223,7 @@ class Tracker(nn.Module):
         if self.weigher is not None:
             evidence = Evidence(observations, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
             observations = judged(evidence, self.weigher)
-        found = judge_fit(prediction, align(recorded, contours, index, widening, observations, config), config)
+        found = judge_fit(prediction, align(recorded, contours, index, widening, observations, config), config, explained_at_rest(widening))
         if in_doubt.any():
             found = search_wanted(recorded, doubt, seen, found, config)
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)

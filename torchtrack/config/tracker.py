@@ -123,7 +123,7 @@ class MatchingConfig(Settings):
     )
     burst_us: int = Field(10_000, ge=0, le=30_000, description="A burst is what a pixel fires of one polarity in this time (µs); 0 for no bursts.")
     learned_trust: bool = Field(False, description="Trust observations as a small network has learned from the events around them.")
-    max_events: int = Field(1000, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
+    max_events: int = Field(1500, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
     @model_validator(mode="after")
     def _shares_in_order(self) -> "MatchingConfig":
@@ -176,6 +176,9 @@ class SearchConfig(Settings):
 
     hypotheses: int = Field(24, ge=0, le=1000, description="Poses aligned at once; 0 switches the search off.")
     drawn: int = Field(2000, ge=1, le=100_000, description="Poses drawn from the prediction, of which the most promising are aligned.")
+    kept: int = Field(64, ge=1, le=1000, description="Poses that others are drawn around, nearer each time, where a prediction is very uncertain.")
+    wide_sigma_px: float = Field(10.0, gt=0, description="Standard deviation of the prediction in the image from which that is so (px).")
+    interval_us: int = Field(20_000, ge=0, description="A very uncertain object is searched for once in this time (µs); 0 for in every window.")
     from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
     dropped_to: float = Field(0.8, ge=0, le=1, description="Share of the usual quality below which others are tried.")
     least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
@@ -194,6 +197,7 @@ class QualityConfig(Settings):
     caught_above: float = Field(
         0.35, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object is found again."
     )
+    certain_at: float = Field(0.75, ge=0, le=1, description="Share of the usual quality from which the find of an uncertain object counts fully.")
     min_on_contour: int = Field(3, ge=1, description="Observations on the contours of a patch of the image from which these are explained.")
     min_speed_px_s: float = Field(30.0, ge=0, description="Contours moving slower than this across themselves need not fire (px/s).")
     max_step_rotation_rad: float = Field(0.5, gt=0, description="A larger rotation against the prediction within one window has diverged (rad).")

@@ -1,0 +1,156 @@
+"""Poses worth trying: how they are drawn, how events mark them, and that the true one is among them."""
+
+import pytest
+import torch
+from helpers import SMALL_CAMERA, generator, pose_errors
+from tracked_boxes import in_motion
+
+from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.hypotheses import draw_offsets, drawn_around, event_density, mark, outlines_at, promising, thinned
+from torchtrack.lie import retract_about
+
+IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
+
+
+def random_covariance(seed=0, scale=1e-4):
+    root = torch.randn((12, 24), generator=generator(seed), dtype=torch.float64)
+    return scale * root @ root.T / 24
+
+
+# ---- what is drawn
+
+
+def test_offsets_are_drawn_with_the_covariance():
+    covariance = random_covariance()
+    offsets = draw_offsets(covariance, 8000)
+    assert offsets.shape == (8000, 13)
+    assert (offsets[0] == 0).all()
+    assert (offsets[:, 12] == 0).all()
+    found = offsets[:, :6].T @ offsets[:, :6] / len(offsets)
+    scale = covariance[:6, :6].diagonal().sqrt()
+    assert float(((found - covariance[:6, :6]) / (scale[:, None] * scale)).abs().max()) < 0.03
+    assert float((offsets[:, :6].mean(0) / scale).abs().max()) < 0.01
+    assert torch.isfinite(offsets).all()
+
+
+def test_the_velocity_of_an_offset_is_what_its_pose_implies():
+    """The mean of the velocity given the pose; with a covariance that knows of no relation there is none."""
+    covariance = random_covariance()
+    offsets = draw_offsets(covariance, 100)
+    gain = covariance[6:, :6] @ torch.linalg.inv(covariance[:6, :6])
+    torch.testing.assert_close(offsets[:, 6:12], offsets[:, :6] @ gain.T)
+    apart = covariance.clone()
+    apart[6:, :6] = apart[:6, 6:] = 0
+    assert float(draw_offsets(apart, 100)[:, 6:].abs().max()) == 0
+
+
+def test_the_draw_is_the_same_every_time_and_more_of_it_begins_as_less():
+    covariance = random_covariance()
+    assert torch.equal(draw_offsets(covariance, 300), draw_offsets(covariance, 300))
+    assert torch.equal(draw_offsets(covariance, 600)[:300], draw_offsets(covariance, 300))
+
+
+# ---- how poses are marked
+
+
+def test_density_counts_the_events_around_every_pixel():
+    places = torch.tensor([[[10.0, 20.0], [10.4, 20.4], [11.0, 20.0], [60.0, 30.0], [0.0, 0.0], [90.0, 40.0]]])
+    density = event_density(places, torch.tensor([[True] * 5 + [False]]), IMAGE_SIZE)
+    # Two pixels of border all around.
+    assert density.shape == (154, 204)
+    for (u, v), count in {(10, 20): 3, (9, 20): 2, (12, 21): 1, (60, 30): 1, (62, 30): 0, (0, 0): 1, (90, 40): 0}.items():
+        assert int(density[v + 2, u + 2]) == count
+    assert int(density.sum()) == 9 * 5
+
+
+def test_events_outside_the_image_or_nowhere_are_not_counted():
+    places = torch.tensor([[[-50.0, 3.0], [1e9, 1e9], [torch.nan, 5.0], [50.0, torch.inf], [199.0, 149.0]]])
+    density = event_density(places, torch.ones(1, 5, dtype=torch.bool), IMAGE_SIZE)
+    assert int(density.sum()) == 9
+    assert int(density[151, 201]) == 1
+
+
+def test_the_true_pose_is_marked_best(dtype):
+    _, prediction, seen, found, _ = in_motion(dtype=dtype)
+    density = event_density(seen.pixels + prediction.plane_velocity(seen.pixels) * seen.age_s[..., None], seen.mask, IMAGE_SIZE)
+    away = torch.zeros(13, 13, dtype=dtype)
+    for axis in range(6):
+        away[2 * axis + 1, axis], away[2 * axis + 2, axis] = (0.15, -0.15) if axis < 3 else (0.015, -0.015)
+    # Depth moves contours least.
+    away[11:] *= 4
+    marks = mark(prediction, thinned(found.fit.contours), away, (density.clamp(max=3), 0))
+    assert int(marks.argmax()) == 0
+    assert float(marks[0]) > 1.5 * float(marks[1:].max())
+
+
+def test_marks_of_poses_behind_the_camera_are_numbers():
+    _, prediction, seen, found, _ = in_motion()
+    offsets = torch.zeros(2, 13)
+    offsets[1, 5] = -2.0
+    seen_there = event_density(seen.pixels, seen.mask, IMAGE_SIZE), 0
+    assert torch.isfinite(mark(prediction, thinned(found.fit.contours), offsets, seen_there)).all()
+
+
+def test_thinned_contours_are_some_of_the_visible_ones():
+    _, _, _, found, _ = in_motion()
+    contours, few = found.fit.contours, thinned(found.fit.contours)
+    assert few.mask.sum() == min(int(contours.mask.sum()), 200)
+    visible = {tuple(row) for row in contours.pixels[contours.mask].tolist()}
+    assert {tuple(row) for row in few.pixels[few.mask].tolist()} <= visible
+
+
+# ---- nearer and nearer
+
+
+def test_others_are_drawn_around_each_pose_with_a_share_of_the_spread():
+    covariance = random_covariance()
+    middles = 10 * draw_offsets(covariance, 300).float()
+    around = drawn_around(middles, 0.5, covariance).view(300, 16, 13)
+    torch.testing.assert_close(around[:, 0], middles)
+    steps = (around - middles[:, None])[:, 1:, :6].flatten(0, 1).double()
+    expected = 0.25 * covariance[:6, :6]
+    scale = expected.diagonal().sqrt()
+    assert float(((steps.T @ steps / len(steps) - expected) / (scale[:, None] * scale)).abs().max()) < 0.1
+
+
+def test_outlines_are_those_of_their_own_poses():
+    _, prediction, _, _, _ = in_motion()
+    offsets = torch.zeros(2, 13)
+    offsets[1, 1] = 0.6
+    one, other = (outlines_at(prediction, offsets[k : k + 1], TrackerConfig()) for k in range(2))
+    both = outlines_at(prediction, offsets, TrackerConfig())
+    for number, alone in enumerate((one, other)):
+        assert torch.equal(both.mask[number], alone.mask[0])
+        torch.testing.assert_close(both.points_obj[number], alone.points_obj[0])
+
+
+def nearest(offsets, prediction, T_true):
+    """The smallest error of poses at some offsets, one degree being as bad as a millimetre."""
+    count = len(offsets)
+    poses = retract_about(prediction.T_cam_obj.expand(count, 4, 4), offsets[:, :6], prediction.objects.centre_obj.expand(count, 3))
+    return float(sum(pose_errors(poses.double(), T_true.expand(count, 4, 4))).min())
+
+
+@pytest.mark.parametrize("rotation_rad", [0.15, 0.3])
+def test_a_pose_near_the_true_one_is_among_the_promising(rotation_rad):
+    displaced = torch.tensor([[rotation_rad, -rotation_rad, rotation_rad, 0.02, -0.02, 0.01]], dtype=torch.float64)
+    tracker, prediction, seen, found, T_true = in_motion(displaced=displaced)
+    sigma = torch.tensor([rotation_rad] * 3 + [0.03] * 3 + [1.0] * 3 + [0.1] * 3, dtype=torch.float64)
+    density = event_density(seen.pixels + prediction.plane_velocity(seen.pixels) * seen.age_s[..., None], seen.mask, IMAGE_SIZE)
+    once = TrackerConfig(search=SearchConfig(wide_sigma_px=100.0))
+    nearer, at_once = (
+        promising(prediction, found.fit.contours, torch.diag(sigma.square()), 30.0, density, config) for config in (tracker.config, once)
+    )
+    assert nearer.shape == at_once.shape == (24, 13)
+    assert not nearer[0].any()
+    assert nearest(nearer, prediction, T_true) < min(15, 0.7 * nearest(at_once, prediction, T_true))
+
+
+def test_where_the_prediction_is_good_only_what_it_allows_is_promising():
+    tracker, prediction, seen, found, _ = in_motion()
+    covariance = 1e-6 * torch.eye(12, dtype=torch.float64)
+    density = event_density(seen.pixels, seen.mask, IMAGE_SIZE)
+    offsets = promising(prediction, found.fit.contours, covariance, 3.0, density, tracker.config)
+    drawn = draw_offsets(covariance, SearchConfig().drawn).float()
+    assert ((offsets[:, None] == drawn).all(-1).any(-1)).all()
+    assert float(offsets[:, :6].abs().max()) < 5e-3
