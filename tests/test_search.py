@@ -89,7 +89,7 @@ def test_a_box_is_found_again_where_hardly_anything_is_known_of_it(velocity_know
     sigma = torch.tensor([0.3] * 3 + [0.04] * 3 + [2.0] * 3 + [0.3] * 3, dtype=torch.float64)
     velocity = prediction.velocity if velocity_known else torch.zeros_like(prediction.velocity)
     prediction = replace(prediction, covariance=torch.diag_embed(sigma.square())[None], velocity=velocity)
-    better = search(0, prediction, 30.0, MARGIN, seen, replace(found, share=torch.zeros(1)), tracker.config)
+    better = search(0, prediction, 30.0, MARGIN, seen, replace(found, measured=torch.zeros(1)), tracker.config)
     degrees, millimetres = pose_errors(better.fit.solution.T_cam_obj.double(), T_true)
     assert float(degrees) < 2.0
     assert float(millimetres) < 5.0

@@ -207,7 +207,7 @@ class Tracker(nn.Module):
         nearby = NearbyEvents(events) if self.weigher is not None else sensors.near_objects(events, prediction, dt_s, config)
         seen, burst_age_us = sensors.window_events(nearby, state, t_us, config.matching.burst_us)
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
-        sigma_px = prediction.sigma_px(contours) if config.solver.prior else torch.zeros_like(self.diameter_m)
+        sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(self.diameter_m)
         starting = torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
         doubt = Doubt(sigma_px, state.share, state.usual_share, starting, search_is_due(state.t_us, t_us, config.search)[self.stream_index])
         widening = gate_widening(sigma_px, config)

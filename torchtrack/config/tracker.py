@@ -178,7 +178,7 @@ class SearchConfig(Settings):
     drawn: int = Field(2000, ge=1, le=100_000, description="Poses drawn from the prediction, of which the most promising are aligned.")
     kept: int = Field(64, ge=1, le=1000, description="Poses that others are drawn around, nearer each time, where a prediction is very uncertain.")
     wide_sigma_px: float = Field(10.0, gt=0, description="Standard deviation of the prediction in the image from which that is so (px).")
-    interval_us: int = Field(20_000, ge=0, description="A very uncertain object is searched for once in this time (µs); 0 for in every window.")
+    interval_us: int = Field(10_000, ge=0, description="A very uncertain object is searched for once in this time (µs); 0 for in every window.")
     from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
     dropped_to: float = Field(0.8, ge=0, le=1, description="Share of the usual quality below which others are tried.")
     least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
