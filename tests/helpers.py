@@ -8,7 +8,8 @@ import trimesh
 from torch import Tensor
 
 from torchtrack.camera import Camera, project
-from torchtrack.contours import ContourKind, Contours
+from torchtrack.contour_model import ContourKind
+from torchtrack.contours import Contours
 from torchtrack.events import EventBatch
 from torchtrack.image_motion import MovingObjects
 from torchtrack.io import Trajectory

@@ -10,7 +10,8 @@ from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, generator, pose, ran
 
 from torchtrack.camera import project
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import ContourKind, ContourModel, group_by_model, image_normals, mesh_contours, reproject, select_ranked, take_points
+from torchtrack.contour_model import ContourKind, ContourModel, group_by_model
+from torchtrack.contours import image_normals, mesh_contours, reproject, select_ranked, take_points
 from torchtrack.lie import transform_points
 from torchtrack.object_model import ObjectModel
 

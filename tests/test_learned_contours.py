@@ -11,7 +11,7 @@ from tracked_boxes import assert_same, follow, merged, moving_box, poses_of, win
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import ContourConfig, LearningConfig, TrackerConfig
-from torchtrack.contours import ContourKind
+from torchtrack.contour_model import ContourKind
 from torchtrack.events import concatenate
 from torchtrack.learned_contours import LearnedContours
 from torchtrack.lie import rotation_angle_deg

@@ -8,7 +8,7 @@ from tracked_boxes import started
 from torchtrack.alignment import gate_widening
 from torchtrack.camera import project
 from torchtrack.config.tracker import ContourConfig, MatchingConfig, TrackerConfig
-from torchtrack.contours import group_by_model
+from torchtrack.contour_model import group_by_model
 from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.lie import retract_about, transform_points
 from torchtrack.object_batch import ObjectBatch

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from torchtrack.config.tracker import QualityConfig
-from torchtrack.contours import ContourKind, Contours
+from torchtrack.contour_model import ContourKind
+from torchtrack.contours import Contours
 from torchtrack.matching import Matches
 from torchtrack.quality import Status, explained_share, judge, needed_share, trust, visible_share
 

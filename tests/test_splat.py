@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 from torchtrack.camera import project
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import ContourKind, group_by_model
+from torchtrack.contour_model import ContourKind, group_by_model
 from torchtrack.lie import transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.splat import boundary_points, splat_contours

@@ -7,7 +7,7 @@ from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, generator, pose, ran
 
 from torchtrack.camera import project
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import group_by_model
+from torchtrack.contour_model import group_by_model
 from torchtrack.lie import se3_inverse, transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.surface_rays import rays_of, surface_points

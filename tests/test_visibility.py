@@ -8,7 +8,8 @@ from helpers import SMALL_CAMERA, box_model, pose, random_pose
 
 from torchtrack.camera import Camera
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import group_by_model, mesh_contours
+from torchtrack.contour_model import group_by_model
+from torchtrack.contours import mesh_contours
 from torchtrack.object_model import ObjectModel
 from torchtrack.quality import visible_share
 from torchtrack.visibility import Scene, depth_buffer, hidden_by_faces, remove_hidden

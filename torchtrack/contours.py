@@ -6,19 +6,16 @@ image. Objects that share a model are handled as one batch.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtrack import readback
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
+from torchtrack.contour_model import ContourKind, ContourModel
 from torchtrack.lie import transform_points
-from torchtrack.object_model import ObjectModel
 
 # Of a model with no more edges than this, all are looked at.
 _FEW_EDGES = 512
@@ -28,19 +25,8 @@ _MAX_ACTIVE_EDGES = 8192
 _MIN_PX_PER_M = 1e-3
 # Texture seen at a grazing angle (cosine below this) is foreshortened beyond use.
 _MIN_TEXTURE_COSINE = 0.15
-# Faces that meet at more than 60° make a sharp edge, whatever its scale; a scanned mesh is rough at smaller angles.
-_SHARP_COSINE = 0.5
-
-
-class ContourKind(IntEnum):
-    """What a contour point comes from: the limb of a smooth surface, a sharp edge (occluding or not), and so on."""
-
-    LIMB = 0
-    CREASE = 1
-    TEXTURE = 2
-    SEGMENT = 3
-    SPLAT = 4
-    LEARNED = 5
+# Points and tangents (object frame), kinds and mask; where it was said which elements are shown, the element of each as well.
+_Points = tuple[Tensor, ...]
 
 
 @dataclass(frozen=True)
@@ -74,90 +60,6 @@ class Contours:
         return Contours(*(_widened(value, count) for value in vars(self).values()))
 
 
-class ContourModel(nn.Module):
-    """The constant tensors of one :class:`ObjectModel` that contours are made from, as buffers."""
-
-    edge_ends: Tensor
-    edges: Tensor
-    face_normals: Tensor
-    face_offsets: Tensor
-    is_crease: Tensor
-    is_segment: Tensor
-    texture_points: Tensor
-    texture_tangents: Tensor
-    texture_normals: Tensor
-    surface_points: Tensor
-    triangles: Tensor
-    triangle_normals: Tensor
-    members: Tensor
-
-    def __init__(self, model: ObjectModel, members: Sequence[int], config: ContourConfig) -> None:
-        """Take what ``config`` switches on from ``model``, which the objects numbered ``members`` have."""
-        super().__init__()
-        self.numbers = tuple(members)
-        self.register_buffer("members", torch.tensor(members))
-        segments = model.segments if config.segments else model.segments[:0]
-        points = torch.cat([model.edge_points, segments])
-        normals = torch.cat([model.edge_normals, torch.zeros_like(segments)])
-        is_segment = torch.zeros(len(points), dtype=torch.bool)
-        is_segment[len(model.edge_points) :] = True
-        self.register_buffer("edge_ends", points.clone())
-        self.register_buffer("edges", _edge_table(points, normals, is_segment))
-        self.register_buffer("face_normals", normals)
-        self.register_buffer("face_offsets", (normals * points[:, :1]).sum(-1))
-        self.register_buffer("is_segment", is_segment)
-        self.register_buffer("is_crease", torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)]) & config.creases)
-        texture_count = min(len(model.texture_points), config.max_texture_points) if config.texture else 0
-        spread = torch.linspace(0, max(len(model.texture_points) - 1, 0), texture_count).long()
-        for name in ("texture_points", "texture_tangents", "texture_normals"):
-            self.register_buffer(name, getattr(model, name)[spread].clone())
-        self.texture_spacing_m = _spacing(self.texture_points)
-        self.register_buffer("surface_points", model.surface_points.clone())
-        exact = len(model.triangles) <= config.exact_faces
-        triangles = model.triangles if exact else model.triangles[:0]
-        self.register_buffer("triangles", triangles.clone())
-        self.register_buffer("triangle_normals", _normals(triangles))
-
-    def active_edges(self, camera_obj: Float[Tensor, "b 3"], occluding: bool) -> Bool[Tensor, "b e"]:
-        """Which edges are contours for a camera at ``camera_obj`` (object frame)."""
-        facing = torch.einsum("esk,bk->bes", self.face_normals, camera_obj) > self.face_offsets
-        front, back = facing.unbind(-1)
-        active = self.is_crease & (front | back) | self.is_segment
-        return active | (front != back) if occluding else active
-
-
-def _edge_table(points: Float[Tensor, "e 2 3"], face_normals: Float[Tensor, "e 2 3"], is_segment: Bool[Tensor, "e"]) -> Float[Tensor, "13 e"]:
-    """Of every edge: start, vector, direction, the way that turns its tangent (see :func:`_edge_points`), and kind."""
-    start, vector = points[:, 0], points[:, 1] - points[:, 0]
-    sharp = (face_normals[:, 0] * face_normals[:, 1]).sum(-1) < _SHARP_COSINE
-    kind = torch.where(is_segment, int(ContourKind.SEGMENT), torch.where(sharp, int(ContourKind.CREASE), int(ContourKind.LIMB)))
-    turning = torch.linalg.cross(vector, face_normals.sum(1), dim=-1)
-    direction = torch.nn.functional.normalize(vector, dim=-1)
-    return torch.cat([start, vector, direction, turning, kind[:, None].to(start.dtype)], -1).T.contiguous()
-
-
-def _normals(triangles: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3"]:
-    """Unit normals."""
-    first, second, third = triangles.unbind(1)
-    return torch.nn.functional.normalize(torch.linalg.cross(second - first, third - first, dim=-1), dim=-1)
-
-
-def _spacing(points: Float[Tensor, "n 3"]) -> float:
-    """Distance of most points from the one nearest to them (m)."""
-    if len(points) < 2:
-        return 0.0
-    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=2)
-    return float(np.median(distances[:, 1]))
-
-
-def group_by_model(models: Sequence[ObjectModel], config: ContourConfig) -> list[ContourModel]:
-    """One :class:`ContourModel` per distinct object model, with the objects that have it."""
-    members: dict[int, list[int]] = {}
-    for number, model in enumerate(models):
-        members.setdefault(id(model), []).append(number)
-    return [ContourModel(models[numbers[0]], numbers, config) for numbers in members.values()]
-
-
 def select_ranked(mask: Bool[Tensor, "b n"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
     """Indices of ``count`` true entries of each row, spread evenly over them, and which of these exist.
 
@@ -179,16 +81,21 @@ def take_points(values: Float[Tensor, "b n k"], index: Int[Tensor, "b m"]) -> Fl
     return values.transpose(1, 2).gather(2, index[:, None].expand(-1, values.shape[2], -1)).transpose(1, 2)
 
 
-def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points (object frame), tangents, kinds and mask on the active edges, spread evenly in the image."""
+def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
+    """Points on the active edges, spread evenly in the image."""
     batch = len(T_cam_obj)
     camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])
-    active = model.active_edges(camera_obj[..., 0], config.occluding)
+    active, limb = model.active_edges(camera_obj[..., 0], config.occluding)
+    element = None
+    if shown is not None:
+        element = model.elements_of_edges(limb)
+        active = active & shown.gather(1, element)
     ends, edges = model.edge_ends.expand(batch, -1, -1, -1), model.edges.expand(batch, -1, -1)
     places = _places_for(active)
     if places < active.shape[1]:
         chosen, active = select_ranked(active, places)
         ends, edges = model.edge_ends[chosen], model.edges[:, chosen].transpose(0, 1)
+        element = None if element is None else element.gather(1, chosen)
     lengths, start_z, end_z = _lengths_px(ends, T_cam_obj, intrinsics)
     lengths = lengths * active
     cumulative = lengths.cumsum(-1)
@@ -207,7 +114,8 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     # The normal in the image is to point out of the object: tangents turn with it on their right.
     side = (turning * (points - camera_obj)).sum(1, keepdim=True)
     tangents = torch.where(side > 0, direction, -direction)
-    return points.transpose(1, 2), tangents.transpose(1, 2), kind[:, 0].long(), number < counts
+    made = points.transpose(1, 2), tangents.transpose(1, 2), kind[:, 0].long(), number < counts
+    return made if element is None else (*made, element.gather(1, edge[:, 0]))
 
 
 def _places_for(active: Bool[Tensor, "b e"]) -> int:
@@ -234,38 +142,41 @@ def _texture_mask(model: ContourModel, T_cam_obj: Tensor) -> Tensor:
     return (normals * points).sum(-1) < -_MIN_TEXTURE_COSINE * points.square().sum(-1).sqrt()
 
 
-def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points, tangents, kinds and mask of the texture that looks at the camera."""
+def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
+    """Points of the texture that looks at the camera."""
     spacing_px = model.texture_spacing_m * intrinsics[:, 0] / T_cam_obj[:, 2, 3].clamp(min=MIN_DEPTH_M)
     # Every second, third and so on, where they lie closer than need be.
     every = (config.spacing_px / spacing_px).floor().clamp(1, len(model.texture_points)).long()
     number = torch.arange(len(model.texture_points), device=every.device)
     facing = _texture_mask(model, T_cam_obj) & (number % every[:, None] == 0)
+    if shown is not None:
+        facing = facing & shown[:, model.texture_element]
     # On a GPU, which would have to be waited for to know how many there are, all keep their places.
     count = int(facing.sum(1).amax()) if readback.read_at_once(facing) else facing.shape[1]
     chosen, mask = select_ranked(facing, count)
     points, tangents = (values.T[:, chosen].permute(1, 2, 0) for values in (model.texture_points, model.texture_tangents))
-    return points, tangents, torch.full_like(chosen, int(ContourKind.TEXTURE)), mask
+    made = points, tangents, torch.full_like(chosen, int(ContourKind.TEXTURE)), mask
+    return made if shown is None else (*made, model.texture_element[chosen])
 
 
-def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points, tangents, kinds and mask of objects that share a model, before hidden parts are removed."""
-    parts = [_no_points(T_cam_obj)]
+def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
+    """Contour points of objects that share a model, before hidden parts are removed."""
+    parts = [_no_points(T_cam_obj, shown)]
     if len(model.edge_ends):
-        parts.append(_edge_points(model, T_cam_obj, intrinsics, config))
+        parts.append(_edge_points(model, T_cam_obj, intrinsics, config, shown))
     if len(model.texture_points):
-        parts.append(_texture_points(model, T_cam_obj, intrinsics, config))
+        parts.append(_texture_points(model, T_cam_obj, intrinsics, config, shown))
     if len(parts) == 2:
         return parts[1]
-    points, tangents, kind, mask = (torch.cat(column, 1) for column in zip(*parts, strict=True))
-    return points, tangents, kind, mask
+    return tuple(torch.cat(column, 1) for column in zip(*parts, strict=True))
 
 
-def _no_points(T_cam_obj: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _no_points(T_cam_obj: Tensor, shown: Tensor | None) -> _Points:
     """One place of contours, and nothing there: what selects from contours needs a place to point at."""
     nowhere = T_cam_obj.new_zeros(len(T_cam_obj), 1, 3)
     nothing = torch.zeros(len(T_cam_obj), 1, dtype=torch.int64, device=T_cam_obj.device)
-    return nowhere, nowhere, nothing, nothing.bool()
+    made = nowhere, nowhere, nothing, nothing.bool()
+    return made if shown is None else (*made, nothing)
 
 
 def image_normals(
@@ -293,16 +204,44 @@ def joined(first: Contours, second: Contours) -> Contours:
 
 
 def mesh_contours(
-    models: Sequence[ContourModel], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"], config: ContourConfig
+    models: Sequence[ContourModel],
+    T_cam_obj: Float[Tensor, "b 4 4"],
+    intrinsics: Float[Tensor, "b 4"],
+    config: ContourConfig,
+    shown: Bool[Tensor, "b k"] | None = None,
 ) -> Contours:
-    """Contours of each object at its pose, hidden parts included."""
-    if len(models) == 1:
-        return assemble(*_model_contours(models[0], T_cam_obj, intrinsics, config), T_cam_obj, intrinsics)
-    parts = [_model_contours(model, T_cam_obj[model.members], intrinsics[model.members], config) for model in models]
-    width = max(mask.shape[1] for *_, mask in parts)
-    order = torch.cat([model.members for model in models]).argsort()
-    points, tangents, kind, mask = (torch.cat([_widened(value, width) for value in column])[order] for column in zip(*parts, strict=True))
+    """Contours of each object at its pose, hidden parts included.
+
+    Args:
+        shown: which elements of each object's model are taken; all when not given.
+    """
+    points, tangents, kind, mask, *_ = _mesh_points(models, T_cam_obj, intrinsics, config, shown)
     return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics)
+
+
+def mesh_elements(
+    models: Sequence[ContourModel],
+    T_cam_obj: Float[Tensor, "b 4 4"],
+    intrinsics: Float[Tensor, "b 4"],
+    config: ContourConfig,
+    shown: Bool[Tensor, "b k"],
+) -> tuple[Contours, Int[Tensor, "b m"]]:
+    """:func:`mesh_contours`, and the element of the model that each point is on (:mod:`torchtrack.contour_model`)."""
+    points, tangents, kind, mask, element = _mesh_points(models, T_cam_obj, intrinsics, config, shown)
+    return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics), element
+
+
+def _mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
+    """Contour points of all objects, in places of their own, before hidden parts are removed."""
+    if len(models) == 1:
+        return _model_contours(models[0], T_cam_obj, intrinsics, config, shown)
+    parts = [
+        _model_contours(model, T_cam_obj[model.members], intrinsics[model.members], config, None if shown is None else shown[model.members])
+        for model in models
+    ]
+    width = max(mask.shape[1] for _, _, _, mask, *_ in parts)
+    order = torch.cat([model.members for model in models]).argsort()
+    return tuple(torch.cat([_widened(value, width) for value in column])[order] for column in zip(*parts, strict=True))
 
 
 def _widened(values: Tensor, count: int) -> Tensor:

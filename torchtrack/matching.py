@@ -15,7 +15,8 @@ from torchtrack.bursts import without_tail
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
-from torchtrack.contours import ContourKind, Contours, take_points
+from torchtrack.contour_model import ContourKind
+from torchtrack.contours import Contours, take_points
 from torchtrack.image_motion import MovingObjects
 from torchtrack.observations import Observations
 

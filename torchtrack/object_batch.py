@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import ContourKind, ContourModel, Contours, assemble, joined, mesh_contours
+from torchtrack.contour_model import ContourKind, ContourModel
+from torchtrack.contours import Contours, assemble, joined, mesh_contours, mesh_elements
 from torchtrack.lie import transform_points
 from torchtrack.splat import splat_contours
 from torchtrack.visibility import Scene, remove_hidden
@@ -49,6 +51,7 @@ class ObjectBatch:
         image_shape: streams, height and width of the image.
         shared: whether any stream has more than one object.
         learned: contour points beside those of the models; none when not given.
+        shown: which elements of the models are taken for contours; all when not given.
     """
 
     models: Sequence[ContourModel]
@@ -59,6 +62,7 @@ class ObjectBatch:
     image_shape: tuple[int, int, int]
     shared: bool
     learned: LearnedPoints | None = None
+    shown: Bool[Tensor, "b k"] | None = None
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -73,7 +77,18 @@ class ObjectBatch:
         """Visible contours at given poses."""
         if config.source == "splat":
             return splat_contours(self.models, T_cam_obj, self.intrinsics, config)
-        contours = mesh_contours(self.models, T_cam_obj, self.intrinsics, config)
+        return self._visible_with_learned(mesh_contours(self.models, T_cam_obj, self.intrinsics, config, self.shown), T_cam_obj, config)
+
+    def contours_of(
+        self, elements: Bool[Tensor, "b k"], T_cam_obj: Float[Tensor, "b 4 4"], config: ContourConfig
+    ) -> tuple[Contours, Int[Tensor, "b m"]]:
+        """Visible contours of some elements of the models, whether shown or not, and the element of each point; of learned ones, 0."""
+        contours, element = mesh_elements(self.models, T_cam_obj, self.intrinsics, config, elements)
+        contours = self._visible_with_learned(contours, T_cam_obj, config)
+        return contours, pad(element, (0, contours.mask.shape[1] - element.shape[1]))
+
+    def _visible_with_learned(self, contours: Contours, T_cam_obj: Tensor, config: ContourConfig) -> Contours:
+        """Contours of the models joined with those that were learned, without hidden parts."""
         if self.learned is not None:
             contours = joined(contours, self.learned.contours(T_cam_obj, self.intrinsics))
         return self.visible(contours, T_cam_obj, config)
@@ -94,7 +109,8 @@ class ObjectBatch:
         model.numbers, model._buffers = tuple(range(count)), {**has_it._buffers, "members": streams}
         intrinsics, centre_obj, diameter_m = (repeat_row(value, number, count) for value in (self.intrinsics, self.centre_obj, self.diameter_m))
         learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))
-        return ObjectBatch([model], intrinsics, centre_obj, diameter_m, streams, (count, *self.image_size), False, learned)
+        shown = None if self.shown is None else repeat_row(self.shown, number, count)
+        return ObjectBatch([model], intrinsics, centre_obj, diameter_m, streams, (count, *self.image_size), False, learned, shown)
 
 
 def repeat_row(values: Tensor, number: int, count: int) -> Tensor:

@@ -50,13 +50,13 @@ def measured_share(
     on, near = counts.gather(2, patch(contours.pixels)[:, None].expand(-1, 2, -1)).unbind(1)
     explained = (on >= config.min_on_contour) & (on + 1 > _LEAST_SHARE * (near + 2))
     speed = (contours.normals * contour_velocity).sum(-1).abs()
-    moving = contours.mask & _inside(contours.pixels, image_size) & (speed > config.min_speed_px_s)
+    moving = contours.mask & inside(contours.pixels, image_size) & (speed > config.min_speed_px_s)
     total = moving.sum(-1)
     share = (moving & explained).sum(-1) / total.clamp(min=1)
     return torch.where(total < _MIN_MOVING_POINTS, torch.nan, share).to(contours.pixels.dtype)
 
 
-def _inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
+def inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
     """Which pixels lie in the image (height, width)."""
     u, v = pixels.unbind(-1)
     return (u >= 0) & (u < image_size[1]) & (v >= 0) & (v < image_size[0])
@@ -64,7 +64,7 @@ def _inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
 
 def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
     """Share of an object's contour points that lie in the image; zero without any."""
-    seen = contours.mask & _inside(contours.pixels, image_size)
+    seen = contours.mask & inside(contours.pixels, image_size)
     return seen.sum(-1) / contours.mask.sum(-1).clamp(min=1)
 
 

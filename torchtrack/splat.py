@@ -10,7 +10,8 @@ from torch.nn.functional import max_pool2d, normalize
 
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import ContourKind, ContourModel, Contours, assemble, select_ranked, take_points
+from torchtrack.contour_model import ContourKind, ContourModel
+from torchtrack.contours import Contours, assemble, select_ranked, take_points
 from torchtrack.lie import transform_points
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchtrack.contours import Contours
 from torchtrack.corners import Corners
 from torchtrack.learned_contours import LearnedContours
+from torchtrack.model_trust import ModelTrust
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class TrackerState:
         last_event_us: time of the newest event of every sensor pixel (µs).
         burst_age_us: how long ago the newest burst of every sensor pixel and polarity began (µs).
         learned: contours learned on the objects; none where that is switched off.
+        model_trust: which parts of the models are seen; none where that is switched off.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]
@@ -38,6 +40,7 @@ class TrackerState:
     last_event_us: Int[Tensor, "s h w"]
     burst_age_us: Int[Tensor, "s 2 h w"]
     learned: LearnedContours | None = None
+    model_trust: ModelTrust | None = None
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,8 @@ def take_part(value: S, objects: slice, streams: slice) -> S:
 
 def joined(states: Sequence[TrackerState]) -> TrackerState:
     """One state of the objects and streams of several, one after the other."""
+    elements = max(0 if state.model_trust is None else state.model_trust.explained.shape[1] for state in states)
+    states = [state if state.model_trust is None else replace(state, model_trust=state.model_trust.of_width(elements)) for state in states]
     state: TrackerState = _mapped(lambda *rows: torch.cat(rows), lambda *rows: torch.cat(rows), *states)
     return state
 

@@ -57,6 +57,7 @@ class Surroundings:
         window_s: duration of each object's window.
         contours: visible contours, with the learned ones that count.
         learning: which objects may learn: their poses are to be trusted.
+        taken_share: share of the contours of each object's model that are taken; all when not given.
     """
 
     objects: ObjectBatch
@@ -65,6 +66,7 @@ class Surroundings:
     window_s: Float[Tensor, "b"]
     contours: Contours
     learning: Bool[Tensor, "b"]
+    taken_share: Float[Tensor, "b"] | None = None
 
     @property
     def centre_cam(self) -> Float[Tensor, "b 3"]:
@@ -94,8 +96,8 @@ class _Sample:
 @torch.no_grad()
 def learn_after(learned: LearnedContours, around: Surroundings, found: Found, events: WindowEvents, config: TrackerConfig) -> LearnedContours:
     """What is known after a window of contours that the models lack; learned from only in the windows that are due."""
-    objects = around.objects
-    learned = judge_model(learned, found, around.contour_velocity, objects.image_size, config, any_count=objects.learned is not None)
+    velocity, image_size, any_count = around.contour_velocity, around.objects.image_size, around.objects.learned is not None
+    learned = judge_model(learned, found, velocity, image_size, config, any_count=any_count, taken_share=around.taken_share)
     return learn(learned, around, events, config) if learned.due(config.learning) else learned
 
 

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.contours import ContourModel, take_points
+from torchtrack.contour_model import ContourModel
+from torchtrack.contours import take_points
 from torchtrack.lie import transform_points
 
 # Nothing is met farther away than this (m).

@@ -10,20 +10,22 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor, nn
 
-from torchtrack import lie, quality, readback
+from torchtrack import lie, readback
 from torchtrack.alignment import align, gate_widening, index_for, index_radius, usual_index_radius
 from torchtrack.bursts import no_bursts
 from torchtrack.camera import Camera
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contours import ContourModel, group_by_model
+from torchtrack.contour_model import ContourModel, group_by_model
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.learned_contours import LearnedContours
+from torchtrack.model_trust import ModelTrust, element_groups
 from torchtrack.motion import initial_covariance, predict_covariance, with_dropped
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import corner_observations, join, select_events
+from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.prediction import Prediction, before_camera, far_pose
 from torchtrack.search import Doubt, explained_at_rest, judge_fit, may_be_wanted, search_is_due, search_wanted
 from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
@@ -31,7 +33,6 @@ from torchtrack.sensors import Sensors, sensor_tables
 from torchtrack.setup_check import check_setup, check_start
 from torchtrack.speed_limit import largest_speed, limit_speed
 from torchtrack.state import StepResult, TrackerState, choose_rows
-from torchtrack.surface_learning import Surroundings, learn_after
 from torchtrack.time_surface import empty_last_event, update_last_event
 from torchtrack.trust import TrustNetwork
 from torchtrack.window_parts import to_be_parted
@@ -58,6 +59,7 @@ class Tracker(nn.Module):
     ideal_pixels: Tensor
     sensor_pixels: Tensor
     stream_index: Tensor
+    element_groups: Tensor
     centre_obj: Tensor
     diameter_m: Tensor
     far_pose: Tensor
@@ -81,6 +83,7 @@ class Tracker(nn.Module):
         self.image_size = (max(c.height for c in cameras), max(c.width for c in cameras))
         self.groups = nn.ModuleList(group_by_model(objects, self.config.contours))
         self.register_buffer("stream_index", torch.tensor(streams))
+        self.register_buffer("element_groups", element_groups(self.models, len(objects)))
         self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
         ideal_pixels, sensor_pixels = sensor_tables(cameras)
         self.register_buffer("ideal_pixels", ideal_pixels)
@@ -116,6 +119,12 @@ class Tracker(nn.Module):
         return self.config.corners.max_corners > 0 or self.weigher is not None
 
     @property
+    def _judges(self) -> bool:
+        """Whether parts of the models may be left out."""
+        config = self.config
+        return config.model_trust.least_share > 0 and config.matching.max_events > 0 and config.contours.source == "mesh"
+
+    @property
     def streams(self) -> int:
         """Number of event streams."""
         return len(self.ideal_pixels)
@@ -135,7 +144,8 @@ class Tracker(nn.Module):
         last_event_us, burst_age_us = (empty(self.streams, *self.image_size, T_cam_obj.device) for empty in (empty_last_event, no_bursts))
         learning = self.config.learning
         learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
-        return TrackerState(T_cam_obj.clone(), velocity, covariance, nothing, nothing, times, last_event_us, burst_age_us, learned)
+        trust = ModelTrust.none(self.element_groups, velocity) if self._judges else None
+        return TrackerState(T_cam_obj.clone(), velocity, covariance, nothing, nothing, times, last_event_us, burst_age_us, learned, trust)
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """:meth:`step`, as a layer of a network: what comes in first."""
@@ -227,10 +237,7 @@ class Tracker(nn.Module):
         if in_doubt.any():
             found = search_wanted(recorded, doubt, seen, found, config)
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
-        if state.learned is not None and self._learns:
-            trusted = (result.status <= int(quality.Status.UNCERTAIN)) & (sigma_px < config.learning.max_sigma_px)
-            around = Surroundings(prediction.objects, next_state.T_cam_obj.to(sigma_px.dtype), next_state.velocity, dt_s, result.contours, trusted)
-            next_state = replace(next_state, learned=learn_after(state.learned, around, found, seen, config))
+        next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self._learns), config)
         return replace(next_state, t_us=t_us, last_event_us=last_event_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
@@ -249,17 +256,9 @@ class Tracker(nn.Module):
         moved = velocity * dt_s[:, None]
         T_prior = lie.move_about(state.T_cam_obj.to(velocity.dtype), lie.cayley(moved[:, :3]), moved[:, 3:], self.centre_obj)
         covariance = predict_covariance(covariance.detach(), velocity.detach(), dt_s, self.diameter_m, self.config.motion)
+        objects = objects_as_known(self.objects, state, self.element_groups, self._learns, self.config)
         T_prior, usable = before_camera(T_prior, self.centre_obj, self.far_pose)
-        return Prediction(self._objects_with(state.learned), T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance)
-
-    def _objects_with(self, learned: LearnedContours | None) -> ObjectBatch:
-        """The objects, with the contours learned on them that count by now."""
-        if learned is None or not self._learns:
-            return self.objects
-        counting = learned.that_count(self.config.learning)
-        if readback.read_at_once(counting.mask) and not bool(counting.mask.any()):
-            return self.objects
-        return replace(self.objects, learned=counting)
+        return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance)
 
     @torch.no_grad()
     def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor) -> TrackerState:
@@ -278,4 +277,5 @@ def _counted(done: tuple[TrackerState, StepResult]) -> tuple[TrackerState, StepR
     """A window more was taken, in parts or not."""
     state, result = done
     learned = None if state.learned is None else replace(state.learned, windows=state.learned.windows + 1)
-    return replace(state, learned=learned), result
+    trust = None if state.model_trust is None else replace(state.model_trust, windows=state.model_trust.windows + 1)
+    return replace(state, learned=learned, model_trust=trust), result

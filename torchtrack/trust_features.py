@@ -16,7 +16,8 @@ from torch import Tensor
 from torch.nn.functional import one_hot, softsign
 
 from torchtrack.constants import constant
-from torchtrack.contours import ContourKind, take_points
+from torchtrack.contour_model import ContourKind
+from torchtrack.contours import take_points
 from torchtrack.evidence import Evidence
 
 # Where the patch is sampled: across the contour and along it (px). Negative is behind the moving edge.

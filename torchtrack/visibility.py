@@ -14,7 +14,8 @@ from torch import Tensor
 from torchtrack import readback
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import ContourModel, Contours
+from torchtrack.contour_model import ContourModel
+from torchtrack.contours import Contours
 from torchtrack.lie import transform_points
 
 # A point this far behind a face's plane is behind it, not on it (diameters).

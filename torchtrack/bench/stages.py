@@ -36,7 +36,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "quality": ("tracker:judge_fit",),
     "search": ("tracker:may_be_wanted", "tracker:search_wanted"),
     "conclusion": ("tracker:conclude",),
-    "learning": ("tracker:learn_after",),
+    "learning": ("tracker:learned_after",),
     "rest": ("tracker:Tracker.step",),
 }
 """Functions of each stage, by the module of the package that looks them up."""

@@ -171,6 +171,17 @@ class LearningConfig(Settings):
     every: int = Field(10, ge=1, description="After them, one window of this many is.")
 
 
+class ModelTrustConfig(Settings):
+    """Creases, segments and print of a model that events do not show where they should: learned online, and left out."""
+
+    least_share: float = Field(
+        0.0, ge=0, le=1, description="A part of the model is left out below this share of what should be seen of it, such as 0.5; 0 for never."
+    )
+    memory: float = Field(200.0, gt=0, description="Observations that are remembered of each part of the model.")
+    first_windows: int = Field(20, ge=0, description="The first windows are all learned from.")
+    every: int = Field(10, ge=1, description="After them, one window of this many is.")
+
+
 class SearchConfig(Settings):
     """Many poses tried at once, where one prediction is too uncertain or a pose explains less than it did."""
 
@@ -216,5 +227,6 @@ class TrackerConfig(Settings):
     solver: SolverConfig = SolverConfig()
     motion: MotionConfig = MotionConfig()
     learning: LearningConfig = LearningConfig()
+    model_trust: ModelTrustConfig = ModelTrustConfig()
     search: SearchConfig = SearchConfig()
     quality: QualityConfig = QualityConfig()

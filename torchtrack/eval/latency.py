@@ -18,7 +18,8 @@ from torch import Tensor
 
 from torchtrack.camera import project, undistortion_table
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import Contours, group_by_model, mesh_contours
+from torchtrack.contour_model import group_by_model
+from torchtrack.contours import Contours, mesh_contours
 from torchtrack.errors import EventDataError
 from torchtrack.lie import transform_points
 from torchtrack.session import Session

@@ -1,0 +1,152 @@
+"""What contours are made from: the constant tensors of an object's model, and the elements that it is made of.
+
+An element is a part of the model that may turn out not to be seen (:mod:`torchtrack.model_trust`): a long crease, the short
+ones of one place, all short ones that are bent but little, a segment, the print in one place.
+"""
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from torchtrack.config.tracker import ContourConfig
+from torchtrack.object_model import ObjectModel
+
+# Faces that meet at more than 60° make a sharp edge, whatever its scale; a scanned mesh is rough at smaller angles.
+_SHARP_COSINE = 0.5
+# Places on an object are told apart by this share of its diameter.
+_PLACE = 0.04
+
+
+class ContourKind(IntEnum):
+    """What a contour point comes from: the limb of a smooth surface, a sharp edge (occluding or not), and so on."""
+
+    LIMB = 0
+    CREASE = 1
+    TEXTURE = 2
+    SEGMENT = 3
+    SPLAT = 4
+    LEARNED = 5
+
+
+class ContourModel(nn.Module):
+    """The constant tensors of one :class:`ObjectModel` that contours are made from, as buffers."""
+
+    edge_ends: Tensor
+    edges: Tensor
+    face_normals: Tensor
+    face_offsets: Tensor
+    is_crease: Tensor
+    is_segment: Tensor
+    texture_points: Tensor
+    texture_tangents: Tensor
+    texture_normals: Tensor
+    surface_points: Tensor
+    triangles: Tensor
+    triangle_normals: Tensor
+    is_bent: Tensor
+    edge_element: Tensor
+    texture_element: Tensor
+    element_group: Tensor
+    members: Tensor
+
+    def __init__(self, model: ObjectModel, members: Sequence[int], config: ContourConfig) -> None:
+        """Take what ``config`` switches on from ``model``, which the objects numbered ``members`` have."""
+        super().__init__()
+        self.numbers = tuple(members)
+        self.register_buffer("members", torch.tensor(members))
+        segments = model.segments if config.segments else model.segments[:0]
+        points = torch.cat([model.edge_points, segments])
+        normals = torch.cat([model.edge_normals, torch.zeros_like(segments)])
+        is_segment = torch.zeros(len(points), dtype=torch.bool)
+        is_segment[len(model.edge_points) :] = True
+        self.register_buffer("edge_ends", points.clone())
+        self.register_buffer("face_normals", normals)
+        self.register_buffer("face_offsets", (normals * points[:, :1]).sum(-1))
+        self.register_buffer("is_segment", is_segment)
+        self.register_buffer("is_crease", torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)]) & config.creases)
+        texture_count = min(len(model.texture_points), config.max_texture_points) if config.texture else 0
+        spread = torch.linspace(0, max(len(model.texture_points) - 1, 0), texture_count).long()
+        for name in ("texture_points", "texture_tangents", "texture_normals"):
+            self.register_buffer(name, getattr(model, name)[spread].clone())
+        self.texture_spacing_m = _spacing(self.texture_points)
+        edges = _edge_table(points, normals, is_segment)
+        self.register_buffer("edges", edges)
+        self.register_buffer("is_bent", edges[-1] == int(ContourKind.LIMB))
+        place_m = _PLACE * model.diameter_m
+        parts = _edge_parts(points, edges[-1], place_m)[self.is_crease | self.is_segment], _print_parts(self.texture_points, place_m)
+        elements, element = torch.cat(parts).unique(dim=0, return_inverse=True)
+        of_edges, of_print = (element + 1).split([len(part) for part in parts])
+        edge_element = torch.zeros(len(points), dtype=torch.int64).masked_scatter(self.is_crease | self.is_segment, of_edges)
+        self.register_buffer("edge_element", edge_element)
+        self.register_buffer("texture_element", of_print)
+        # Of the kind of each; the first, which stands for all the rest of the model, has a group of its own.
+        self.register_buffer("element_group", pad(elements[:, -1].long() + 1, (1, 0)))
+        self.register_buffer("surface_points", model.surface_points.clone())
+        exact = len(model.triangles) <= config.exact_faces
+        triangles = model.triangles if exact else model.triangles[:0]
+        self.register_buffer("triangles", triangles.clone())
+        self.register_buffer("triangle_normals", _normals(triangles))
+
+    def active_edges(self, camera_obj: Float[Tensor, "b 3"], occluding: bool) -> tuple[Bool[Tensor, "b e"], Bool[Tensor, "b e"]]:
+        """Which edges are contours for a camera at ``camera_obj`` (object frame), and which are on the limb."""
+        facing = torch.einsum("esk,bk->bes", self.face_normals, camera_obj) > self.face_offsets
+        front, back = facing.unbind(-1)
+        limb = front != back
+        active = self.is_crease & (front | back) | self.is_segment
+        return active | limb if occluding else active, limb
+
+    def elements_of_edges(self, limb: Bool[Tensor, "b e"]) -> Int[Tensor, "b e"]:
+        """The element of each edge; 0 on the limb of what may be smooth: it shows, whether or not its facets do."""
+        return self.edge_element * ~(limb & self.is_bent)
+
+
+def _edge_table(points: Float[Tensor, "e 2 3"], face_normals: Float[Tensor, "e 2 3"], is_segment: Bool[Tensor, "e"]) -> Float[Tensor, "13 e"]:
+    """Of every edge: start, vector, direction, the way that turns its tangent (see :func:`_edge_points`), and kind."""
+    start, vector = points[:, 0], points[:, 1] - points[:, 0]
+    sharp = (face_normals[:, 0] * face_normals[:, 1]).sum(-1) < _SHARP_COSINE
+    kind = torch.where(is_segment, int(ContourKind.SEGMENT), torch.where(sharp, int(ContourKind.CREASE), int(ContourKind.LIMB)))
+    turning = torch.linalg.cross(vector, face_normals.sum(1), dim=-1)
+    direction = torch.nn.functional.normalize(vector, dim=-1)
+    return torch.cat([start, vector, direction, turning, kind[:, None].to(start.dtype)], -1).T.contiguous()
+
+
+def _edge_parts(points: Float[Tensor, "e 2 3"], kind: Float[Tensor, "e"], place_m: float) -> Float[Tensor, "e 5"]:
+    """What tells the elements of edges apart: place, number and kind, where they count."""
+    short = (points[:, 1] - points[:, 0]).norm(dim=-1) < place_m
+    # Facets of what is smooth in reality are all alike.
+    placed = short & (kind != int(ContourKind.LIMB))
+    number = torch.arange(1, len(points) + 1) * ~short
+    return torch.cat([(points.mean(1) / place_m).round() * placed[:, None], number[:, None], kind[:, None]], -1)
+
+
+def _print_parts(points: Float[Tensor, "n 3"], place_m: float) -> Float[Tensor, "n 5"]:
+    """The same of points of print."""
+    return pad(pad((points / place_m).round(), (0, 1)), (0, 1), value=float(ContourKind.TEXTURE))
+
+
+def _normals(triangles: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3"]:
+    """Unit normals."""
+    first, second, third = triangles.unbind(1)
+    return torch.nn.functional.normalize(torch.linalg.cross(second - first, third - first, dim=-1), dim=-1)
+
+
+def _spacing(points: Float[Tensor, "n 3"]) -> float:
+    """Distance of most points from the one nearest to them (m)."""
+    if len(points) < 2:
+        return 0.0
+    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=2)
+    return float(np.median(distances[:, 1]))
+
+
+def group_by_model(models: Sequence[ObjectModel], config: ContourConfig) -> list[ContourModel]:
+    """One :class:`ContourModel` per distinct object model, with the objects that have it."""
+    members: dict[int, list[int]] = {}
+    for number, model in enumerate(models):
+        members.setdefault(id(model), []).append(number)
+    return [ContourModel(models[numbers[0]], numbers, config) for numbers in members.values()]

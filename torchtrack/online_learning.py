@@ -1,0 +1,78 @@
+"""What is learned of objects while they are tracked: contours that their models lack, and parts of the models that are not seen."""
+
+from dataclasses import dataclass, replace
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchtrack import readback
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.model_trust import judge_elements
+from torchtrack.object_batch import ObjectBatch
+from torchtrack.observations import WindowEvents
+from torchtrack.prediction import Prediction
+from torchtrack.quality import Status
+from torchtrack.search import Found
+from torchtrack.state import StepResult, TrackerState
+from torchtrack.surface_learning import Surroundings, learn_after
+
+
+def objects_as_known(
+    objects: ObjectBatch, state: TrackerState, element_groups: Int[Tensor, "b k"], on_surfaces: bool, config: TrackerConfig
+) -> ObjectBatch:
+    """The objects with the contours learned on them that count by now, and without those parts of their models that are not seen.
+
+    Args:
+        element_groups: the group of each element of the objects' models.
+        on_surfaces: whether contours can be learned on any object.
+    """
+    if state.learned is not None and on_surfaces:
+        counting = state.learned.that_count(config.learning)
+        if not readback.read_at_once(counting.mask) or bool(counting.mask.any()):
+            objects = replace(objects, learned=counting)
+    if state.model_trust is not None:
+        shown = state.model_trust.of_width(element_groups.shape[1]).shown(element_groups, config.model_trust)
+        if not readback.read_at_once(shown) or not bool(shown.all()):
+            objects = replace(objects, shown=shown)
+    return objects
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """A window to learn from.
+
+    Args:
+        events: of the window.
+        window_s: its duration, for each object.
+        sigma_px: standard deviation of each object's prediction in the image: of an uncertain one nothing is learned.
+        on_surfaces: whether contours can be learned on any object.
+    """
+
+    events: WindowEvents
+    window_s: Float[Tensor, "b"]
+    sigma_px: Float[Tensor, "b"]
+    on_surfaces: bool
+
+
+def learned_after(
+    state: TrackerState, result: StepResult, prediction: Prediction, found: Found, lesson: Lesson, config: TrackerConfig
+) -> TrackerState:
+    """The state after a window with what was learned in it.
+
+    Args:
+        prediction: of the objects, before the window.
+        found: what ``state`` and ``result`` stand on.
+    """
+    trust, learned = state.model_trust, state.learned
+    is_judged = trust is not None and trust.due(config.model_trust)
+    if not is_judged and (learned is None or not lesson.on_surfaces):
+        return state
+    trusted = (result.status <= int(Status.UNCERTAIN)) & (lesson.sigma_px < config.learning.max_sigma_px)
+    fitted = replace(prediction, T_cam_obj=state.T_cam_obj.to(lesson.sigma_px.dtype), velocity=state.velocity)
+    if trust is not None and is_judged:
+        trust = judge_elements(trust, fitted, lesson.window_s, lesson.events, trusted, config)
+    if learned is not None and lesson.on_surfaces:
+        taken_share = None if trust is None else trust.taken_share
+        around = Surroundings(fitted.objects, fitted.T_cam_obj, fitted.velocity, lesson.window_s, result.contours, trusted, taken_share)
+        learned = learn_after(learned, around, found, lesson.events, config)
+    return replace(state, model_trust=trust, learned=learned)
