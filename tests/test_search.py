@@ -12,7 +12,7 @@ from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
-from torchtrack.search import Doubt, explained_at_rest, may_be_wanted, search, search_is_due
+from torchtrack.search import Doubt, _likeliest, explained_at_rest, may_be_wanted, search, search_is_due
 
 SEARCHED = TrackerConfig()
 UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
@@ -93,6 +93,16 @@ def test_a_box_is_found_again_where_hardly_anything_is_known_of_it(velocity_know
     degrees, millimetres = pose_errors(better.fit.solution.T_cam_obj.double(), T_true)
     assert float(degrees) < 2.0
     assert float(millimetres) < 5.0
+
+
+def test_of_poses_that_explain_as_much_the_most_expected_is_taken():
+    """Turns of a vase about its axis all explain the same: the best of them by a hair is chance."""
+    from_prior = torch.zeros(4, 13)
+    from_prior[:, 1] = torch.tensor([0.5, 0.01, 0.0, 0.3])
+    share, covariance = torch.tensor([0.9, 0.89, 0.6, 0.885]), 1e-2 * torch.eye(12, dtype=torch.float64)
+    assert _likeliest(share, from_prior, covariance).tolist() == [1]
+    assert _likeliest(share, from_prior.index_fill(0, torch.tensor([1]), torch.nan), covariance).tolist() == [3]
+    assert _likeliest(torch.tensor([0.9, 0.8, 0.6, 0.0]), from_prior, covariance).tolist() == [0]
 
 
 def test_what_is_no_better_by_the_margin_is_left():

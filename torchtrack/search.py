@@ -20,6 +20,9 @@ from torchtrack.pose_solver import Linearisation
 from torchtrack.prediction import Prediction
 from torchtrack.readback import Answer
 
+# Shares that differ by less are the same: which of them is larger is chance.
+_AS_MUCH = 0.03
+
 
 @dataclass(frozen=True)
 class Found:
@@ -130,10 +133,17 @@ def search(
     offsets = promising(one, found.fit.contours.of(number), covariance, widened_px, density, config)
     tried = _align_all(prediction.copies(number, len(offsets)), offsets, seen, config)
     share = torch.where(tried.count >= config.quality.min_observations, tried.share, 0)
-    best = share.argmax()[None]
+    best = _likeliest(share, tried.fit.solution.from_prior, prediction.covariance[number])
     mine = torch.where(found.count[number] >= config.quality.min_observations, found.share[number], 0.0)
     better = share.index_select(0, best) > mine + margin
     return found if readback.read_at_once(better) and not bool(better) else _replaced(found, number, tried, best, better)
+
+
+def _likeliest(share: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Int[Tensor, "1"]:
+    """Of the poses that explain as much as the best does, the one that the prediction expects most: a turn of a vase explains nothing."""
+    root = torch.linalg.cholesky_ex(covariance).L
+    away = torch.linalg.solve_triangular(root, from_prior[:, :12].to(root.dtype).T, upper=False).square().sum(0)
+    return torch.where(share >= share.max() - _AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]
 
 
 def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: TrackerConfig) -> Found:
