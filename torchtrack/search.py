@@ -21,7 +21,7 @@ from torchtrack.prediction import Prediction
 from torchtrack.readback import Answer
 
 # Shares that differ by less are the same: which of them is larger is chance.
-_AS_MUCH = 0.03
+_AS_MUCH = 0.02
 
 
 @dataclass(frozen=True)
