@@ -121,7 +121,7 @@ def _first_place(begin: Prediction, observations: Observations, config: TrackerC
     """Where the first round looks for each observation: carried to the window's end with the object's plane."""
     if not config.matching.motion_compensation:
         return observations.pixels
-    return torch.addcmul(observations.pixels, begin.plane_velocity(observations.pixels), observations.age_s[..., None])
+    return begin.carried(observations.pixels, observations.age_s)
 
 
 def _information(prediction: Prediction, config: TrackerConfig) -> Tensor:

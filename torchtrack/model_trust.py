@@ -130,7 +130,7 @@ def _lacks_contours(fitted: Prediction, contours: Contours, index: ContourIndex,
     """Whether many events before an object are near no contour at all of its model."""
     objects = fitted.objects
     radius_px = 0.5 * objects.diameter_m * objects.intrinsics[:, 0] / objects.depth_m(fitted.T_cam_obj)
-    pixels = torch.addcmul(events.pixels, fitted.plane_velocity(events.pixels), events.age_s[..., None])
+    pixels = fitted.carried(events.pixels, events.age_s)
     x, y = (pixels - project(fitted.centre_cam[:, None], objects.intrinsics)).unbind(-1)
     before = events.mask & (x * x + y * y < radius_px[:, None].square())
     nearest = index.look_up(pixels)
@@ -154,7 +154,7 @@ def _observed(fitted: Prediction, contours: Contours, index: ContourIndex, event
     """How many observations lie on each contour point, and around it."""
     matching, moving = config.matching, fitted.moving(compensated=True)
     seen = select_events(events, index, fitted.plane_velocity(events.pixels), matching.max_events)
-    place = torch.addcmul(seen.pixels, fitted.plane_velocity(seen.pixels), seen.age_s[..., None])
+    place = fitted.carried(seen.pixels, seen.age_s)
     table, gate_px = ContourTable.of(contours, index), max(matching.gates_px)
     # Once more from where the first contour's own motion carries it.
     for _ in range(2):

@@ -58,6 +58,10 @@ class Prediction:
         """Image velocity of pixels at the depth of the object's centre (px/s)."""
         return object_plane_velocity(pixels, self.velocity, self.centre_cam, self.objects.intrinsics)
 
+    def carried(self, pixels: Float[Tensor, "b n 2"], age_s: Float[Tensor, "b n"]) -> Float[Tensor, "b n 2"]:
+        """Where pixels that were seen some time ago have come by the window's end, at the depth of the object's centre."""
+        return torch.addcmul(pixels, self.plane_velocity(pixels), age_s[..., None])
+
     def contour_velocity(self, contours: Contours) -> Float[Tensor, "b m 2"]:
         """Image velocity of contour points (px/s)."""
         return pixel_velocity(contours.points_cam, self.velocity, self.centre_cam, self.objects.intrinsics)

@@ -129,7 +129,7 @@ def search(
     widened_px = max(sigma_px, settings.least_sigma_px)
     covariance = prediction.covariance[number] * (widened_px / max(sigma_px, 1e-6)) ** 2
     one, seen = prediction.copies(number, 1), events.of(number)
-    density = event_density(seen.pixels + one.plane_velocity(seen.pixels) * seen.age_s[..., None], seen.mask, prediction.objects.image_size)
+    density = event_density(one.carried(seen.pixels, seen.age_s), seen.mask, prediction.objects.image_size)
     offsets = promising(one, found.fit.contours.of(number), covariance, widened_px, density, config)
     tried = _align_all(prediction.copies(number, len(offsets)), offsets, seen, config)
     share = torch.where(tried.count >= config.quality.min_observations, tried.share, 0)

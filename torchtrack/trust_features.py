@@ -104,7 +104,7 @@ def _ages(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
 def _counts(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
     """Events of the observation's own polarity and of the other, around it, all moved to the window's end with the object."""
     events, prediction = evidence.events, evidence.prediction
-    moved = torch.addcmul(events.pixels, prediction.plane_velocity(events.pixels), events.age_s[..., None])
+    moved = prediction.carried(events.pixels, events.age_s)
     height, width = (size + 2 * _BORDER_PX for size in prediction.objects.image_size)
     cell = _cells(moved[..., 0], moved[..., 1], height, width) + (events.polarity > 0)
     counts = torch.zeros(len(cell), 2 * height * width, dtype=moved.dtype, device=moved.device)

@@ -25,7 +25,7 @@ def true_distance(tracker: Tracker, evidence: Evidence, T_cam_obj: Float[Tensor,
     truth = Prediction(predicted.objects, T_cam_obj.to(dtype), predicted.usable, velocity.to(dtype), predicted.covariance)
     contours = predicted.objects.contours(truth.T_cam_obj, tracker.config.contours)
     index = index_for(contours, predicted.objects.image_size, tracker.config, torch.ones_like(truth.velocity[:, 0]))
-    moved = torch.addcmul(observations.pixels, truth.plane_velocity(observations.pixels), observations.age_s[..., None])
+    moved = truth.carried(observations.pixels, observations.age_s)
     found = index.look_up(moved)
     table = torch.cat([contours.pixels, contours.normals, truth.contour_velocity(contours)], -1)
     pixels, normals, speed = take_points(table, found.clamp(min=0)).chunk(3, -1)
