@@ -21,9 +21,10 @@ from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.learned_contours import LearnedContours
 from torchtrack.model_trust import ModelTrust, element_groups
-from torchtrack.motion import initial_covariance, predict_covariance, with_dropped
+from torchtrack.motion import initial_covariance, predict_covariance, with_dropped, without_spin
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.symmetry import revolution_axes
 from torchtrack.observations import corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.prediction import Prediction, before_camera, far_pose
@@ -62,6 +63,7 @@ class Tracker(nn.Module):
     element_groups: Tensor
     centre_obj: Tensor
     diameter_m: Tensor
+    revolution_axes: Tensor
     far_pose: Tensor
 
     def __init__(
@@ -91,6 +93,8 @@ class Tracker(nn.Module):
         self.tiles = SensorTiles(self.ideal_pixels[0]) if len(cameras) == 1 else None
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
+        self.register_buffer("revolution_axes", revolution_axes(objects))
+        self._revolves = bool(self.revolution_axes.any())
         self.register_buffer("far_pose", far_pose(self.centre_obj))
         self.weigher = TrustNetwork.shipped() if weigher is None and self.config.matching.learned_trust else weigher
         # On dense meshes no line of sight is followed.
@@ -253,6 +257,9 @@ class Tracker(nn.Module):
         velocity, covariance = state.velocity, state.covariance
         if self.config.motion.model == "hold":
             velocity, covariance = torch.zeros_like(velocity), with_dropped(covariance, velocity)
+        if self._revolves and self.config.motion.spin_fades:
+            axes_cam = (state.T_cam_obj[:, :3, :3].to(velocity.dtype) @ self.revolution_axes[..., None])[..., 0]
+            velocity, covariance = without_spin(velocity, covariance, axes_cam, dt_s, self.config.motion)
         moved = velocity * dt_s[:, None]
         T_prior = lie.move_about(state.T_cam_obj.to(velocity.dtype), lie.cayley(moved[:, :3]), moved[:, 3:], self.centre_obj)
         covariance = predict_covariance(covariance.detach(), velocity.detach(), dt_s, self.diameter_m, self.config.motion)

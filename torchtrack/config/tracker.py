@@ -156,6 +156,7 @@ class MotionConfig(Settings):
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
     coast_s: float = Field(0.2, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
+    spin_fades: bool = Field(True, description="So does the spin of a surface of revolution about its axis, which no event can show.")
 
 
 class LearningConfig(Settings):

@@ -1,5 +1,6 @@
 """Surfaces of revolution, such as bottles and bowls: turned about their axis they look the same."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -59,6 +60,13 @@ def revolution_axis(model: ObjectModel) -> RevolutionAxis | None:
     if values[1] < values[0] + _DISTINCT or (area * keeps).sum() < _KEEPING:
         return None
     return RevolutionAxis(middle, direction)
+
+
+def revolution_axes(models: Sequence[ObjectModel]) -> Float[Tensor, "b 3"]:
+    """Direction of the :func:`revolution_axis` of each object (float64); zero where there is none."""
+    found = {id(model): revolution_axis(model) for model in models}
+    axes = [found[id(model)] for model in models]
+    return torch.stack([torch.zeros(3, dtype=torch.float64) if axis is None else axis.direction_obj for axis in axes])
 
 
 def _corners(triangles: Float[Tensor, "f 3 3"]) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"], Float[Tensor, "p"]]:
