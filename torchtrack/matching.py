@@ -26,6 +26,8 @@ _MIN_CROSSING = 0.3
 _SLOW_PX_S = 10.0
 # Concentration: side of a patch (16 px, as a power of two), patches a side of the image, and offsets that are near and on a contour (px).
 _PATCH_BITS, _PATCHES, _SMEAR_PX, _ON_CONTOUR_PX = 4, 64, 3.0, 0.8
+# Mutual agreement: side of a bit of contour (8 px, as a power of two), and how many others there make its mean count in full.
+_PIECE_BITS, _MANY_OTHERS = 3, 3
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,8 @@ def match_nearest(
     weights = _weights(offsets, targets, near, dark * oriented, config)
     if config.print_polarity:
         weights = weights * _agreeing(dark * printed, config)
+    if config.mutual_px:
+        weights = weights * mutual_agreement(pixels, offsets, matched, config.mutual_px)
     matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)
@@ -175,17 +179,40 @@ def _agreeing(agreement: Tensor, config: MatchingConfig) -> Tensor:
     return torch.add(one(agreement), agreement, alpha=config.polarity_gain).clamp_(config.least_agreement, 1)
 
 
+def mutual_agreement(
+    pixels: Float[Tensor, "b n 2"], offsets: Float[Tensor, "b n"], matched: Bool[Tensor, "b n"], spread_px: float
+) -> Float[Tensor, "b n"]:
+    """How far each observation lies where the others of its bit of contour do, 0 to 1: Cauchy's weight of its distance from their mean.
+
+    Events of one edge lie side by side, on the contour or, as a pose begins to slip, beside it. One that lies elsewhere
+    than they do is of another edge, or noise. Not the pose but the mean is what it is measured against, so that nothing
+    keeps a contour from being pulled to where all its events are.
+
+    Args:
+        pixels: the contour point of each.
+        offsets: from it, along its normal (px).
+        matched: which of them count; one on its own is trusted.
+        spread_px: distance from the mean at which trust is a half, among many.
+    """
+    cell, counted = patch(pixels, _PIECE_BITS), matched.to(offsets.dtype)
+    sums = patch_sums(cell, torch.stack([counted, counted * offsets], 1))
+    count, total = sums.gather(2, cell[:, None].expand(-1, 2, -1)).unbind(1)
+    relative = (offsets - total / count.clamp(min=1)) / spread_px
+    known = (count - one(count)).clamp_(0, _MANY_OTHERS) / _MANY_OTHERS
+    return torch.addcmul(one(known), known, relative * relative).reciprocal()
+
+
 def _two(like: Tensor) -> Tensor:
     return constant((2.0,), like.dtype, like.device)
 
 
-def patch(pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
-    """The patch of the image that each pixel lies in.
+def patch(pixels: Float[Tensor, "b n 2"], bits: int = _PATCH_BITS) -> Int[Tensor, "b n"]:
+    """The patch of the image that each pixel lies in, whose side is a power of two (px): that of ``bits``.
 
-    Patches wrap around: no object is so large that two of its own would meet.
+    Patches wrap around: no object is so large that two of its own would meet, and if two of few pixels do, little is lost.
     """
     # The whole part of a shift to the right is rounded down, below zero too, unlike that of a division.
-    u, v = ((pixels.floor().long() >> _PATCH_BITS) & (_PATCHES - 1)).unbind(-1)
+    u, v = ((pixels.floor().long() >> bits) & (_PATCHES - 1)).unbind(-1)
     return torch.add(u, v, alpha=_PATCHES)
 
 

@@ -115,6 +115,12 @@ class MatchingConfig(Settings):
     print_polarity: bool = Field(True, description="Trust events on print less whose polarity is not that of its darker side.")
     polarity_gain: float = Field(1.5, ge=0, description="How fast trust falls with the majority of the others.")
     least_agreement: float = Field(0.05, ge=0, le=1, description="What an event of the wrong polarity still counts.")
+    mutual_px: float = Field(
+        0.0,
+        ge=0,
+        le=100,
+        description="Trust observations less that lie this far from the mean of their bit of contour (px), such as 0.7; 0 for not at all.",
+    )
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
