@@ -109,12 +109,14 @@ def test_the_velocity_is_learned(in_window, dtype):
 def test_the_usual_share_follows_the_share_slowly(dtype):
     _, events = moving_box(pose(), 10)
     tracker = tracker_of(dtype=dtype)
-    state, usual = tracker.init(pose()[None], 0), 0.0
+    state, usual, full = tracker.init(pose()[None], 0), 0.0, 0.0
     for batch, end_us in windows(events, 10):
         state, result = tracker.step(state, batch, end_us)
         usual += 0.1 * (float(result.quality) - usual)
+        full += (0.1 if float(result.quality) > full else 0.005) * (float(result.quality) - full)
         assert float(state.share) == float(result.quality)
         assert float(state.usual_share) == pytest.approx(usual, abs=1e-5)
+        assert float(state.full_share) == pytest.approx(full, abs=1e-5)
     assert 0.5 < usual < float(result.quality)
 
 
@@ -123,6 +125,7 @@ def test_a_window_that_failed_does_not_change_what_is_usual():
     after, result = tracker.step(state, EventBatch.empty(), 30_000)
     assert int(result.status) == Status.TOO_FEW_EVENTS
     assert float(after.usual_share) == float(state.usual_share)
+    assert float(after.full_share) == float(state.full_share)
     assert float(after.share) < float(state.share)
 
 

@@ -17,6 +17,8 @@ from torchtrack.state import StepResult, TrackerState
 
 # Share of a new window in the usual quality.
 _USUAL_GAIN = 0.1
+# And in the full one where it is less: what is hidden for a while is not seen well.
+_FALL_GAIN = 0.005
 
 
 def conclude(
@@ -44,13 +46,14 @@ def conclude(
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
-    trusted = torch.where(failed, 0, quality.trust(share, config.quality, state.usual_share, widening))
+    trusted = torch.where(failed, 0, quality.trust(share, config.quality, state.full_share, widening))
     velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
     usual = torch.where(failed, state.usual_share, torch.lerp(state.usual_share, share, _USUAL_GAIN))
+    full = torch.where(failed, state.full_share, torch.maximum(*(torch.lerp(state.full_share, share, gain) for gain in (_USUAL_GAIN, _FALL_GAIN))))
     contours = reproject(contours, T_cam_obj.to(velocity.dtype), objects.intrinsics)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
-    return replace(state, T_cam_obj=T_cam_obj, velocity=velocity, covariance=covariance, share=share, usual_share=usual), result
+    return replace(state, T_cam_obj=T_cam_obj, velocity=velocity, covariance=covariance, share=share, usual_share=usual, full_share=full), result
 
 
 def _updated_motion(

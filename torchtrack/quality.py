@@ -74,15 +74,15 @@ def needed_share(widening: Float[Tensor, "b"], config: QualityConfig) -> Float[T
 
 
 def trust(
-    share: Float[Tensor, "b"], config: QualityConfig, usual_share: Float[Tensor, "b"] | None = None, widening: Float[Tensor, "b"] | None = None
+    share: Float[Tensor, "b"], config: QualityConfig, full_share: Float[Tensor, "b"] | None = None, widening: Float[Tensor, "b"] | None = None
 ) -> Float[Tensor, "b"]:
     """How far a pose that was found counts against the prediction: nothing where it is lost, fully once it is certain.
 
-    Of an object that was looked for in many places (``widening``) near to its usual share is asked: chance explains some.
+    Of an object that was looked for in many places (``widening``) near to its full share is asked: chance explains some.
     """
     full = torch.full_like(share, config.uncertain_below)
-    if usual_share is not None and widening is not None:
-        full = torch.maximum(full, config.certain_at * usual_share * (widening - 1).clamp(0, 1))
+    if full_share is not None and widening is not None:
+        full = torch.maximum(full, config.certain_at * full_share * (widening - 1).clamp(0, 1))
     return ((share - config.lost_below) / (full - config.lost_below).clamp(min=1e-6)).clamp(0, 1)
 
 

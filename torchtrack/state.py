@@ -15,6 +15,27 @@ from torchtrack.model_trust import ModelTrust
 
 
 @dataclass(frozen=True)
+class Probation:
+    """Where to look for objects again, should what was found of them turn out to be wrong.
+
+    Args:
+        runs: which objects are on probation.
+        evidence: for what was found of each, in windows.
+        T_cam_obj, covariance: of the object before it was found.
+    """
+
+    runs: Bool[Tensor, "b"]
+    evidence: Float[Tensor, "b"]
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    covariance: Float[Tensor, "b 12 12"]
+
+    @classmethod
+    def none(cls, T_cam_obj: Float[Tensor, "b 4 4"], covariance: Float[Tensor, "b 12 12"]) -> "Probation":
+        """Nothing on probation."""
+        return cls(torch.zeros_like(T_cam_obj[:, 0, 0], dtype=torch.bool), torch.zeros_like(T_cam_obj[:, 0, 0]), T_cam_obj, covariance)
+
+
+@dataclass(frozen=True)
 class TrackerState:
     """Everything the tracker remembers between windows.
 
@@ -24,9 +45,11 @@ class TrackerState:
         covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.motion`.
         share: of the moving contour, what events explained in the last window.
         usual_share: its running mean.
+        full_share: the same of when the object is seen well: rises as fast, but falls slowly.
         t_us: end of the last window of each stream (µs).
         last_event_us: time of the newest event of every sensor pixel (µs).
         burst_age_us: how long ago the newest burst of every sensor pixel and polarity began (µs).
+        probation: which finds are not certain yet.
         learned: contours learned on the objects; none where that is switched off.
         model_trust: which parts of the models are seen; none where that is switched off.
     """
@@ -36,9 +59,11 @@ class TrackerState:
     covariance: Float[Tensor, "b 12 12"]
     share: Float[Tensor, "b"]
     usual_share: Float[Tensor, "b"]
+    full_share: Float[Tensor, "b"]
     t_us: Int[Tensor, "s"]
     last_event_us: Int[Tensor, "s h w"]
     burst_age_us: Int[Tensor, "s 2 h w"]
+    probation: Probation
     learned: LearnedContours | None = None
     model_trust: ModelTrust | None = None
 

@@ -28,12 +28,13 @@ from torchtrack.object_model.symmetry import revolution_axes
 from torchtrack.observations import corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.prediction import Prediction, before_camera, far_pose
+from torchtrack.probation import after_probation
 from torchtrack.search import Doubt, explained_at_rest, judge_fit, may_be_wanted, search_is_due, search_wanted
 from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
 from torchtrack.sensors import Sensors, sensor_tables
 from torchtrack.setup_check import check_setup, check_start
 from torchtrack.speed_limit import largest_speed, limit_speed
-from torchtrack.state import StepResult, TrackerState, choose_rows
+from torchtrack.state import Probation, StepResult, TrackerState, choose_rows
 from torchtrack.time_surface import empty_last_event, update_last_event
 from torchtrack.trust import TrustNetwork
 from torchtrack.window_parts import to_be_parted
@@ -149,7 +150,10 @@ class Tracker(nn.Module):
         learning = self.config.learning
         learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
         trust = ModelTrust.none(self.element_groups, velocity) if self._judges else None
-        return TrackerState(T_cam_obj.clone(), velocity, covariance, nothing, nothing, times, last_event_us, burst_age_us, learned, trust)
+        probation = Probation.none(T_cam_obj, covariance)
+        return TrackerState(
+            T_cam_obj.clone(), velocity, covariance, nothing, nothing, nothing, times, last_event_us, burst_age_us, probation, learned, trust
+        )
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """:meth:`step`, as a layer of a network: what comes in first."""
@@ -241,6 +245,8 @@ class Tracker(nn.Module):
         if in_doubt.any():
             found = search_wanted(recorded, doubt, seen, found, config)
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
+        if config.search.probation:
+            next_state, result = after_probation(state, next_state, result, prediction, widening, config)
         next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self._learns), config)
         return replace(next_state, t_us=t_us, last_event_us=last_event_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
 

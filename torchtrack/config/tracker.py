@@ -201,6 +201,7 @@ class SearchConfig(Settings):
     dropped_to: float = Field(0.8, ge=0, le=1, description="Share of the usual quality below which others are tried.")
     least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
     at_start: bool = Field(True, description="Others are also tried while an object's motion is not known: dense print fits many.")
+    probation: bool = Field(True, description="What was found of a very uncertain object is taken back unless it explains as much as usual soon.")
     start_margin: float = Field(0.02, ge=0, le=1, description="By how much the quality of another pose must be better then.")
     margin: float = Field(0.1, ge=0, le=1, description="By how much the quality of another pose must be better.")
 
@@ -215,7 +216,7 @@ class QualityConfig(Settings):
     caught_above: float = Field(
         0.35, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object is found again."
     )
-    certain_at: float = Field(0.75, ge=0, le=1, description="Share of the usual quality from which the find of an uncertain object counts fully.")
+    certain_at: float = Field(0.75, ge=0, le=1, description="Share of the quality when seen well, from which the find of an uncertain object counts.")
     min_on_contour: int = Field(3, ge=1, description="Observations on the contours of a patch of the image from which these are explained.")
     min_speed_px_s: float = Field(30.0, ge=0, description="Contours moving slower than this across themselves need not fire (px/s).")
     max_step_rotation_rad: float = Field(0.5, gt=0, description="A larger rotation against the prediction within one window has diverged (rad).")

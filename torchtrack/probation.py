@@ -1,0 +1,64 @@
+"""Finds on probation: what was found of an object that was hardly known anything of may be wrong, and then has to be taken back.
+
+Of thousands of poses one explains much by chance now and then, above all while the object is still hidden. So where it was
+looked for is kept, until what was found has explained about as much as is usual for some windows, or too little.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.prediction import Prediction
+from torchtrack.quality import Status
+from torchtrack.state import Probation, StepResult, TrackerState
+
+# Finds of objects whose first gate had to be this many times wider are on probation.
+_WIDE = 2.0
+# A window speaks for a find by its share of what is wanted, as far as it is more than this.
+_NEUTRAL = 0.6
+# Windows' worth of evidence at which a find is kept or taken back.
+_KEPT_AT, _TAKEN_BACK_AT = 3.0, -1.5
+
+
+def after_probation(
+    before: TrackerState, state: TrackerState, result: StepResult, prediction: Prediction, widening: Float[Tensor, "b"], config: TrackerConfig
+) -> tuple[TrackerState, StepResult]:
+    """State and result of a window, with finds taken back that did not prove themselves.
+
+    Args:
+        before: the state before the window.
+        state, result: after it.
+        prediction: of the objects, with ``widening`` of their first gates.
+    """
+    probation = _begun(before, result, prediction, widening)
+    wanted = config.quality.certain_at * before.full_share
+    speaks_for = (result.quality / wanted.clamp(min=1e-3)).clamp(max=1) - _NEUTRAL
+    evidence = torch.where(probation.runs, probation.evidence + speaks_for, 0)
+    wrong = probation.runs & (evidence <= _TAKEN_BACK_AT)
+    probation = replace(probation, runs=probation.runs & ~wrong & (evidence < _KEPT_AT), evidence=evidence)
+    back = wrong[:, None, None]
+    state = replace(
+        state,
+        T_cam_obj=torch.where(back, probation.T_cam_obj, state.T_cam_obj),
+        velocity=torch.where(wrong[:, None], 0, state.velocity),
+        covariance=torch.where(back, probation.covariance, state.covariance),
+        probation=probation,
+    )
+    lost = torch.where(wrong & (result.status < int(Status.LOST)), int(Status.LOST), result.status)
+    return state, replace(result, status=lost)
+
+
+def _begun(before: TrackerState, result: StepResult, prediction: Prediction, widening: Float[Tensor, "b"]) -> Probation:
+    """The probation with those objects that were found in this window although hardly anything was known of them."""
+    old = before.probation
+    begins = ~old.runs & (widening >= _WIDE) & (result.status < int(Status.LOST))
+    first = begins[:, None, None]
+    return Probation(
+        runs=old.runs | begins,
+        evidence=old.evidence,
+        T_cam_obj=torch.where(first, prediction.T_cam_obj.to(old.T_cam_obj.dtype), old.T_cam_obj),
+        covariance=torch.where(first, prediction.covariance, old.covariance),
+    )
