@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack import readback
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.prediction import Prediction
 from torchtrack.quality import Status
@@ -33,6 +34,9 @@ def after_probation(
         state, result: after it.
         prediction: of the objects, with ``widening`` of their first gates.
     """
+    concerned = before.probation.runs | (widening >= _WIDE)
+    if readback.read_at_once(concerned) and not bool(concerned.any()):
+        return state, result
     probation = _begun(before, result, prediction, widening)
     wanted = config.quality.certain_at * before.full_share
     speaks_for = (result.quality / wanted.clamp(min=1e-3)).clamp(max=1) - _NEUTRAL
