@@ -85,6 +85,17 @@ def test_a_find_that_explains_too_little_is_taken_back_and_its_neighbour_stays(s
         assert torch.equal(getattr(state, name)[1], getattr(after, name)[1])
 
 
+@pytest.mark.parametrize("share", [0.8, 0.0])
+def test_what_became_of_one_find_says_nothing_of_the_next(share):
+    state, _ = begun(share)
+    for _ in range(8):
+        state, _ = window(replace(state, full_share=two_boxes()[0].full_share), [share, share])
+    assert not state.probation.runs.any()
+    again, _ = window(replace(state, full_share=two_boxes()[0].full_share), [FULL_SHARE] * 2, WIDE)
+    assert torch.equal(again.probation.evidence, begun()[0].probation.evidence)
+    assert again.probation.runs.tolist() == [True, False]
+
+
 def test_a_graver_status_stays():
     state, _ = begun(0.0)
     for _ in range(2):

@@ -40,9 +40,11 @@ def after_probation(
     probation = _begun(before, result, prediction, widening)
     wanted = config.quality.certain_at * before.full_share
     speaks_for = (result.quality / wanted.clamp(min=1e-3)).clamp(max=1) - _NEUTRAL
-    evidence = torch.where(probation.runs, probation.evidence + speaks_for, 0)
+    evidence = probation.evidence + speaks_for
     wrong = probation.runs & (evidence <= _TAKEN_BACK_AT)
-    probation = replace(probation, runs=probation.runs & ~wrong & (evidence < _KEPT_AT), evidence=evidence)
+    runs = probation.runs & ~wrong & (evidence < _KEPT_AT)
+    # The next find of the object begins without any.
+    probation = replace(probation, runs=runs, evidence=torch.where(runs, evidence, 0))
     back = wrong[:, None, None]
     state = replace(
         state,

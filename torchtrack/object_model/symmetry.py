@@ -64,7 +64,7 @@ def revolution_axis(model: ObjectModel) -> RevolutionAxis | None:
 
 def revolution_axes(models: Sequence[ObjectModel]) -> Float[Tensor, "b 3"]:
     """Direction of the :func:`revolution_axis` of each object (float64); zero where there is none."""
-    found = {id(model): revolution_axis(model) for model in models}
+    found = {number: revolution_axis(model) for number, model in {id(model): model for model in models}.items()}
     axes = [found[id(model)] for model in models]
     return torch.stack([torch.zeros(3, dtype=torch.float64) if axis is None else axis.direction_obj for axis in axes])
 
