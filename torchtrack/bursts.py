@@ -20,25 +20,27 @@ def no_bursts(streams: int, height: int, width: int, device: torch.device | str 
     return torch.full((streams, 2, height, width), LONG_AGO_US, dtype=torch.int16, device=device)
 
 
-def update_bursts(
-    burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int
-) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
+def aged(burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"]) -> Int[Tensor, "s 2 h w"]:
+    """The bursts' ages some time later (µs); the input is left as it was."""
+    elapsed_us = elapsed_us.clamp(max=LONG_AGO_US).to(torch.int16)[:, None, None, None]
+    return torch.minimum(burst_age_us, LONG_AGO_US - elapsed_us).add_(elapsed_us)
+
+
+def update_bursts(burst_age_us: Int[Tensor, "s 2 h w"], events: PaddedEvents, longest_us: int) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
     """Ages of the newest burst of every pixel and polarity at a window's end (µs), and how far into its burst each event is (µs).
 
     What one pixel fires of one polarity within ``longest_us`` is one burst; the next event after that begins another. In a
     window that is longer, bursts that follow the first of a pixel are not told from one another: each event begins its own.
 
     Args:
-        burst_age_us: at the end of the window before; left as it was.
-        elapsed_us: length of the window of each stream.
+        burst_age_us: of the bursts before the window, at its end; left as it was.
         events: of the window.
         longest_us: less than :data:`LONG_AGO_US`.
 
     Of padding, the second result says nothing.
     """
     _, _, height, width = burst_age_us.shape
-    elapsed_us = elapsed_us.clamp(max=LONG_AGO_US).to(torch.int16)[:, None, None, None]
-    ages = torch.minimum(burst_age_us, LONG_AGO_US - elapsed_us).add_(elapsed_us)
+    ages = burst_age_us.clone()
     flat = ages.flatten(1)
     place = (events.polarity * height + events.y) * width + events.x
     age_us = events.age_us.clamp(max=LONG_AGO_US).to(torch.int16)

@@ -13,9 +13,14 @@ Numbers = tuple[Any, ...]
 """Numbers, or rows of them."""
 
 
-@lru_cache(maxsize=256)
 def constant(values: Numbers, dtype: torch.dtype, device: torch.device) -> Tensor:
     """A tensor of these numbers; whoever asks for it must not write to it."""
+    # A compiled graph holds its constants itself.
+    return torch.tensor(values, dtype=dtype, device=device) if torch.compiler.is_compiling() else _kept(values, dtype, device)
+
+
+@lru_cache(maxsize=256)
+def _kept(values: Numbers, dtype: torch.dtype, device: torch.device) -> Tensor:
     # What is made while nothing is recorded could not be used where gradients are, nor what is made within a
     # transform of torch.func outside of it; PyTorch has no public name for leaving one.
     with torch.inference_mode(False), torch._C._DisableFuncTorch():

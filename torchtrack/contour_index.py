@@ -99,8 +99,7 @@ def index_contours(
 def _radii(radius_px: int | Tensor | readback.Answer, contours: Contours) -> readback.Answer:
     """The radius of each object."""
     if isinstance(radius_px, int):
-        count = len(contours.mask)
-        return readback.Answer(torch.full((count,), radius_px, device=contours.mask.device), torch.full((count,), radius_px), None)
+        return readback.Answer.of(radius_px, contours.mask[:, 0].long())
     return radius_px if isinstance(radius_px, readback.Answer) else readback.Answer.to(radius_px)
 
 

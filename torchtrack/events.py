@@ -24,7 +24,7 @@ class EventBatch:
         x, y: sensor pixels, int32.
         t_us: times in microseconds, int64.
         polarity: bool, ``True`` where the pixel got brighter.
-        stream_index: which stream each event belongs to, int64, not decreasing.
+        stream_index: which stream each event belongs to, int64, not decreasing; those past the last stream are of none.
         most_of_one: no stream has more of the events than this; noted by :meth:`to` on the way to a GPU, where counting them
             would take a wait.
     """
@@ -270,8 +270,8 @@ def pad_streams(events: EventBatch, streams: int, t_end_us: Int[Tensor, "s"]) ->
         EventDataError: if the streams are mixed up. It is not looked for on a GPU, which would have to be waited for.
     """
     if streams == 1 and len(events):
-        # Nothing to pad: the events are the row.
-        mask = torch.ones_like(events.polarity)[None]
+        # Nothing to pad: the events are the row. Those of no stream, after it, are padding already.
+        mask = (events.stream_index < streams)[None]
         return PaddedEvents(events.x.long()[None], events.y.long()[None], t_end_us[:, None] - events.t_us, events.polarity[None], mask)
     if streams > 1 and readback.read_at_once(events.stream_index):
         _check_streams_in_order(events.stream_index)

@@ -4,12 +4,12 @@ kornia's run as convolutions with one channel, which a CPU does slowly. The ``sl
 instead; they are the same to 1e-5 (a test holds them to it) and several times faster on the CPU.
 """
 
-from functools import cache
+from math import exp
 
 import torch
 from jaxtyping import Float
 from kornia.feature import harris_response
-from kornia.filters import get_gaussian_kernel1d, guided_blur
+from kornia.filters import guided_blur
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -34,6 +34,24 @@ def corner_response(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> F
     return sliced_harris(sliced_guided_filter(surface, config.filter_size_px, config.filter_eps))
 
 
+def _bordered(images: Float[Tensor, "b h w"], reach: tuple[int, int], border: str) -> Tensor:
+    """Images with so many more rows and columns on either side; ``border`` as in ``torch.nn.functional.pad``."""
+    rows, columns = reach
+    if not torch.compiler.is_compiling():
+        return pad(images[:, None], (columns, columns, rows, rows), border)[:, 0]
+    # Put together from pieces, which a compiler keeps: the border's arithmetic within every sum takes four times as long.
+    for axis, width in ((1, rows), (2, columns)):
+        images = torch.cat([_beyond(images, axis, width, border), images, _beyond(images.flip(axis), axis, width, border).flip(axis)], axis)
+    return images
+
+
+def _beyond(images: Tensor, axis: int, width: int, border: str) -> Tensor:
+    """What comes before the first row or column."""
+    if border == "replicate":
+        return images.narrow(axis, 0, 1).expand(*(width if number == axis else size for number, size in enumerate(images.shape)))
+    return images.narrow(axis, 1, width).flip(axis)
+
+
 def _weighted_shifts(image: Tensor, weights: tuple[float, ...], axis: int) -> Tensor:
     """Correlation along one axis of an image that is already padded."""
     length = image.shape[axis] - len(weights) + 1
@@ -49,7 +67,7 @@ def separable_filter(
 ) -> Float[Tensor, "b h w"]:
     """Correlation with the outer product of two odd kernels; ``border`` as in ``torch.nn.functional.pad``."""
     rows, columns = len(vertical) // 2, len(horizontal) // 2
-    padded = pad(image[:, None], (columns, columns, rows, rows), border)[:, 0]
+    padded = _bordered(image, (rows, columns), border)
     return _weighted_shifts(_weighted_shifts(padded, vertical, -2), horizontal, -1)
 
 
@@ -68,7 +86,7 @@ def _sums_along(image: Tensor, size: int, axis: int) -> Tensor:
 
 def box_mean(images: Float[Tensor, "b h w"], size_px: int) -> Float[Tensor, "b h w"]:
     """Mean over the square around each pixel; beyond its border an image goes on mirrored."""
-    padded = pad(images[:, None], (size_px // 2,) * 4, "reflect")[:, 0]
+    padded = _bordered(images, (size_px // 2, size_px // 2), "reflect")
     return _sums_along(_sums_along(padded, size_px, -2), size_px, -1) * size_px**-2
 
 
@@ -82,15 +100,16 @@ def sliced_guided_filter(surface: Float[Tensor, "b h w"], size_px: int, eps: flo
     return torch.addcmul(mean_offset, mean_slope, surface)
 
 
-@cache
 def _harris_window() -> tuple[float, ...]:
-    """Weights of the Gaussian window along one axis; they never change."""
-    return tuple(get_gaussian_kernel1d(_HARRIS_WINDOW_PX, _HARRIS_SIGMA_PX, dtype=torch.float64)[0].tolist())
+    """Weights of the Gaussian window along one axis."""
+    reach = _HARRIS_WINDOW_PX // 2
+    weights = [exp(-0.5 * (step / _HARRIS_SIGMA_PX) ** 2) for step in range(-reach, reach + 1)]
+    return tuple(weight / sum(weights) for weight in weights)
 
 
 def sliced_harris(image: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
     """Harris response ``det M - k tr² M`` with Sobel gradients and a 7x7 Gaussian window."""
-    padded = pad(image[:, None], (1, 1, 1, 1), "replicate")[:, 0]
+    padded = _bordered(image, (1, 1), "replicate")
     du, dv = _step(_smooth(padded, -2), -1), _step(_smooth(padded, -1), -2)
     window = _harris_window()
     scaled = tuple(weight / _SOBEL_SCALE**2 for weight in window)

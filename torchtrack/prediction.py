@@ -1,7 +1,6 @@
 """Where objects are expected at a window's end, how they move, and how certain that is."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,6 +11,7 @@ from torchtrack.contours import Contours, select_ranked, take_points
 from torchtrack.image_motion import MovingObjects, object_plane_velocity, pixel_velocity
 from torchtrack.lie import retract_about, transform_points
 from torchtrack.object_batch import ObjectBatch, repeat_row
+from torchtrack.once import once
 from torchtrack.pose_solver import pose_jacobian
 
 # Nothing that is tracked is farther away (m).
@@ -38,7 +38,7 @@ class Prediction:
     velocity: Float[Tensor, "b 6"]
     covariance: Float[Tensor, "b 12 12"]
 
-    @cached_property
+    @once
     def centre_cam(self) -> Float[Tensor, "b 3"]:
         """Centre of each object in the camera's frame (m)."""
         return transform_points(self.T_cam_obj, self.objects.centre_obj[:, None])[:, 0]

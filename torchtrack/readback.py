@@ -19,47 +19,50 @@ from torch import Tensor
 
 def read_at_once(values: Tensor) -> bool:
     """Whether values can be read, and shapes hang on them, at no cost: on the CPU."""
-    return values.device.type == "cpu"
+    return values.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Values on their way to the CPU, where decisions are taken.
+    """Values that the CPU has, or that are on their way to it, where decisions are taken.
 
     Args:
         on_device: the values.
+        known: the same as numbers, where they were known from the start.
         copy: the same on the CPU, once ``arrived``.
         arrived: when the copy is there; none where nothing had to be copied.
     """
 
     on_device: Tensor
-    copy: Tensor
-    arrived: torch.cuda.Event | None
+    known: list[Any] | None = None
+    copy: Tensor | None = None
+    arrived: torch.cuda.Event | None = None
 
     @classmethod
     def to(cls, values: Tensor) -> "Answer":
         """Begin to copy values; from the CPU they need not be."""
         values = values.detach()
         if values.device.type != "cuda":
-            return cls(values, values, None)
+            return cls(values, copy=values)
         copy = values.to("cpu", non_blocking=True)
         arrived = torch.cuda.Event()
         arrived.record(torch.cuda.current_stream(values.device))
-        return cls(values, copy, arrived)
+        return cls(values, copy=copy, arrived=arrived)
+
+    @classmethod
+    def of(cls, number: int, like: Tensor) -> "Answer":
+        """One number for each of some values, known without a look at them."""
+        return cls(torch.full_like(like, number), known=[number] * like.numel())
 
     def any(self) -> bool:
         """Whether any of the values is true."""
-        return bool(self._there().any())
+        return any(self.numbers())
 
     def numbers(self) -> list[Any]:
-        """The values."""
-        return self._there().tolist()
-
-    def _there(self) -> Tensor:
-        """The copy, once it has arrived."""
+        """The values, once they have arrived."""
         if self.arrived is not None:
             self.arrived.synchronize()
-        return self.copy
+        return self.copy.tolist() if self.known is None and self.copy is not None else self.known or []
 
 
 class Questions:
@@ -68,6 +71,10 @@ class Questions:
     def ask(self, values: Tensor, usual: int) -> Answer:
         """Begin to ask for values, which in a steady window are all ``usual``."""
         return Answer.to(values)
+
+    def none_of(self, values: Tensor) -> bool:
+        """Whether it is certain that no value is true, as in a steady window; on a GPU it never is, as it would take a wait."""
+        return read_at_once(values) and not bool(values.any())
 
 
 class Assumptions(Questions):
@@ -79,7 +86,12 @@ class Assumptions(Questions):
     def ask(self, values: Tensor, usual: int) -> Answer:
         """The usual answer; whether it is the right one is noted."""
         self._wrong.append((values.detach() != usual).any())
-        return Answer(torch.full_like(values, usual), torch.full(values.shape, usual), None)
+        return Answer.of(usual, values)
+
+    def none_of(self, values: Tensor) -> bool:
+        """As usual: none."""
+        self._wrong.append(values.detach().any())
+        return True
 
     def wrong(self) -> Tensor:
         """Whether any answer so far was not the right one."""

@@ -4,7 +4,6 @@ The most promising of thousands (:mod:`torchtrack.hypotheses`) are aligned as on
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,6 +15,7 @@ from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.contours import Contours
 from torchtrack.hypotheses import event_density, promising
 from torchtrack.observations import WindowEvents, select_events
+from torchtrack.once import once
 from torchtrack.pose_solver import Linearisation
 from torchtrack.prediction import Prediction
 from torchtrack.readback import Answer
@@ -40,7 +40,7 @@ class Found:
     at_rest: Float[Tensor, "b"]
     count: Int[Tensor, "b"]
 
-    @cached_property
+    @once
     def share(self) -> Float[Tensor, "b"]:
         """What events explain of the contour."""
         return torch.where(self.measured.isnan(), self.at_rest, self.measured)

@@ -17,13 +17,12 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.constants import constant
 from torchtrack.contours import Contours
 from torchtrack.corners import Corners, detect_corners, no_corners
-from torchtrack.events import EventBatch, PaddedEvents, pad_streams
+from torchtrack.events import PaddedEvents, pad_streams
 from torchtrack.evidence import AgeAt
 from torchtrack.flow import estimate_flow
 from torchtrack.observations import WindowEvents
 from torchtrack.prediction import Prediction
 from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
-from torchtrack.state import TrackerState
 from torchtrack.time_surface import at_pixels, object_regions, time_surface
 
 # Contours this far outside the image still find their place on a distorted sensor (px).
@@ -60,25 +59,26 @@ class Sensors:
         """Height and width of the largest sensor."""
         return self.ideal_pixels.shape[1], self.ideal_pixels.shape[2]
 
-    def near_objects(self, events: EventBatch, prediction: Prediction, window_s: Float[Tensor, "b"], config: TrackerConfig) -> NearbyEvents:
+    def near_objects(self, events: NearbyEvents, prediction: Prediction, window_s: Float[Tensor, "b"], config: TrackerConfig) -> NearbyEvents:
         """The events that can have to do with the objects. A GPU would have to be waited for: there, all are kept."""
         if self.tiles is None or not readback.read_at_once(window_s):
-            return NearbyEvents(events)
+            return events
         margin_px = max(config.matching.max_gate_px, *config.matching.gates_px) + _DRAWN_SIGMAS * config.search.least_sigma_px
-        return self.tiles.keep(events, self.tiles.near(prediction, window_s, margin_px))
+        return self.tiles.keep(events.events, self.tiles.near(prediction, window_s, margin_px))
 
     def window_events(
-        self, nearby: NearbyEvents, state: TrackerState, t_us: Int[Tensor, "s"], longest_us: int
+        self, nearby: NearbyEvents, burst_age_us: Int[Tensor, "s 2 h w"], t_us: Int[Tensor, "s"], longest_us: int
     ) -> tuple[WindowEvents, Int[Tensor, "s 2 h w"]]:
-        """The events of the window after ``state`` as each object's camera saw them, and the bursts' ages after it (µs).
+        """The events of a window as each object's camera saw them, and the bursts' ages with them (µs).
 
         Args:
             nearby: the events that count.
+            burst_age_us: ages at the window's end without them.
             t_us: end of the window of each stream.
             longest_us: how long a pixel's events are of one burst.
         """
         window = pad_streams(nearby.events, len(self.ideal_pixels), t_us)
-        burst_age_us, into_burst_us = update_bursts(state.burst_age_us, t_us - state.t_us, window, longest_us)
+        burst_age_us, into_burst_us = update_bursts(burst_age_us, window, longest_us)
         seen = self.seen(window, into_burst_us, nearby.number)
         return seen if nearby.of_each is None else seen.only(*nearby.of_each), burst_age_us
 

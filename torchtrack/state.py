@@ -67,6 +67,15 @@ class TrackerState:
     learned: LearnedContours | None = None
     model_trust: ModelTrust | None = None
 
+    def numbered(self, before: "TrackerState", more: int = 0) -> "TrackerState":
+        """The state with as many windows taken as ``before``, and some more."""
+        learned, trust = self.learned, self.model_trust
+        if learned is not None and before.learned is not None:
+            learned = replace(learned, windows=before.learned.windows + more)
+        if trust is not None and before.model_trust is not None:
+            trust = replace(trust, windows=before.model_trust.windows + more)
+        return replace(self, learned=learned, model_trust=trust)
+
 
 @dataclass(frozen=True)
 class StepResult:
@@ -121,6 +130,12 @@ def take_part(value: S, objects: slice, streams: slice) -> S:
     """The state or the result of some objects and of the streams that they are in."""
     part: S = _mapped(lambda tensor: tensor[objects], lambda tensor: tensor[streams], value)
     return part
+
+
+def each_tensor(change: Callable[[Tensor], Tensor], value: S) -> S:
+    """The state or the result with each of its tensors changed."""
+    changed: S = _mapped(change, change, value)
+    return changed
 
 
 def joined(states: Sequence[TrackerState]) -> TrackerState:

@@ -102,7 +102,12 @@ def build_tracker(sessions: Sequence[Session], config: TrackingConfig) -> Tracke
     models = [model for session in sessions for model in session.models]
     cameras = [session.camera for session in sessions]
     stream_index = [stream for stream, session in enumerate(sessions) for _ in session.models]
-    return tracker_class(config.preset)(models, cameras, config.tracker, stream_index, getattr(torch, config.dtype)).to(config.device)
+    kind, dtype = tracker_class(config.preset), getattr(torch, config.dtype)
+    if not config.compiled:
+        return kind(models, cameras, config.tracker, stream_index, dtype).to(config.device)
+    if kind is not Tracker:
+        raise ConfigError(f"compiled: the method '{config.preset}' cannot be compiled. Leave it out, or use the preset default, paper or nns.")
+    return Tracker(models, cameras, config.tracker, stream_index, dtype, compiled=True).to(config.device)
 
 
 @dataclass(frozen=True)
@@ -149,23 +154,30 @@ def _steps(followers: Mapping[int, Follower[R]], config: TrackingConfig) -> Iter
 
 def _one_batch(streams: Sequence[_Stream], config: TrackingConfig) -> Iterator[tuple[int, Step | Ended]]:
     """The steps of streams whose windows are one batch, as long as there are any."""
-    tracker: Tracker | None = None
+    tracker, state, rows = _together(streams, config)
+    # Before the first window is asked for: a live camera does not wait.
+    tracker.prepare(state)
     while True:
         windows = [(stream, _next_window(stream)) for stream in streams]
         yield from ((stream.number, window) for stream, window in windows if isinstance(window, Ended))
         due = [(stream, window) for stream, window in windows if not isinstance(window, Ended)]
         if not due:
             return
-        if tracker is None or len(due) < len(streams):
+        if len(due) < len(streams):
             streams = [stream for stream, _ in due]
-            tracker = build_tracker([stream.session for stream in streams], config)
-            state, rows = joined([stream.state for stream in streams]), _rows([len(stream.session.models) for stream in streams])
+            tracker, state, rows = _together(streams, config)
         events = concatenate(window.events.of_stream(place) for place, (_, window) in enumerate(due))
         t_end_us = torch.tensor([window.t_end_us for _, window in due], device=config.device)
         state, result, seconds = timed_step(tracker, state, events, t_end_us, [stream.length for stream in streams])
         for (stream, window), own in zip(due, rows, strict=True):
             stream.state = take_part(state, *own)
             yield stream.number, Step(window, stream.state, take_part(result, *own), seconds / len(due))
+
+
+def _together(streams: Sequence[_Stream], config: TrackingConfig) -> tuple[Tracker, TrackerState, list[tuple[slice, slice]]]:
+    """A tracker of all the streams, their state as one, and the rows of each."""
+    tracker = build_tracker([stream.session for stream in streams], config)
+    return tracker, joined([stream.state for stream in streams]), _rows([len(stream.session.models) for stream in streams])
 
 
 def _next_window(stream: _Stream) -> EventWindow | Ended:

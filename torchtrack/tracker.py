@@ -12,37 +12,34 @@ from torch import Tensor, nn
 
 from torchtrack import lie, readback
 from torchtrack.alignment import align, gate_widening, index_for, index_radius, usual_index_radius
-from torchtrack.bursts import no_bursts
+from torchtrack.bursts import aged, no_bursts
 from torchtrack.camera import Camera
+from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contour_model import ContourModel, group_by_model
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.learned_contours import LearnedContours
-from torchtrack.model_trust import ModelTrust, element_groups
+from torchtrack.model_trust import ModelTrust
 from torchtrack.motion import initial_covariance, predict_covariance, with_dropped, without_spin
-from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
-from torchtrack.object_model.symmetry import revolution_axes
 from torchtrack.observations import corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
-from torchtrack.prediction import Prediction, before_camera, far_pose
+from torchtrack.prediction import Prediction, before_camera
 from torchtrack.probation import after_probation
 from torchtrack.search import Doubt, explained_at_rest, judge_fit, may_be_wanted, search_is_due, search_wanted
-from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
-from torchtrack.sensors import Sensors, sensor_tables
-from torchtrack.setup_check import check_setup, check_start
+from torchtrack.sensor_tiles import NearbyEvents
+from torchtrack.setup_check import check_start
 from torchtrack.speed_limit import largest_speed, limit_speed
 from torchtrack.state import Probation, StepResult, TrackerState, choose_rows
 from torchtrack.time_surface import empty_last_event, update_last_event
-from torchtrack.trust import TrustNetwork
+from torchtrack.tracked_objects import TrackedObjects
 from torchtrack.window_parts import to_be_parted
 
 _QUESTIONS = readback.Questions()
 
 
-class Tracker(nn.Module):
+class Tracker(TrackedObjects):
     """Tracks known rigid objects in one or more event streams.
 
     Args:
@@ -55,17 +52,11 @@ class Tracker(nn.Module):
             ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
             comes with the package where ``matching.learned_trust`` is on, and none otherwise. Other poses that a search
             tries are aligned without it.
-    """
+        compiled: whether steady windows are taken by compiled graphs, see :mod:`torchtrack.compiled`.
 
-    intrinsics: Tensor
-    ideal_pixels: Tensor
-    sensor_pixels: Tensor
-    stream_index: Tensor
-    element_groups: Tensor
-    centre_obj: Tensor
-    diameter_m: Tensor
-    revolution_axes: Tensor
-    far_pose: Tensor
+    Raises:
+        ConfigError: if graphs are asked for, and this version of PyTorch cannot make them.
+    """
 
     def __init__(
         self,
@@ -75,64 +66,11 @@ class Tracker(nn.Module):
         stream_index: Sequence[int] | None = None,
         dtype: torch.dtype = torch.float32,
         weigher: nn.Module | None = None,
+        *,
+        compiled: bool = False,
     ) -> None:
-        super().__init__()
-        cameras = [camera] if isinstance(camera, Camera) else list(camera)
-        self.config = config or TrackerConfig()
-        self.object_names = tuple(model.name for model in objects)
-        streams = list(stream_index) if stream_index is not None else [0] * len(objects)
-        check_setup(objects, cameras, streams, self.config)
-        self._shared = len(set(streams)) < len(streams)
-        self.image_size = (max(c.height for c in cameras), max(c.width for c in cameras))
-        self.groups = nn.ModuleList(group_by_model(objects, self.config.contours))
-        self.register_buffer("stream_index", torch.tensor(streams))
-        self.register_buffer("element_groups", element_groups(self.models, len(objects)))
-        self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
-        ideal_pixels, sensor_pixels = sensor_tables(cameras)
-        self.register_buffer("ideal_pixels", ideal_pixels)
-        self.register_buffer("sensor_pixels", sensor_pixels)
-        self.tiles = SensorTiles(self.ideal_pixels[0]) if len(cameras) == 1 else None
-        self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
-        self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
-        self.register_buffer("revolution_axes", revolution_axes(objects))
-        self._revolves = bool(self.revolution_axes.any())
-        self.register_buffer("far_pose", far_pose(self.centre_obj))
-        self.weigher = TrustNetwork.shipped() if weigher is None and self.config.matching.learned_trust else weigher
-        # On dense meshes no line of sight is followed.
-        self._learns = any(len(model.triangles) for model in self.models)
-        self.to(dtype)
-
-    @property
-    def models(self) -> list[ContourModel]:
-        """The distinct models, with the objects that have each."""
-        return [group for group in self.groups if isinstance(group, ContourModel)]
-
-    @property
-    def objects(self) -> ObjectBatch:
-        """The objects as one batch."""
-        shape = (self.streams, *self.image_size)
-        return ObjectBatch(self.models, self.intrinsics, self.centre_obj, self.diameter_m, self.stream_index, shape, self._shared)
-
-    @property
-    def sensors(self) -> Sensors:
-        """The sensors that the objects are seen by."""
-        return Sensors(self.ideal_pixels, self.sensor_pixels, self.stream_index, self.tiles)
-
-    @property
-    def _looks_back(self) -> bool:
-        """Whether anything needs the events of earlier windows: they are not kept for nothing."""
-        return self.config.corners.max_corners > 0 or self.weigher is not None
-
-    @property
-    def _judges(self) -> bool:
-        """Whether parts of the models may be left out."""
-        config = self.config
-        return config.model_trust.least_share > 0 and config.matching.max_events > 0 and config.contours.source == "mesh"
-
-    @property
-    def streams(self) -> int:
-        """Number of event streams."""
-        return len(self.ideal_pixels)
+        super().__init__(objects, camera, config, stream_index, dtype, weigher)
+        self._graphs = CompiledStep(self) if compiled else None
 
     def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
         """The state before the first window, from each object's pose at ``t_us``.
@@ -149,7 +87,7 @@ class Tracker(nn.Module):
         last_event_us, burst_age_us = (empty(self.streams, *self.image_size, T_cam_obj.device) for empty in (empty_last_event, no_bursts))
         learning = self.config.learning
         learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
-        trust = ModelTrust.none(self.element_groups, velocity) if self._judges else None
+        trust = ModelTrust.none(self.element_groups, velocity) if self.judges else None
         probation = Probation.none(T_cam_obj, covariance)
         return TrackerState(
             T_cam_obj.clone(), velocity, covariance, nothing, nothing, nothing, times, last_event_us, burst_age_us, probation, learned, trust
@@ -177,7 +115,7 @@ class Tracker(nn.Module):
             parted = readback.Answer.to(in_parts)
             if readback.read_at_once(in_parts) and bool(in_parts.all()):
                 return _counted(self._advance_in_parts(state, events, t_us, in_parts))
-            done = self._advance(state, events, t_us)
+            done = self._steady(state, events, t_us) or self._advance(state, events, t_us)
             return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us, in_parts), done) if parted.any() else done)
 
     def steady_step(
@@ -194,8 +132,26 @@ class Tracker(nn.Module):
         t_us, assumptions = self._window_end(state, events, t_end_us), readback.Assumptions()
         with torch.autocast(t_us.device.type, enabled=False):
             assumptions.ask(to_be_parted(state, events, t_us, self.objects, self.config), False)
-            done = _counted(self._advance(state, events, t_us, questions=assumptions))
+            done = _counted(self.advance(self.opened(state, events, t_us), NearbyEvents(events), t_us, questions=assumptions))
         return *done, assumptions.wrong()
+
+    def prepare(self, state: TrackerState) -> None:
+        """Compile what is compiled, before the first window: it takes a minute or more, and a live camera does not wait.
+
+        Args:
+            state: from :meth:`init`.
+        """
+        if self._graphs is not None:
+            self._graphs.prepare(state)
+
+    def _steady(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult] | None:
+        """A window by a compiled graph, where there is one and it holds."""
+        return None if self._graphs is None or torch.is_grad_enabled() else self._graphs(state, events, t_us)
+
+    def steady_advance(self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
+        """:meth:`advance` with nothing to decide; and whether anything of it was called for."""
+        assumptions = readback.Assumptions()
+        return *self.advance(state, events, t_us, questions=assumptions), assumptions.wrong()
 
     def _advance_in_parts(self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor) -> tuple[TrackerState, StepResult]:
         """The window as several short ones, with a search for objects that are ``starting``."""
@@ -206,24 +162,40 @@ class Tracker(nn.Module):
             events = events[~early]
         return self._advance(state, events, t_us, starting)
 
-    def _advance(
+    def _advance(self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor | None = None) -> tuple[TrackerState, StepResult]:
+        """One window, or one part of it."""
+        return self.advance(self.opened(state, events, t_us), NearbyEvents(events), t_us, starting)
+
+    def opened(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> TrackerState:
+        """The state with its maps of the sensor as they are at a window's end, but for the bursts that begin in it."""
+        last_event_us = update_last_event(state.last_event_us, events) if self.looks_back else state.last_event_us
+        return replace(state, last_event_us=last_event_us, burst_age_us=aged(state.burst_age_us, t_us - state.t_us))
+
+    def advance(
         self,
         state: TrackerState,
-        events: EventBatch,
-        t_us: Tensor,
+        events: NearbyEvents,
+        t_us: Int[Tensor, "s"],
         starting: Tensor | None = None,
         questions: readback.Questions = _QUESTIONS,
     ) -> tuple[TrackerState, StepResult]:
-        """One window, or one part of it: events, contours where they are expected, corners and flow, matching and solving, conclusion."""
-        config, sensors = self.config, self.sensors
+        """A window from its events to poses: contours where they are expected, corners and flow, matching and solving, conclusion.
+
+        Args:
+            state: from :meth:`opened`.
+            events: of the window, as far as they can have to do with the objects.
+            t_us: end of the window.
+            starting: objects whose motion is not known yet.
+            questions: asks for what has to be decided.
+        """
+        config, sensors, last_event_us = self.config, self.sensors, state.last_event_us
         window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
         dt_s = window_s[self.stream_index]
-        last_event_us = update_last_event(state.last_event_us, events) if self._looks_back else state.last_event_us
-        recorded = self._predict(self._held_back(state, events, t_us, dt_s), dt_s)
+        recorded = self._predict(self._held_back(state, events.events, t_us, dt_s, questions), dt_s)
         prediction = recorded.detached()
         # A weigher is shown all events.
-        nearby = NearbyEvents(events) if self.weigher is not None else sensors.near_objects(events, prediction, dt_s, config)
-        seen, burst_age_us = sensors.window_events(nearby, state, t_us, config.matching.burst_us)
+        nearby = events if self.weigher is not None else sensors.near_objects(events, prediction, dt_s, config)
+        seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, config.matching.burst_us)
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(self.diameter_m)
         starting = torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
@@ -247,8 +219,8 @@ class Tracker(nn.Module):
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
         if config.search.probation:
             next_state, result = after_probation(state, next_state, result, prediction, widening, config)
-        next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self._learns), config)
-        return replace(next_state, t_us=t_us, last_event_us=last_event_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
+        next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self.on_surfaces), config)
+        return replace(next_state, t_us=t_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""
@@ -263,22 +235,22 @@ class Tracker(nn.Module):
         velocity, covariance = state.velocity, state.covariance
         if self.config.motion.model == "hold":
             velocity, covariance = torch.zeros_like(velocity), with_dropped(covariance, velocity)
-        if self._revolves and self.config.motion.spin_fades:
+        if self.revolves and self.config.motion.spin_fades:
             axes_cam = (state.T_cam_obj[:, :3, :3].to(velocity.dtype) @ self.revolution_axes[..., None])[..., 0]
             velocity, covariance = without_spin(velocity, covariance, axes_cam, dt_s, self.config.motion)
         moved = velocity * dt_s[:, None]
         T_prior = lie.move_about(state.T_cam_obj.to(velocity.dtype), lie.cayley(moved[:, :3]), moved[:, 3:], self.centre_obj)
         covariance = predict_covariance(covariance.detach(), velocity.detach(), dt_s, self.diameter_m, self.config.motion)
-        objects = objects_as_known(self.objects, state, self.element_groups, self._learns, self.config)
+        objects = objects_as_known(self.objects, state, self.element_groups, self.on_surfaces, self.config)
         T_prior, usable = before_camera(T_prior, self.centre_obj, self.far_pose)
         return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance)
 
     @torch.no_grad()
-    def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor) -> TrackerState:
+    def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:
         """The state, with the speed of objects that were never found yet limited by the events before them."""
         # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.
         found = state.usual_share > 0
-        if not self.config.motion.speed_from_events or (readback.read_at_once(found) and bool(found.all())):
+        if not self.config.motion.speed_from_events or questions.none_of(~found):
             return state
         T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)
         limit_m_s = largest_speed(self.objects, T_cam_obj, self.sensors.seen(pad_streams(events, self.streams, t_us)), dt_s)
@@ -289,6 +261,4 @@ class Tracker(nn.Module):
 def _counted(done: tuple[TrackerState, StepResult]) -> tuple[TrackerState, StepResult]:
     """A window more was taken, in parts or not."""
     state, result = done
-    learned = None if state.learned is None else replace(state.learned, windows=state.learned.windows + 1)
-    trust = None if state.model_trust is None else replace(state.model_trust, windows=state.model_trust.windows + 1)
-    return replace(state, learned=learned, model_trust=trust), result
+    return state.numbered(state, 1), result

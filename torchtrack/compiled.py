@@ -1,0 +1,150 @@
+"""Steady windows as one compiled graph: fused kernels in the place of some three thousand small operations.
+
+What a step of one object costs is the calls of operations, not what they compute. ``torch.compile`` turns the part of it in
+which nothing has to be decided into fewer and larger kernels; on a GPU, a CUDA graph holds them. Shapes are those of a GPU
+(:mod:`torchtrack.readback`), and the number of events is left open.
+
+Where a window turns out not to be steady, as an object is to be searched for, or is very uncertain, what the graph gave is
+dropped and the window is taken as without one: poses are the same, to rounding.
+"""
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from inspect import signature
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.errors import ConfigError
+from torchtrack.events import EventBatch
+from torchtrack.sensor_tiles import NearbyEvents
+from torchtrack.state import StepResult, TrackerState, each_tensor
+
+if TYPE_CHECKING:
+    from torchtrack.tracker import Tracker
+
+# Windows of a kind have a graph of their own: whether anything is learned from them, and how many events a stream has at most.
+_Kind = tuple[bool, bool, int | None]
+_Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
+# At a start, windows differ in what is learned from them.
+_FIRST_WINDOWS = 5
+# What takes Python out of the calls of kernels.
+_WITHOUT_PYTHON = {"cpu": "cpp_wrapper", "cuda": "triton.cudagraphs"}
+# Events are filled up to numbers of this many binary digits, so that a GPU needs few graphs; and there are so many at least.
+_DIGITS, _LEAST = 3, 64
+
+
+class CompiledStep:
+    """Takes steady windows by graphs, compiled when they are first needed: for a minute or more, and for seconds from a cache on disk.
+
+    Args:
+        tracker: whose windows they are.
+
+    Raises:
+        ConfigError: if this version of PyTorch cannot.
+    """
+
+    def __init__(self, tracker: "Tracker") -> None:
+        if "isolate_recompiles" not in signature(torch.compile).parameters:
+            raise ConfigError(f"compiled: PyTorch {torch.__version__} cannot compile a tracker. Update it to 2.13 or later, or go without.")
+        self._tracker = tracker
+        self._graphs: dict[_Kind, _Graph] = {}
+
+    def __call__(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult] | None:
+        """State and result of a window, not counted yet; None where it is not steady, or there is hardly any event in it."""
+        if len(events) < 2 or (state.learned is not None and state.learned.windows < _FIRST_WINDOWS):
+            return None
+        next_state, result, wrong = self._taken(state, events, t_us)
+        return None if bool(wrong) else (each_tensor(_own, next_state).numbered(state), each_tensor(_own, result))
+
+    def prepare(self, state: TrackerState) -> None:
+        """Compile the graphs of one stream, from the state that it begins with; with several, more than that would have to be known."""
+        if len(state.t_us) > 1:
+            return
+        t_us, nothing = state.t_us + 1, torch.zeros_like(state.t_us).expand(2)
+        events = EventBatch(nothing.int(), nothing.int(), t_us.expand(2), nothing > 0, nothing)
+        taken = max((part.windows for part in (state.learned, state.model_trust) if part is not None), default=0)
+        for window in _of_each_kind(self._tracker.config):
+            self._taken(state.numbered(state, window - taken), events, t_us)
+
+    @torch.inference_mode()
+    def _taken(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:
+        """What the graph makes of a window, and whether that does not hold."""
+        opened, filled = each_tensor(_plain, self._tracker.opened(state, events, t_us)), _filled(events, len(state.t_us))
+        kind = _kind(state, filled, self._tracker.config)
+        if kind in self._graphs:
+            torch.compiler.cudagraph_mark_step_begin()
+            return self._graphs[kind](opened, filled, t_us)
+        self._graphs[kind] = _compiled(self._tracker.steady_advance, t_us.device)
+        with _as_expected():
+            return self._graphs[kind](opened, filled, t_us)
+
+
+def _compiled(function: _Graph, device: torch.device) -> _Graph:
+    """The function as a graph of its own."""
+    # All that it hangs on is fixed with the tracker, or with the kind of window: to look whether it is takes a tenth of a step.
+    options = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe, _WITHOUT_PYTHON[device.type]: True}
+    # Without guards, no two functions may share what is compiled.
+    how: dict[str, Any] = {"fullgraph": True, "dynamic": False, "options": options, "isolate_recompiles": True}
+    graph: _Graph = torch.compile(function, **how)
+    return graph
+
+
+@contextmanager
+def _as_expected() -> Iterator[None]:
+    """Within it, the compiler does not report which operations it leaves to PyTorch."""
+    logger = logging.getLogger("torch._inductor")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+def _of_each_kind(config: TrackerConfig) -> tuple[int, ...]:
+    """Numbers of windows, one of each kind that there is once a start is over."""
+    learning, trust = config.learning, config.model_trust
+    first = max(learning.first_windows, trust.first_windows, _FIRST_WINDOWS)
+    kinds = {(n % learning.every == 0, n % trust.every == 0): n for n in range(first, first + learning.every * trust.every + 1)}
+    return tuple(kinds.values())
+
+
+def _kind(state: TrackerState, events: NearbyEvents, config: TrackerConfig) -> _Kind:
+    """Which graph a window is for."""
+    learns = state.learned is not None and state.learned.due(config.learning)
+    judges = state.model_trust is not None and state.model_trust.due(config.model_trust)
+    return learns, judges, events.events.most_of_one
+
+
+def _plain(value: Tensor) -> Tensor:
+    """The tensor as graphs are made for: row by row in memory, and of no use for gradients."""
+    return value.contiguous() if value.is_inference() else value.clone(memory_format=torch.contiguous_format)
+
+
+def _own(value: Tensor) -> Tensor:
+    """The tensor as the caller may keep it: a CUDA graph writes its results to the same places every time."""
+    return value.clone() if value.is_cuda or not torch.is_inference_mode_enabled() else value
+
+
+def _filled(events: EventBatch, streams: int) -> NearbyEvents:
+    """The events, with some of no stream after them."""
+    missing = _rounded_up(len(events)) - len(events)
+    x, y, t_us, polarity = (pad(values, (0, missing)) for values in (events.x, events.y, events.t_us, events.polarity))
+    most = None if streams == 1 else 1 << (events.most_of_one or len(events)).bit_length()
+    filled = EventBatch(x, y, t_us, polarity, pad(events.stream_index, (0, missing), value=streams), most_of_one=most)
+    number = torch.arange(len(filled), device=x.device)
+    for values in (x, y, t_us, polarity, filled.stream_index, number):
+        torch._dynamo.mark_dynamic(values, 0)
+    return NearbyEvents(filled, number)
+
+
+def _rounded_up(count: int) -> int:
+    """The next larger number of few binary digits."""
+    step = 1 << max(count.bit_length() - _DIGITS, 0)
+    return max(-(-count // step) * step, _LEAST)

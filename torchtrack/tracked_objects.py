@@ -1,0 +1,100 @@
+"""What a tracker is made for: the objects, the cameras that see them, and the settings; nothing of it changes."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchtrack.camera import Camera
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.contour_model import ContourModel, group_by_model
+from torchtrack.model_trust import element_groups
+from torchtrack.object_batch import ObjectBatch
+from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.symmetry import revolution_axes
+from torchtrack.prediction import far_pose
+from torchtrack.sensor_tiles import SensorTiles
+from torchtrack.sensors import Sensors, sensor_tables
+from torchtrack.setup_check import check_setup
+from torchtrack.trust import TrustNetwork
+
+
+class TrackedObjects(nn.Module):
+    """The objects of a tracker, in its streams; arguments as those of :class:`torchtrack.tracker.Tracker`."""
+
+    intrinsics: Tensor
+    ideal_pixels: Tensor
+    sensor_pixels: Tensor
+    stream_index: Tensor
+    element_groups: Tensor
+    centre_obj: Tensor
+    diameter_m: Tensor
+    revolution_axes: Tensor
+    far_pose: Tensor
+
+    def __init__(
+        self,
+        objects: Sequence[ObjectModel],
+        camera: Camera | Sequence[Camera],
+        config: TrackerConfig | None = None,
+        stream_index: Sequence[int] | None = None,
+        dtype: torch.dtype = torch.float32,
+        weigher: nn.Module | None = None,
+    ) -> None:
+        super().__init__()
+        cameras = [camera] if isinstance(camera, Camera) else list(camera)
+        self.config = config or TrackerConfig()
+        self.object_names = tuple(model.name for model in objects)
+        streams = list(stream_index) if stream_index is not None else [0] * len(objects)
+        check_setup(objects, cameras, streams, self.config)
+        self._shared = len(set(streams)) < len(streams)
+        self.image_size = (max(c.height for c in cameras), max(c.width for c in cameras))
+        self.groups = nn.ModuleList(group_by_model(objects, self.config.contours))
+        self.register_buffer("stream_index", torch.tensor(streams))
+        self.register_buffer("element_groups", element_groups(self.models, len(objects)))
+        self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
+        ideal_pixels, sensor_pixels = sensor_tables(cameras)
+        self.register_buffer("ideal_pixels", ideal_pixels)
+        self.register_buffer("sensor_pixels", sensor_pixels)
+        self.tiles = SensorTiles(self.ideal_pixels[0]) if len(cameras) == 1 else None
+        self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
+        self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
+        self.register_buffer("revolution_axes", revolution_axes(objects))
+        self.revolves = bool(self.revolution_axes.any())
+        self.register_buffer("far_pose", far_pose(self.centre_obj))
+        self.weigher = TrustNetwork.shipped() if weigher is None and self.config.matching.learned_trust else weigher
+        # On dense meshes no line of sight is followed.
+        self.on_surfaces = any(len(model.triangles) for model in self.models)
+        self.to(dtype)
+
+    @property
+    def models(self) -> list[ContourModel]:
+        """The distinct models, with the objects that have each."""
+        return [group for group in self.groups if isinstance(group, ContourModel)]
+
+    @property
+    def objects(self) -> ObjectBatch:
+        """The objects as one batch."""
+        shape = (self.streams, *self.image_size)
+        return ObjectBatch(self.models, self.intrinsics, self.centre_obj, self.diameter_m, self.stream_index, shape, self._shared)
+
+    @property
+    def sensors(self) -> Sensors:
+        """The sensors that the objects are seen by."""
+        return Sensors(self.ideal_pixels, self.sensor_pixels, self.stream_index, self.tiles)
+
+    @property
+    def looks_back(self) -> bool:
+        """Whether anything needs the events of earlier windows: they are not kept for nothing."""
+        return self.config.corners.max_corners > 0 or self.weigher is not None
+
+    @property
+    def judges(self) -> bool:
+        """Whether parts of the models may be left out."""
+        config = self.config
+        return config.model_trust.least_share > 0 and config.matching.max_events > 0 and config.contours.source == "mesh"
+
+    @property
+    def streams(self) -> int:
+        """Number of event streams."""
+        return len(self.ideal_pixels)
