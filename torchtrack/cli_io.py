@@ -84,6 +84,8 @@ class Bench:
     """Of io: events of each file."""
     sequence: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Of pipeline and stages: a sequence (.npz), in place of simulated scenes."""
+    compiled: bool = False
+    """Of pipeline: one object by compiled graphs too; compiling takes some minutes."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
@@ -92,7 +94,7 @@ class Bench:
 
         refuse_settings(overrides)
         sequence, compare = (Path(text) if text is not None else None for text in (self.sequence, self.compare))
-        setup = Setup(self.repeats, bench_device(self.device), self.threads, self.events, sequence)
+        setup = Setup(self.repeats, bench_device(self.device), self.threads, self.events, sequence, self.compiled)
         return bench(self.part, Path(self.output), compare, setup)
 
 

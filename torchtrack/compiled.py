@@ -62,6 +62,11 @@ class CompiledStep:
         next_state, result, wrong = self._taken(state, events, t_us)
         return None if bool(wrong) else (each_tensor(_own, next_state).numbered(state), each_tensor(_own, result))
 
+    @property
+    def kinds(self) -> tuple[_Kind, ...]:
+        """The kinds of windows that there are graphs for."""
+        return tuple(self._graphs)
+
     def prepare(self, state: TrackerState) -> None:
         """Compile the graphs of one stream, from the state that it begins with; with several, more than that would have to be known."""
         if len(state.t_us) > 1:
@@ -69,7 +74,7 @@ class CompiledStep:
         t_us, nothing = state.t_us + 1, torch.zeros_like(state.t_us).expand(2)
         events = EventBatch(nothing.int(), nothing.int(), t_us.expand(2), nothing > 0, nothing)
         taken = max((part.windows for part in (state.learned, state.model_trust) if part is not None), default=0)
-        for window in _of_each_kind(self._tracker.config):
+        for window in _of_each_kind(state, self._tracker.config):
             self._taken(state.numbered(state, window - taken), events, t_us)
 
     @torch.inference_mode()
@@ -78,7 +83,9 @@ class CompiledStep:
         opened, filled = each_tensor(_plain, self._tracker.opened(state, events, t_us)), _filled(events, len(state.t_us))
         kind = _kind(state, filled, self._tracker.config)
         if kind in self._graphs:
-            torch.compiler.cudagraph_mark_step_begin()
+            if t_us.is_cuda:
+                # What the last window gave may be written over.
+                torch.compiler.cudagraph_mark_step_begin()
             return self._graphs[kind](opened, filled, t_us)
         self._graphs[kind] = _compiled(self._tracker.steady_advance, t_us.device)
         with _as_expected():
@@ -107,11 +114,12 @@ def _as_expected() -> Iterator[None]:
         logger.setLevel(before)
 
 
-def _of_each_kind(config: TrackerConfig) -> tuple[int, ...]:
+def _of_each_kind(state: TrackerState, config: TrackerConfig) -> tuple[int, ...]:
     """Numbers of windows, one of each kind that there is once a start is over."""
     learning, trust = config.learning, config.model_trust
     first = max(learning.first_windows, trust.first_windows, _FIRST_WINDOWS)
-    kinds = {(n % learning.every == 0, n % trust.every == 0): n for n in range(first, first + learning.every * trust.every + 1)}
+    every = 1 if state.learned is None else learning.every, 1 if state.model_trust is None else trust.every
+    kinds = {(n % every[0] == 0, n % every[1] == 0): n for n in range(first, first + every[0] * every[1] + 1)}
     return tuple(kinds.values())
 
 

@@ -15,7 +15,7 @@ Numbers = tuple[Any, ...]
 
 def constant(values: Numbers, dtype: torch.dtype, device: torch.device) -> Tensor:
     """A tensor of these numbers; whoever asks for it must not write to it."""
-    # A compiled graph holds its constants itself.
+    # A compiled graph keeps its constants itself.
     return torch.tensor(values, dtype=dtype, device=device) if torch.compiler.is_compiling() else _kept(values, dtype, device)
 
 
@@ -27,13 +27,22 @@ def _kept(values: Numbers, dtype: torch.dtype, device: torch.device) -> Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
 
 
-@lru_cache(maxsize=64)
-def disc(radius: float | int, device: torch.device) -> Tensor:
+def disc(radius: float, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Offsets ``[2, d]`` (column, row) of the cells whose middles lie within a radius of one's own, row by row."""
+    return constant(_within(radius), dtype, device).T
+
+
+@torch.compiler.assume_constant_result
+def _within(radius: float) -> Numbers:
+    """The cells as numbers; apart from how they are kept, as a compiler does not look into that."""
+    return _cells(radius)
+
+
+@lru_cache(maxsize=64)
+def _cells(radius: float) -> Numbers:
     reach = int(radius)
     steps = range(-reach, reach + 1)
-    inside = tuple((column, row) for row in steps for column in steps if row**2 + column**2 <= radius**2)
-    return constant(inside, torch.int64, device).T
+    return tuple((column, row) for row in steps for column in steps if row**2 + column**2 <= radius**2)
 
 
 def one(like: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ instead.
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from math import ceil
 
 import torch
@@ -15,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import readback
-from torchtrack.constants import constant
+from torchtrack.constants import constant, disc
 from torchtrack.contours import Contours
 
 # Squared distances are compared in these fractions of a pixel².
@@ -142,25 +141,18 @@ def _write(keys: Tensor, points: tuple[Tensor, Tensor, Tensor], radius_px: int, 
         points: the cell of each, the way from each to the centre of its cell (px), and its number.
     """
     cell, to_centre, number = points
-    disc = constant(_disc(radius_px / cell_px), to_centre.dtype, to_centre.device)
-    steps = _squared_distances(_DISTANCE_STEPS**0.5 * to_centre, _DISTANCE_STEPS**0.5 * cell_px * disc)
+    # The cells that reach into the radius around a cell's middle.
+    column, row = disc(radius_px / cell_px + _HALF_DIAGONAL, to_centre.dtype, to_centre.device)
+    steps = _squared_distances(_DISTANCE_STEPS**0.5 * to_centre, _DISTANCE_STEPS**0.5 * cell_px * torch.stack([column, row], -1))
     # What is farther than the radius need not be told apart, and must fit.
     key = steps.clamp_(0, _DISTANCE_STEPS * radius_px**2 + 1).to(keys.dtype).mul_(count).add_(number[:, None])
-    around = torch.add(disc[:, 0], disc[:, 1], alpha=columns).long()
+    around = torch.add(column, row, alpha=columns).long()
     keys.scatter_reduce_(0, (cell[:, None] + around).flatten(), key.flatten(), "amin")
 
 
 def _reach(radius_px: int, cell_px: int) -> int:
     """How many cells away a point still counts."""
     return int(radius_px / cell_px + _HALF_DIAGONAL)
-
-
-@lru_cache
-def _disc(radius: float) -> tuple[tuple[int, int], ...]:
-    """Offsets (column, row) of the cells that reach into ``radius`` cells around a cell's middle."""
-    reach = int(radius + _HALF_DIAGONAL)
-    steps = range(-reach, reach + 1)
-    return tuple((column, row) for row in steps for column in steps if row**2 + column**2 <= (radius + _HALF_DIAGONAL) ** 2)
 
 
 def _squared_distances(to_centre: Float[Tensor, "p 2"], offsets: Float[Tensor, "d 2"]) -> Float[Tensor, "p d"]:

@@ -35,7 +35,7 @@ def newest_events_around(
         ideal_pixels: undistortion table of each stream.
     """
     _, height, width = last_event_us.shape
-    du, dv = disc(config.radius_px, last_event_us.device)
+    du, dv = disc(config.radius_px, torch.int64, last_event_us.device)
     u = sensor_pixels[..., 0, None] + du
     v = sensor_pixels[..., 1, None] + dv
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)

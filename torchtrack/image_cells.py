@@ -1,13 +1,12 @@
 """An object's part of the image as a square of cells, in which points are counted and lines among them are found."""
 
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.constants import constant
+from torchtrack.constants import disc
 
 # Cells a side of the square, and those that an object's diameter takes at most.
 _SIDE, _DIAMETER = 256, 240.0
@@ -51,22 +50,15 @@ def tallied(places: Float[Tensor, "b n 2"], values: Float[Tensor, "b k n"]) -> F
     return values.new_zeros(*values.shape[:2], _SIDE**2).scatter_add_(2, cell, values)
 
 
-def disc(radius: int, like: Tensor) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:
-    """Offsets (column, row) of the cells within a radius."""
-    column, row = constant(_disc(radius), like.dtype, like.device).unbind(-1)
+def around(radius: int, like: Tensor) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:
+    """Offsets (column, row) of the cells within a radius, and of those that are little farther."""
+    column, row = disc((radius * radius + 1) ** 0.5, like.dtype, like.device)
     return column, row
-
-
-@cache
-def _disc(radius: int) -> tuple[tuple[int, int], ...]:
-    """The same as numbers."""
-    step = range(-radius, radius + 1)
-    return tuple((x, y) for y in step for x in step if x * x + y * y <= radius * radius + 1)
 
 
 def is_near(marked: Float[Tensor, "b c"], places: Float[Tensor, "b n 2"], radius: int) -> Bool[Tensor, "b n"]:
     """Which positions have a marked cell within a radius."""
-    column, row = disc(radius, places)
+    column, row = around(radius, places)
     x, y = (value[:, None] + offset[:, None] for value, offset in zip(places.unbind(-1), (column, row), strict=True))
     return (marked.gather(1, cell_of(x, y).flatten(1)).view(x.shape) > 0).any(1)
 
@@ -99,7 +91,7 @@ def point_sums(places: Float[Tensor, "b n 2"], mask: Bool[Tensor, "b n"]) -> Flo
 
 def fit_lines(sums: Float[Tensor, "b 3 c"], places: Float[Tensor, "b n 2"], radius: int) -> Lines:
     """The line through the points around each position: their middle and their principal axis."""
-    column, row = disc(radius, places)
+    column, row = around(radius, places)
     base_x, base_y = places.nan_to_num(0.0).round().unbind(-1)
     cell = cell_of(base_x[:, None] + column[:, None], base_y[:, None] + row[:, None])
     number, dx, dy = sums.gather(2, cell.flatten(1)[:, None].expand(-1, 3, -1)).view(len(places), 3, *cell.shape[1:]).unbind(1)

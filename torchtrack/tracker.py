@@ -70,7 +70,7 @@ class Tracker(TrackedObjects):
         compiled: bool = False,
     ) -> None:
         super().__init__(objects, camera, config, stream_index, dtype, weigher)
-        self._graphs = CompiledStep(self) if compiled else None
+        self.graphs = CompiledStep(self) if compiled else None
 
     def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
         """The state before the first window, from each object's pose at ``t_us``.
@@ -141,12 +141,12 @@ class Tracker(TrackedObjects):
         Args:
             state: from :meth:`init`.
         """
-        if self._graphs is not None:
-            self._graphs.prepare(state)
+        if self.graphs is not None:
+            self.graphs.prepare(state)
 
     def _steady(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult] | None:
         """A window by a compiled graph, where there is one and it holds."""
-        return None if self._graphs is None or torch.is_grad_enabled() else self._graphs(state, events, t_us)
+        return None if self.graphs is None or torch.is_grad_enabled() else self.graphs(state, events, t_us)
 
     def steady_advance(self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
         """:meth:`advance` with nothing to decide; and whether anything of it was called for."""

@@ -38,14 +38,17 @@ def measure(setup: Setup) -> Report:
 
 def _of_sequence(setup: Setup) -> Iterator[_Part]:
     if setup.sequence is not None:
-        scene = read(setup.sequence)
-        yield _latency(setup, f"{setup.sequence.stem}, {len(scene.models)} objects", scene)
+        scene, name = read(setup.sequence), setup.sequence.stem
+        for compiled in (False, True)[: 1 + setup.compiled]:
+            yield _latency(setup, f"{name}, {len(scene.models)} objects" + ", compiled" * compiled, scene, compiled=compiled)
 
 
 def _of_scenes(setup: Setup) -> Iterator[_Part]:
     kind = setup.device.type
     for shape in SHAPES:
         yield _latency(setup, f"1 object ({shape})", simulated((shape,)), *ONE_OBJECT_MS[kind])
+        if setup.compiled:
+            yield _latency(setup, f"1 object ({shape}), compiled", simulated((shape,)), *ONE_OBJECT_MS[kind], compiled=True)
     for count, columns, streams, target_ms in MANY[kind]:
         name = f"{count * streams} objects" + (f" in {streams} streams" if streams > 1 else "")
         yield _latency(setup, name, simulated(shapes_of(count), columns), target_ms, streams=streams)
@@ -53,10 +56,19 @@ def _of_scenes(setup: Setup) -> Iterator[_Part]:
     yield _real_time(setup)
 
 
-def _latency(setup: Setup, name: str, scene: Scene, median_ms: float | None = None, p95_ms: float | None = None, streams: int = 1) -> _Part:
+def _latency(
+    setup: Setup,
+    name: str,
+    scene: Scene,
+    median_ms: float | None = None,
+    p95_ms: float | None = None,
+    *,
+    streams: int = 1,
+    compiled: bool = False,
+) -> _Part:
     """Median and 95 % of the time of a step, each once per repeat, and how well it tracked."""
     setup.show(name)
-    run = started(scene, setup.device, streams)
+    run = started(scene, setup.device, streams, compiled=compiled)
     quality = run.quality(setup.clock)
     repeats = [run.latencies(setup.clock) for _ in range(setup.repeats)]
     median, p95 = ([float(value) for value in np.quantile(repeats, share, axis=1)] for share in (0.5, 0.95))

@@ -239,7 +239,7 @@ class Run:
         return torch.stack([rotation_angle_deg(found[:, :3, :3], expected[:, :3, :3]), 1e3 * (found - expected)[:, :3, 3].norm(dim=-1)], -1)
 
 
-def started(scene: Scene, device: torch.device, streams: int = 1, config: TrackerConfig | None = None) -> Run:
+def started(scene: Scene, device: torch.device, streams: int = 1, config: TrackerConfig | None = None, *, compiled: bool = False) -> Run:
     """A tracker that follows the scene, after its first windows.
 
     Args:
@@ -247,14 +247,16 @@ def started(scene: Scene, device: torch.device, streams: int = 1, config: Tracke
         device: where the tracker runs.
         streams: how many cameras see the same scene, each in a stream of its own.
         config: settings; those of the preset ``default`` when not given.
+        compiled: whether steady windows are taken by compiled graphs.
 
     Raises:
         ConfigError: if the scene ends with its first windows.
     """
     count = len(scene.models)
     index = [stream for stream in range(streams) for _ in range(count)]
-    tracker = Tracker(scene.models * streams, [scene.camera] * streams, config, index).to(device)
+    tracker = Tracker(scene.models * streams, [scene.camera] * streams, config, index, compiled=compiled).to(device)
     state = tracker.init(scene.T_cam_obj.repeat(streams, 1, 1), scene.start_us)
+    tracker.prepare(state)
     windows = []
     for events, end_us in scene.windows(tracker.config.window.duration_us):
         windows.append((concatenate([events.of_stream(stream) for stream in range(streams)]).to(device), end_us))

@@ -24,6 +24,7 @@ class Setup:
         threads: of PyTorch on the CPU.
         events: of the files of the part ``io``.
         sequence: a sequence to track in place of simulated scenes.
+        compiled: whether one object is also tracked by compiled graphs, which takes minutes to prepare.
         show: called with the name of what is measured next.
     """
 
@@ -32,6 +33,7 @@ class Setup:
     threads: int = 1
     events: int = 5_000_000
     sequence: Path | None = None
+    compiled: bool = False
     show: Callable[[str], None] = _tell_nobody
 
     @cached_property

@@ -1,0 +1,50 @@
+"""Tracks a box with and without compiled graphs, and prints how far the poses are apart: in a process of its own, without checks of types.
+
+Arguments: the compiler's backend, and how many windows.
+"""
+
+import json
+import sys
+from unittest import mock
+
+import torch
+from helpers import SMALL_CAMERA, box_model, pose
+from tracked_boxes import follow, moving_box, windows
+
+from torchtrack import Tracker, compiled
+from torchtrack.config.tracker import CornerConfig, LearningConfig, TrackerConfig
+
+LEARNING = TrackerConfig(learning=LearningConfig(first_windows=0, every=3))
+SMALL = TrackerConfig(learning=LearningConfig(points=0), corners=CornerConfig(max_corners=0))
+
+
+def with_backend(backend):
+    """``torch.compile`` with another backend, without the options of its own."""
+
+    def compile_with(function, *, options, **how):
+        options = {name: value for name, value in options.items() if backend == "inductor" or name == "guard_filter_fn"}
+        return torch_compile(function, options=options, backend=backend, **how)
+
+    torch_compile = torch.compile
+    compile_with.__signature__ = compiled.signature(torch_compile)
+    return mock.patch.object(torch, "compile", compile_with)
+
+
+def main(backend, count):
+    _, events = moving_box(pose(), count)
+    config, cut = SMALL if backend == "inductor" else LEARNING, windows(events, count)
+    plain = Tracker([box_model()], SMALL_CAMERA, config)
+    with torch.inference_mode():
+        _, expected = follow(plain, plain.init(pose()[None], 0), cut)
+    with with_backend(backend), torch.inference_mode():
+        tracker = Tracker([box_model()], SMALL_CAMERA, config, compiled=True)
+        state = tracker.init(pose()[None], 0)
+        tracker.prepare(state)
+        prepared = len(tracker.graphs.kinds)
+        _, found = follow(tracker, state, cut)
+    apart = max(float((one.T_cam_obj - other.T_cam_obj).abs().max()) for one, other in zip(found, expected, strict=True))
+    print(json.dumps({"apart": apart, "prepared": prepared, "graphs": len(tracker.graphs.kinds), "status": int(found[-1].status[0])}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]))

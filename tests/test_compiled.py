@@ -1,0 +1,201 @@
+"""Steady windows by compiled graphs: what is handed to them, when what they give counts, and that a compiler takes them as they are."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from compiled_boxes import LEARNING
+from helpers import SMALL_CAMERA, box_model, pose
+from tracked_boxes import PREDICT, WIDE_CAMERA, follow, moving_box, windows
+
+from torchtrack import Tracker, compiled, readback
+from torchtrack.config.run import RunConfig
+from torchtrack.errors import ConfigError
+from torchtrack.events import EventBatch, concatenate
+from torchtrack.runner import run
+
+TESTS = Path(__file__).resolve().parent
+COUNT = 12
+
+
+class Graphs:
+    """In the place of compiled graphs: functions that read nothing, as graphs do not, and say how often they were asked."""
+
+    def __init__(self, monkeypatch):
+        self.calls, self.dropped = [], 0
+        monkeypatch.setattr(compiled, "_compiled", self._graph_of)
+
+    def _graph_of(self, function, device):
+        number = len(self.calls)
+        self.calls.append(0)
+
+        def graph(*args):
+            self.calls[number] += 1
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(readback, "read_at_once", lambda values: False)
+                *done, wrong = function(*args)
+            self.dropped += bool(wrong)
+            return *done, wrong
+
+        return graph
+
+
+@pytest.fixture
+def graphs(monkeypatch):
+    return Graphs(monkeypatch)
+
+
+def both_ways(config=None, streams=1, count=COUNT, mode=torch.inference_mode):
+    """Results of a box per stream without graphs and with them, and the last states."""
+    parts = [moving_box(pose(), count, SMALL_CAMERA, seed=stream, stream=stream)[1] for stream in range(streams)]
+    cut = [(concatenate([window[0] for window in step]), step[0][1]) for step in zip(*(windows(events, count) for events in parts), strict=True)]
+    found = []
+    for is_compiled in (False, True):
+        tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, config, list(range(streams)), compiled=is_compiled)
+        with mode():
+            state = tracker.init(pose().expand(streams, 4, 4), 0)
+            tracker.prepare(state)
+            found.append(follow(tracker, state, cut))
+    return found
+
+
+@pytest.mark.parametrize("streams", [1, 2])
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_poses_are_those_of_a_step(graphs, streams, mode):
+    (state, expected), (compiled_state, found) = both_ways(LEARNING, streams, mode=mode)
+    assert sum(graphs.calls) > COUNT // 2
+    for one, other in zip(expected, found, strict=True):
+        torch.testing.assert_close(other.T_cam_obj, one.T_cam_obj, rtol=0, atol=1e-6)
+        assert torch.equal(other.status, one.status)
+    assert torch.equal(compiled_state.last_event_us, state.last_event_us)
+    assert torch.equal(compiled_state.burst_age_us, state.burst_age_us)
+    assert compiled_state.learned.windows == state.learned.windows == COUNT
+    assert found[-1].T_cam_obj.is_inference() == (mode is torch.inference_mode)
+
+
+def test_windows_that_are_learned_from_have_a_graph_of_their_own(graphs):
+    both_ways(LEARNING)
+    assert len(graphs.calls) == 2
+    # Once each to prepare them.
+    assert graphs.calls[0] > 1 and graphs.calls[1] > 1
+
+
+def test_all_graphs_of_one_stream_are_prepared(graphs):
+    tracker = Tracker([box_model()], SMALL_CAMERA, LEARNING, compiled=True)
+    state = tracker.init(pose()[None], 0)
+    tracker.prepare(state)
+    assert graphs.calls == [1, 1]
+    tracker.prepare(replace(state, learned=replace(state.learned, windows=7)))
+    assert len(graphs.calls) == 2
+
+
+def test_a_window_that_is_not_steady_is_taken_without_a_graph(graphs):
+    _, events = moving_box(pose(), COUNT)
+    cut = windows(events, COUNT)
+    results = []
+    for is_compiled in (False, True):
+        tracker = Tracker([box_model()], SMALL_CAMERA, compiled=is_compiled)
+        with torch.inference_mode():
+            state, _ = follow(tracker, tracker.init(pose()[None], 0), cut[:-1])
+            uncertain = state.covariance.clone()
+            uncertain[:, :6, :6] += torch.eye(6) * 0.05**2
+            before = graphs.dropped
+            results.append(tracker.step(replace(state, covariance=uncertain), *cut[-1])[1])
+    assert graphs.dropped == before + 1
+    torch.testing.assert_close(results[1].T_cam_obj, results[0].T_cam_obj, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_hardly_any_event_is_no_work_for_a_graph(graphs, count):
+    _, events = moving_box(pose(), COUNT)
+    tracker = Tracker([box_model()], SMALL_CAMERA, PREDICT, compiled=True)
+    with torch.inference_mode():
+        state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, COUNT))
+        before = sum(graphs.calls)
+        few = events[:count]
+        tracker.step(state, replace(few, t_us=few.t_us + 5_000 * COUNT), 5_000 * (COUNT + 1))
+    assert sum(graphs.calls) == before
+
+
+def test_gradients_are_not_taken_through_graphs(graphs):
+    _, events = moving_box(pose(), COUNT)
+    cut = windows(events, COUNT)
+    tracker = Tracker([box_model()], SMALL_CAMERA, compiled=True)
+    with torch.inference_mode():
+        state, _ = follow(tracker, tracker.init(pose()[None], 0), cut[:-1])
+    before = sum(graphs.calls)
+    plain = tracker.init(state.T_cam_obj.clone(), state.t_us.clone())
+    tracker.step(plain, *cut[-1])
+    assert sum(graphs.calls) == before
+
+
+@pytest.mark.parametrize("streams", [1, 2])
+@pytest.mark.parametrize("count", [2, 3, 100, 1000, 1001])
+def test_events_are_filled_up_with_some_of_no_stream(count, streams):
+    random = torch.Generator().manual_seed(0)
+    x, y = (torch.randint(0, 90, (count,), generator=random, dtype=torch.int32) for _ in range(2))
+    stream = torch.arange(count) * streams // count
+    events = EventBatch(x, y, torch.arange(count), torch.ones(count, dtype=torch.bool), stream)
+    filled = compiled._filled(events, streams)
+    assert len(filled.events) >= max(count, 64)
+    assert len(filled.events) < max(1.3 * count, 65)
+    assert (filled.events.stream_index[count:] == streams).all()
+    assert torch.equal(filled.events.stream_index[:count], stream)
+    assert torch.equal(filled.events.x[:count], x)
+    assert torch.equal(filled.number, torch.arange(len(filled.events)))
+    # Few sizes for many counts: a GPU holds a graph for each.
+    sizes = {compiled._rounded_up(n) for n in range(1000, 2000)}
+    assert len(sizes) <= 6
+
+
+def test_an_old_version_of_pytorch_is_told(monkeypatch):
+    monkeypatch.setattr(torch, "compile", lambda model, *, fullgraph=False: model)
+    with pytest.raises(ConfigError, match=r"compiled: PyTorch .* cannot compile a tracker. Update it"):
+        Tracker([box_model()], WIDE_CAMERA, compiled=True)
+
+
+def test_methods_without_graphs_are_told(folder, tmp_path):
+    config = RunConfig(source=folder / "one.npz", preset="line", compiled=True, output=tmp_path / "out")
+    with pytest.raises(ConfigError, match="compiled: the method 'line' cannot be compiled"):
+        run(config)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_is_the_same_with_graphs(graphs, folder, tmp_path):
+    outputs = []
+    for is_compiled in (False, True):
+        output = tmp_path / str(is_compiled)
+        run(RunConfig(source=folder / "one.npz", compiled=is_compiled, output=output, overlay={"enabled": False}))
+        outputs.append(sorted(path.name for path in output.iterdir()))
+    assert sum(graphs.calls) > 0
+    assert outputs[0] == outputs[1]
+
+
+def in_own_process(backend):
+    """What a tracker that is compiled by a backend gives, in a process in which no types are checked."""
+    path = os.pathsep.join([str(TESTS.parent), str(TESTS)])
+    command = [sys.executable, "-W", "error::UserWarning", str(TESTS / "compiled_boxes.py"), backend, str(COUNT)]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_a_compiler_takes_a_step_as_one_graph():
+    told = in_own_process("eager")
+    assert told["prepared"] == told["graphs"] == 2
+    assert told["apart"] < 1e-6
+    assert told["status"] == 0
+
+
+@pytest.mark.skipif(shutil.which("g++") is None and shutil.which("clang++") is None, reason="needs a C++ compiler")
+def test_compiled_poses_are_those_of_a_step():
+    told = in_own_process("inductor")
+    assert told["graphs"] == 1
+    assert told["apart"] < 1e-5
+    assert told["status"] == 0
