@@ -12,13 +12,14 @@ import pytest
 import torch
 from compiled_boxes import LEARNING
 from helpers import SMALL_CAMERA, box_model, pose
-from tracked_boxes import PREDICT, WIDE_CAMERA, follow, moving_box, windows
+from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, windows
 
 from torchtrack import Tracker, compiled, readback
 from torchtrack.config.run import RunConfig
 from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch, concatenate
 from torchtrack.runner import run
+from torchtrack.sensor_tiles import NearbyEvents
 
 TESTS = Path(__file__).resolve().parent
 COUNT = 12
@@ -111,6 +112,23 @@ def test_a_window_that_is_not_steady_is_taken_without_a_graph(graphs):
     torch.testing.assert_close(results[1].T_cam_obj, results[0].T_cam_obj, rtol=0, atol=1e-5)
 
 
+def test_of_many_events_those_far_from_all_objects_are_left_out(graphs, monkeypatch):
+    _, events = moving_box(pose(), COUNT, WIDE_CAMERA)
+    t_us = torch.arange(1, 5_000 * COUNT, 5)
+    far = EventBatch(torch.full_like(t_us, 319).int(), (t_us % 150).int(), t_us, t_us % 2 > 0, torch.zeros_like(t_us))
+    cut = windows(merged(events, far), COUNT)
+    kept, near, results = [], Tracker.near, []
+    monkeypatch.setattr(Tracker, "near", lambda *args: kept.append(near(*args)) or kept[-1])
+    for most, is_compiled in ((0, False), (10**6, True), (0, True)):
+        monkeypatch.setattr(compiled, "_MANY", most)
+        tracker = Tracker([box_model()], WIDE_CAMERA, compiled=is_compiled)
+        with torch.inference_mode():
+            results.append(follow(tracker, tracker.init(pose()[None], 0), cut)[1][-1])
+    assert kept and all(len(nearby.events) < 0.5 * len(window[0]) for nearby, window in zip(kept, cut[-len(kept) :], strict=True))
+    for result in results[1:]:
+        torch.testing.assert_close(result.T_cam_obj, results[0].T_cam_obj, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_hardly_any_event_is_no_work_for_a_graph(graphs, count):
     _, events = moving_box(pose(), COUNT)
@@ -142,7 +160,7 @@ def test_events_are_filled_up_with_some_of_no_stream(count, streams):
     x, y = (torch.randint(0, 90, (count,), generator=random, dtype=torch.int32) for _ in range(2))
     stream = torch.arange(count) * streams // count
     events = EventBatch(x, y, torch.arange(count), torch.ones(count, dtype=torch.bool), stream)
-    filled = compiled._filled(events, streams)
+    filled = compiled._filled(NearbyEvents(events), streams)
     assert len(filled.events) >= max(count, 64)
     assert len(filled.events) < max(1.3 * count, 65)
     assert (filled.events.stream_index[count:] == streams).all()

@@ -35,6 +35,8 @@ _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, Step
 _FIRST_WINDOWS = 5
 # What takes Python out of the calls of kernels.
 _WITHOUT_PYTHON = {"cpu": "cpp_wrapper", "cuda": "triton.cudagraphs"}
+# Of more events than this, those that are near no object are left out first.
+_MANY = 16_384
 # Events are filled up to numbers of this many binary digits, so that a GPU needs few graphs; and there are so many at least.
 _DIGITS, _LEAST = 3, 64
 
@@ -57,9 +59,12 @@ class CompiledStep:
 
     def __call__(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult] | None:
         """State and result of a window, not counted yet; None where it is not steady, or there is hardly any event in it."""
-        if len(events) < 2 or (state.learned is not None and state.learned.windows < _FIRST_WINDOWS):
+        if state.learned is not None and state.learned.windows < _FIRST_WINDOWS:
             return None
-        next_state, result, wrong = self._taken(state, events, t_us)
+        nearby = self._tracker.near(state, events, t_us) if len(events) > _MANY else NearbyEvents(events)
+        if len(nearby.events) < 2:
+            return None
+        next_state, result, wrong = self._taken(self._tracker.opened(state, events, t_us), nearby, t_us)
         return None if bool(wrong) else (each_tensor(_own, next_state).numbered(state), each_tensor(_own, result))
 
     @property
@@ -75,13 +80,13 @@ class CompiledStep:
         events = EventBatch(nothing.int(), nothing.int(), t_us.expand(2), nothing > 0, nothing)
         taken = max((part.windows for part in (state.learned, state.model_trust) if part is not None), default=0)
         for window in _of_each_kind(state, self._tracker.config):
-            self._taken(state.numbered(state, window - taken), events, t_us)
+            self._taken(state.numbered(state, window - taken), NearbyEvents(events), t_us)
 
     @torch.inference_mode()
-    def _taken(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:
+    def _taken(self, opened: TrackerState, nearby: NearbyEvents, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:
         """What the graph makes of a window, and whether that does not hold."""
-        opened, filled = each_tensor(_plain, self._tracker.opened(state, events, t_us)), _filled(events, len(state.t_us))
-        kind = _kind(state, filled, self._tracker.config)
+        opened, filled = each_tensor(_plain, opened), _filled(nearby, len(t_us))
+        kind = _kind(opened, filled, self._tracker.config)
         if kind in self._graphs:
             if t_us.is_cuda:
                 # What the last window gave may be written over.
@@ -140,13 +145,14 @@ def _own(value: Tensor) -> Tensor:
     return value.clone() if value.is_cuda or not torch.is_inference_mode_enabled() else value
 
 
-def _filled(events: EventBatch, streams: int) -> NearbyEvents:
+def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
     """The events, with some of no stream after them."""
+    events = nearby.events
     missing = _rounded_up(len(events)) - len(events)
     x, y, t_us, polarity = (pad(values, (0, missing)) for values in (events.x, events.y, events.t_us, events.polarity))
     most = None if streams == 1 else 1 << (events.most_of_one or len(events)).bit_length()
     filled = EventBatch(x, y, t_us, polarity, pad(events.stream_index, (0, missing), value=streams), most_of_one=most)
-    number = torch.arange(len(filled), device=x.device)
+    number = torch.arange(len(filled), device=x.device) if nearby.number is None else pad(nearby.number, (0, missing))
     for values in (x, y, t_us, polarity, filled.stream_index, number):
         torch._dynamo.mark_dynamic(values, 0)
     return NearbyEvents(filled, number)

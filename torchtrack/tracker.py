@@ -148,6 +148,16 @@ class Tracker(TrackedObjects):
         """A window by a compiled graph, where there is one and it holds."""
         return None if self.graphs is None or torch.is_grad_enabled() else self.graphs(state, events, t_us)
 
+    def near(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> NearbyEvents:
+        """The events of the window after ``state`` that can have to do with the objects."""
+        dt_s = ((t_us - state.t_us) * 1e-6).to(self.intrinsics.dtype)[self.stream_index]
+        # A weigher is shown all events.
+        return (
+            NearbyEvents(events)
+            if self.weigher is not None
+            else self.sensors.near_objects(NearbyEvents(events), self._predict(state, dt_s), dt_s, self.config)
+        )
+
     def steady_advance(self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
         """:meth:`advance` with nothing to decide; and whether anything of it was called for."""
         assumptions = readback.Assumptions()
