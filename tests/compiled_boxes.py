@@ -1,6 +1,6 @@
 """Tracks a box with and without compiled graphs, and prints how far the poses are apart: in a process of its own, without checks of types.
 
-Arguments: the compiler's backend, and how many windows.
+Arguments: the compiler's backend, how many windows, and the device.
 """
 
 import json
@@ -30,21 +30,21 @@ def with_backend(backend):
     return mock.patch.object(torch, "compile", compile_with)
 
 
-def main(backend, count):
+def main(backend, count, device):
     _, events = moving_box(pose(), count)
     config, cut = SMALL if backend == "inductor" else LEARNING, windows(events, count)
     plain = Tracker([box_model()], SMALL_CAMERA, config)
     with torch.inference_mode():
         _, expected = follow(plain, plain.init(pose()[None], 0), cut)
     with with_backend(backend), torch.inference_mode():
-        tracker = Tracker([box_model()], SMALL_CAMERA, config, compiled=True)
+        tracker = Tracker([box_model()], SMALL_CAMERA, config, compiled=True).to(device)
         state = tracker.init(pose()[None], 0)
         tracker.prepare(state)
         prepared = len(tracker.graphs.kinds)
-        _, found = follow(tracker, state, cut)
-    apart = max(float((one.T_cam_obj - other.T_cam_obj).abs().max()) for one, other in zip(found, expected, strict=True))
+        _, found = follow(tracker, state, [(window.to(device), end_us) for window, end_us in cut])
+    apart = max(float((one.T_cam_obj.cpu() - other.T_cam_obj).abs().max()) for one, other in zip(found, expected, strict=True))
     print(json.dumps({"apart": apart, "prepared": prepared, "graphs": len(tracker.graphs.kinds), "status": int(found[-1].status[0])}))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    main(sys.argv[1], int(sys.argv[2]), sys.argv[3])

@@ -195,10 +195,10 @@ def test_a_run_is_the_same_with_graphs(graphs, folder, tmp_path):
     assert outputs[0] == outputs[1]
 
 
-def in_own_process(backend):
+def in_own_process(backend, device="cpu"):
     """What a tracker that is compiled by a backend gives, in a process in which no types are checked."""
     path = os.pathsep.join([str(TESTS.parent), str(TESTS)])
-    command = [sys.executable, "-W", "error::UserWarning", str(TESTS / "compiled_boxes.py"), backend, str(COUNT)]
+    command = [sys.executable, "-W", "error::UserWarning", str(TESTS / "compiled_boxes.py"), backend, str(COUNT), device]
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout.splitlines()[-1])
@@ -216,4 +216,12 @@ def test_compiled_poses_are_those_of_a_step():
     told = in_own_process("inductor")
     assert told["graphs"] == 1
     assert told["apart"] < 1e-5
+    assert told["status"] == 0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no GPU here")
+def test_poses_of_cuda_graphs_are_those_of_the_cpu():
+    told = in_own_process("inductor", "cuda")
+    assert told["graphs"] == 1
+    assert told["apart"] < 1e-4
     assert told["status"] == 0
