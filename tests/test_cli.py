@@ -50,6 +50,12 @@ def test_a_sequence_can_be_tracked_without_a_config(sequence_path, tmp_path, cap
     assert "Traceback" not in captured.err
 
 
+def test_a_method_that_cannot_be_compiled_is_told(sequence_path, tmp_path, capsys):
+    assert command("track", sequence_path, "--compiled", "--preset", "line", "-o", tmp_path / "out") == 2
+    assert "compiled: the method 'line' cannot be compiled" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_evaluate_writes_metrics_and_shows_them(sequence_path, tmp_path, capsys):
     arguments = ("--methods", "default,paper", "--jobs", 1, "--quiet", "--tracker.window.duration-us", 10_000)
     assert command("evaluate", sequence_path, "-o", tmp_path / "out", *arguments) == 0

@@ -62,6 +62,8 @@ class Track:
     """Processes for several sources."""
     executor: _Executor = None
     """Where these are: on this machine, or Ray's (the cluster at RAY_ADDRESS)."""
+    compiled: bool = False
+    """Compile the tracker: a step takes half the time, the first start some minutes."""
     quiet: bool = False
     """No progress bar."""
 
@@ -71,7 +73,7 @@ class Track:
 
         if not self.configs:
             raise ConfigError("command line: track needs a config file or a source.")
-        given = _given(self, ("configs", "quiet", *_OF_MANY)) | overrides
+        given = _given(self, ("configs", "quiet", "compiled", *_OF_MANY)) | ({"compiled": True} if self.compiled else {}) | overrides
         of_many = {name: getattr(self, name) for name in _OF_MANY if getattr(self, name) is not None}
         if len(self.configs) > 1:
             return track_many(self.configs, given, **of_many, quiet=self.quiet)

@@ -27,19 +27,19 @@ def _kept(values: Numbers, dtype: torch.dtype, device: torch.device) -> Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
 
 
-def disc(radius: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+def disc(radius: float | int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Offsets ``[2, d]`` (column, row) of the cells whose middles lie within a radius of one's own, row by row."""
     return constant(_within(radius), dtype, device).T
 
 
 @torch.compiler.assume_constant_result
-def _within(radius: float) -> Numbers:
+def _within(radius: float | int) -> Numbers:
     """The cells as numbers; apart from how they are kept, as a compiler does not look into that."""
     return _cells(radius)
 
 
 @lru_cache(maxsize=64)
-def _cells(radius: float) -> Numbers:
+def _cells(radius: float | int) -> Numbers:
     reach = int(radius)
     steps = range(-reach, reach + 1)
     return tuple((column, row) for row in steps for column in steps if row**2 + column**2 <= radius**2)
