@@ -14,7 +14,6 @@ from tracked_boxes import follow, moving_box, windows
 from torchtrack import Tracker, compiled
 from torchtrack.config.tracker import CornerConfig, LearningConfig, TrackerConfig
 
-LEARNING = TrackerConfig(learning=LearningConfig(first_windows=0, every=3))
 SMALL = TrackerConfig(learning=LearningConfig(points=0), corners=CornerConfig(max_corners=0))
 
 
@@ -32,7 +31,7 @@ def with_backend(backend):
 
 def main(backend, count, device):
     _, events = moving_box(pose(), count)
-    config, cut = SMALL if backend == "inductor" else LEARNING, windows(events, count)
+    config, cut = SMALL if backend == "inductor" else TrackerConfig(), windows(events, count)
     plain = Tracker([box_model()], SMALL_CAMERA, config)
     with torch.inference_mode():
         _, expected = follow(plain, plain.init(pose()[None], 0), cut)
@@ -40,10 +39,10 @@ def main(backend, count, device):
         tracker = Tracker([box_model()], SMALL_CAMERA, config, compiled=True).to(device)
         state = tracker.init(pose()[None], 0)
         tracker.prepare(state)
-        prepared = len(tracker.graphs.kinds)
+        prepared = len(tracker.graphs)
         _, found = follow(tracker, state, [(window.to(device), end_us) for window, end_us in cut])
     apart = max(float((one.T_cam_obj.cpu() - other.T_cam_obj).abs().max()) for one, other in zip(found, expected, strict=True))
-    print(json.dumps({"apart": apart, "prepared": prepared, "graphs": len(tracker.graphs.kinds), "status": int(found[-1].status[0])}))
+    print(json.dumps({"apart": apart, "prepared": prepared, "graphs": len(tracker.graphs), "status": int(found[-1].status[0])}))
 
 
 if __name__ == "__main__":

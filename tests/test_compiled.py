@@ -10,17 +10,19 @@ from pathlib import Path
 
 import pytest
 import torch
-from compiled_boxes import LEARNING
 from helpers import SMALL_CAMERA, box_model, pose
 from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, windows
 
 from torchtrack import Tracker, compiled, readback
 from torchtrack.config.run import RunConfig
+from torchtrack.config.tracker import LearningConfig, ModelTrustConfig, TrackerConfig
 from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch, concatenate
 from torchtrack.runner import run
 from torchtrack.sensor_tiles import NearbyEvents
 
+# Something is learned from every third window.
+LEARNING = TrackerConfig(learning=LearningConfig(first_windows=0, every=3, up_to_share=1.0))
 TESTS = Path(__file__).resolve().parent
 COUNT = 12
 
@@ -70,7 +72,7 @@ def both_ways(config=None, streams=1, count=COUNT, mode=torch.inference_mode):
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_poses_are_those_of_a_step(graphs, streams, mode):
     (state, expected), (compiled_state, found) = both_ways(LEARNING, streams, mode=mode)
-    assert sum(graphs.calls) > COUNT // 2
+    assert sum(graphs.calls) >= COUNT // 3
     for one, other in zip(expected, found, strict=True):
         torch.testing.assert_close(other.T_cam_obj, one.T_cam_obj, rtol=0, atol=1e-6)
         assert torch.equal(other.status, one.status)
@@ -80,20 +82,30 @@ def test_poses_are_those_of_a_step(graphs, streams, mode):
     assert found[-1].T_cam_obj.is_inference() == (mode is torch.inference_mode)
 
 
-def test_windows_that_are_learned_from_have_a_graph_of_their_own(graphs):
-    both_ways(LEARNING)
-    assert len(graphs.calls) == 2
-    # Once each to prepare them.
-    assert graphs.calls[0] > 1 and graphs.calls[1] > 1
+@pytest.mark.parametrize("config", [LEARNING, TrackerConfig(model_trust=ModelTrustConfig(least_share=0.1, first_windows=0, every=3))])
+def test_windows_that_are_learned_from_are_taken_without_a_graph(graphs, config):
+    (state, _), (compiled_state, _) = both_ways(config)
+    if config is LEARNING:
+        # One call prepares the graph.
+        assert graphs.calls == [1 + sum(window % 3 > 0 for window in range(5, COUNT))]
+    learned = "learned" if config is LEARNING else "model_trust"
+    expected, found = (vars(getattr(of, learned)) for of in (state, compiled_state))
+    for name, value in expected.items():
+        assert torch.equal(found[name], value) if torch.is_tensor(value) else found[name] == value
 
 
-def test_all_graphs_of_one_stream_are_prepared(graphs):
-    tracker = Tracker([box_model()], SMALL_CAMERA, LEARNING, compiled=True)
+def test_the_graph_of_one_stream_is_prepared(graphs):
+    tracker = Tracker([box_model()], SMALL_CAMERA, compiled=True)
     state = tracker.init(pose()[None], 0)
     tracker.prepare(state)
-    assert graphs.calls == [1, 1]
     tracker.prepare(replace(state, learned=replace(state.learned, windows=7)))
-    assert len(graphs.calls) == 2
+    assert graphs.calls == [2]
+
+
+def test_of_several_streams_nothing_is_prepared(graphs):
+    tracker = Tracker([box_model()] * 2, [SMALL_CAMERA] * 2, stream_index=[0, 1], compiled=True)
+    tracker.prepare(tracker.init(pose().expand(2, 4, 4), 0))
+    assert graphs.calls == []
 
 
 def test_a_window_that_is_not_steady_is_taken_without_a_graph(graphs):
@@ -206,7 +218,7 @@ def in_own_process(backend, device="cpu"):
 
 def test_a_compiler_takes_a_step_as_one_graph():
     told = in_own_process("eager")
-    assert told["prepared"] == told["graphs"] == 2
+    assert told["prepared"] == told["graphs"] == 1
     assert told["apart"] < 1e-6
     assert told["status"] == 0
 

@@ -81,6 +81,22 @@ def test_an_object_that_its_model_explains_uses_nothing_learned():
     assert torch.equal(poses_of(results), poses_of(without))
 
 
+def test_an_object_that_its_model_explains_learns_nothing_beside_one_that_lacks_contours():
+    _, events = plate_sequence()
+    cut = windows(events, 7)
+    tracker = Tracker([plate_model()] * 2, [PLATE_CAMERA] * 2, stream_index=[0, 1])
+    both = [(concatenate([window, window.of_stream(1)]), end_us) for window, end_us in cut]
+    state, _ = follow(tracker, tracker.init(PLATE_POSE.repeat(2, 1, 1), 0), both[:-1])
+    before = replace(state, learned=replace(state.learned, model_share=torch.tensor([0.3, 0.9])))
+    after, _ = tracker.step(before, *both[-1])
+    for name in ("drafts_obj", "drafted", "evidence"):
+        mine, theirs = getattr(after.learned, name), getattr(before.learned, name)
+        assert not torch.equal(mine[0], theirs[0])
+        assert torch.equal(mine[1], theirs[1])
+    # Whether that is still so is looked at all the same.
+    assert (after.learned.model_share != before.learned.model_share).all()
+
+
 def test_an_occluder_that_passes_teaches_nothing():
     """Bars that sweep over a plate whose own print is known by then."""
     trajectory, events = plate_sequence()

@@ -5,7 +5,7 @@ which nothing has to be decided into fewer and larger kernels; on a GPU, a CUDA 
 (:mod:`torchtrack.readback`), and the number of events is left open.
 
 Where a window turns out not to be steady, as an object is to be searched for, or is very uncertain, what the graph gave is
-dropped and the window is taken as without one: poses are the same, to rounding.
+dropped and the window is taken as without one; so are windows that contours are learned from. Poses are the same, to rounding.
 """
 
 import logging
@@ -19,19 +19,17 @@ from jaxtyping import Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchtrack.config.tracker import TrackerConfig
 from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch
+from torchtrack.online_learning import learning_is_due
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.state import StepResult, TrackerState, each_tensor
 
 if TYPE_CHECKING:
     from torchtrack.tracker import Tracker
 
-# Windows of a kind have a graph of their own: whether anything is learned from them, and how many events a stream has at most.
-_Kind = tuple[bool, bool, int | None]
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
-# At a start, windows differ in what is learned from them.
+# At a start, it is looked at more than later on which contours a model lacks.
 _FIRST_WINDOWS = 5
 # What takes Python out of the calls of kernels.
 _WITHOUT_PYTHON = {"cpu": "cpp_wrapper", "cuda": "triton.cudagraphs"}
@@ -55,11 +53,13 @@ class CompiledStep:
         if "isolate_recompiles" not in signature(torch.compile).parameters:
             raise ConfigError(f"compiled: PyTorch {torch.__version__} cannot compile a tracker. Update it to 2.13 or later, or go without.")
         self._tracker = tracker
-        self._graphs: dict[_Kind, _Graph] = {}
+        # By how many events a stream has at most, where there are several.
+        self._graphs: dict[int | None, _Graph] = {}
 
     def __call__(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult] | None:
         """State and result of a window, not counted yet; None where it is not steady, or there is hardly any event in it."""
-        if state.learned is not None and state.learned.windows < _FIRST_WINDOWS:
+        starts = state.learned is not None and state.learned.windows < _FIRST_WINDOWS
+        if starts or learning_is_due(state, self._tracker.on_surfaces, self._tracker.config):
             return None
         nearby = self._tracker.near(state, events, t_us) if len(events) > _MANY else NearbyEvents(events)
         if len(nearby.events) < 2:
@@ -67,26 +67,23 @@ class CompiledStep:
         next_state, result, wrong = self._taken(self._tracker.opened(state, events, t_us), nearby, t_us)
         return None if bool(wrong) else (each_tensor(_own, next_state).numbered(state), each_tensor(_own, result))
 
-    @property
-    def kinds(self) -> tuple[_Kind, ...]:
-        """The kinds of windows that there are graphs for."""
-        return tuple(self._graphs)
+    def __len__(self) -> int:
+        """How many graphs there are."""
+        return len(self._graphs)
 
     def prepare(self, state: TrackerState) -> None:
-        """Compile the graphs of one stream, from the state that it begins with; with several, more than that would have to be known."""
+        """Compile the graph of one stream, from the state that it begins with; with several, more than that would have to be known."""
         if len(state.t_us) > 1:
             return
         t_us, nothing = state.t_us + 1, torch.zeros_like(state.t_us).expand(2)
         events = EventBatch(nothing.int(), nothing.int(), t_us.expand(2), nothing > 0, nothing)
-        taken = max((part.windows for part in (state.learned, state.model_trust) if part is not None), default=0)
-        for window in _of_each_kind(state, self._tracker.config):
-            self._taken(state.numbered(state, window - taken), NearbyEvents(events), t_us)
+        self._taken(state.numbered(state, _FIRST_WINDOWS), NearbyEvents(events), t_us)
 
     @torch.inference_mode()
     def _taken(self, opened: TrackerState, nearby: NearbyEvents, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:
         """What the graph makes of a window, and whether that does not hold."""
         opened, filled = each_tensor(_plain, opened), _filled(nearby, len(t_us))
-        kind = _kind(opened, filled, self._tracker.config)
+        kind = filled.events.most_of_one
         if kind in self._graphs:
             if t_us.is_cuda:
                 # What the last window gave may be written over.
@@ -99,7 +96,7 @@ class CompiledStep:
 
 def _compiled(function: _Graph, device: torch.device) -> _Graph:
     """The function as a graph of its own."""
-    # All that it hangs on is fixed with the tracker, or with the kind of window: to look whether it is takes a tenth of a step.
+    # All that it hangs on is fixed with the tracker: to look whether it is takes a tenth of a step.
     options = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe, _WITHOUT_PYTHON[device.type]: True}
     # Without guards, no two functions may share what is compiled.
     how: dict[str, Any] = {"fullgraph": True, "dynamic": False, "options": options, "isolate_recompiles": True}
@@ -117,22 +114,6 @@ def _as_expected() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(before)
-
-
-def _of_each_kind(state: TrackerState, config: TrackerConfig) -> tuple[int, ...]:
-    """Numbers of windows, one of each kind that there is once a start is over."""
-    learning, trust = config.learning, config.model_trust
-    first = max(learning.first_windows, trust.first_windows, _FIRST_WINDOWS)
-    every = 1 if state.learned is None else learning.every, 1 if state.model_trust is None else trust.every
-    kinds = {(n % every[0] == 0, n % every[1] == 0): n for n in range(first, first + every[0] * every[1] + 1)}
-    return tuple(kinds.values())
-
-
-def _kind(state: TrackerState, events: NearbyEvents, config: TrackerConfig) -> _Kind:
-    """Which graph a window is for."""
-    learns = state.learned is not None and state.learned.due(config.learning)
-    judges = state.model_trust is not None and state.model_trust.due(config.model_trust)
-    return learns, judges, events.events.most_of_one
 
 
 def _plain(value: Tensor) -> Tensor:

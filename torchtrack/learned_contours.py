@@ -8,6 +8,7 @@ holds the errors of the poses it was learned at, and a good model needs none of 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -58,6 +59,14 @@ class LearnedContours:
         share = like.new_full((batch,), _FIRST_SHARE)
         return cls(drafts, drafted, points, points, points[..., 0], share, drafted == 0, 0)
 
+    def but_of(self, chosen: Bool[Tensor, "b"], other: "LearnedContours") -> "LearnedContours":
+        """The same, but of some objects what another knows."""
+        of_each = {name: value for name, value in vars(self).items() if torch.is_tensor(value)}
+        rows: dict[str, Any] = {
+            name: torch.where(chosen.view(-1, *[1] * (value.dim() - 1)), getattr(other, name), value) for name, value in of_each.items()
+        }
+        return replace(self, **rows)
+
     def points(self, least: float) -> LearnedPoints:
         """The learned points with at least that evidence."""
         return LearnedPoints(self.points_obj, self.tangents_obj, self.evidence >= least)
@@ -67,8 +76,12 @@ class LearnedContours:
         points = self.points(config.trusted_from)
         return replace(points, mask=points.mask & self.needed[:, None])
 
+    def wanted(self, on_surfaces: Bool[Tensor, "b"], config: LearningConfig) -> Bool[Tensor, "b"]:
+        """Objects whose models may lack contours, among those on whose surfaces any can be learned."""
+        return on_surfaces & (self.model_share < config.up_to_share)
+
     def due(self, config: LearningConfig) -> bool:
-        """Whether this window is learned from: all of the first ones, and then some."""
+        """Whether this window may be learned from: all of the first ones, and then some."""
         return self.windows < config.first_windows or self.windows % config.every == 0
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import readback
@@ -45,13 +45,15 @@ class Lesson:
         events: of the window.
         window_s: its duration, for each object.
         sigma_px: standard deviation of each object's prediction in the image: of an uncertain one nothing is learned.
-        on_surfaces: whether contours can be learned on any object.
+        on_surfaces: on which objects contours can be learned; None where on none.
+        learns: whether anything is learned, and not only looked whether there is need to.
     """
 
     events: WindowEvents
     window_s: Float[Tensor, "b"]
     sigma_px: Float[Tensor, "b"]
-    on_surfaces: bool
+    on_surfaces: Bool[Tensor, "b"] | None
+    learns: bool = True
 
 
 def learned_after(
@@ -64,15 +66,26 @@ def learned_after(
         found: what ``state`` and ``result`` stand on.
     """
     trust, learned = state.model_trust, state.learned
-    is_judged = trust is not None and trust.due(config.model_trust)
-    if not is_judged and (learned is None or not lesson.on_surfaces):
+    is_judged = lesson.learns and trust is not None and trust.due(config.model_trust)
+    if not is_judged and (learned is None or lesson.on_surfaces is None):
         return state
     trusted = (result.status <= int(Status.UNCERTAIN)) & (lesson.sigma_px < config.learning.max_sigma_px)
     fitted = replace(prediction, T_cam_obj=state.T_cam_obj.to(lesson.sigma_px.dtype), velocity=state.velocity)
     if trust is not None and is_judged:
         trust = judge_elements(trust, fitted, lesson.window_s, lesson.events, trusted, config)
-    if learned is not None and lesson.on_surfaces:
+    if learned is not None and lesson.on_surfaces is not None:
         taken_share = None if trust is None else trust.taken_share
         around = Surroundings(fitted.objects, fitted.T_cam_obj, fitted.velocity, lesson.window_s, result.contours, trusted, taken_share)
-        learned = learn_after(learned, around, found, lesson.events, config)
+        wanted = learned.wanted(lesson.on_surfaces, config.learning) if lesson.learns and learned.due(config.learning) else None
+        learned = learn_after(learned, around, found, lesson.events, wanted, config)
     return replace(state, model_trust=trust, learned=learned)
+
+
+def learning_is_due(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, config: TrackerConfig) -> bool:
+    """Whether anything is to be learned from the window after ``state``."""
+    learned, trust = state.learned, state.model_trust
+    if trust is not None and trust.due(config.model_trust):
+        return True
+    return (
+        learned is not None and on_surfaces is not None and learned.due(config.learning) and bool(learned.wanted(on_surfaces, config.learning).any())
+    )

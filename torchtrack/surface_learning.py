@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torchtrack import readback
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
 from torchtrack.constants import constant
@@ -94,11 +95,19 @@ class _Sample:
 
 
 @torch.no_grad()
-def learn_after(learned: LearnedContours, around: Surroundings, found: Found, events: WindowEvents, config: TrackerConfig) -> LearnedContours:
-    """What is known after a window of contours that the models lack; learned from only in the windows that are due."""
+def learn_after(
+    learned: LearnedContours, around: Surroundings, found: Found, events: WindowEvents, wanted: Bool[Tensor, "b"] | None, config: TrackerConfig
+) -> LearnedContours:
+    """What is known after a window of contours that the models lack.
+
+    Args:
+        wanted: objects to learn of, from the state before the window; none where the window is not due.
+    """
     velocity, image_size, any_count = around.contour_velocity, around.objects.image_size, around.objects.learned is not None
     learned = judge_model(learned, found, velocity, image_size, config, any_count=any_count, taken_share=around.taken_share)
-    return learn(learned, around, events, config) if learned.due(config.learning) else learned
+    if wanted is None or (readback.read_at_once(wanted) and not bool(wanted.any())):
+        return learned
+    return learned.but_of(wanted, learn(learned, around, events, config))
 
 
 def learn(learned: LearnedContours, around: Surroundings, events: WindowEvents, config: TrackerConfig) -> LearnedContours:

@@ -30,6 +30,7 @@ class TrackedObjects(nn.Module):
     centre_obj: Tensor
     diameter_m: Tensor
     revolution_axes: Tensor
+    with_surface: Tensor
     far_pose: Tensor
 
     def __init__(
@@ -64,7 +65,11 @@ class TrackedObjects(nn.Module):
         self.register_buffer("far_pose", far_pose(self.centre_obj))
         self.weigher = TrustNetwork.shipped() if weigher is None and self.config.matching.learned_trust else weigher
         # On dense meshes no line of sight is followed.
-        self.on_surfaces = any(len(model.triangles) for model in self.models)
+        with_surface = torch.zeros(len(objects), dtype=torch.bool)
+        for model in self.models:
+            with_surface[model.members] = len(model.triangles) > 0
+        self.register_buffer("with_surface", with_surface)
+        self._any_surface = bool(with_surface.any())
         self.to(dtype)
 
     @property
@@ -82,6 +87,11 @@ class TrackedObjects(nn.Module):
     def sensors(self) -> Sensors:
         """The sensors that the objects are seen by."""
         return Sensors(self.ideal_pixels, self.sensor_pixels, self.stream_index, self.tiles)
+
+    @property
+    def on_surfaces(self) -> Tensor | None:
+        """On which objects contours can be learned; None where on none."""
+        return self.with_surface if self._any_surface else None
 
     @property
     def looks_back(self) -> bool:

@@ -159,9 +159,9 @@ class Tracker(TrackedObjects):
         )
 
     def steady_advance(self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
-        """:meth:`advance` with nothing to decide; and whether anything of it was called for."""
+        """:meth:`advance` with nothing to decide and to learn; and whether anything of the first was called for."""
         assumptions = readback.Assumptions()
-        return *self.advance(state, events, t_us, questions=assumptions), assumptions.wrong()
+        return *self.advance(state, events, t_us, questions=assumptions, learns=False), assumptions.wrong()
 
     def _advance_in_parts(self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor) -> tuple[TrackerState, StepResult]:
         """The window as several short ones, with a search for objects that are ``starting``."""
@@ -188,6 +188,8 @@ class Tracker(TrackedObjects):
         t_us: Int[Tensor, "s"],
         starting: Tensor | None = None,
         questions: readback.Questions = _QUESTIONS,
+        *,
+        learns: bool = True,
     ) -> tuple[TrackerState, StepResult]:
         """A window from its events to poses: contours where they are expected, corners and flow, matching and solving, conclusion.
 
@@ -197,6 +199,7 @@ class Tracker(TrackedObjects):
             t_us: end of the window.
             starting: objects whose motion is not known yet.
             questions: asks for what has to be decided.
+            learns: whether anything may be learned from the window.
         """
         config, sensors, last_event_us = self.config, self.sensors, state.last_event_us
         window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
@@ -229,7 +232,7 @@ class Tracker(TrackedObjects):
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
         if config.search.probation:
             next_state, result = after_probation(state, next_state, result, prediction, widening, config)
-        next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self.on_surfaces), config)
+        next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self.on_surfaces, learns), config)
         return replace(next_state, t_us=t_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
@@ -251,7 +254,7 @@ class Tracker(TrackedObjects):
         moved = velocity * dt_s[:, None]
         T_prior = lie.move_about(state.T_cam_obj.to(velocity.dtype), lie.cayley(moved[:, :3]), moved[:, 3:], self.centre_obj)
         covariance = predict_covariance(covariance.detach(), velocity.detach(), dt_s, self.diameter_m, self.config.motion)
-        objects = objects_as_known(self.objects, state, self.element_groups, self.on_surfaces, self.config)
+        objects = objects_as_known(self.objects, state, self.element_groups, self.on_surfaces is not None, self.config)
         T_prior, usable = before_camera(T_prior, self.centre_obj, self.far_pose)
         return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance)
 

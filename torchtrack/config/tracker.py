@@ -173,6 +173,7 @@ class LearningConfig(Settings):
     drafts: int = Field(4096, ge=16, le=100_000, description="Unexplained events that are kept until they make a contour, per object.")
     trusted_from: float = Field(3.0, ge=1, le=10, description="Evidence from which a learned contour counts: about the windows that confirmed it.")
     below_share: float = Field(0.6, ge=0, le=1, description="Learned contours count once the model's own explain less than this share of themselves.")
+    up_to_share: float = Field(0.8, ge=0, le=1, description="Nothing is learned where the model's own explain this share of themselves or more.")
     max_sigma_px: float = Field(2.0, gt=0, description="Nothing is learned while the standard deviation of the prediction is larger (px).")
     first_windows: int = Field(20, ge=0, description="The first windows are all learned from.")
     every: int = Field(10, ge=1, description="After them, one window of this many is.")
