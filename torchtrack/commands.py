@@ -87,6 +87,8 @@ def _run_config(config_or_source: str, overrides: Mapping[str, Any]) -> RunConfi
 def _run(config: RunConfig, quiet: bool) -> int:
     console = output_console()
     session = open_session(config)
+    if config.compiled and not quiet:
+        Console(stderr=True).print("compiling the tracker, which takes a minute or two for the first time")
     progress = [] if quiet else [ProgressBar(Console(stderr=True), session.name, session.known_duration_s)]
     return _show_run(console, run(config, progress, session), config.output)
 

@@ -53,7 +53,8 @@ def _of_scenes(setup: Setup) -> Iterator[_Part]:
         name = f"{count * streams} objects" + (f" in {streams} streams" if streams > 1 else "")
         yield _latency(setup, name, simulated(shapes_of(count), columns), target_ms, streams=streams)
     yield _outside(setup)
-    yield _real_time(setup)
+    for compiled in (False, True)[: 1 + setup.compiled]:
+        yield _real_time(setup, compiled)
 
 
 def _latency(
@@ -89,13 +90,13 @@ def _outside(setup: Setup) -> _Part:
     return results, "Events outside an object keep away from its bounding box at all times."
 
 
-def _real_time(setup: Setup) -> _Part:
+def _real_time(setup: Setup, compiled: bool) -> _Part:
     """Seconds of an HD stream per second of work, with one object in it."""
-    name = f"1 object in {HD[0]}x{HD[1]} at {HD_MEV_S:g} Mev/s"
+    name = f"1 object in {HD[0]}x{HD[1]} at {HD_MEV_S:g} Mev/s" + ", compiled" * compiled
     setup.show(name)
     scene = simulated(SHAPES[:1], size=HD)
     scene = with_events_outside(scene, max(HD_MEV_S - scene.mev_per_s, 0))
-    run = started(scene, setup.device)
+    run = started(scene, setup.device, compiled=compiled)
     start_us = int(run.state.t_us[0])
     stream = scene.events.slice_time(start_us, scene.end_us)
     factors = []
