@@ -190,6 +190,16 @@ def test_an_old_version_of_pytorch_is_told(monkeypatch):
         Tracker([box_model()], WIDE_CAMERA, compiled=True)
 
 
+def test_a_compiler_that_fails_is_told(monkeypatch, folder, tmp_path):
+    def without_compiler(*args):
+        raise RuntimeError("No working C++ compiler found\nand more")
+
+    monkeypatch.setattr(compiled, "_compiled", lambda function, device: without_compiler)
+    with pytest.raises(ConfigError, match=r"could not be compiled: No working C\+\+ compiler found\. It needs a C\+\+ compiler"):
+        run(RunConfig(source=folder / "one.npz", compiled=True, output=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
 def test_methods_without_graphs_are_told(folder, tmp_path):
     config = RunConfig(source=folder / "one.npz", preset="line", compiled=True, output=tmp_path / "out")
     with pytest.raises(ConfigError, match="compiled: the method 'line' cannot be compiled"):

@@ -9,6 +9,7 @@ dropped and the window is taken as without one; so are windows that contours are
 """
 
 import logging
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from inspect import signature
@@ -90,8 +91,13 @@ class CompiledStep:
                 torch.compiler.cudagraph_mark_step_begin()
             return self._graphs[kind](opened, filled, t_us)
         self._graphs[kind] = _compiled(self._tracker.steady_advance, t_us.device)
-        with _as_expected():
-            return self._graphs[kind](opened, filled, t_us)
+        try:
+            with _as_expected():
+                return self._graphs[kind](opened, filled, t_us)
+        except RuntimeError as error:
+            reason = str(error).partition("\n")[0]
+            needed = "a C++ compiler (g++ or clang++)" if t_us.device.type == "cpu" else "triton and a C compiler"
+            raise ConfigError(f"compiled: the tracker could not be compiled: {reason}. It needs {needed}. Install that, or go without.") from error
 
 
 def _compiled(function: _Graph, device: torch.device) -> _Graph:
@@ -106,12 +112,14 @@ def _compiled(function: _Graph, device: torch.device) -> _Graph:
 
 @contextmanager
 def _as_expected() -> Iterator[None]:
-    """Within it, the compiler does not report which operations it leaves to PyTorch."""
+    """Within it, the compiler does not report which operations it leaves to PyTorch, nor what it will do otherwise one day."""
     logger = logging.getLogger("torch._inductor")
     before = logger.level
     logger.setLevel(logging.ERROR)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            yield
     finally:
         logger.setLevel(before)
 
