@@ -173,8 +173,8 @@ def test_events_are_filled_up_with_some_of_no_stream(count, streams):
     stream = torch.arange(count) * streams // count
     events = EventBatch(x, y, torch.arange(count), torch.ones(count, dtype=torch.bool), stream)
     filled = compiled._filled(NearbyEvents(events), streams)
-    assert len(filled.events) >= max(count, 64)
-    assert len(filled.events) < max(1.3 * count, 65)
+    assert len(filled.events) % 64 == 0
+    assert count <= len(filled.events) < 1.25 * count + 64
     assert (filled.events.stream_index[count:] == streams).all()
     assert torch.equal(filled.events.stream_index[:count], stream)
     assert torch.equal(filled.events.x[:count], x)

@@ -36,8 +36,9 @@ _FIRST_WINDOWS = 5
 _WITHOUT_PYTHON = {"cpu": "cpp_wrapper", "cuda": "triton.cudagraphs"}
 # Of more events than this, those that are near no object are left out first.
 _MANY = 16_384
-# Events are filled up to numbers of this many binary digits, so that a GPU needs few graphs; and there are so many at least.
-_DIGITS, _LEAST = 3, 64
+# Events are filled up to numbers of this many binary digits, so that a GPU needs few graphs, and to multiples of this: loops
+# of a compiled kernel take several at once.
+_DIGITS, _MULTIPLE = 3, 64
 
 
 class CompiledStep:
@@ -149,5 +150,5 @@ def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
 
 def _rounded_up(count: int) -> int:
     """The next larger number of few binary digits."""
-    step = 1 << max(count.bit_length() - _DIGITS, 0)
-    return max(-(-count // step) * step, _LEAST)
+    step = max(1 << max(count.bit_length() - _DIGITS, 0), _MULTIPLE)
+    return -(-count // step) * step
