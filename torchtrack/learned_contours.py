@@ -76,9 +76,9 @@ class LearnedContours:
         points = self.points(config.trusted_from)
         return replace(points, mask=points.mask & self.needed[:, None])
 
-    def wanted(self, on_surfaces: Bool[Tensor, "b"], config: LearningConfig) -> Bool[Tensor, "b"]:
-        """Objects whose models may lack contours, among those on whose surfaces any can be learned."""
-        return on_surfaces & (self.model_share < config.up_to_share)
+    def wanted(self, on_surfaces: Bool[Tensor, "b"], config: LearningConfig) -> Bool[Tensor, "b"] | None:
+        """Objects to learn of in this window: those whose models may lack contours, of ``on_surfaces``; None where it is not due."""
+        return on_surfaces & (self.model_share < config.up_to_share) if self.due(config) else None
 
     def due(self, config: LearningConfig) -> bool:
         """Whether this window may be learned from: all of the first ones, and then some."""

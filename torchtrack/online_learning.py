@@ -28,7 +28,7 @@ def objects_as_known(
     """
     if state.learned is not None and on_surfaces:
         counting = state.learned.that_count(config.learning)
-        if not readback.read_at_once(counting.mask) or bool(counting.mask.any()):
+        if not readback.none_of(counting.mask):
             objects = replace(objects, learned=counting)
     if state.model_trust is not None:
         shown = state.model_trust.of_width(element_groups.shape[1]).shown(element_groups, config.model_trust)
@@ -76,7 +76,7 @@ def learned_after(
     if learned is not None and lesson.on_surfaces is not None:
         taken_share = None if trust is None else trust.taken_share
         around = Surroundings(fitted.objects, fitted.T_cam_obj, fitted.velocity, lesson.window_s, result.contours, trusted, taken_share)
-        wanted = learned.wanted(lesson.on_surfaces, config.learning) if lesson.learns and learned.due(config.learning) else None
+        wanted = learned.wanted(lesson.on_surfaces, config.learning) if lesson.learns else None
         learned = learn_after(learned, around, found, lesson.events, wanted, config)
     return replace(state, model_trust=trust, learned=learned)
 
@@ -86,6 +86,5 @@ def learning_is_due(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, 
     learned, trust = state.learned, state.model_trust
     if trust is not None and trust.due(config.model_trust):
         return True
-    return (
-        learned is not None and on_surfaces is not None and learned.due(config.learning) and bool(learned.wanted(on_surfaces, config.learning).any())
-    )
+    wanted = None if learned is None or on_surfaces is None else learned.wanted(on_surfaces, config.learning)
+    return wanted is not None and bool(wanted.any())

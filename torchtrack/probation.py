@@ -35,7 +35,7 @@ def after_probation(
         prediction: of the objects, with ``widening`` of their first gates.
     """
     concerned = before.probation.runs | (widening >= _WIDE)
-    if readback.read_at_once(concerned) and not bool(concerned.any()):
+    if readback.none_of(concerned):
         return state, result
     probation = _begun(before, result, prediction, widening)
     wanted = config.quality.certain_at * before.full_share

@@ -22,20 +22,23 @@ def read_at_once(values: Tensor) -> bool:
     return values.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
+def none_of(values: Tensor) -> bool:
+    """Whether it is certain, at no cost, that no value is true: what only true ones need can then be left out."""
+    return read_at_once(values) and not bool(values.any())
+
+
 @dataclass(frozen=True)
 class Answer:
     """Values that the CPU has, or that are on their way to it, where decisions are taken.
 
     Args:
         on_device: the values.
-        known: the same as numbers, where they were known from the start.
-        copy: the same on the CPU, once ``arrived``.
+        copy: the same on the CPU, once ``arrived``; as numbers, where they were known from the start.
         arrived: when the copy is there; none where nothing had to be copied.
     """
 
     on_device: Tensor
-    known: list[Any] | None = None
-    copy: Tensor | None = None
+    copy: Tensor | list[Any]
     arrived: torch.cuda.Event | None = None
 
     @classmethod
@@ -43,16 +46,16 @@ class Answer:
         """Begin to copy values; from the CPU they need not be."""
         values = values.detach()
         if values.device.type != "cuda":
-            return cls(values, copy=values)
+            return cls(values, values)
         copy = values.to("cpu", non_blocking=True)
         arrived = torch.cuda.Event()
         arrived.record(torch.cuda.current_stream(values.device))
-        return cls(values, copy=copy, arrived=arrived)
+        return cls(values, copy, arrived)
 
     @classmethod
     def of(cls, number: int, like: Tensor) -> "Answer":
         """One number for each of some values, known without a look at them."""
-        return cls(torch.full_like(like, number), known=[number] * like.numel())
+        return cls(torch.full_like(like, number), [number] * like.numel())
 
     def any(self) -> bool:
         """Whether any of the values is true."""
@@ -62,7 +65,7 @@ class Answer:
         """The values, once they have arrived."""
         if self.arrived is not None:
             self.arrived.synchronize()
-        return self.copy.tolist() if self.known is None and self.copy is not None else self.known or []
+        return self.copy.tolist() if torch.is_tensor(self.copy) else self.copy
 
 
 class Questions:
@@ -74,7 +77,7 @@ class Questions:
 
     def none_of(self, values: Tensor) -> bool:
         """Whether it is certain that no value is true, as in a steady window; on a GPU it never is, as it would take a wait."""
-        return read_at_once(values) and not bool(values.any())
+        return none_of(values)
 
 
 class Assumptions(Questions):

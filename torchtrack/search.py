@@ -136,7 +136,7 @@ def search(
     best = _likeliest(share, tried.fit.solution.from_prior, prediction.covariance[number])
     mine = torch.where(found.count[number] >= config.quality.min_observations, found.share[number], 0.0)
     better = share.index_select(0, best) > mine + margin
-    return found if readback.read_at_once(better) and not bool(better) else _replaced(found, number, tried, best, better)
+    return found if readback.none_of(better) else _replaced(found, number, tried, best, better)
 
 
 def _likeliest(share: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Int[Tensor, "1"]:

@@ -105,7 +105,7 @@ def learn_after(
     """
     velocity, image_size, any_count = around.contour_velocity, around.objects.image_size, around.objects.learned is not None
     learned = judge_model(learned, found, velocity, image_size, config, any_count=any_count, taken_share=around.taken_share)
-    if wanted is None or (readback.read_at_once(wanted) and not bool(wanted.any())):
+    if wanted is None or readback.none_of(wanted):
         return learned
     return learned.but_of(wanted, learn(learned, around, events, config))
 

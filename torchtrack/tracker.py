@@ -150,13 +150,16 @@ class Tracker(TrackedObjects):
 
     def near(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> NearbyEvents:
         """The events of the window after ``state`` that can have to do with the objects."""
-        dt_s = ((t_us - state.t_us) * 1e-6).to(self.intrinsics.dtype)[self.stream_index]
-        # A weigher is shown all events.
-        return (
-            NearbyEvents(events)
-            if self.weigher is not None
-            else self.sensors.near_objects(NearbyEvents(events), self._predict(state, dt_s), dt_s, self.config)
-        )
+        dt_s = self._window_s(state, t_us)[self.stream_index]
+        return self._near(NearbyEvents(events), self._predict(state, dt_s), dt_s)
+
+    def _near(self, events: NearbyEvents, prediction: Prediction, dt_s: Tensor) -> NearbyEvents:
+        """Those of the events that can have to do with the objects; a weigher is shown all."""
+        return events if self.weigher is not None else self.sensors.near_objects(events, prediction, dt_s, self.config)
+
+    def _window_s(self, state: TrackerState, t_us: Tensor) -> Tensor:
+        """Length of the window after ``state``, of each stream (s)."""
+        return (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
 
     def steady_advance(self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
         """:meth:`advance` with nothing to decide and to learn; and whether anything of the first was called for."""
@@ -202,12 +205,11 @@ class Tracker(TrackedObjects):
             learns: whether anything may be learned from the window.
         """
         config, sensors, last_event_us = self.config, self.sensors, state.last_event_us
-        window_s = (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
+        window_s = self._window_s(state, t_us)
         dt_s = window_s[self.stream_index]
         recorded = self._predict(self._held_back(state, events.events, t_us, dt_s, questions), dt_s)
         prediction = recorded.detached()
-        # A weigher is shown all events.
-        nearby = events if self.weigher is not None else sensors.near_objects(events, prediction, dt_s, config)
+        nearby = self._near(events, prediction, dt_s)
         seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, config.matching.burst_us)
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(self.diameter_m)

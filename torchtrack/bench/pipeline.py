@@ -38,22 +38,21 @@ def measure(setup: Setup) -> Report:
 
 def _of_sequence(setup: Setup) -> Iterator[_Part]:
     if setup.sequence is not None:
-        scene, name = read(setup.sequence), setup.sequence.stem
-        for compiled in (False, True)[: 1 + setup.compiled]:
-            yield _latency(setup, f"{name}, {len(scene.models)} objects" + ", compiled" * compiled, scene, compiled=compiled)
+        scene = read(setup.sequence)
+        for compiled in setup.ways:
+            yield _latency(setup, f"{setup.sequence.stem}, {len(scene.models)} objects", scene, compiled=compiled)
 
 
 def _of_scenes(setup: Setup) -> Iterator[_Part]:
     kind = setup.device.type
     for shape in SHAPES:
-        yield _latency(setup, f"1 object ({shape})", simulated((shape,)), *ONE_OBJECT_MS[kind])
-        if setup.compiled:
-            yield _latency(setup, f"1 object ({shape}), compiled", simulated((shape,)), *ONE_OBJECT_MS[kind], compiled=True)
+        for compiled in setup.ways:
+            yield _latency(setup, f"1 object ({shape})", simulated((shape,)), *ONE_OBJECT_MS[kind], compiled=compiled)
     for count, columns, streams, target_ms in MANY[kind]:
         name = f"{count * streams} objects" + (f" in {streams} streams" if streams > 1 else "")
         yield _latency(setup, name, simulated(shapes_of(count), columns), target_ms, streams=streams)
     yield _outside(setup)
-    for compiled in (False, True)[: 1 + setup.compiled]:
+    for compiled in setup.ways:
         yield _real_time(setup, compiled)
 
 
@@ -68,6 +67,7 @@ def _latency(
     compiled: bool = False,
 ) -> _Part:
     """Median and 95 % of the time of a step, each once per repeat, and how well it tracked."""
+    name = _named(name, compiled)
     setup.show(name)
     run = started(scene, setup.device, streams, compiled=compiled)
     quality = run.quality(setup.clock)
@@ -75,6 +75,11 @@ def _latency(
     median, p95 = ([float(value) for value in np.quantile(repeats, share, axis=1)] for share in (0.5, 0.95))
     results = [time_result(f"{name}, median", median, median_ms), time_result(f"{name}, 95 %", p95, p95_ms)]
     return results, f"{name}: {scene.mev_per_s:.1f} Mev/s, {quality}"
+
+
+def _named(name: str, compiled: bool) -> str:
+    """The name of what is measured one way or the other."""
+    return f"{name}, compiled" if compiled else name
 
 
 def _outside(setup: Setup) -> _Part:
@@ -92,7 +97,7 @@ def _outside(setup: Setup) -> _Part:
 
 def _real_time(setup: Setup, compiled: bool) -> _Part:
     """Seconds of an HD stream per second of work, with one object in it."""
-    name = f"1 object in {HD[0]}x{HD[1]} at {HD_MEV_S:g} Mev/s" + ", compiled" * compiled
+    name = _named(f"1 object in {HD[0]}x{HD[1]} at {HD_MEV_S:g} Mev/s", compiled)
     setup.show(name)
     scene = simulated(SHAPES[:1], size=HD)
     scene = with_events_outside(scene, max(HD_MEV_S - scene.mev_per_s, 0))

@@ -41,6 +41,11 @@ class Setup:
         """The clock that fits the device."""
         return Clock(self.device, self.threads)
 
+    @property
+    def ways(self) -> tuple[bool, ...]:
+        """Whether one object is tracked by compiled graphs: not, and where that is asked for also so."""
+        return (False, True) if self.compiled else (False,)
+
     def cpu_target(self, target: float | None) -> float | None:
         """A target that holds on a CPU alone; None elsewhere."""
         return target if self.device.type == "cpu" else None
