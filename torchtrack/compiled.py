@@ -12,16 +12,18 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from inspect import signature
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchtrack.bursts import update_bursts
 from torchtrack.errors import ConfigError
-from torchtrack.events import EventBatch
+from torchtrack.events import EventBatch, pad_streams
 from torchtrack.online_learning import learning_is_due
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.state import StepResult, TrackerState, each_tensor
@@ -29,6 +31,7 @@ from torchtrack.state import StepResult, TrackerState, each_tensor
 if TYPE_CHECKING:
     from torchtrack.tracker import Tracker
 
+S = TypeVar("S", TrackerState, StepResult)
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
 # At a start, it is looked at more than later on which contours a model lacks.
 _FIRST_WINDOWS = 5
@@ -67,7 +70,7 @@ class CompiledStep:
         if len(nearby.events) < 2:
             return None
         next_state, result, wrong = self._taken(self._tracker.opened(state, events, t_us), nearby, t_us)
-        return None if bool(wrong) else (each_tensor(_own, next_state).numbered(state), each_tensor(_own, result))
+        return None if bool(wrong) else (_own(next_state).numbered(state), _own(result))
 
     def __len__(self) -> int:
         """How many graphs there are."""
@@ -85,12 +88,15 @@ class CompiledStep:
     def _taken(self, opened: TrackerState, nearby: NearbyEvents, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:
         """What the graph makes of a window, and whether that does not hold."""
         opened, filled = each_tensor(_plain, opened), _filled(nearby, len(t_us))
+        if t_us.device.type == "cpu":
+            opened, filled = _in_bursts(opened, filled, t_us, self._tracker.config.matching.burst_us)
         kind = filled.events.most_of_one
         if kind in self._graphs:
             if t_us.is_cuda:
                 # What the last window gave may be written over.
                 torch.compiler.cudagraph_mark_step_begin()
             return self._graphs[kind](opened, filled, t_us)
+        _of_any_number(filled)
         self._graphs[kind] = _compiled(self._tracker.steady_advance, t_us.device)
         try:
             with _as_expected():
@@ -130,9 +136,9 @@ def _plain(value: Tensor) -> Tensor:
     return value.contiguous() if value.is_inference() else value.clone(memory_format=torch.contiguous_format)
 
 
-def _own(value: Tensor) -> Tensor:
-    """The tensor as the caller may keep it: a CUDA graph writes its results to the same places every time."""
-    return value.clone() if value.is_cuda or not torch.is_inference_mode_enabled() else value
+def _own(value: S) -> S:
+    """The state or the result as the caller may keep it: a CUDA graph writes its results to the same places every time."""
+    return each_tensor(Tensor.clone, value) if value.t_us.is_cuda or not torch.is_inference_mode_enabled() else value
 
 
 def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
@@ -143,9 +149,29 @@ def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
     most = None if streams == 1 else 1 << (events.most_of_one or len(events)).bit_length()
     filled = EventBatch(x, y, t_us, polarity, pad(events.stream_index, (0, missing), value=streams), most_of_one=most)
     number = torch.arange(len(filled), device=x.device) if nearby.number is None else pad(nearby.number, (0, missing))
-    for values in (x, y, t_us, polarity, filled.stream_index, number):
-        torch._dynamo.mark_dynamic(values, 0)
     return NearbyEvents(filled, number)
+
+
+def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest_us: int) -> tuple[TrackerState, NearbyEvents]:
+    """The state with its map of bursts brought up, and the events with how far into them they are.
+
+    Not in the graph: where 16 bits are enough, a CPU's compiler takes one pixel at a time.
+    """
+    streams, most = len(t_us), filled.events.most_of_one
+    burst_age_us, into_burst_us = update_bursts(opened.burst_age_us, pad_streams(filled.events, streams, t_us), longest_us)
+    if most is not None:
+        into_burst_us = pad(into_burst_us, (0, min(most, len(filled.events)) - into_burst_us.shape[1]))
+    return replace(opened, burst_age_us=burst_age_us), replace(filled, into_burst_us=into_burst_us)
+
+
+def _of_any_number(filled: NearbyEvents) -> None:
+    """Say that there may be another number of events another time."""
+    events = filled.events
+    for values in (events.x, events.y, events.t_us, events.polarity, events.stream_index, filled.number):
+        if values is not None:
+            torch._dynamo.mark_dynamic(values, 0)
+    if filled.into_burst_us is not None:
+        torch._dynamo.mark_dynamic(filled.into_burst_us, 1)
 
 
 def _rounded_up(count: int) -> int:

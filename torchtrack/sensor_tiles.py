@@ -32,11 +32,13 @@ class NearbyEvents:
         events: the events.
         number: of each among all of the window, where some were left out.
         of_each: indices of those that can have to do with each object, padded, and which of these exist; all where not given.
+        into_burst_us: how far each is into its burst (µs), a padded row per stream, where the map of bursts has been brought up already.
     """
 
     events: EventBatch
     number: Int[Tensor, "e"] | None = None
     of_each: tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]] | None = None
+    into_burst_us: Int[Tensor, "s e"] | None = None
 
 
 class SensorTiles(nn.Module):

@@ -78,7 +78,9 @@ class Sensors:
             longest_us: how long a pixel's events are of one burst.
         """
         window = pad_streams(nearby.events, len(self.ideal_pixels), t_us)
-        burst_age_us, into_burst_us = update_bursts(burst_age_us, window, longest_us)
+        into_burst_us = nearby.into_burst_us
+        if into_burst_us is None:
+            burst_age_us, into_burst_us = update_bursts(burst_age_us, window, longest_us)
         seen = self.seen(window, into_burst_us, nearby.number)
         return seen if nearby.of_each is None else seen.only(*nearby.of_each), burst_age_us
 

@@ -34,7 +34,7 @@ from torchtrack.speed_limit import largest_speed, limit_speed
 from torchtrack.state import Probation, StepResult, TrackerState, choose_rows
 from torchtrack.time_surface import empty_last_event, update_last_event
 from torchtrack.tracked_objects import TrackedObjects
-from torchtrack.window_parts import to_be_parted
+from torchtrack.window_parts import of_unknown_motion, to_be_parted
 
 _QUESTIONS = readback.Questions()
 
@@ -111,11 +111,14 @@ class Tracker(TrackedObjects):
         """
         t_us = self._window_end(state, events, t_end_us)
         with torch.autocast(t_us.device.type, enabled=False):
+            steady = self._steady(state, events, t_us)
+            if steady is not None:
+                return _counted(steady)
             in_parts = to_be_parted(state, events, t_us, self.objects, self.config)
             parted = readback.Answer.to(in_parts)
             if readback.read_at_once(in_parts) and bool(in_parts.all()):
                 return _counted(self._advance_in_parts(state, events, t_us, in_parts))
-            done = self._steady(state, events, t_us) or self._advance(state, events, t_us)
+            done = self._advance(state, events, t_us)
             return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us, in_parts), done) if parted.any() else done)
 
     def steady_step(
@@ -162,8 +165,9 @@ class Tracker(TrackedObjects):
         return (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
 
     def steady_advance(self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
-        """:meth:`advance` with nothing to decide and to learn; and whether anything of the first was called for."""
+        """:meth:`advance` with nothing to decide and to learn; and whether anything of the first, or windows in parts, may be called for."""
         assumptions = readback.Assumptions()
+        assumptions.ask(of_unknown_motion(state, t_us, self.objects, self.config), False)
         return *self.advance(state, events, t_us, questions=assumptions, learns=False), assumptions.wrong()
 
     def _advance_in_parts(self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor) -> tuple[TrackerState, StepResult]:

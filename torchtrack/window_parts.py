@@ -18,7 +18,7 @@ _EVENTS_OF_A_PART = 400
 
 
 def to_be_parted(state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], objects: ObjectBatch, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """Objects whose window is taken in parts: while a large part of their motion within it is not known.
+    """Objects whose window is taken in parts: of unknown motion, and with events enough for each part.
 
     Each object is asked for itself: its neighbours do not matter.
 
@@ -27,15 +27,26 @@ def to_be_parted(state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]
         events: of the window.
         t_us: its end.
     """
-    window, streams = config.window, objects.image_shape[0]
-    if window.parts == 1 or not config.solver.prior or len(events) < window.parts * _EVENTS_OF_A_PART:
+    streams, fewest = objects.image_shape[0], config.window.parts * _EVENTS_OF_A_PART
+    if len(events) < fewest:
+        return torch.zeros_like(objects.stream_index, dtype=torch.bool)
+    unknown = of_unknown_motion(state, t_us, objects, config)
+    if streams == 1:
+        return unknown
+    return unknown & (torch.diff(stream_bounds(events, streams))[objects.stream_index] >= fewest)
+
+
+def of_unknown_motion(state: TrackerState, t_us: Int[Tensor, "s"], objects: ObjectBatch, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Objects of which a large part of their motion within a window is not known; none, where no window is to be taken in parts.
+
+    Args:
+        state: before the window.
+        t_us: its end.
+    """
+    window = config.window
+    if window.parts == 1 or not config.solver.prior:
         return torch.zeros_like(objects.stream_index, dtype=torch.bool)
     unknown_m_s = unknown_speed(state.covariance, objects.diameter_m).to(objects.intrinsics.dtype)
     depth_m = objects.depth_m(state.T_cam_obj.to(unknown_m_s.dtype))
     window_s = ((t_us - state.t_us) * 1e-6)[objects.stream_index]
-    unknown_px = unknown_m_s * window_s * objects.intrinsics[:, 0] / depth_m
-    unknown = unknown_px > window.max_unknown_px
-    if streams == 1:
-        return unknown
-    count = torch.diff(stream_bounds(events, streams))[objects.stream_index]
-    return unknown & (count >= window.parts * _EVENTS_OF_A_PART)
+    return unknown_m_s * window_s * objects.intrinsics[:, 0] / depth_m > window.max_unknown_px
