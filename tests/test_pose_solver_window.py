@@ -44,7 +44,8 @@ def windowed(T_true, *, count=300, faster=FASTER, swelling_px=0.0, noise_px=0.0,
         T_prior=T_true.to(dtype),
         prior_information=prior * torch.eye(13, dtype=dtype).expand(batch, 13, 13),
     )
-    return replace(problem, window=WindowTerms(ages.to(dtype), torch.zeros(batch, 6, dtype=dtype), outward.to(dtype)))
+    nothing = torch.zeros(batch, 6, dtype=dtype)
+    return replace(problem, window=WindowTerms(ages.to(dtype), nothing, outward.to(dtype), nothing))
 
 
 def without_window(problem):

@@ -12,7 +12,6 @@ from torchtrack.contour_index import ContourIndex, index_contours
 from torchtrack.contours import Contours, reproject
 from torchtrack.implicit_gradient import with_gradient
 from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
-from torchtrack.motion import inverse
 from torchtrack.observations import Observations
 from torchtrack.pose_solver import Linearisation, PoseProblem, WindowTerms, solve_pose
 from torchtrack.prediction import Prediction
@@ -97,7 +96,7 @@ def align(
             contours = objects.contours(begin.T_cam_obj, config.contours)
             table = ContourTable.of(contours, index_for(contours, objects.image_size, config, widening, index.radius_px))
             place = _first_place(begin, observations, config)
-        moving = begin.moving(compensated=matching.motion_compensation)
+        moving = begin.moving(compensated=matching.motion_compensation, offset=offset if config.solver.acceleration_in_window else None)
         if matching.along_flow:
             contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
             matches = match_along_flow(observations, contours, moving, gate_px, matching)
@@ -130,7 +129,7 @@ def _information(prediction: Prediction, config: TrackerConfig) -> Tensor:
         return prediction.velocity.new_zeros(len(prediction.velocity), 6, 6)
     swelling_px = config.solver.swelling_px or _NO_SWELLING_PX
     information = prediction.covariance.new_zeros(len(prediction.covariance), 13, 13)
-    information[:, :12, :12] = inverse(prediction.covariance)
+    information[:, :12, :12] = prediction.information
     information[:, 12, 12] = swelling_px**-2
     return (config.solver.observation_px**2 * information).to(prediction.velocity.dtype)
 
@@ -165,15 +164,19 @@ def _problem(
         scale_px=gate_px,
         T_prior=prediction.T_cam_obj,
         prior_information=information,
-        window=_window_terms(rows, offset, config) if config.solver.prior else None,
+        window=_window_terms(prediction, rows, offset, config) if config.solver.prior else None,
     )
 
 
-def _window_terms(rows: Matches, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
+def _window_terms(prediction: Prediction, rows: Matches, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
     """What observations tell beside the pose: of the velocity by their ages, and of how far limbs stand out."""
     age_s, outward = rows.age_s, rows.limb
     if config.matching.residual != "normal":
         outward = torch.zeros_like(outward)
     if not config.solver.velocity_in_window:
         age_s = torch.zeros_like(age_s)
-    return WindowTerms(age_s, offset[:, 6:12], outward)
+    velocity = offset[:, 6:12]
+    rate_hz = torch.zeros_like(velocity)
+    if prediction.acceleration is not None and config.solver.acceleration_in_window:
+        rate_hz = prediction.acceleration.rate_hz
+    return WindowTerms(age_s, velocity, outward, rate_hz)

@@ -10,7 +10,7 @@ from torchtrack import lie, quality
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import reproject
 from torchtrack.corners import Corners
-from torchtrack.motion import fade, inverse, left_covariance, with_dropped
+from torchtrack.motion import fade, found_acceleration, inverse, left_covariance, with_dropped
 from torchtrack.prediction import Prediction
 from torchtrack.search import Found
 from torchtrack.state import StepResult, TrackerState
@@ -48,12 +48,26 @@ def conclude(
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
     trusted = torch.where(failed, 0, quality.trust(share, config.quality, state.full_share, widening))
     velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
+    # Of an object that is partly hidden too little is seen to tell.
+    seen_well = ~failed & (share >= config.quality.certain_at * state.full_share)
+    acceleration = _acceleration(prediction, found, torch.where(seen_well, trusted, 0), dt_s)
     usual = torch.where(failed, state.usual_share, torch.lerp(state.usual_share, share, _USUAL_GAIN))
     full = torch.where(failed, state.full_share, torch.maximum(*(torch.lerp(state.full_share, share, gain) for gain in (_USUAL_GAIN, _FALL_GAIN))))
     contours = reproject(contours, T_cam_obj.to(velocity.dtype), objects.intrinsics)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
-    return replace(state, T_cam_obj=T_cam_obj, velocity=velocity, covariance=covariance, share=share, usual_share=usual, full_share=full), result
+    state = replace(state, T_cam_obj=T_cam_obj, velocity=velocity, acceleration=acceleration, covariance=covariance)
+    return replace(state, share=share, usual_share=usual, full_share=full), result
+
+
+def _acceleration(prediction: Prediction, found: Found, trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 6"]:
+    """Acceleration of a window, as found, as far as the find is to be trusted."""
+    offset = found.fit.solution.from_prior
+    if prediction.acceleration is None:
+        return torch.zeros_like(prediction.velocity)
+    acceleration = found_acceleration(prediction.acceleration, prediction.information, offset[:, :12], dt_s)
+    known = trusted * (acceleration.sum(1).abs() < torch.inf)
+    return torch.where(known[:, None] > 0, known[:, None] * acceleration, 0)
 
 
 def _updated_motion(

@@ -110,11 +110,14 @@ def match_nearest(
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
     found = table.index.look_up(place)
     points_obj, normals, indexed, limb, step, oriented, printed = table.take(contour := found.clamp(min=0))
-    pixels, velocity = objects.show(points_obj)
+    pixels, velocity, change = objects.show(points_obj)
     crossing_px_s = vecdot(normals, velocity)
     dark = observations.polarity * _leading(crossing_px_s)
     age_s = without_tail(observations.age_s, observations.into_burst_s, crossing_px_s, config.burst_px)
     carried = torch.addcmul(observations.pixels, velocity, age_s[..., None])
+    if change is not None:
+        # It had moved less, or more, when it was slower or faster.
+        carried = torch.addcmul(carried, change, age_s[..., None].square(), value=-0.5)
     targets = torch.addcmul(carried, normals, (dark * step)[..., None], value=-config.dark_shift_px)
     difference = pixels - targets
     near = observations.mask & (found >= 0)

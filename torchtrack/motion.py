@@ -6,6 +6,9 @@ filter: what a window's events say is weighed against it direction by direction,
 them, and what they hardly see (an edge that moves along itself, depth) goes on as it moved before.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -15,6 +18,88 @@ from torchtrack.lie import hat
 
 # A prediction is not let grow less certain than this (rad, and diameters).
 _MOST_UNCERTAIN = 0.5
+# How sharply accelerations that count are told from those that do not.
+_STEEPNESS = 4
+
+
+@dataclass(frozen=True)
+class Acceleration:
+    """How velocities come to be what they are at a window's end: by an acceleration that is constant over the window.
+
+    Args:
+        expected: acceleration that the prediction was made with (rad/s², m/s²).
+        variance: of the true one from it (rad²/s⁴, m²/s⁴).
+        rate_hz: acceleration beyond the expected one that goes with each unit of velocity beyond the predicted one (1/s).
+    """
+
+    expected: Float[Tensor, "b 6"]
+    variance: Float[Tensor, "b 6"]
+    rate_hz: Float[Tensor, "b 6"]
+
+    def at(self, velocity_offset: Float[Tensor, "b 6"]) -> Float[Tensor, "b 6"]:
+        """The acceleration of objects with that velocity beyond the predicted one (rad/s², m/s²)."""
+        return torch.addcmul(self.expected, self.rate_hz, velocity_offset)
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> "Acceleration":
+        """The same with each of its tensors changed."""
+        return Acceleration(change(self.expected), change(self.variance), change(self.rate_hz))
+
+
+def acceleration_counts(
+    sigma: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], px_per_m: Float[Tensor, "b"], config: MotionConfig
+) -> Float[Tensor, "b 1"]:
+    """How far accelerations are taken into account, 0 to 1: little where they hardly move contours within a window.
+
+    Of slow objects, what is found of an acceleration is noise, which would come into their velocity.
+
+    Args:
+        sigma: standard deviation of the acceleration (rad/s², m/s²).
+        px_per_m: how far objects move in the image when they move by a metre across it.
+    """
+    way_px = 0.5 * sigma[:, 3:4] * (dt_s.square() * px_per_m)[:, None]
+    return (1 + (config.acceleration_px / way_px.clamp(min=1e-6)) ** _STEEPNESS).reciprocal()
+
+
+def carried_on(acceleration: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 6"]:
+    """What is expected of an acceleration in the window after it (rad/s², m/s²)."""
+    if not config.acceleration_s or config.model == "hold":
+        return torch.zeros_like(acceleration)
+    return acceleration * torch.exp(-dt_s / config.acceleration_s)[:, None]
+
+
+def window_acceleration(
+    expected: Float[Tensor, "b 6"],
+    sigma: Float[Tensor, "b 6"],
+    counts: Float[Tensor, "b 1"],
+    covariance: Float[Tensor, "b 12 12"],
+    dt_s: Float[Tensor, "b"],
+) -> Acceleration:
+    """The acceleration of a window.
+
+    Args:
+        expected, sigma: of it, with its standard deviation from that.
+        counts: from :func:`acceleration_counts`.
+        covariance: of pose and velocity at the window's end, as predicted.
+    """
+    variance, velocity_variance = sigma.square(), covariance.diagonal(dim1=-2, dim2=-1)[:, 6:].to(sigma.dtype)
+    return Acceleration(expected, variance, counts * variance * dt_s[:, None] / velocity_variance.clamp(min=1e-12))
+
+
+def found_acceleration(
+    acceleration: Acceleration, information: Float[Tensor, "b 12 12"], offset: Float[Tensor, "b 12"], dt_s: Float[Tensor, "b"]
+) -> Float[Tensor, "b 6"]:
+    """The likeliest acceleration of objects whose pose and velocity turned out to be off the prediction (rad/s², m/s²).
+
+    It has no covariance of its own: what a window tells of it is weighed against what is to be expected of any window. With
+    one, accelerations that events hardly show would run away.
+
+    Args:
+        information: inverse of the prediction's covariance.
+        offset: of pose and velocity from the prediction.
+    """
+    pull = (information @ offset.to(information.dtype)[..., None])[..., 0].to(offset.dtype)
+    dt_s = dt_s[:, None]
+    return acceleration.expected + acceleration.variance * dt_s * torch.addcmul(pull[:, 6:], dt_s, pull[:, :6], value=0.5)
 
 
 def initial_covariance(diameter_m: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 12 12"]:
@@ -45,14 +130,19 @@ def predict_covariance(
     # [[1, dt], [0, 1]] P [[1, 0], [dt, 1]], by blocks.
     carried = torch.cat([torch.addcmul(covariance[:, :6], dt_s[..., None], covariance[:, 6:]), covariance[:, 6:]], 1)
     carried = torch.cat([torch.addcmul(carried[..., :6], dt_s[..., None], carried[..., 6:]), carried[..., 6:]], 2)
-    rim_m_s = velocity[:, 3:].norm(dim=-1, keepdim=True) + 0.5 * diameter_m * velocity[:, :3].norm(dim=-1, keepdim=True)
-    acceleration = _both(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m)
     # An acceleration adds half its square of the time to the pose, and its time to the velocity.
+    acceleration = acceleration_sigma(velocity, diameter_m, config)
     push = torch.cat([0.5 * dt_s.square() * acceleration, dt_s * acceleration], -1).view(-1, 2, 6)
     predicted = carried + torch.diag_embed(push[:, :, None] * push[:, None]).permute(0, 1, 3, 2, 4).reshape(-1, 12, 12)
     sigma = predicted.diagonal(dim1=-2, dim2=-1).sqrt()
     lost = (sigma[:, :3] > _MOST_UNCERTAIN).any(-1) | (sigma[:, 3:6] > _MOST_UNCERTAIN * diameter_m).any(-1)
     return torch.where(lost[:, None, None], covariance, predicted)
+
+
+def acceleration_sigma(velocity: Float[Tensor, "b 6"], diameter_m: Float[Tensor, "b 1"], config: MotionConfig) -> Float[Tensor, "b 6"]:
+    """Standard deviation of an acceleration from the expected one (rad/s², m/s²)."""
+    rim_m_s = velocity[:, 3:].norm(dim=-1, keepdim=True) + 0.5 * diameter_m * velocity[:, :3].norm(dim=-1, keepdim=True)
+    return _both(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m)
 
 
 def inverse(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:

@@ -37,11 +37,13 @@ class WindowTerms:
         age_s: time from each observation to the pose (s).
         velocity: offset from the predicted velocity that the targets were moved with (rad/s, m/s).
         outward: 1 where the outline's swelling counts along the direction, 0 where not.
+        rate_hz: acceleration in the window for each unit of velocity beyond the predicted one (1/s); zero where it is the same all along.
     """
 
     age_s: Float[Tensor, "b n"]
     velocity: Float[Tensor, "b 6"]
     outward: Float[Tensor, "b n"]
+    rate_hz: Float[Tensor, "b 6"]
 
 
 @dataclass(frozen=True)
@@ -205,10 +207,16 @@ def _see(problem: PoseProblem, rows: _Rows, place: _Place) -> _Seen:
     if problem.window is None:
         return _Seen(residuals[:, 0], torch.cat([jacobian, residuals], 1))
     # Linear in all that is unknown beside the pose; the targets have been moved with one velocity already.
-    further = torch.cat([jacobian * -problem.window.age_s[:, None], problem.window.outward[:, None]], 1)
+    further = torch.cat([jacobian * _ways_s(problem.window), problem.window.outward[:, None]], 1)
     beside = place.from_prior[:, None, 6:] - torch.nn.functional.pad(problem.window.velocity, (0, 1))[:, None]
     residuals = torch.baddbmm(residuals, beside, further)
     return _Seen(residuals[:, 0], torch.cat([jacobian, further, residuals, rows.padding], 1))
+
+
+def _ways_s(window: WindowTerms) -> Float[Tensor, "b 6 n"]:
+    """How far an observation was from where it is at the pose, for each unit of velocity beyond the predicted one (s)."""
+    age_s = window.age_s[:, None]
+    return torch.addcmul(-age_s, age_s.square(), window.rate_hz[..., None], value=0.5)
 
 
 def robust_cost(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], from_prior: Float[Tensor, "b k"], loss: str) -> Float[Tensor, "b"]:

@@ -1,6 +1,6 @@
 """Where objects are expected at a window's end, how they move, and how certain that is."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,6 +10,7 @@ from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.contours import Contours, select_ranked, take_points
 from torchtrack.image_motion import MovingObjects, object_plane_velocity, pixel_velocity
 from torchtrack.lie import retract_about, transform_points
+from torchtrack.motion import Acceleration, inverse
 from torchtrack.object_batch import ObjectBatch, repeat_row
 from torchtrack.once import once
 from torchtrack.pose_solver import pose_jacobian
@@ -30,6 +31,7 @@ class Prediction:
         usable: which predictions are finite poses before the camera.
         velocity: rotation and velocity of the centre (rad/s, m/s).
         covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.motion`.
+        acceleration: how the velocity, which is that at the window's end, comes about; none where it is taken to be the same all along.
     """
 
     objects: ObjectBatch
@@ -37,6 +39,7 @@ class Prediction:
     usable: Bool[Tensor, "b"]
     velocity: Float[Tensor, "b 6"]
     covariance: Float[Tensor, "b 12 12"]
+    acceleration: Acceleration | None = None
 
     @once
     def centre_cam(self) -> Float[Tensor, "b 3"]:
@@ -47,12 +50,25 @@ class Prediction:
         """The same prediction as a constant, to look for matches from; itself where no gradients are recorded."""
         if not torch.is_grad_enabled():
             return self
-        return replace(self, T_cam_obj=self.T_cam_obj.detach(), velocity=self.velocity.detach(), covariance=self.covariance.detach())
+        acceleration = None if self.acceleration is None else self.acceleration.each(Tensor.detach)
+        return Prediction(self.objects, self.T_cam_obj.detach(), self.usable, self.velocity.detach(), self.covariance.detach(), acceleration)
 
-    def moving(self, *, compensated: bool) -> MovingObjects:
-        """The objects as predicted; standing still where their motion is not to be compensated for."""
+    @once
+    def information(self) -> Float[Tensor, "b 12 12"]:
+        """Inverse of the covariance."""
+        return inverse(self.covariance)
+
+    def moving(self, *, compensated: bool, offset: Float[Tensor, "b k"] | None = None) -> MovingObjects:
+        """The objects as predicted; standing still where their motion is not to be compensated for.
+
+        Args:
+            offset: of the prediction from the one that ``acceleration`` is of, as :meth:`at` has it; then their velocity changes.
+        """
         velocity = self.velocity if compensated else torch.zeros_like(self.velocity)
-        return MovingObjects(self.T_cam_obj, velocity, self.centre_cam, self.objects.intrinsics)
+        acceleration = None
+        if compensated and self.acceleration is not None and offset is not None:
+            acceleration = self.acceleration.at(offset[:, 6:12])
+        return MovingObjects(self.T_cam_obj, velocity, self.centre_cam, self.objects.intrinsics, acceleration)
 
     def plane_velocity(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
         """Image velocity of pixels at the depth of the object's centre (px/s)."""
@@ -73,14 +89,15 @@ class Prediction:
     def at(self, T_cam_obj: Float[Tensor, "b 4 4"], offset: Float[Tensor, "b k"]) -> "Prediction":
         """The prediction with another pose, and its velocity moved by what ``offset`` has beside the pose's part."""
         velocity = self.velocity + offset[:, 6:12] if offset.shape[1] > 6 else self.velocity
-        return Prediction(self.objects, T_cam_obj, self.usable, velocity, self.covariance)
+        return Prediction(self.objects, T_cam_obj, self.usable, velocity, self.covariance, self.acceleration)
 
     def copies(self, number: int, count: int) -> "Prediction":
         """One object's prediction many times, each in a stream of its own."""
         T_cam_obj, usable, velocity, covariance = (
             repeat_row(value, number, count) for value in (self.T_cam_obj, self.usable, self.velocity, self.covariance)
         )
-        return Prediction(self.objects.copies(number, count), T_cam_obj, usable, velocity, covariance)
+        acceleration = None if self.acceleration is None else self.acceleration.each(lambda value: repeat_row(value, number, count))
+        return Prediction(self.objects.copies(number, count), T_cam_obj, usable, velocity, covariance, acceleration)
 
     def sigma_px(self, contours: Contours) -> Float[Tensor, "b"]:
         """Standard deviation of the contours across themselves in the image (px), in the mean over them."""

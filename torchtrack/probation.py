@@ -50,6 +50,7 @@ def after_probation(
         state,
         T_cam_obj=torch.where(back, probation.T_cam_obj, state.T_cam_obj),
         velocity=torch.where(wrong[:, None], 0, state.velocity),
+        acceleration=torch.where(wrong[:, None], 0, state.acceleration),
         covariance=torch.where(back, probation.covariance, state.covariance),
         probation=probation,
     )

@@ -42,6 +42,7 @@ class TrackerState:
     Args:
         T_cam_obj: pose of each object at its stream's ``t_us`` (float64).
         velocity: rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s).
+        acceleration: how they changed in the last window (rad/s², m/s²).
         covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.motion`.
         share: of the moving contour, what events explained in the last window.
         usual_share: its running mean.
@@ -56,6 +57,7 @@ class TrackerState:
 
     T_cam_obj: Float[Tensor, "b 4 4"]
     velocity: Float[Tensor, "b 6"]
+    acceleration: Float[Tensor, "b 6"]
     covariance: Float[Tensor, "b 12 12"]
     share: Float[Tensor, "b"]
     usual_share: Float[Tensor, "b"]

@@ -148,6 +148,9 @@ class SolverConfig(Settings):
     prior: bool = Field(True, description="Weigh the observations against the prediction by its covariance, and find the velocity with the pose.")
     observation_px: float = Field(1.5, gt=0, description="Standard deviation of one observation (px), with its share of what all have in common.")
     velocity_in_window: bool = Field(True, description="Older observations tell of the velocity: pose and velocity are found together.")
+    acceleration_in_window: bool = Field(
+        True, description="A velocity that is other than predicted became so steadily over the window, as far as it was certain."
+    )
     swelling_px: float = Field(0.2, ge=0, description="Standard deviation of how far smooth limbs stand out, in a window (px); 0 for not at all.")
 
 
@@ -160,6 +163,12 @@ class MotionConfig(Settings):
     speed_from_events: bool = Field(True, description="Few events before an object that has not been found yet: its speed cannot be large.")
     acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
+    acceleration_px: float = Field(
+        0.25, ge=0, le=100, description="Accelerations that are hardly to be expected to move contours by this much in a window are left out (px)."
+    )
+    acceleration_s: float = Field(
+        0.03, ge=0, le=10, description="An acceleration goes on in the windows after, and dies away with this time constant (s); 0 for not at all."
+    )
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
     coast_s: float = Field(0.2, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
     spin_fades: bool = Field(True, description="So does the spin of a surface of revolution about its axis, which no event can show.")
