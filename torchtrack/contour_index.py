@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchtrack import readback
 from torchtrack.constants import constant, disc
-from torchtrack.contours import Contours
+from torchtrack.contours import Contours, take_points
 
 # Squared distances are compared in these fractions of a pixel².
 _DISTANCE_STEPS = 16
@@ -33,7 +33,7 @@ class ContourIndex:
 
     Args:
         first: the region's first cell (column, row); cell (0, 0) is centred at pixel (0, 0).
-        size: rows and columns of the region, whose outermost cells are empty.
+        size: rows and columns of the region, whose outermost two cells are empty on each side.
         cell_px: side of a cell.
         nearest: contour index per cell, -1 where none is near.
         pixels: where the contour points were when the index was made.
@@ -48,13 +48,30 @@ class ContourIndex:
     radius_px: readback.Answer
 
     def look_up(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
-        """The contour point nearest to the centre of each pixel's cell, -1 where none is near."""
+        """The nearest to each pixel of the contour points that the four cells around it know, -1 where they know none.
+
+        A single cell knows what is nearest to its own centre: where edges lie as close as cells, that is often another one.
+        """
+        rows, columns = self.size
+        column, row = pixels.div(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
+        place = self._flat(column.clamp(0, columns - 2), row.clamp(0, rows - 2))
+        steps = constant((0, 1, columns, columns + 1), place.dtype, place.device)
+        known = self.nearest.gather(1, (place[:, None] + steps[:, None]).flatten(1))
+        u, v = (take_points(self.pixels, known.clamp(min=0)).unflatten(1, (4, -1)) - pixels[:, None]).unbind(-1)
+        known = known.unflatten(1, (4, -1))
+        away = torch.where(known >= 0, u * u + v * v, torch.inf)
+        return known.gather(1, away.argmin(1, keepdim=True))[:, 0]
+
+    def is_near(self, pixels: Float[Tensor, "b n 2"]) -> Bool[Tensor, "b n"]:
+        """Whether the cell of each pixel knows any contour point, at half the cost."""
         rows, columns = self.size
         # Whole cells first: rounded the same way wherever the region begins, as events lie halfway between the centres of two cells.
         column, row = pixels.add(0.5 * self.cell_px).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
-        # The region's border is empty: whatever lies outside finds nothing there, nor does what is not a number.
-        place = torch.add(column.clamp(0, columns - 1), row.clamp(0, rows - 1), alpha=columns)
-        return self.nearest.gather(1, place.nan_to_num_(0.0).long())
+        return self.nearest.gather(1, self._flat(column.clamp(0, columns - 1), row.clamp(0, rows - 1))) >= 0
+
+    def _flat(self, column: Float[Tensor, "b n"], row: Float[Tensor, "b n"]) -> Int[Tensor, "b n"]:
+        """Numbers of cells. The region's border is empty: whatever lies outside finds nothing there, nor does what is not a number."""
+        return torch.add(column, row, alpha=self.size[1]).nan_to_num_(0.0).long()
 
 
 def index_contours(
@@ -74,7 +91,7 @@ def index_contours(
     middle = constant((0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)), contours.pixels.dtype, contours.pixels.device)
     inside = contours.mask & ((contours.pixels - middle).abs() < middle + radius[:, None, None]).all(-1)
     centre = (contours.pixels / cell_px).round()
-    margin = _reach(max([0, *radii_px]), cell_px) + 1
+    margin = _reach(max([0, *radii_px]), cell_px) + 2
     low = _first_cells(centre, inside, margin)
     local = torch.where(inside[..., None], centre - low[:, None], margin)
     rows, columns = _size(local, image_size, margin, cell_px)
