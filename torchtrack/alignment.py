@@ -91,6 +91,7 @@ def align(
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
     place = _first_place(begin, observations, config)
     table = ContourTable.of(contours, index)
+    small = objects.size_px(begin.T_cam_obj).detach() < matching.fine_below_px
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, _narrowing(widening, len(matching.gates_px)), strict=True)):
         if number and number in config.contours.refresh_rounds:
             contours = objects.contours(begin.T_cam_obj, config.contours)
@@ -101,7 +102,7 @@ def align(
             contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
             matches = match_along_flow(observations, contours, moving, gate_px, matching)
         else:
-            matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider)
+            matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider, small)
         matches = _believed(matches, observations, config)
         problem = _problem(prediction, information, matches, observations, offset, gate_px * wider, config)
         solution = solve_pose(problem, begin.T_cam_obj, config.solver, offset)

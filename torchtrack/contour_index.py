@@ -47,11 +47,23 @@ class ContourIndex:
     pixels: Float[Tensor, "b m 2"]
     radius_px: readback.Answer
 
-    def look_up(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
-        """The nearest to each pixel of the contour points that the four cells around it know, -1 where they know none.
+    def look_up(self, pixels: Float[Tensor, "b n 2"], finely: Bool[Tensor, "b"] | None = None) -> Int[Tensor, "b n"]:
+        """The contour point nearest to the centre of each pixel's cell, -1 where none is near.
 
-        A single cell knows what is nearest to its own centre: where edges lie as close as cells, that is often another one.
+        Args:
+            finely: objects of which the four cells around a pixel are asked, and what is nearest to the pixel itself is taken. Where edges
+                lie as close as cells, that is often another one.
         """
+        rows, columns = self.size
+        # Whole cells first: rounded the same way wherever the region begins, as events lie halfway between the centres of two cells.
+        column, row = pixels.add(0.5 * self.cell_px).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
+        nearest = self.nearest.gather(1, self._flat(column.clamp(0, columns - 1), row.clamp(0, rows - 1)))
+        if finely is None or readback.none_of(finely):
+            return nearest
+        return torch.where(finely[:, None], self._nearest_of_four(pixels), nearest)
+
+    def _nearest_of_four(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
+        """The nearest to each pixel of the contour points that the four cells around it know."""
         rows, columns = self.size
         column, row = pixels.div(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
         place = self._flat(column.clamp(0, columns - 2), row.clamp(0, rows - 2))
@@ -61,13 +73,6 @@ class ContourIndex:
         known = known.unflatten(1, (4, -1))
         away = torch.where(known >= 0, u * u + v * v, torch.inf)
         return known.gather(1, away.argmin(1, keepdim=True))[:, 0]
-
-    def is_near(self, pixels: Float[Tensor, "b n 2"]) -> Bool[Tensor, "b n"]:
-        """Whether the cell of each pixel knows any contour point, at half the cost."""
-        rows, columns = self.size
-        # Whole cells first: rounded the same way wherever the region begins, as events lie halfway between the centres of two cells.
-        column, row = pixels.add(0.5 * self.cell_px).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
-        return self.nearest.gather(1, self._flat(column.clamp(0, columns - 1), row.clamp(0, rows - 1))) >= 0
 
     def _flat(self, column: Float[Tensor, "b n"], row: Float[Tensor, "b n"]) -> Int[Tensor, "b n"]:
         """Numbers of cells. The region's border is empty: whatever lies outside finds nothing there, nor does what is not a number."""

@@ -98,6 +98,7 @@ def match_nearest(
     gate_px: float,
     config: MatchingConfig,
     wider: Float[Tensor, "b"] | None = None,
+    finely: Bool[Tensor, "b"] | None = None,
 ) -> tuple[Matches, Float[Tensor, "b n 2"]]:
     """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
 
@@ -106,9 +107,10 @@ def match_nearest(
         place: where to look for each observation among the contours as indexed; returned anew for the next round.
         objects: at the current poses; a velocity of zero switches motion compensation off.
         wider: by how much the gate, and all that is measured against contours, is wider for each object.
+        finely: objects whose contours are looked up finely; none where not given.
     """
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
-    found = table.index.look_up(place)
+    found = table.index.look_up(place, finely)
     points_obj, normals, indexed, limb, step, oriented, printed = table.take(contour := found.clamp(min=0))
     pixels, velocity, change = objects.show(points_obj)
     crossing_px_s = vecdot(normals, velocity)

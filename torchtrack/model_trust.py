@@ -129,7 +129,7 @@ def judge_elements(
 def _lacks_contours(fitted: Prediction, contours: Contours, index: ContourIndex, events: WindowEvents) -> Bool[Tensor, "b"]:
     """Whether many events before an object are near no contour at all of its model."""
     objects = fitted.objects
-    radius_px = 0.5 * objects.diameter_m * objects.intrinsics[:, 0] / objects.depth_m(fitted.T_cam_obj)
+    radius_px = 0.5 * objects.size_px(fitted.T_cam_obj)
     pixels = fitted.carried(events.pixels, events.age_s)
     x, y = (pixels - project(fitted.centre_cam[:, None], objects.intrinsics)).unbind(-1)
     before = events.mask & (x * x + y * y < radius_px[:, None].square())

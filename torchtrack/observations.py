@@ -101,7 +101,7 @@ def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Flo
     different takes almost the same events.
     """
     pixels, mask = events.pixels, events.mask
-    near = mask & index.is_near(torch.addcmul(pixels, plane_velocity, events.age_s[..., None]))
+    near = mask & (index.look_up(torch.addcmul(pixels, plane_velocity, events.age_s[..., None])) >= 0)
     total = near.sum(-1, keepdim=True)
     share = torch.where(total > count, _FILL * count / total, 1.0)
     chosen, exists = events.draw(near, share, count)

@@ -138,7 +138,7 @@ class EventLineTracker(Tracker):
         velocity = object_plane_velocity(pixels, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
         matching = self.config.matching
         index = index_contours(contours, self.image_size, int(max(matching.gates_px)) + 1, matching.index_cell_px)
-        near = seen.mask & index.is_near(torch.addcmul(pixels, velocity, age_s[..., None]))
+        near = seen.mask & (index.look_up(torch.addcmul(pixels, velocity, age_s[..., None])) >= 0)
         chosen, exists = select_ranked(near, matching.max_events)
         taken = take_points(torch.cat([pixels, age_s[..., None]], -1), chosen)
         return LineEvents(taken[..., :2], taken[..., 2], exists)

@@ -105,6 +105,9 @@ class MatchingConfig(Settings):
     max_gate_px: float = Field(16.0, gt=0, description="The first gate opens up to this where the prediction is uncertain (px).")
     gate_sigmas: float = Field(3.0, gt=0, description="Width of an uncertain object's first gate, in standard deviations of its prediction.")
     index_cell_px: int = Field(2, ge=1, le=4, description="Cell of the index of nearest contour points (px).")
+    fine_below_px: float = Field(
+        120.0, ge=0, description="Of objects smaller than this in the image (px) the nearest contour is looked for finer than by cells."
+    )
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
     concentration: bool = Field(True, description="Trust observations less where those around them are smeared across the contour.")
