@@ -10,6 +10,7 @@ from torchtrack import Tracker
 from torchtrack.alignment import align, gate_widening, index_for
 from torchtrack.camera import Camera
 from torchtrack.config.tracker import (
+    MatchingConfig,
     MotionConfig,
     TrackerConfig,
 )
@@ -77,6 +78,8 @@ def started(dtype=torch.float32, config=None, count=5):
 
 def in_motion(config=None, displaced=None, dtype=torch.float32):
     """A box in full motion, whose pose may be displaced: tracker, prediction, events, found alone, and the true pose."""
+    # Looked up by cells, as the tracker does with what may be far off.
+    config = config or TrackerConfig(matching=MatchingConfig(fine_below_px=0))
     tracker, state, _, (events, end_us), trajectory = started(dtype, config)
     if displaced is not None:
         state = replace(state, T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()))

@@ -91,7 +91,8 @@ def align(
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
     place = _first_place(begin, observations, config)
     table = ContourTable.of(contours, index)
-    small = objects.size_px(begin.T_cam_obj).detach() < matching.fine_below_px
+    # One that may be far off would settle on the first edges that it is nearest to.
+    small = (objects.size_px(begin.T_cam_obj).detach() < matching.fine_below_px) & (widening <= 1)
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, _narrowing(widening, len(matching.gates_px)), strict=True)):
         if number and number in config.contours.refresh_rounds:
             contours = objects.contours(begin.T_cam_obj, config.contours)
