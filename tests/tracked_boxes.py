@@ -78,8 +78,9 @@ def started(dtype=torch.float32, config=None, count=5):
 
 def in_motion(config=None, displaced=None, dtype=torch.float32):
     """A box in full motion, whose pose may be displaced: tracker, prediction, events, found alone, and the true pose."""
-    # Looked up by cells, as the tracker does with what may be far off.
-    config = config or TrackerConfig(matching=MatchingConfig(fine_below_px=0))
+    if displaced is not None and config is None:
+        # Looked up by cells, as the tracker does with what may be far off.
+        config = TrackerConfig(matching=MatchingConfig(fine_below_px=0))
     tracker, state, _, (events, end_us), trajectory = started(dtype, config)
     if displaced is not None:
         state = replace(state, T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()))

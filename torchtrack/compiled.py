@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from inspect import signature
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Int
@@ -26,12 +26,11 @@ from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.online_learning import learning_is_due
 from torchtrack.sensor_tiles import NearbyEvents
-from torchtrack.state import StepResult, TrackerState, each_tensor
+from torchtrack.state import S, StepResult, TrackerState, each_tensor
 
 if TYPE_CHECKING:
     from torchtrack.tracker import Tracker
 
-S = TypeVar("S", TrackerState, StepResult)
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
 # At a start, it is looked at more than later on which contours a model lacks.
 _FIRST_WINDOWS = 5

@@ -147,7 +147,8 @@ def _remembered(trust: ModelTrust, explained: Tensor, expected: Tensor, learning
     both = old + new * (most / expected.clamp(min=most))
     both = both * (memory / both[1].clamp(min=memory))
     explained, expected = torch.where(learning[:, None], both, old)
-    return replace(trust, explained=explained, expected=expected)
+    # Rounding may leave a little more.
+    return replace(trust, explained=explained, expected=expected.clamp(max=memory))
 
 
 def _observed(fitted: Prediction, contours: Contours, index: ContourIndex, events: WindowEvents, config: TrackerConfig) -> Float[Tensor, "b 2 m"]:

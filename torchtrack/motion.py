@@ -85,6 +85,27 @@ def window_acceleration(
     return Acceleration(expected, variance, counts * variance * dt_s[:, None] / velocity_variance.clamp(min=1e-12))
 
 
+def next_acceleration(
+    last: Float[Tensor, "b 6"],
+    velocity: Float[Tensor, "b 6"],
+    covariance: Float[Tensor, "b 12 12"],
+    dt_s: Float[Tensor, "b"],
+    diameter_m: Float[Tensor, "b"],
+    px_per_m: Float[Tensor, "b"],
+    config: MotionConfig,
+) -> Acceleration:
+    """The acceleration of the window after one in which it was ``last`` (rad/s², m/s²), as far as accelerations count.
+
+    Args:
+        velocity: at the window's start.
+        covariance: of pose and velocity at its end, as predicted.
+        px_per_m: as for :func:`acceleration_counts`.
+    """
+    sigma = acceleration_sigma(velocity, diameter_m[:, None], config)
+    counts = acceleration_counts(sigma, dt_s, px_per_m, config)
+    return window_acceleration(counts * carried_on(last, dt_s, config), sigma, counts, covariance, dt_s)
+
+
 def found_acceleration(
     acceleration: Acceleration, information: Float[Tensor, "b 12 12"], offset: Float[Tensor, "b 12"], dt_s: Float[Tensor, "b"]
 ) -> Float[Tensor, "b 6"]:

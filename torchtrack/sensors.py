@@ -73,7 +73,7 @@ class Sensors:
 
         Args:
             nearby: the events that count.
-            burst_age_us: ages at the window's end without them.
+            burst_age_us: ages at the window's end without them; with them, where ``nearby`` says how far into their bursts they are.
             t_us: end of the window of each stream.
             longest_us: how long a pixel's events are of one burst.
         """

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.camera import MIN_DEPTH_M, project
+from torchtrack.camera import project
 from torchtrack.lie import transform_points
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import WindowEvents
@@ -38,7 +38,7 @@ def largest_speed(objects: ObjectBatch, T_cam_obj: Float[Tensor, "b 4 4"], event
     An outline that moves fires in every pixel it passes, and it is at least twice as long as the object is wide.
     """
     centre_cam = transform_points(T_cam_obj, objects.centre_obj[:, None])
-    diameter_px = objects.diameter_m * objects.intrinsics[:, 0] / centre_cam[:, 0, 2].clamp(min=MIN_DEPTH_M)
+    diameter_px = objects.size_px(T_cam_obj)
     x, y = (events.pixels - project(centre_cam, objects.intrinsics)).unbind(-1)
     before_it = events.mask & (x * x + y * y < (0.5 * diameter_px[:, None]).square())
     way_px = (before_it.sum(-1) / (2 * diameter_px)).clamp(min=_LEAST_WAY_PX)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchtrack import readback
-from torchtrack.camera import MIN_DEPTH_M, project
+from torchtrack.camera import project
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
 from torchtrack.constants import constant
 from torchtrack.contours import Contours, assemble, joined, take_points
@@ -113,7 +113,7 @@ def learn_after(
 def learn(learned: LearnedContours, around: Surroundings, events: WindowEvents, config: TrackerConfig) -> LearnedContours:
     """What is known after a window: confirmed or doubted, and added to."""
     centre_px = project(around.centre_cam[:, None], around.objects.intrinsics)
-    grid = CellGrid.around(centre_px, _diameter_px(around))
+    grid = CellGrid.around(centre_px, around.objects.size_px(around.T_cam_obj))
     sample = _sample(around, grid, events, config.learning.events)
     known = learned.points(least=1e-6).contours(around.T_cam_obj, around.objects.intrinsics)
     known = around.objects.visible(known, around.T_cam_obj, config.contours)
@@ -124,14 +124,9 @@ def learn(learned: LearnedContours, around: Surroundings, events: WindowEvents, 
     return _with_lines(learned, around, grid, taken, added, config.learning)
 
 
-def _diameter_px(around: Surroundings) -> Tensor:
-    """Diameter of each object in the image."""
-    return around.objects.diameter_m * around.objects.intrinsics[:, 0] / around.centre_cam[:, 2].clamp(min=MIN_DEPTH_M)
-
-
 def _sample(around: Surroundings, grid: CellGrid, events: WindowEvents, count: int) -> _Sample:
     """Events before each object that learns, spread evenly in time, and young enough to be carried to the window's end."""
-    intrinsics, radius_px = around.objects.intrinsics, 0.5 * _diameter_px(around)
+    intrinsics, radius_px = around.objects.intrinsics, 0.5 * around.objects.size_px(around.T_cam_obj)
     drift = object_plane_velocity(grid.middle, around.velocity, around.centre_cam, intrinsics).norm(dim=-1)[:, 0]
     speed_px_s = drift + around.velocity[:, :3].norm(dim=-1) * radius_px
     x, y = (events.pixels - grid.middle).unbind(-1)

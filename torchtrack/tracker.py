@@ -21,16 +21,7 @@ from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.learned_contours import LearnedContours
 from torchtrack.model_trust import ModelTrust
-from torchtrack.motion import (
-    acceleration_counts,
-    acceleration_sigma,
-    carried_on,
-    initial_covariance,
-    predict_covariance,
-    window_acceleration,
-    with_dropped,
-    without_spin,
-)
+from torchtrack.motion import initial_covariance, next_acceleration, predict_covariance, with_dropped, without_spin
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
@@ -267,17 +258,15 @@ class Tracker(TrackedObjects):
             velocity, covariance = without_spin(velocity, covariance, axes_cam, dt_s, self.config.motion)
         motion, before = self.config.motion, velocity.detach()
         px_per_m = self.intrinsics[:, 0].detach() / self.objects.depth_m(state.T_cam_obj.detach().to(before.dtype))
-        sigma = acceleration_sigma(before, self.diameter_m[:, None], motion)
-        counts = acceleration_counts(sigma, dt_s, px_per_m, motion)
-        expected = counts * carried_on(state.acceleration, dt_s, motion)
-        gained = expected * dt_s[:, None]
+        covariance = predict_covariance(covariance.detach(), before, dt_s, self.diameter_m, motion)
+        acceleration = next_acceleration(state.acceleration, before, covariance, dt_s, self.diameter_m, px_per_m, motion)
+        gained = acceleration.expected * dt_s[:, None]
         moved, velocity = torch.add(velocity, gained, alpha=0.5) * dt_s[:, None], velocity + gained
         T_prior = lie.move_about(state.T_cam_obj.to(velocity.dtype), lie.cayley(moved[:, :3]), moved[:, 3:], self.centre_obj)
-        covariance = predict_covariance(covariance.detach(), before, dt_s, self.diameter_m, motion)
-        acceleration = window_acceleration(expected, sigma, counts, covariance, dt_s) if self.config.solver.prior else None
         objects = objects_as_known(self.objects, state, self.element_groups, self.on_surfaces is not None, self.config)
         T_prior, usable = before_camera(T_prior, self.centre_obj, self.far_pose)
-        return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance, acceleration)
+        told = acceleration if self.config.solver.prior else None
+        return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance, told)
 
     @torch.no_grad()
     def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:
