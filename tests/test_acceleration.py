@@ -178,7 +178,7 @@ def test_what_is_not_seen_has_no_acceleration():
 
 def test_an_object_that_is_partly_hidden_has_none_either():
     tracker, state, _, (events, end_us), _ = started()
-    seen, hidden = (tracker.step(replace(state, full_share=torch.full_like(state.share, full)), events, end_us) for full in (1.0, 10.0))
+    seen, hidden = (tracker.step(replace(state, full_share=torch.full_like(state.score, full)), events, end_us) for full in (1.0, 10.0))
     assert seen[0].acceleration.any()
     assert not hidden[0].acceleration.any()
     assert torch.equal(seen[1].T_cam_obj, hidden[1].T_cam_obj)

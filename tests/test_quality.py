@@ -7,7 +7,7 @@ from torchtrack.config.tracker import QualityConfig
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours
 from torchtrack.matching import Matches
-from torchtrack.quality import Status, explained_share, judge, needed_share, trust, visible_share
+from torchtrack.quality import Status, explained_share, gathered_share, judge, needed_share, trust, visible_share
 
 IMAGE_SIZE = (150, 200)
 CONFIG = QualityConfig()
@@ -227,6 +227,21 @@ def test_the_share_of_an_object_does_not_depend_on_the_others():
     found = share(contours, matches).tolist()
     assert found[0] == float(share(contours_at(upright_line()), matches_at(upright_line(count=80, first=60.0))))
     assert found[1] == 1
+
+
+# ---- how far events gather
+
+
+@pytest.mark.parametrize(("on", "around", "away", "expected"), [(30, 0, 0, 1.0), (30, 30, 0, 0.5), (30, 30, 100, 0.5), (0, 40, 0, 0.0)])
+def test_events_around_contours_gather_on_them_or_not(on, around, away, expected):
+    offsets = torch.cat([torch.full((on,), -0.7), torch.full((around,), 0.9), torch.full((away,), 5.5)])[None]
+    assert float(gathered_share(matches_at(torch.zeros(1, on + around + away, 2), offsets=offsets), CONFIG)) == expected
+
+
+def test_few_events_do_not_tell_how_far_they_gather():
+    assert gathered_share(matches_at(torch.zeros(1, 29, 2)), CONFIG).isnan().all()
+    far = torch.zeros(1, 60, dtype=torch.bool)
+    assert gathered_share(matches_at(torch.zeros(1, 60, 2), near=far), CONFIG).isnan().all()
 
 
 # ---- in view

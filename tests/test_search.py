@@ -12,7 +12,7 @@ from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
-from torchtrack.search import Doubt, _likeliest, explained_at_rest, may_be_wanted, search, search_is_due
+from torchtrack.search import _likeliest, explained_at_rest, search
 
 SEARCHED = TrackerConfig()
 UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
@@ -21,42 +21,8 @@ IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
 DISPLACED = torch.tensor([[0.09, -0.06, 0.12, 0.008, -0.006, 0.0]], dtype=torch.float64)
 
 
-MARGIN = torch.tensor(0.1)
-
-
-# ---- when
-
-
-def test_uncertain_objects_and_those_explained_worse_than_usual_are_searched_for():
-    config = SearchConfig(from_sigma_px=4.0, dropped_to=0.8)
-    share, usual = torch.tensor([0.9, 0.71, 0.73, 0.9, 0.0]), torch.tensor([0.9, 0.9, 0.9, 0.9, 0.0])
-    sigma_px = torch.tensor([1.0, 1.0, 1.0, 4.1, 1.0])
-    starting, due = torch.zeros(5, dtype=torch.bool), torch.ones(5, dtype=torch.bool)
-    assert Doubt(sigma_px, share, usual, starting, due).asks(share, config).tolist() == [False, True, False, True, False]
-
-
-@pytest.mark.parametrize("at_start", [True, False])
-def test_objects_whose_motion_is_not_known_are_searched_for(at_start):
-    starting, usual = torch.tensor([True, False]), torch.full((2,), 0.9)
-    doubt = Doubt(torch.ones(2), usual, usual, starting, torch.zeros(2, dtype=torch.bool))
-    config = TrackerConfig(search=SearchConfig(at_start=at_start))
-    assert doubt.asks(usual, config.search).tolist() == may_be_wanted(doubt, config).tolist() == [at_start, False]
-
-
-def test_very_uncertain_objects_wait_until_it_is_time_and_others_do_not():
-    config = SearchConfig(from_sigma_px=4.0, wide_sigma_px=10.0)
-    sigma_px, nothing = torch.tensor([11.0, 11.0, 9.0]), torch.zeros(3)
-    starting, due = torch.tensor([False, False, False]), torch.tensor([False, True, False])
-    assert Doubt(sigma_px, nothing, nothing + 0.9, starting, due).asks(nothing, config).tolist() == [False, True, True]
-    assert Doubt(sigma_px, nothing, nothing + 0.9, ~starting, ~due).asks(nothing, config).all()
-
-
-def test_it_is_time_once_in_every_interval_whatever_the_windows():
-    ends_us = torch.arange(0, 100_001, 5000)
-    due = search_is_due(ends_us[:-1], ends_us[1:], SearchConfig(interval_us=20_000))
-    assert due.nonzero().flatten().tolist() == [3, 7, 11, 15, 19]
-    assert search_is_due(ends_us[:-1], ends_us[1:], SearchConfig(interval_us=0)).all()
-    assert search_is_due(torch.tensor([1000]), torch.tensor([61_000]), SearchConfig(interval_us=20_000)).all()
+# By how much another pose must explain more, and how much it must explain.
+LEAST = torch.tensor([0.1, 0.0])
 
 
 def test_rest_explains_nothing_of_what_was_looked_for_in_many_places():
@@ -70,7 +36,7 @@ def test_a_displaced_box_is_found_again_by_the_search(dtype):
     tracker, prediction, seen, found, T_true = in_motion(displaced=DISPLACED, dtype=dtype)
     sigma = torch.tensor([0.1] * 3 + [0.01] * 3 + [1.0] * 3 + [0.1] * 3, dtype=torch.float64)
     prediction = replace(prediction, covariance=torch.diag_embed(sigma.square())[None])
-    before, better = found, search(0, prediction, 8.0, MARGIN, seen, found, tracker.config)
+    before, better = found, search(0, prediction, 8.0, LEAST, seen, found, tracker.config)
     degrees, millimetres = pose_errors(better.fit.solution.T_cam_obj.double(), T_true)
     assert float(pose_errors(before.fit.solution.T_cam_obj.double(), T_true)[0]) > 3
     assert float(degrees) < 1.0
@@ -89,7 +55,7 @@ def test_a_box_is_found_again_where_hardly_anything_is_known_of_it(velocity_know
     sigma = torch.tensor([0.3] * 3 + [0.04] * 3 + [2.0] * 3 + [0.3] * 3, dtype=torch.float64)
     velocity = prediction.velocity if velocity_known else torch.zeros_like(prediction.velocity)
     prediction = replace(prediction, covariance=torch.diag_embed(sigma.square())[None], velocity=velocity)
-    better = search(0, prediction, 30.0, MARGIN, seen, replace(found, measured=torch.zeros(1)), tracker.config)
+    better = search(0, prediction, 30.0, LEAST, seen, replace(found, measured=torch.zeros(1)), tracker.config)
     degrees, millimetres = pose_errors(better.fit.solution.T_cam_obj.double(), T_true)
     assert float(degrees) < 2.0
     assert float(millimetres) < 5.0
@@ -108,14 +74,22 @@ def test_of_poses_that_explain_as_much_the_most_expected_is_taken():
 def test_what_is_no_better_by_the_margin_is_left():
     tracker, prediction, seen, found, _ = in_motion()
     assert float(found.share) > 0.7
-    assert search(0, prediction, 1.0, MARGIN, seen, found, tracker.config) is found
+    assert search(0, prediction, 1.0, LEAST, seen, found, tracker.config) is found
+
+
+def test_what_explains_too_little_for_being_far_away_is_left():
+    tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
+    prediction = replace(prediction, covariance=1e2 * prediction.covariance)
+    assert search(0, prediction, 8.0, torch.tensor([0.1, 1.1]), seen, found, tracker.config) is found
+    better = search(0, prediction, 8.0, LEAST, seen, found, tracker.config)
+    assert better.elsewhere.tolist() == [True] and found.elsewhere.tolist() == [False]
 
 
 def test_a_search_leaves_what_it_was_given_as_it_was():
     tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
     prediction = replace(prediction, covariance=1e2 * prediction.covariance)
     before = [tensor.clone() for tensor in tensors_of(found)]
-    search(0, prediction, 8.0, MARGIN, seen, found, tracker.config)
+    search(0, prediction, 8.0, LEAST, seen, found, tracker.config)
     assert all(torch.equal(now, then) for now, then in zip(tensors_of(found), before, strict=True))
 
 
@@ -147,14 +121,14 @@ def test_a_lost_box_is_found_again_and_without_the_search_it_is_not():
 @pytest.mark.parametrize("config", [UNSEARCHED, SEARCHED.model_copy(update={"solver": SEARCHED.solver.model_copy(update={"prior": False})})])
 def test_without_hypotheses_or_a_prior_nothing_is_searched_for(config, monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, margin, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
     displaced_runs(config, 100.0, count=2)
     assert searched == []
 
 
 def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, margin, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
     _, events = moving_box(pose(), 10)
     tracker = Tracker([box_model()], SMALL_CAMERA)
     follow(tracker, tracker.init(pose()[None], 0), windows(events, 10))
@@ -187,7 +161,7 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
 @pytest.mark.parametrize(("count", "times"), [(0, 0), (29, 0), (200, 1)])
 def test_without_enough_events_there_is_nothing_to_search_in(count, times, monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, margin, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
     tracker, state, _, _, _ = started(config=TrackerConfig(search=SearchConfig(interval_us=0)))
     noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
     after, result = tracker.step(replace(state, covariance=1e3 * state.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)

@@ -134,7 +134,7 @@ def test_results_have_their_shapes_and_types(dtype):
     assert result.covariance.shape == (1, 6, 6)
     assert result.contours.pixels.dtype == result.corners.pixels.dtype == result.quality.dtype == dtype
     assert state.covariance.dtype == result.covariance.dtype == torch.float64
-    assert state.velocity.dtype == state.share.dtype == state.usual_share.dtype == dtype
+    assert state.velocity.dtype == state.score.dtype == state.usual_score.dtype == dtype
     assert state.covariance.shape == (1, 12, 12)
     assert Status(int(result.status)) == Status.TRACKING
     assert 0.5 < float(result.quality) <= 1

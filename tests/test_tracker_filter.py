@@ -40,7 +40,7 @@ def test_the_first_covariance_is_that_of_the_settings():
     tracker = tracker_of(2, config=config)
     state = tracker.init(pose().repeat(2, 1, 1), 0)
     torch.testing.assert_close(state.covariance, initial_covariance(tracker.diameter_m, config.motion))
-    assert state.share.tolist() == state.usual_share.tolist() == [0, 0]
+    assert state.score.tolist() == state.usual_score.tolist() == [0, 0]
 
 
 def test_events_make_pose_and_velocity_certain(dtype):
@@ -106,7 +106,7 @@ def test_the_velocity_is_learned(in_window, dtype):
 # ---- the usual quality
 
 
-def test_the_usual_share_follows_the_share_slowly(dtype):
+def test_the_usual_score_follows_the_share_slowly(dtype):
     _, events = moving_box(pose(), 10)
     tracker = tracker_of(dtype=dtype)
     state, usual, full = tracker.init(pose()[None], 0), 0.0, 0.0
@@ -114,8 +114,8 @@ def test_the_usual_share_follows_the_share_slowly(dtype):
         state, result = tracker.step(state, batch, end_us)
         usual += 0.1 * (float(result.quality) - usual)
         full += (0.1 if float(result.quality) > full else 0.005) * (float(result.quality) - full)
-        assert float(state.share) == float(result.quality)
-        assert float(state.usual_share) == pytest.approx(usual, abs=1e-5)
+        assert float(state.score) == float(result.quality)
+        assert float(state.usual_score) == pytest.approx(usual, abs=1e-5)
         assert float(state.full_share) == pytest.approx(full, abs=1e-5)
     assert 0.5 < usual < float(result.quality)
 
@@ -124,9 +124,9 @@ def test_a_window_that_failed_does_not_change_what_is_usual():
     tracker, state, _, _, _ = started()
     after, result = tracker.step(state, EventBatch.empty(), 30_000)
     assert int(result.status) == Status.TOO_FEW_EVENTS
-    assert float(after.usual_share) == float(state.usual_share)
+    assert float(after.usual_score) == float(state.usual_score)
     assert float(after.full_share) == float(state.full_share)
-    assert float(after.share) < float(state.share)
+    assert float(after.score) < float(state.score)
 
 
 # ---- back after an outage

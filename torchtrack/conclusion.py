@@ -10,6 +10,7 @@ from torchtrack import lie, quality
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import reproject
 from torchtrack.corners import Corners
+from torchtrack.doubt import in_doubt
 from torchtrack.motion import fade, found_acceleration, inverse, left_covariance, with_dropped
 from torchtrack.prediction import Prediction
 from torchtrack.search import Found
@@ -47,17 +48,31 @@ def conclude(
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
     trusted = torch.where(failed, 0, quality.trust(share, config.quality, state.full_share, widening))
+    doubted = ~failed & ~found.measured.isnan() & in_doubt(found.score, state.full_share, config.search)
+    status = torch.where(doubted, status.clamp(min=int(quality.Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
     # Of an object that is partly hidden too little is seen to tell.
     seen_well = ~failed & (share >= config.quality.certain_at * state.full_share)
     acceleration = _acceleration(prediction, found, torch.where(seen_well, trusted, 0), dt_s)
-    usual = torch.where(failed, state.usual_share, torch.lerp(state.usual_share, share, _USUAL_GAIN))
-    full = torch.where(failed, state.full_share, torch.maximum(*(torch.lerp(state.full_share, share, gain) for gain in (_USUAL_GAIN, _FALL_GAIN))))
     contours = reproject(contours, T_cam_obj.to(velocity.dtype), objects.intrinsics)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
     state = replace(state, T_cam_obj=T_cam_obj, velocity=velocity, acceleration=acceleration, covariance=covariance)
-    return replace(state, share=share, usual_share=usual, full_share=full), result
+    state = replace(state, doubted_s=torch.where(doubted, state.doubted_s + dt_s, 0))
+    return _with_scores(state, found, failed), result
+
+
+def _with_scores(state: TrackerState, found: Found, failed: Bool[Tensor, "b"]) -> TrackerState:
+    """The state with what a window's find explains, as a rule and when seen well; of objects that failed, the last alone."""
+    usual = torch.where(failed, state.usual_score, torch.lerp(state.usual_score, found.score, _USUAL_GAIN))
+    full_share = torch.where(failed, state.full_share, _seen_well(state.full_share, found.share))
+    full_gathered = torch.where(failed | found.gathered.isnan(), state.full_gathered, _seen_well(state.full_gathered, found.gathered))
+    return replace(state, score=found.score, usual_score=usual, full_share=full_share, full_gathered=full_gathered)
+
+
+def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
+    """A running mean of when objects are seen well: it rises fast, and falls slowly."""
+    return torch.maximum(*(torch.lerp(before, now, gain) for gain in (_USUAL_GAIN, _FALL_GAIN)))
 
 
 def _acceleration(prediction: Prediction, found: Found, trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 6"]:

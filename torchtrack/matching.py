@@ -25,7 +25,7 @@ _MIN_CROSSING = 0.3
 # Contours slower than this across themselves (px/s) have no clear leading side.
 _SLOW_PX_S = 10.0
 # Concentration: side of a patch (16 px, as a power of two), patches a side of the image, and offsets that are near and on a contour (px).
-_PATCH_BITS, _PATCHES, _SMEAR_PX, _ON_CONTOUR_PX = 4, 64, 3.0, 0.8
+_PATCH_BITS, _PATCHES, _SMEAR_PX, ON_CONTOUR_PX = 4, 64, 3.0, 0.8
 # Mutual agreement: side of a bit of contour (8 px, as a power of two), and how many others there make its mean count in full.
 _PIECE_BITS, _MANY_OTHERS = 3, 3
 
@@ -223,7 +223,7 @@ def patch(pixels: Float[Tensor, "b n 2"], bits: int = _PATCH_BITS) -> Int[Tensor
 
 def on_and_around(offsets: Float[Tensor, "b n"], near: Bool[Tensor, "b n"]) -> Float[Tensor, "b 2 n"]:
     """Which observations are on a contour, and which are so near to one that their share tells: 1 or 0."""
-    limits = constant(((_ON_CONTOUR_PX,), (_SMEAR_PX,)), offsets.dtype, offsets.device)
+    limits = constant(((ON_CONTOUR_PX,), (_SMEAR_PX,)), offsets.dtype, offsets.device)
     return (near[:, None] & (offsets.abs()[:, None] < limits)).to(offsets.dtype)
 
 

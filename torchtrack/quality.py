@@ -12,12 +12,14 @@ from torch import Tensor
 from torchtrack.config.tracker import QualityConfig
 from torchtrack.constants import constant
 from torchtrack.contours import Contours
-from torchtrack.matching import Matches, on_and_around, patch, patch_sums
+from torchtrack.matching import ON_CONTOUR_PX, Matches, on_and_around, patch, patch_sums
 
 # A patch explains its contours when this share of the observations near them are on them.
 _LEAST_SHARE = 0.5
 # Fewer moving contour points than this say nothing.
 _MIN_MOVING_POINTS = 16
+# How far around a contour observations are that should gather on it (px).
+_AROUND_PX = 5.0
 
 
 class Status(IntEnum):
@@ -54,6 +56,17 @@ def measured_share(
     total = moving.sum(-1)
     share = (moving & explained).sum(-1) / total.clamp(min=1)
     return torch.where(total < _MIN_MOVING_POINTS, torch.nan, share).to(contours.pixels.dtype)
+
+
+def gathered_share(matches: Matches, config: QualityConfig) -> Float[Tensor, "b"]:
+    """Of the observations near an object's contours, the share that is on them; not a number where they are too few to tell.
+
+    Contours that slipped onto others are explained by events of those, but what is around them is no longer theirs alone.
+    """
+    offsets, near = matches.offsets.abs(), matches.near & (matches.offsets.abs() < _AROUND_PX)
+    count = near.sum(-1)
+    share = (near & (offsets < ON_CONTOUR_PX)).sum(-1) / count.clamp(min=1)
+    return torch.where(count < config.min_observations, torch.nan, share).to(offsets.dtype)
 
 
 def inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:

@@ -3,16 +3,17 @@
 The most promising of thousands (:mod:`torchtrack.hypotheses`) are aligned as one batch; the one that explains most is taken.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import quality, readback
-from torchtrack.alignment import Fit, align, index_for
-from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.alignment import Fit, align, gate_widening, index_for
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours
+from torchtrack.doubt import Doubt, drifted
 from torchtrack.hypotheses import event_density, promising
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.once import once
@@ -22,6 +23,8 @@ from torchtrack.readback import Answer
 
 # Shares that differ by less are the same: which of them is larger is chance.
 _AS_MUCH = 0.02
+# What Found tells of each object beside its fit.
+_PER_OBJECT = ("measured", "at_rest", "count", "gathered", "full_gathered", "elsewhere")
 
 
 @dataclass(frozen=True)
@@ -33,24 +36,47 @@ class Found:
         measured: share of the moving contour that events explain; not a number where hardly anything moves.
         at_rest: what stands for it then.
         count: matched observations.
+        gathered: share of the events near the contour that are on it; not a number where it does not tell.
+        full_gathered: the same of when the object is seen well.
+        elsewhere: which objects a search found in another place than the prediction led to.
     """
 
     fit: Fit
     measured: Float[Tensor, "b"]
     at_rest: Float[Tensor, "b"]
     count: Int[Tensor, "b"]
+    gathered: Float[Tensor, "b"]
+    full_gathered: Float[Tensor, "b"]
+    elsewhere: Bool[Tensor, "b"]
 
     @once
     def share(self) -> Float[Tensor, "b"]:
         """What events explain of the contour."""
         return torch.where(self.measured.isnan(), self.at_rest, self.measured)
 
+    @once
+    def score(self) -> Float[Tensor, "b"]:
+        """The share, and less where events are gathered less on the contour than when the object is seen well: poses are compared by it."""
+        gathered = self.gathered / self.full_gathered.clamp(min=1e-3)
+        return self.share * gathered.nan_to_num(1.0).clamp(max=1)
 
-def judge_fit(prediction: Prediction, fit: Fit, config: TrackerConfig, at_rest: Float[Tensor, "b"]) -> Found:
-    """A fit with its quality, by the motion that was found with it; without enough observations it explains nothing."""
+
+def judge_fit(
+    prediction: Prediction, fit: Fit, config: TrackerConfig, at_rest: Float[Tensor, "b"], full_gathered: Float[Tensor, "b"] | None = None
+) -> Found:
+    """A fit with its quality, by the motion that was found with it; without enough observations it explains nothing.
+
+    Args:
+        full_gathered: of when each object is seen well; zero, or none at all, where that is not known.
+    """
     velocity = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).contour_velocity(fit.contours)
     measured = quality.measured_share(fit.contours, fit.matches, velocity, prediction.objects.image_size, config.quality)
-    return Found(fit, measured, at_rest, fit.matches.mask.sum(-1))
+    gathered = torch.full_like(measured, torch.nan)
+    if config.search.by_gathering:
+        # Of what does not move, events are noise.
+        gathered = torch.where(measured.isnan(), gathered, quality.gathered_share(fit.matches, config.quality))
+    full_gathered = torch.zeros_like(measured) if full_gathered is None else full_gathered
+    return Found(fit, measured, at_rest, fit.matches.mask.sum(-1), gathered, full_gathered, torch.zeros_like(measured, dtype=torch.bool))
 
 
 def explained_at_rest(widening: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
@@ -62,67 +88,42 @@ def explained_at_rest(widening: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     return 2 - widening.clamp(1, 2)
 
 
-@dataclass(frozen=True)
-class Doubt:
-    """What speaks for trying other poses, before a window is aligned.
+def search_wanted(
+    prediction: Prediction, doubt: Doubt, events: WindowEvents, found: Found, widening: Float[Tensor, "b"], config: TrackerConfig
+) -> tuple[Found, Prediction, Float[Tensor, "b"]]:
+    """Try other poses for the objects that need it, one object after the other.
 
-    Args:
-        sigma_px: standard deviation of each object's prediction in the image.
-        last_share: explained in the window before: one bad window alone is no reason.
-        usual_share: explained as a rule.
-        starting: objects whose motion is not known yet.
-        due: objects that it is time for, should they be very uncertain: what is hidden is not found by looking more often.
+    Returns:
+        What was found, the prediction that it is to be weighed against, and the widening of the first gates: of an object that had
+        drifted off, those of one as uncertain as it turned out to be.
     """
-
-    sigma_px: Float[Tensor, "b"]
-    last_share: Float[Tensor, "b"]
-    usual_share: Float[Tensor, "b"]
-    starting: Bool[Tensor, "b"]
-    due: Bool[Tensor, "b"]
-
-    def asks(self, share: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
-        """Which objects are to be searched for: uncertain ones, and those whose explained share stays below the usual."""
-        starting = self.starting if config.at_start else torch.zeros_like(self.starting)
-        due = self.due | (self.sigma_px <= config.wide_sigma_px)
-        return starting | (due & ((self.sigma_px > config.from_sigma_px) | (share < config.dropped_to * self.usual_share)))
-
-
-def search_is_due(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], config: SearchConfig) -> Bool[Tensor, "s"]:
-    """Streams in which it is time to search for what is very uncertain: by the clock, whatever the windows."""
-    interval_us = max(config.interval_us, 1)
-    return t_us // interval_us > since_us // interval_us
-
-
-def may_be_wanted(doubt: Doubt, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """Which objects :func:`search_wanted` can turn out to search for, as far as is known before the window is aligned."""
     if config.search.hypotheses == 0 or not config.solver.prior:
-        return torch.zeros_like(doubt.starting)
-    return doubt.asks(doubt.last_share, config.search)
-
-
-def search_wanted(prediction: Prediction, doubt: Doubt, events: WindowEvents, found: Found, config: TrackerConfig) -> Found:
-    """Try other poses for the objects that need it, one object after the other."""
-    if config.search.hypotheses == 0 or not config.solver.prior:
-        return found
+        return found, prediction, widening
     # Without events no pose is better than another.
     enough = events.mask.sum(-1) >= config.quality.min_observations
-    tried = enough & doubt.asks(torch.maximum(found.share, doubt.last_share), config.search)
+    tried = enough & doubt.asks(torch.maximum(found.score, doubt.last_score), config.search)
     margin = torch.where(doubt.starting, config.search.start_margin, config.search.margin)
-    answers = Answer.to(tried), Answer.to(doubt.sigma_px)
+    # What is far away has to explain about as much as usual.
+    needed = torch.where(doubt.adrift, config.search.adrift_share * doubt.full_share, 0)
+    uncertain = drifted(prediction, doubt, config.search)
+    sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
+    answers = Answer.to(tried), Answer.to(sigma_px)
     for number, (is_tried, own_sigma_px) in enumerate(zip(*(answer.numbers() for answer in answers), strict=True)):
         if is_tried:
-            found = search(number, prediction, own_sigma_px, margin[number], events, found, config)
-    return found
+            found = search(number, uncertain, own_sigma_px, torch.stack([margin, needed])[:, number], events, found, config)
+    was_adrift = doubt.adrift & found.elsewhere
+    prediction = replace(prediction, covariance=torch.where(was_adrift[:, None, None], uncertain.covariance, prediction.covariance))
+    return found, prediction, torch.where(was_adrift, gate_widening(sigma_px, config), widening)
 
 
 def search(
-    number: int, prediction: Prediction, sigma_px: float, margin: Float[Tensor, ""], events: WindowEvents, found: Found, config: TrackerConfig
+    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "2"], events: WindowEvents, found: Found, config: TrackerConfig
 ) -> Found:
     """Try other poses for the object ``number``; ``found`` with the best of them in its place, if that is better.
 
     Args:
         sigma_px: standard deviation of the object's prediction in the image.
-        margin: by how much another pose must explain more.
+        least: by how much another pose must explain more, and how much it must explain.
         events: of all objects.
     """
     settings = config.search
@@ -131,22 +132,23 @@ def search(
     one, seen = prediction.copies(number, 1), events.of(number)
     density = event_density(one.carried(seen.pixels, seen.age_s), seen.mask, prediction.objects.image_size)
     offsets = promising(one, found.fit.contours.of(number), covariance, widened_px, density, config)
-    tried = _align_all(prediction.copies(number, len(offsets)), offsets, seen, config)
-    share = torch.where(tried.count >= config.quality.min_observations, tried.share, 0)
-    best = _likeliest(share, tried.fit.solution.from_prior, prediction.covariance[number])
-    mine = torch.where(found.count[number] >= config.quality.min_observations, found.share[number], 0.0)
-    better = share.index_select(0, best) > mine + margin
+    tried = _align_all(prediction.copies(number, len(offsets)), offsets, seen, config, found.full_gathered[number])
+    score = torch.where(tried.count >= config.quality.min_observations, tried.score, 0)
+    best = _likeliest(score, tried.fit.solution.from_prior, prediction.covariance[number])
+    mine = torch.where(found.count[number] >= config.quality.min_observations, found.score[number], 0.0)
+    margin, needed = least.unbind()
+    better = score.index_select(0, best) > torch.maximum(mine + margin, needed)
     return found if readback.none_of(better) else _replaced(found, number, tried, best, better)
 
 
-def _likeliest(share: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Int[Tensor, "1"]:
+def _likeliest(score: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Int[Tensor, "1"]:
     """Of the poses that explain as much as the best does, the one that the prediction expects most: a turn of a vase explains nothing."""
     root = torch.linalg.cholesky_ex(covariance).L
     away = torch.linalg.solve_triangular(root, from_prior[:, :12].to(root.dtype).T, upper=False).square().sum(0)
-    return torch.where(share >= share.max() - _AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]
+    return torch.where(score >= score.max() - _AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]
 
 
-def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: TrackerConfig) -> Found:
+def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: TrackerConfig, full_gathered: Float[Tensor, ""]) -> Found:
     """Align copies of one object, each from its own offset, on the events of the object."""
     begin = copies.moved(offsets)
     contours = copies.objects.contours(begin.T_cam_obj, config.contours)
@@ -154,7 +156,9 @@ def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: 
     index = index_for(contours, copies.objects.image_size, config, tight)
     events = seen.repeated(len(offsets))
     observations = select_events(events, index, begin.plane_velocity(events.pixels), config.matching.max_events)
-    return judge_fit(copies, align(copies, contours, index, tight, observations, config, offsets), config, torch.zeros_like(tight))
+    fit = align(copies, contours, index, tight, observations, config, offsets)
+    found = judge_fit(copies, fit, config, torch.zeros_like(tight), full_gathered.expand_as(tight))
+    return replace(found, elsewhere=torch.ones_like(found.elsewhere))
 
 
 def _replaced(found: Found, number: int, other: Found, row: Int[Tensor, "1"], better: Bool[Tensor, "1"]) -> Found:
@@ -170,5 +174,5 @@ def _replaced(found: Found, number: int, other: Found, row: Int[Tensor, "1"], be
     count = max(mine.contours.mask.shape[1], theirs.contours.mask.shape[1])
     own, others = mine.contours.widened(count), theirs.contours.widened(count)
     contours = Contours(*(put(value, getattr(others, name)) for name, value in vars(own).items()))
-    values = (put(getattr(found, name), getattr(other, name)) for name in ("measured", "at_rest", "count"))
-    return Found(Fit(solution, contours, mine.matches), *values)
+    values = {name: put(value, getattr(other, name)) for name, value in vars(found).items() if name in _PER_OBJECT}
+    return Found(Fit(solution, contours, mine.matches), **values)

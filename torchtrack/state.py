@@ -44,9 +44,11 @@ class TrackerState:
         velocity: rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s).
         acceleration: how they changed in the last window (rad/s², m/s²).
         covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.motion`.
-        share: of the moving contour, what events explained in the last window.
-        usual_share: its running mean.
-        full_share: the same of when the object is seen well: rises as fast, but falls slowly.
+        score: of the last window, :attr:`torchtrack.search.Found.score`.
+        usual_score: its running mean.
+        full_share: of the moving contour, what events explain when the object is seen well: rises as fast, but falls slowly.
+        full_gathered: the same of how far events near its contours are on them.
+        doubted_s: for how long the score has been so low that the object may be elsewhere (s).
         t_us: end of the last window of each stream (µs).
         last_event_us: time of the newest event of every sensor pixel (µs).
         burst_age_us: how long ago the newest burst of every sensor pixel and polarity began (µs).
@@ -59,9 +61,11 @@ class TrackerState:
     velocity: Float[Tensor, "b 6"]
     acceleration: Float[Tensor, "b 6"]
     covariance: Float[Tensor, "b 12 12"]
-    share: Float[Tensor, "b"]
-    usual_share: Float[Tensor, "b"]
+    score: Float[Tensor, "b"]
+    usual_score: Float[Tensor, "b"]
     full_share: Float[Tensor, "b"]
+    full_gathered: Float[Tensor, "b"]
+    doubted_s: Float[Tensor, "b"]
     t_us: Int[Tensor, "s"]
     last_event_us: Int[Tensor, "s h w"]
     burst_age_us: Int[Tensor, "s 2 h w"]

@@ -17,6 +17,7 @@ from torchtrack.camera import Camera
 from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.doubt import Doubt, is_adrift, is_due, may_be_wanted
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.learned_contours import LearnedContours
@@ -27,7 +28,7 @@ from torchtrack.observations import corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.prediction import Prediction, before_camera
 from torchtrack.probation import after_probation
-from torchtrack.search import Doubt, explained_at_rest, judge_fit, may_be_wanted, search_is_due, search_wanted
+from torchtrack.search import explained_at_rest, judge_fit, search_wanted
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.setup_check import check_start
 from torchtrack.speed_limit import largest_speed, limit_speed
@@ -89,7 +90,7 @@ class Tracker(TrackedObjects):
         learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
         trust = ModelTrust.none(self.element_groups, velocity) if self.judges else None
         probation = Probation.none(T_cam_obj, covariance)
-        motion, shares = (velocity, velocity, covariance), (nothing, nothing, nothing)
+        motion, shares = (velocity, velocity, covariance), (nothing,) * 5
         return TrackerState(T_cam_obj.clone(), *motion, *shares, times, last_event_us, burst_age_us, probation, learned, trust)
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
@@ -217,7 +218,7 @@ class Tracker(TrackedObjects):
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(self.diameter_m)
         starting = torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
-        doubt = Doubt(sigma_px, state.share, state.usual_share, starting, search_is_due(state.t_us, t_us, config.search)[self.stream_index])
+        doubt = self._doubt(state, t_us, sigma_px, starting)
         widening = gate_widening(sigma_px, config)
         # Asked for here: a GPU answers while corners are looked for.
         radius_px = questions.ask(index_radius(widening, config), usual_index_radius(config))
@@ -231,9 +232,12 @@ class Tracker(TrackedObjects):
         if self.weigher is not None:
             evidence = Evidence(observations, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
             observations = judged(evidence, self.weigher)
-        found = judge_fit(prediction, align(recorded, contours, index, widening, observations, config), config, explained_at_rest(widening))
+        found = judge_fit(
+            prediction, align(recorded, contours, index, widening, observations, config), config, explained_at_rest(widening), state.full_gathered
+        )
         if in_doubt.any():
-            found = search_wanted(recorded, doubt, seen, found, config)
+            found, recorded, widening = search_wanted(recorded, doubt, seen, found, widening, config)
+            prediction = recorded.detached()
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
         if config.search.probation:
             next_state, result = after_probation(state, next_state, result, prediction, widening, config)
@@ -268,11 +272,18 @@ class Tracker(TrackedObjects):
         told = acceleration if self.config.solver.prior else None
         return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance, told)
 
+    def _doubt(self, state: TrackerState, t_us: Tensor, sigma_px: Tensor, starting: Tensor) -> Doubt:
+        """What speaks for trying other poses in the window that ends at ``t_us``."""
+        config = self.config.search
+        due, far_due = (is_due(state.t_us, t_us, interval_us)[self.stream_index] for interval_us in (config.interval_us, config.doubt_us))
+        adrift = is_adrift(state.doubted_s, far_due, config)
+        return Doubt(sigma_px, state.score, state.usual_score, starting, due, adrift, state.doubted_s, state.full_share)
+
     @torch.no_grad()
     def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:
         """The state, with the speed of objects that were never found yet limited by the events before them."""
         # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.
-        found = state.usual_share > 0
+        found = state.usual_score > 0
         if not self.config.motion.speed_from_events or questions.none_of(~found):
             return state
         T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)

@@ -215,6 +215,11 @@ class SearchConfig(Settings):
     least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
     at_start: bool = Field(True, description="Others are also tried while an object's motion is not known: dense print fits many.")
     probation: bool = Field(True, description="What was found of a very uncertain object is taken back unless it explains as much as usual soon.")
+    by_gathering: bool = Field(True, description="Poses are also compared by how far the events around contours gather on them: slips smear them.")
+    doubted_below: float = Field(0.6, ge=0, le=1, description="Share of what an object explains when it is seen well below which it is in doubt.")
+    doubt_us: int = Field(50_000, ge=0, description="What is in doubt for so long is looked for farther away, once in this time (µs); 0 for never.")
+    drift_px_s: float = Field(200.0, gt=0, description="How fast it may have drifted off since the doubt began (px/s).")
+    adrift_share: float = Field(0.65, ge=0, le=1, description="Share of what an object explains when seen well that is asked of a find farther away.")
     start_margin: float = Field(0.02, ge=0, le=1, description="By how much the quality of another pose must be better then.")
     margin: float = Field(0.1, ge=0, le=1, description="By how much the quality of another pose must be better.")
 

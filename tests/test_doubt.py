@@ -1,0 +1,161 @@
+"""When other poses are tried, how far away they may be, and that poses which slipped unnoticed are found again."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import SMALL_CAMERA, box_model, pose, pose_errors
+from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, windows
+
+from torchtrack import Tracker
+from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.doubt import Doubt, drifted, in_doubt, is_adrift, is_due, may_be_wanted
+from torchtrack.events import concatenate
+from torchtrack.lie import retract_about
+from torchtrack.quality import Status
+
+SEARCHED = TrackerConfig(search=SearchConfig(doubt_us=10_000))
+NEVER_ADRIFT = TrackerConfig(search=SearchConfig(doubt_us=0))
+# Seventeen degrees, onto other edges: farther than a pose that is sure of itself is looked for.
+SLIPPED = torch.tensor([[0.3, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+
+
+def doubt(sigma_px, score=0.9, usual=0.9, starting=False, due=True, adrift=False, doubted_s=0.0, full=0.9):
+    sigma_px = torch.as_tensor(sigma_px)
+    spread = (torch.as_tensor(value).expand_as(sigma_px) for value in (score, usual, starting, due, adrift, doubted_s, full))
+    return Doubt(sigma_px, *spread)
+
+
+# ---- when
+
+
+def test_uncertain_objects_and_those_explained_worse_than_usual_are_searched_for():
+    config = SearchConfig(from_sigma_px=4.0, dropped_to=0.8)
+    score, usual = torch.tensor([0.9, 0.71, 0.73, 0.9, 0.0]), torch.tensor([0.9, 0.9, 0.9, 0.9, 0.0])
+    asked = doubt([1.0, 1.0, 1.0, 4.1, 1.0], score, usual).asks(score, config)
+    assert asked.tolist() == [False, True, False, True, False]
+
+
+@pytest.mark.parametrize("at_start", [True, False])
+def test_objects_whose_motion_is_not_known_are_searched_for(at_start):
+    start = doubt([1.0, 1.0], starting=torch.tensor([True, False]), due=False)
+    config = TrackerConfig(search=SearchConfig(at_start=at_start))
+    assert start.asks(start.last_score, config.search).tolist() == may_be_wanted(start, config).tolist() == [at_start, False]
+
+
+def test_very_uncertain_objects_wait_until_it_is_time_and_others_do_not():
+    config, nothing = SearchConfig(from_sigma_px=4.0, wide_sigma_px=10.0), torch.zeros(3)
+    sigma_px, due = [11.0, 11.0, 9.0], torch.tensor([False, True, False])
+    assert doubt(sigma_px, due=due).asks(nothing, config).tolist() == [False, True, True]
+    assert doubt(sigma_px, starting=True, due=~due).asks(nothing, config).all()
+
+
+def test_objects_adrift_are_searched_for_however_certain_they_are():
+    adrift = doubt([0.5, 0.5], adrift=torch.tensor([True, False]))
+    assert adrift.asks(torch.ones(2), SearchConfig()).tolist() == may_be_wanted(adrift, TrackerConfig()).tolist() == [True, False]
+    assert not may_be_wanted(adrift, TrackerConfig(search=SearchConfig(hypotheses=0))).any()
+
+
+def test_it_is_time_once_in_every_interval_whatever_the_windows():
+    ends_us = torch.arange(0, 100_001, 5000)
+    due = is_due(ends_us[:-1], ends_us[1:], 20_000)
+    assert due.nonzero().flatten().tolist() == [3, 7, 11, 15, 19]
+    assert is_due(ends_us[:-1], ends_us[1:], 0).all()
+    assert is_due(torch.tensor([1000]), torch.tensor([61_000]), 20_000).all()
+
+
+@pytest.mark.parametrize(("doubt_us", "expected"), [(50_000, [False, True, False]), (20_000, [True, True, False]), (0, [False] * 3)])
+def test_an_object_is_adrift_once_it_was_in_doubt_for_long_and_it_is_time(doubt_us, expected):
+    doubted_s, due = torch.tensor([0.045, 0.051, 0.051]), torch.tensor([True, True, False])
+    assert is_adrift(doubted_s, due, SearchConfig(doubt_us=doubt_us)).tolist() == expected
+
+
+def test_doubt_is_measured_by_what_is_explained_when_seen_well():
+    score, full = torch.tensor([0.5, 0.2, 0.0, 0.2]), torch.tensor([0.9, 0.3, 0.0, 0.9])
+    assert in_doubt(score, full, SearchConfig(doubted_below=0.6)).tolist() == [True, False, False, True]
+
+
+# ---- how far
+
+
+def test_who_drifts_off_is_the_less_certain_the_longer_it_lasts():
+    _, prediction, _, found, _ = in_motion()
+    contours, config = found.fit.contours, SearchConfig(drift_px_s=200)
+    sigma_px = [float(drifted(prediction, doubt([1.0], adrift=True, doubted_s=t), config).sigma_px(contours)) for t in (0.05, 0.1, 0.4, 5.0)]
+    # Turning and moving together carry contours farther than either.
+    assert all(20 * n < px < 40 * n for px, n in zip(sigma_px, (0.5, 1, 4, 4), strict=True))
+    assert sigma_px[2] == sigma_px[3]
+
+
+def test_a_drift_is_one_velocity_that_explains_where_the_pose_is():
+    _, prediction, _, _, _ = in_motion()
+    lasted_s = 0.25
+    added = drifted(prediction, doubt([1.0], adrift=True, doubted_s=lasted_s), SearchConfig()).covariance - prediction.covariance
+    pose_part, both, rate = added[0, :6, :6], added[0, :6, 6:], added[0, 6:, 6:]
+    torch.testing.assert_close(pose_part, lasted_s**2 * rate)
+    torch.testing.assert_close(both, lasted_s * rate)
+
+
+def test_others_are_as_certain_as_before():
+    _, prediction, _, _, _ = in_motion()
+    assert torch.equal(drifted(prediction, doubt([1.0], doubted_s=0.2), SearchConfig()).covariance, prediction.covariance)
+
+
+# ---- what comes of it
+
+
+def slipped(config, count=10, streams=1, displaced=0):
+    """Runs on from full motion with the pose of one object off, though all is sure of itself; the states before and after, and results."""
+    tracks = [moving_box(pose(), count + 10, seed=stream, stream=stream) for stream in range(streams)]
+    tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, config, stream_index=range(streams))
+    cut = [windows(events, count + 10) for _, events in tracks]
+    batches = [(concatenate([events for events, _ in row]), row[0][1]) for row in zip(*cut, strict=True)]
+    state, _ = follow(tracker, tracker.init(pose().expand(streams, 4, 4), 0), batches[:10])
+    moved = retract_about(state.T_cam_obj, SLIPPED.expand(streams, 6), tracker.centre_obj.double())
+    T_cam_obj = torch.where(torch.arange(streams)[:, None, None] == displaced, moved, state.T_cam_obj)
+    # As after a while of being seen well.
+    state = replace(state, T_cam_obj=T_cam_obj, full_share=torch.full_like(state.full_share, 0.95))
+    after, results = follow(tracker, state, batches[10:])
+    return after, results, tracks[0][0].at(results[-1].t_us)
+
+
+def test_a_pose_that_slipped_is_in_doubt_and_found_again():
+    after, results, T_true = slipped(SEARCHED, count=20)
+    _, without, _ = slipped(NEVER_ADRIFT)
+    in_doubt_first, later = ([int(result.status) for result in part] for part in (results[:3], results[5:]))
+    assert in_doubt_first == [Status.UNCERTAIN] * 3
+    assert later == [Status.TRACKING] * 15
+    degrees, millimetres = pose_errors(results[-1].T_cam_obj, T_true)
+    assert float(degrees) < 0.5
+    assert float(millimetres) < 1.0
+    assert float(after.doubted_s) == 0
+    assert [int(result.status) for result in without] == [Status.UNCERTAIN] * 10
+
+
+def test_finding_one_that_slipped_changes_nothing_for_its_neighbour():
+    _, alone, _ = slipped(SEARCHED, streams=2, displaced=-1)
+    _, beside, _ = slipped(SEARCHED, streams=2, displaced=0)
+    assert torch.equal(poses_of(alone, 1), poses_of(beside, 1))
+    assert not torch.equal(poses_of(alone), poses_of(beside))
+
+
+def test_what_is_tracked_well_is_never_in_doubt():
+    state, results, _ = slipped(SEARCHED, displaced=-1)
+    assert [int(result.status) for result in results] == [Status.TRACKING] * len(results)
+    assert float(state.doubted_s) == 0
+    assert 0.5 < float(state.full_gathered) <= 1
+
+
+def test_how_far_events_gather_can_be_left_out():
+    """Then poses are compared by what they explain alone."""
+    config = TrackerConfig(search=SearchConfig(by_gathering=False))
+    state, results, _ = slipped(config, displaced=-1)
+    assert_same(state.score, results[-1].quality)
+    assert float(state.full_gathered) == 0
+
+
+def test_a_score_is_less_where_events_gather_less_than_when_seen_well():
+    *_, found, _ = in_motion()
+    assert float(replace(found, full_gathered=2 * found.gathered).score) == pytest.approx(0.5 * float(found.share), rel=1e-6)
+    assert float(replace(found, full_gathered=0.5 * found.gathered).score) == float(found.share)
+    assert float(replace(found, full_gathered=0 * found.gathered).score) == float(found.share)

@@ -1,0 +1,86 @@
+"""What speaks for trying other poses than the one that is predicted: uncertainty, a drop of what is explained, or a doubt that lasts.
+
+A pose that slipped onto other edges is sure of itself, and they explain its contours. What tells is that events around its
+contours no longer gather on them as they did. An object of which that is so for a while may have drifted off unnoticed, and
+the farther, the longer it lasts.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.prediction import Prediction
+
+# An object is not looked for farther away than it can have drifted in this time (s).
+_LONGEST_S = 0.4
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What speaks for trying other poses, before a window is aligned.
+
+    Args:
+        sigma_px: standard deviation of each object's prediction in the image.
+        last_score: in the window before: one bad window alone is no reason.
+        usual_score: as a rule.
+        starting: objects whose motion is not known yet.
+        due: objects that it is time for, should they be very uncertain: what is hidden is not found by looking more often.
+        adrift: objects that have been in doubt for long, and which it is time for.
+        doubted_s: for how long each has been in doubt (s).
+        full_share: explained when the object is seen well.
+    """
+
+    sigma_px: Float[Tensor, "b"]
+    last_score: Float[Tensor, "b"]
+    usual_score: Float[Tensor, "b"]
+    starting: Bool[Tensor, "b"]
+    due: Bool[Tensor, "b"]
+    adrift: Bool[Tensor, "b"]
+    doubted_s: Float[Tensor, "b"]
+    full_share: Float[Tensor, "b"]
+
+    def asks(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+        """Which objects are to be searched for: uncertain ones, those whose score stays below the usual, and those long in doubt."""
+        starting = self.starting if config.at_start else torch.zeros_like(self.starting)
+        due = self.due | (self.sigma_px <= config.wide_sigma_px)
+        return starting | self.adrift | (due & ((self.sigma_px > config.from_sigma_px) | (score < config.dropped_to * self.usual_score)))
+
+
+def is_due(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], interval_us: int) -> Bool[Tensor, "s"]:
+    """Streams in which it is time for what is done once in an interval: by the clock, whatever the windows."""
+    interval_us = max(interval_us, 1)
+    return t_us // interval_us > since_us // interval_us
+
+
+def may_be_wanted(doubt: Doubt, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Which objects a search can turn out to be wanted for, as far as is known before the window is aligned."""
+    if config.search.hypotheses == 0 or not config.solver.prior:
+        return torch.zeros_like(doubt.starting)
+    return doubt.asks(doubt.last_score, config.search)
+
+
+def in_doubt(score: Float[Tensor, "b"], full_share: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+    """Which objects explain so much less than when they are seen well that they may be elsewhere."""
+    return score < config.doubted_below * full_share
+
+
+def is_adrift(doubted_s: Float[Tensor, "b"], due: Bool[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+    """Which objects have been in doubt for so long that they are looked for farther away, where that is ``due``."""
+    return due & (doubted_s >= 1e-6 * config.doubt_us) if config.doubt_us else torch.zeros_like(due)
+
+
+def drifted(prediction: Prediction, doubt: Doubt, config: SearchConfig) -> Prediction:
+    """The prediction, of objects that are adrift so uncertain as if they had moved otherwise, at some constant velocity, since the doubt began."""
+    objects = prediction.objects
+    px_per_m = objects.intrinsics[:, 0] / objects.depth_m(prediction.T_cam_obj)
+    speed_m_s = (config.drift_px_s / px_per_m).double()[:, None].expand(-1, 3)
+    turn_rad_s = speed_m_s * (2 / objects.diameter_m.double())[:, None]
+    lasted_s = doubt.doubted_s.clamp(max=_LONGEST_S).double()[:, None]
+    velocity = torch.cat([turn_rad_s, speed_m_s], 1)
+    # Pose and velocity are off together: one such velocity explains both.
+    pose, rate = (torch.diag_embed(part) for part in (velocity * lasted_s, velocity))
+    root = torch.cat([pose, rate], 1)
+    return replace(prediction, covariance=prediction.covariance + doubt.adrift[:, None, None] * (root @ root.mT))
