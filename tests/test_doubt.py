@@ -9,7 +9,7 @@ from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, 
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
-from torchtrack.doubt import Doubt, drifted, in_doubt, is_adrift, is_due, may_be_wanted
+from torchtrack.doubt import Doubt, drifted, gathered_when_known, in_doubt, is_adrift, is_due, may_be_wanted
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
@@ -73,6 +73,11 @@ def test_an_object_is_adrift_once_it_was_in_doubt_for_long_and_it_is_time(doubt_
 def test_doubt_is_measured_by_what_is_explained_when_seen_well():
     score, full = torch.tensor([0.5, 0.2, 0.0, 0.2]), torch.tensor([0.9, 0.3, 0.0, 0.9])
     assert in_doubt(score, full, SearchConfig(doubted_below=0.6)).tolist() == [True, False, False, True]
+
+
+def test_of_those_whose_place_is_not_known_events_need_not_gather():
+    full = gathered_when_known(doubt([1.0, 3.9, 4.1]), torch.tensor([0.9, 0.8, 0.7]), SearchConfig(from_sigma_px=4.0))
+    torch.testing.assert_close(full, torch.tensor([0.9, 0.8, 0.0]))
 
 
 # ---- how far

@@ -32,7 +32,7 @@ def window(before, shares, widening=TIGHT, status=Status.TRACKING, config=None):
     """One window in which the boxes are explained by ``shares``."""
     _, prediction, after, result = two_boxes()
     result = replace(result, quality=torch.tensor(shares), status=torch.full((2,), int(status)))
-    after = replace(after, probation=before.probation, score=torch.tensor(shares))
+    after = replace(after, probation=before.probation)
     return after_probation(before, after, result, prediction, torch.tensor([widening, TIGHT]), config or TrackerConfig())
 
 

@@ -67,6 +67,14 @@ def in_doubt(score: Float[Tensor, "b"], full_share: Float[Tensor, "b"], config: 
     return score < config.doubted_below * full_share
 
 
+def gathered_when_known(doubt: Doubt, full_gathered: Float[Tensor, "b"], config: SearchConfig) -> Float[Tensor, "b"]:
+    """How far events gather on contours when objects are seen well; zero, for nothing, of those whose place is not known.
+
+    They were hidden, as a rule, and the events of what hides them do not gather where they are seen again.
+    """
+    return torch.where(doubt.sigma_px > config.from_sigma_px, 0, full_gathered)
+
+
 def is_adrift(doubted_s: Float[Tensor, "b"], due: Bool[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
     """Which objects have been in doubt for so long that they are looked for farther away, where that is ``due``."""
     return due & (doubted_s >= 1e-6 * config.doubt_us) if config.doubt_us else torch.zeros_like(due)

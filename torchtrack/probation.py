@@ -39,7 +39,7 @@ def after_probation(
         return state, result
     probation = _begun(before, result, prediction, widening)
     wanted = config.quality.certain_at * before.full_share
-    speaks_for = (state.score / wanted.clamp(min=1e-3)).clamp(max=1) - _NEUTRAL
+    speaks_for = (result.quality / wanted.clamp(min=1e-3)).clamp(max=1) - _NEUTRAL
     evidence = probation.evidence + speaks_for
     wrong = probation.runs & (evidence <= _TAKEN_BACK_AT)
     runs = probation.runs & ~wrong & (evidence < _KEPT_AT)

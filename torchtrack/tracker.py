@@ -17,7 +17,7 @@ from torchtrack.camera import Camera
 from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.doubt import Doubt, is_adrift, is_due, may_be_wanted
+from torchtrack.doubt import Doubt, gathered_when_known, is_adrift, is_due, may_be_wanted
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.learned_contours import LearnedContours
@@ -232,9 +232,8 @@ class Tracker(TrackedObjects):
         if self.weigher is not None:
             evidence = Evidence(observations, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
             observations = judged(evidence, self.weigher)
-        found = judge_fit(
-            prediction, align(recorded, contours, index, widening, observations, config), config, explained_at_rest(widening), state.full_gathered
-        )
+        fit = align(recorded, contours, index, widening, observations, config)
+        found = judge_fit(prediction, fit, config, explained_at_rest(widening), gathered_when_known(doubt, state.full_gathered, config.search))
         if in_doubt.any():
             found, recorded, widening = search_wanted(recorded, doubt, seen, found, widening, config)
             prediction = recorded.detached()
