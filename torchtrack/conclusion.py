@@ -48,7 +48,7 @@ def conclude(
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
     trusted = torch.where(failed, 0, quality.trust(share, config.quality, state.full_share, widening))
-    doubted = ~failed & ~found.measured.isnan() & in_doubt(found.score, state.full_share, config.search)
+    doubted = ~failed & in_doubt(found.score, state.full_share, found.gathered, found.full_gathered, config.search)
     status = torch.where(doubted, status.clamp(min=int(quality.Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
     # Of an object that is partly hidden too little is seen to tell.
@@ -58,7 +58,9 @@ def conclude(
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
     state = replace(state, T_cam_obj=T_cam_obj, velocity=velocity, acceleration=acceleration, covariance=covariance)
-    state = replace(state, doubted_s=torch.where(doubted, state.doubted_s + dt_s, 0))
+    # One good window among bad ones does not end a doubt.
+    doubted_s = torch.where(failed, 0, state.doubted_s + torch.where(doubted, dt_s, -dt_s)).clamp(min=0)
+    state = replace(state, doubted_s=doubted_s)
     return _with_scores(state, found, failed), result
 
 

@@ -16,6 +16,8 @@ from torchtrack.prediction import Prediction
 
 # An object is not looked for farther away than it can have drifted in this time (s).
 _LONGEST_S = 0.4
+# Events that gather less than this share of how far they do when an object is seen well are smeared.
+_SMEARED = 0.8
 
 
 @dataclass(frozen=True)
@@ -62,9 +64,18 @@ def may_be_wanted(doubt: Doubt, config: TrackerConfig) -> Bool[Tensor, "b"]:
     return doubt.asks(doubt.last_score, config.search)
 
 
-def in_doubt(score: Float[Tensor, "b"], full_share: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
-    """Which objects explain so much less than when they are seen well that they may be elsewhere."""
-    return score < config.doubted_below * full_share
+def in_doubt(
+    score: Float[Tensor, "b"],
+    full_share: Float[Tensor, "b"],
+    gathered: Float[Tensor, "b"],
+    full_gathered: Float[Tensor, "b"],
+    config: SearchConfig,
+) -> Bool[Tensor, "b"]:
+    """Which objects explain so much less than when they are seen well, by smeared events, that they may be elsewhere.
+
+    Where less is explained but events gather as ever, an object is right, and partly hidden.
+    """
+    return (gathered < _SMEARED * full_gathered) & (score < config.doubted_below * full_share)
 
 
 def gathered_when_known(doubt: Doubt, full_gathered: Float[Tensor, "b"], config: SearchConfig) -> Float[Tensor, "b"]:

@@ -23,6 +23,8 @@ from torchtrack.readback import Answer
 
 # Shares that differ by less are the same: which of them is larger is chance.
 _AS_MUCH = 0.02
+# From this share of how far they do when an object is seen well, events gather in full.
+_AS_GATHERED = 0.9
 # What Found tells of each object beside its fit.
 _PER_OBJECT = ("measured", "at_rest", "count", "gathered", "full_gathered", "elsewhere")
 
@@ -56,8 +58,8 @@ class Found:
 
     @once
     def score(self) -> Float[Tensor, "b"]:
-        """The share, and less where events are gathered less on the contour than when the object is seen well: poses are compared by it."""
-        gathered = self.gathered / self.full_gathered.clamp(min=1e-3)
+        """The share, and less where the events around the contour are smeared: what poses are compared by."""
+        gathered = self.gathered / (_AS_GATHERED * self.full_gathered).clamp(min=1e-3)
         return self.share * gathered.nan_to_num(1.0).clamp(max=1)
 
 

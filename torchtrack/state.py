@@ -48,7 +48,7 @@ class TrackerState:
         usual_score: its running mean.
         full_share: of the moving contour, what events explain when the object is seen well: rises as fast, but falls slowly.
         full_gathered: the same of how far events near its contours are on them.
-        doubted_s: for how long the score has been so low that the object may be elsewhere (s).
+        doubted_s: for how long, less the time it was not, the object has been in doubt of being elsewhere (s).
         t_us: end of the last window of each stream (µs).
         last_event_us: time of the newest event of every sensor pixel (µs).
         burst_age_us: how long ago the newest burst of every sensor pixel and polarity began (µs).
