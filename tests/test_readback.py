@@ -212,6 +212,6 @@ def test_a_steady_step_says_when_it_does_not_hold(nothing_is_read, monkeypatch, 
         uncertain[:, 6:, 6:] += torch.eye(6) * 4.0
     elif reason in ("searched", "far away"):
         uncertain[:, :6, :6] += torch.eye(6) * (0.05 if reason == "searched" else 0.005) ** 2
-    last_share = torch.zeros(1) if reason == "lost" else state.share
-    *_, wrong = boxes.steady_step(replace(state, covariance=uncertain, share=last_share), *window)
+    last_score = torch.zeros(1) if reason == "lost" else state.score
+    *_, wrong = boxes.steady_step(replace(state, covariance=uncertain, score=last_score), *window)
     assert wrong

@@ -269,8 +269,10 @@ def solve_positive(matrix: Float[Tensor, "b n n"], right: Float[Tensor, "b n k"]
 def _damped(hessian: Tensor, damping: Tensor) -> Tensor:
     """The Hessian, damped along its diagonal."""
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
-    # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is.
-    floor = torch.add(constant((1e-12,), hessian.dtype, hessian.device), diagonal[:, :6].amax(-1, keepdim=True), alpha=1e-9)
+    # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is, but for rounding. Poses
+    # alone may have no prior that holds them: then it has to be above that.
+    least = max(1e-9, torch.finfo(hessian.dtype).eps) if hessian.shape[-1] == 6 else 1e-9
+    floor = torch.add(constant((1e-12,), hessian.dtype, hessian.device), diagonal[:, :6].amax(-1, keepdim=True), alpha=least)
     damped = hessian.clone()
     damped.diagonal(dim1=-2, dim2=-1).add_(torch.addcmul(floor, diagonal, damping[:, None]))
     return damped
