@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.motion import rim_and_centre
 from torchtrack.prediction import Prediction
 
 # An object is not looked for farther away than it can have drifted in this time (s).
@@ -94,11 +95,9 @@ def is_adrift(doubted_s: Float[Tensor, "b"], due: Bool[Tensor, "b"], config: Sea
 def drifted(prediction: Prediction, doubt: Doubt, config: SearchConfig) -> Prediction:
     """The prediction, of objects that are adrift so uncertain as if they had moved otherwise, at some constant velocity, since the doubt began."""
     objects = prediction.objects
-    px_per_m = objects.intrinsics[:, 0] / objects.depth_m(prediction.T_cam_obj)
-    speed_m_s = (config.drift_px_s / px_per_m).double()[:, None].expand(-1, 3)
-    turn_rad_s = speed_m_s * (2 / objects.diameter_m.double())[:, None]
+    speed_m_s = (config.drift_px_s / objects.px_per_m(prediction.T_cam_obj)).double()
+    velocity = rim_and_centre(speed_m_s[:, None], objects.diameter_m.double()[:, None])
     lasted_s = doubt.doubted_s.clamp(max=_LONGEST_S).double()[:, None]
-    velocity = torch.cat([turn_rad_s, speed_m_s], 1)
     # Pose and velocity are off together: one such velocity explains both.
     pose, rate = (torch.diag_embed(part) for part in (velocity * lasted_s, velocity))
     root = torch.cat([pose, rate], 1)

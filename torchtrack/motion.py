@@ -127,12 +127,12 @@ def initial_covariance(diameter_m: Float[Tensor, "b"], config: MotionConfig) -> 
     """Covariance of a pose that is given, and of a velocity that is not known (float64)."""
     diameter_m = diameter_m.double()[:, None]
     shift_m, speed_m_s = config.initial_shift * diameter_m, torch.full_like(diameter_m, config.initial_speed_m_s)
-    sigma = torch.cat([_both(shift_m, diameter_m), _both(speed_m_s, diameter_m)], -1)
+    sigma = torch.cat([rim_and_centre(shift_m, diameter_m), rim_and_centre(speed_m_s, diameter_m)], -1)
     return torch.diag_embed(sigma.square())
 
 
-def _both(way_m: Tensor, diameter_m: Tensor) -> Tensor:
-    """A way of the object's rim and of its centre: three rotations and three translations."""
+def rim_and_centre(way_m: Float[Tensor, "b 1"], diameter_m: Float[Tensor, "b 1"]) -> Float[Tensor, "b 6"]:
+    """A way of the object's rim and of its centre (m): three rotations (rad) and three translations (m); or a speed, likewise."""
     return torch.cat([(2 * way_m / diameter_m).expand(-1, 3), way_m.expand(-1, 3)], -1)
 
 
@@ -163,7 +163,7 @@ def predict_covariance(
 def acceleration_sigma(velocity: Float[Tensor, "b 6"], diameter_m: Float[Tensor, "b 1"], config: MotionConfig) -> Float[Tensor, "b 6"]:
     """Standard deviation of an acceleration from the expected one (rad/s², m/s²)."""
     rim_m_s = velocity[:, 3:].norm(dim=-1, keepdim=True) + 0.5 * diameter_m * velocity[:, :3].norm(dim=-1, keepdim=True)
-    return _both(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m)
+    return rim_and_centre(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m)
 
 
 def inverse(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:

@@ -73,6 +73,10 @@ class ObjectBatch:
         """Depth of each object's centre, at least what the camera can see (m)."""
         return transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
 
+    def px_per_m(self, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b"]:
+        """How far each object moves in the image when it moves by a metre across it (px)."""
+        return self.intrinsics[:, 0] / self.depth_m(T_cam_obj)
+
     def size_px(self, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b"]:
         """Diameter of each object in the image, at the depth of its centre (px)."""
         return self.diameter_m * self.intrinsics[:, 0] / self.depth_m(T_cam_obj)

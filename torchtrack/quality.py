@@ -63,7 +63,8 @@ def gathered_share(matches: Matches, config: QualityConfig) -> Float[Tensor, "b"
 
     Contours that slipped onto others are explained by events of those, but what is around them is no longer theirs alone.
     """
-    offsets, near = matches.offsets.abs(), matches.near & (matches.offsets.abs() < _AROUND_PX)
+    offsets = matches.offsets.abs()
+    near = matches.near & (offsets < _AROUND_PX)
     count = near.sum(-1)
     share = (near & (offsets < ON_CONTOUR_PX)).sum(-1) / count.clamp(min=1)
     return torch.where(count < config.min_observations, torch.nan, share).to(offsets.dtype)

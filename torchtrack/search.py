@@ -3,7 +3,7 @@
 The most promising of thousands (:mod:`torchtrack.hypotheses`) are aligned as one batch; the one that explains most is taken.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -25,8 +25,6 @@ from torchtrack.readback import Answer
 _AS_MUCH = 0.02
 # From this share of how far they do when an object is seen well, events gather in full.
 _AS_GATHERED = 0.9
-# What Found tells of each object beside its fit.
-_PER_OBJECT = ("measured", "at_rest", "count", "gathered", "full_gathered", "elsewhere")
 
 
 @dataclass(frozen=True)
@@ -176,5 +174,5 @@ def _replaced(found: Found, number: int, other: Found, row: Int[Tensor, "1"], be
     count = max(mine.contours.mask.shape[1], theirs.contours.mask.shape[1])
     own, others = mine.contours.widened(count), theirs.contours.widened(count)
     contours = Contours(*(put(value, getattr(others, name)) for name, value in vars(own).items()))
-    values = {name: put(value, getattr(other, name)) for name, value in vars(found).items() if name in _PER_OBJECT}
-    return Found(Fit(solution, contours, mine.matches), **values)
+    names = [field.name for field in fields(Found) if field.name != "fit"]
+    return Found(Fit(solution, contours, mine.matches), *(put(getattr(found, name), getattr(other, name)) for name in names))

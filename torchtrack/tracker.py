@@ -260,7 +260,7 @@ class Tracker(TrackedObjects):
             axes_cam = (state.T_cam_obj[:, :3, :3].to(velocity.dtype) @ self.revolution_axes[..., None])[..., 0]
             velocity, covariance = without_spin(velocity, covariance, axes_cam, dt_s, self.config.motion)
         motion, before = self.config.motion, velocity.detach()
-        px_per_m = self.intrinsics[:, 0].detach() / self.objects.depth_m(state.T_cam_obj.detach().to(before.dtype))
+        px_per_m = self.objects.px_per_m(state.T_cam_obj.detach().to(before.dtype)).detach()
         covariance = predict_covariance(covariance.detach(), before, dt_s, self.diameter_m, motion)
         acceleration = next_acceleration(state.acceleration, before, covariance, dt_s, self.diameter_m, px_per_m, motion)
         gained = acceleration.expected * dt_s[:, None]
