@@ -5,7 +5,7 @@ import torch
 from helpers import generator, seen, upright_line
 from test_matching import nearest
 
-from torchtrack.bursts import LONG_AGO_US, aged, no_bursts, update_bursts, without_tail
+from torchtrack.bursts import LONG_AGO_US, no_bursts, update_bursts, without_tail
 from torchtrack.events import EventBatch, PaddedEvents, concatenate, pad_streams
 
 LONGEST_US = 10_000
@@ -20,7 +20,7 @@ def batch(*events, stream=0):
 def update(ages, events, elapsed_us, end_us):
     streams = len(ages)
     ends = torch.full((streams,), end_us)
-    return update_bursts(aged(ages, torch.full((streams,), elapsed_us)), pad_streams(events, streams, ends), LONGEST_US)
+    return update_bursts(ages, torch.full((streams,), elapsed_us), pad_streams(events, streams, ends), LONGEST_US)
 
 
 def test_events_of_a_pixel_and_polarity_are_one_burst():
@@ -98,7 +98,7 @@ def test_no_event_of_a_long_window_is_farther_into_its_burst_than_a_burst_is_lon
 
 def test_where_bursts_have_no_length_there_are_none():
     events = pad_streams(batch((1000, 0, 0, 0), (2000, 0, 0, 0), (4000, 0, 0, 0)), 1, torch.tensor([5000]))
-    _, into = update_bursts(no_bursts(1, 2, 2), events, 0)
+    _, into = update_bursts(no_bursts(1, 2, 2), torch.tensor([5000]), events, 0)
     assert not into.any()
 
 
@@ -122,5 +122,5 @@ def test_the_tail_of_a_slow_circuit_is_matched_where_its_edge_has_gone():
 def test_padded_events_of_nothing():
     nothing = torch.zeros(1, 1, dtype=torch.int64)
     none = PaddedEvents(nothing, nothing, nothing, nothing.bool(), nothing.bool())
-    ages, into = update_bursts(no_bursts(1, 2, 2), none, LONGEST_US)
+    ages, into = update_bursts(no_bursts(1, 2, 2), torch.tensor([5000]), none, LONGEST_US)
     assert (ages == LONG_AGO_US).all() and not into[none.mask].any()

@@ -96,7 +96,8 @@ def test_a_step_is_the_same_without_the_events_that_are_left_out():
     noise = random_events(20_000, width=WIDE.width, height=WIDE.height, duration_us=WINDOW_US)
     noisy = merged(events, replace(noise, t_us=noise.t_us + 5 * WINDOW_US)).slice_time(5 * WINDOW_US, 6 * WINDOW_US)
     results = [tracker.step(state, noisy)[1]]
-    assert len(tracker.near(state, noisy, torch.tensor([6 * WINDOW_US])).events) < len(noisy) // 2
+    near = tracker.near_tiles(state, torch.tensor([6 * WINDOW_US]))
+    assert len(tracker.tiles.keep(noisy, near).events) < len(noisy) // 2
     tracker.tiles = None
     results.append(tracker.step(state, noisy)[1])
     assert torch.equal(results[0].T_cam_obj, results[1].T_cam_obj)

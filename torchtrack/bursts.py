@@ -26,21 +26,25 @@ def aged(burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"]) -> 
     return torch.minimum(burst_age_us, LONG_AGO_US - elapsed_us).add_(elapsed_us)
 
 
-def update_bursts(burst_age_us: Int[Tensor, "s 2 h w"], events: PaddedEvents, longest_us: int) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
+def update_bursts(
+    burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int
+) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
     """Ages of the newest burst of every pixel and polarity at a window's end (µs), and how far into its burst each event is (µs).
 
     What one pixel fires of one polarity within ``longest_us`` is one burst; the next event after that begins another. In a
     window that is longer, bursts that follow the first of a pixel are not told from one another: each event begins its own.
 
     Args:
-        burst_age_us: of the bursts before the window, at its end; left as it was.
+        burst_age_us: of the bursts before the window, where it begins; left as it was.
+        elapsed_us: how long the window lasts.
         events: of the window.
         longest_us: less than :data:`LONG_AGO_US`.
 
     Of padding, the second result says nothing.
     """
     _, _, height, width = burst_age_us.shape
-    ages = burst_age_us.clone()
+    ages = aged(burst_age_us, elapsed_us)
+    # In place: out of place, the whole map is copied again.
     flat = ages.flatten(1)
     place = (events.polarity * height + events.y) * width + events.x
     age_us = events.age_us.clamp(max=LONG_AGO_US).to(torch.int16)

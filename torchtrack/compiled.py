@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from inspect import signature
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import torch
 from jaxtyping import Int
@@ -31,6 +31,7 @@ from torchtrack.state import S, StepResult, TrackerState, each_tensor
 if TYPE_CHECKING:
     from torchtrack.tracker import Tracker
 
+P, R = ParamSpec("P"), TypeVar("R")
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
 # At a start, it is looked at more than later on which contours a model lacks.
 _FIRST_WINDOWS = 5
@@ -59,61 +60,87 @@ class CompiledStep:
         self._tracker = tracker
         # By how many events a stream has at most, where there are several.
         self._graphs: dict[int | None, _Graph] = {}
+        self._near_tiles: Callable[[TrackerState, Tensor], Tensor | None] | None = None
 
     def __call__(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult] | None:
         """State and result of a window, not counted yet; None where it is not steady, or there is hardly any event in it."""
         starts = state.learned is not None and state.learned.windows < _FIRST_WINDOWS
         if starts or learning_is_due(state, self._tracker.on_surfaces, self._tracker.config):
             return None
-        nearby = self._tracker.near(state, events, t_us) if len(events) > _MANY else NearbyEvents(events)
-        if len(nearby.events) < 2:
-            return None
-        next_state, result, wrong = self._taken(self._tracker.opened(state, events, t_us), nearby, t_us)
+        with torch.inference_mode():
+            plain = each_tensor(_plain, state)
+            nearby = self._near(plain, events, t_us) if len(events) > _MANY else NearbyEvents(events)
+            if len(nearby.events) < 2:
+                return None
+            next_state, result, wrong = self._taken(self._tracker.opened(plain, events), nearby, t_us)
         return None if bool(wrong) else (_own(next_state).numbered(state), _own(result))
 
     def __len__(self) -> int:
         """How many graphs there are."""
         return len(self._graphs)
 
+    @torch.inference_mode()
     def prepare(self, state: TrackerState) -> None:
-        """Compile the graph of one stream, from the state that it begins with; with several, more than that would have to be known."""
+        """Compile the graphs of one stream, from the state that it begins with; with several, more than that would have to be known."""
         if len(state.t_us) > 1:
             return
         t_us, nothing = state.t_us + 1, torch.zeros_like(state.t_us).expand(2)
         events = EventBatch(nothing.int(), nothing.int(), t_us.expand(2), nothing > 0, nothing)
-        self._taken(state.numbered(state, _FIRST_WINDOWS), NearbyEvents(events), t_us)
+        plain = each_tensor(_plain, state.numbered(state, _FIRST_WINDOWS))
+        self._near(plain, events, t_us)
+        self._taken(plain, NearbyEvents(events), t_us)
 
-    @torch.inference_mode()
+    def _near(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> NearbyEvents:
+        """The events that can have to do with the objects; all on a GPU, which would have to be waited for."""
+        tiles = self._tracker.tiles
+        if tiles is None or self._tracker.weigher is not None or t_us.device.type != "cpu":
+            return NearbyEvents(events)
+        if self._near_tiles is None:
+            self._near_tiles = _compiled(self._tracker.near_tiles, t_us.device)
+            near = _for_the_first_time(self._near_tiles, state, t_us)
+        else:
+            near = self._near_tiles(state, t_us)
+        return NearbyEvents(events) if near is None else tiles.keep(events, near)
+
     def _taken(self, opened: TrackerState, nearby: NearbyEvents, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:
         """What the graph makes of a window, and whether that does not hold."""
-        opened, filled = each_tensor(_plain, opened), _filled(nearby, len(t_us))
+        filled = _filled(nearby, len(t_us))
         if t_us.device.type == "cpu":
             opened, filled = _in_bursts(opened, filled, t_us, self._tracker.config.matching.burst_us)
         kind = filled.events.most_of_one
-        if kind in self._graphs:
-            if t_us.is_cuda:
-                # What the last window gave may be written over.
-                torch.compiler.cudagraph_mark_step_begin()
-            return self._graphs[kind](opened, filled, t_us)
-        _of_any_number(filled)
-        self._graphs[kind] = _compiled(self._tracker.steady_advance, t_us.device)
-        try:
-            with _as_expected():
-                return self._graphs[kind](opened, filled, t_us)
-        except RuntimeError as error:
-            reason = str(error).partition("\n")[0]
-            needed = "a C++ compiler (g++ or clang++)" if t_us.device.type == "cpu" else "triton and a C compiler"
-            raise ConfigError(f"compiled: the tracker could not be compiled: {reason}. It needs {needed}. Install that, or go without.") from error
+        if kind not in self._graphs:
+            _of_any_number(filled)
+            self._graphs[kind] = _compiled(self._tracker.steady_advance, t_us.device)
+            return _for_the_first_time(self._graphs[kind], opened, filled, t_us)
+        if t_us.is_cuda:
+            # What the last window gave may be written over.
+            torch.compiler.cudagraph_mark_step_begin()
+        return self._graphs[kind](opened, filled, t_us)
 
 
-def _compiled(function: _Graph, device: torch.device) -> _Graph:
+def _compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
     """The function as a graph of its own."""
     # All that it hangs on is fixed with the tracker: to look whether it is takes a tenth of a step.
     options = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe, _WITHOUT_PYTHON[device.type]: True}
     # Without guards, no two functions may share what is compiled.
     how: dict[str, Any] = {"fullgraph": True, "dynamic": False, "options": options, "isolate_recompiles": True}
-    graph: _Graph = torch.compile(function, **how)
+    graph: Callable[P, R] = torch.compile(function, **how)
     return graph
+
+
+def _for_the_first_time(graph: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """What a graph gives that is compiled for this.
+
+    Raises:
+        ConfigError: if it cannot be.
+    """
+    try:
+        with _as_expected():
+            return graph(*args, **kwargs)
+    except RuntimeError as error:
+        reason = str(error).partition("\n")[0]
+        needed = "a C++ compiler (g++ or clang++), or on a GPU triton and a C compiler"
+        raise ConfigError(f"compiled: the tracker could not be compiled: {reason}. It needs {needed}. Install that, or go without.") from error
 
 
 @contextmanager
@@ -157,7 +184,8 @@ def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest
     Not in the graph: where 16 bits are enough, a CPU's compiler takes one pixel at a time.
     """
     streams, most = len(t_us), filled.events.most_of_one
-    burst_age_us, into_burst_us = update_bursts(opened.burst_age_us, pad_streams(filled.events, streams, t_us), longest_us)
+    window = pad_streams(filled.events, streams, t_us)
+    burst_age_us, into_burst_us = update_bursts(opened.burst_age_us, t_us - opened.t_us, window, longest_us)
     if most is not None:
         into_burst_us = pad(into_burst_us, (0, min(most, len(filled.events)) - into_burst_us.shape[1]))
     return replace(opened, burst_age_us=burst_age_us), replace(filled, into_burst_us=into_burst_us)

@@ -66,17 +66,26 @@ class ContourIndex:
         """The nearest to each pixel of the contour points that the four cells around it know."""
         rows, columns = self.size
         column, row = pixels.div(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
-        place = self._flat(column.clamp(0, columns - 2), row.clamp(0, rows - 2))
-        steps = constant((0, 1, columns, columns + 1), place.dtype, place.device)
-        known = self.nearest.gather(1, (place[:, None] + steps[:, None]).flatten(1))
-        u, v = (take_points(self.pixels, known.clamp(min=0)).unflatten(1, (4, -1)) - pixels[:, None]).unbind(-1)
-        known = known.unflatten(1, (4, -1))
-        away = torch.where(known >= 0, u * u + v * v, torch.inf)
-        return known.gather(1, away.argmin(1, keepdim=True))[:, 0]
+        first = self._flat(column.clamp(0, columns - 2), row.clamp(0, rows - 2))
+        known = torch.where(self.nearest[..., None] >= 0, take_points(self.pixels, self.nearest.clamp(min=0)), _FAR_PX)
+        best, least = first, _squared_way(known, first, pixels)
+        # One after the other: what is in memory at a time is then a quarter, and a search for the least of four takes longer still.
+        for step in (1, columns, columns + 1):
+            cell = first + step
+            away = _squared_way(known, cell, pixels)
+            nearer = away < least
+            best, least = torch.where(nearer, cell, best), torch.minimum(away, least)
+        return self.nearest.gather(1, best)
 
     def _flat(self, column: Float[Tensor, "b n"], row: Float[Tensor, "b n"]) -> Int[Tensor, "b n"]:
         """Numbers of cells. The region's border is empty: whatever lies outside finds nothing there, nor does what is not a number."""
         return torch.add(column, row, alpha=self.size[1]).nan_to_num_(0.0).long()
+
+
+def _squared_way(known: Float[Tensor, "b p 2"], cell: Int[Tensor, "b n"], pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n"]:
+    """From each pixel to what the cell knows, squared (px²)."""
+    u, v = (take_points(known, cell) - pixels).unbind(-1)
+    return torch.addcmul(u * u, v, v)
 
 
 def index_contours(

@@ -38,6 +38,11 @@ def sensor_tables(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "s h w 2"], 
     return ideal_pixels, stack_tables([distortion_table(c, _BORDER_PX) for c in cameras], beyond_px=-_BORDER_PX)
 
 
+def farthest_event_px(config: TrackerConfig) -> float:
+    """How far from an object events can have to do with it (px)."""
+    return max(config.matching.max_gate_px, *config.matching.gates_px) + _DRAWN_SIGMAS * config.search.least_sigma_px
+
+
 @dataclass(frozen=True)
 class Sensors:
     """The sensor of each stream, and which of them each object is seen by.
@@ -63,24 +68,24 @@ class Sensors:
         """The events that can have to do with the objects. A GPU would have to be waited for: there, all are kept."""
         if self.tiles is None or not readback.read_at_once(window_s):
             return events
-        margin_px = max(config.matching.max_gate_px, *config.matching.gates_px) + _DRAWN_SIGMAS * config.search.least_sigma_px
-        return self.tiles.keep(events.events, self.tiles.near(prediction, window_s, margin_px))
+        return self.tiles.keep(events.events, self.tiles.near(prediction, window_s, farthest_event_px(config)))
 
     def window_events(
-        self, nearby: NearbyEvents, burst_age_us: Int[Tensor, "s 2 h w"], t_us: Int[Tensor, "s"], longest_us: int
+        self, nearby: NearbyEvents, burst_age_us: Int[Tensor, "s 2 h w"], t_us: Int[Tensor, "s"], elapsed_us: Int[Tensor, "s"], longest_us: int
     ) -> tuple[WindowEvents, Int[Tensor, "s 2 h w"]]:
         """The events of a window as each object's camera saw them, and the bursts' ages with them (µs).
 
         Args:
             nearby: the events that count.
-            burst_age_us: ages at the window's end without them; with them, where ``nearby`` says how far into their bursts they are.
+            burst_age_us: ages where the window begins; at its end, where ``nearby`` says how far into their bursts they are.
             t_us: end of the window of each stream.
+            elapsed_us: how long the window lasts.
             longest_us: how long a pixel's events are of one burst.
         """
         window = pad_streams(nearby.events, len(self.ideal_pixels), t_us)
         into_burst_us = nearby.into_burst_us
         if into_burst_us is None:
-            burst_age_us, into_burst_us = update_bursts(burst_age_us, window, longest_us)
+            burst_age_us, into_burst_us = update_bursts(burst_age_us, elapsed_us, window, longest_us)
         seen = self.seen(window, into_burst_us, nearby.number)
         return seen if nearby.of_each is None else seen.only(*nearby.of_each), burst_age_us
 

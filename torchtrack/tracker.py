@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchtrack import lie, readback
 from torchtrack.alignment import align, gate_widening, index_for, index_radius, usual_index_radius
-from torchtrack.bursts import aged, no_bursts
+from torchtrack.bursts import no_bursts
 from torchtrack.camera import Camera
 from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
@@ -30,6 +30,7 @@ from torchtrack.prediction import Prediction, before_camera
 from torchtrack.probation import after_probation
 from torchtrack.search import explained_at_rest, judge_fit, search_wanted
 from torchtrack.sensor_tiles import NearbyEvents
+from torchtrack.sensors import farthest_event_px
 from torchtrack.setup_check import check_start
 from torchtrack.speed_limit import largest_speed, limit_speed
 from torchtrack.state import Probation, StepResult, TrackerState, choose_rows
@@ -135,7 +136,7 @@ class Tracker(TrackedObjects):
         t_us, assumptions = self._window_end(state, events, t_end_us), readback.Assumptions()
         with torch.autocast(t_us.device.type, enabled=False):
             assumptions.ask(to_be_parted(state, events, t_us, self.objects, self.config), False)
-            done = _counted(self.advance(self.opened(state, events, t_us), NearbyEvents(events), t_us, questions=assumptions))
+            done = _counted(self.advance(self.opened(state, events), NearbyEvents(events), t_us, questions=assumptions))
         return *done, assumptions.wrong()
 
     def prepare(self, state: TrackerState) -> None:
@@ -151,10 +152,10 @@ class Tracker(TrackedObjects):
         """A window by a compiled graph, where there is one and it holds."""
         return None if self.graphs is None or torch.is_grad_enabled() else self.graphs(state, events, t_us)
 
-    def near(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> NearbyEvents:
-        """The events of the window after ``state`` that can have to do with the objects."""
+    def near_tiles(self, state: TrackerState, t_us: Int[Tensor, "s"]) -> Bool[Tensor, "b t"] | None:
+        """Tiles of the one sensor with events of the window after ``state`` that can have to do with each object; none of several sensors."""
         dt_s = self._window_s(state, t_us)[self.stream_index]
-        return self._near(NearbyEvents(events), self._predict(state, dt_s), dt_s)
+        return None if self.tiles is None else self.tiles.near(self._predict(state, dt_s), dt_s, farthest_event_px(self.config))
 
     def _near(self, events: NearbyEvents, prediction: Prediction, dt_s: Tensor) -> NearbyEvents:
         """Those of the events that can have to do with the objects; a weigher is shown all."""
@@ -181,12 +182,11 @@ class Tracker(TrackedObjects):
 
     def _advance(self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor | None = None) -> tuple[TrackerState, StepResult]:
         """One window, or one part of it."""
-        return self.advance(self.opened(state, events, t_us), NearbyEvents(events), t_us, starting)
+        return self.advance(self.opened(state, events), NearbyEvents(events), t_us, starting)
 
-    def opened(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> TrackerState:
-        """The state with its maps of the sensor as they are at a window's end, but for the bursts that begin in it."""
-        last_event_us = update_last_event(state.last_event_us, events) if self.looks_back else state.last_event_us
-        return replace(state, last_event_us=last_event_us, burst_age_us=aged(state.burst_age_us, t_us - state.t_us))
+    def opened(self, state: TrackerState, events: EventBatch) -> TrackerState:
+        """The state with the newest events of a window in its map, where they are remembered."""
+        return replace(state, last_event_us=update_last_event(state.last_event_us, events)) if self.looks_back else state
 
     def advance(
         self,
@@ -214,7 +214,7 @@ class Tracker(TrackedObjects):
         recorded = self._predict(self._held_back(state, events.events, t_us, dt_s, questions), dt_s)
         prediction = recorded.detached()
         nearby = self._near(events, prediction, dt_s)
-        seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, config.matching.burst_us)
+        seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, t_us - state.t_us, config.matching.burst_us)
         contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
         sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(self.diameter_m)
         starting = torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
