@@ -11,7 +11,7 @@ from tracked_boxes import WINDOW_US, follow, started, windows
 
 from torchtrack import Tracker
 from torchtrack.config.presets import preset
-from torchtrack.config.tracker import MotionConfig, SolverConfig, TrackerConfig
+from torchtrack.config.tracker import CornerConfig, MotionConfig, SolverConfig, TrackerConfig
 from torchtrack.events import EventBatch
 from torchtrack.image_motion import MovingObjects
 from torchtrack.lie import so3_exp
@@ -29,10 +29,13 @@ from torchtrack.quality import Status
 from torchtrack.sim.trajectory import Trajectory
 
 DT_S = 0.005
-# Exact events, though few of them.
-STEADY = TrackerConfig(motion=MotionConfig(acceleration_s=0.0), solver=SolverConfig(observation_px=0.2, acceleration_in_window=False))
-ALWAYS = TrackerConfig(motion=MotionConfig(acceleration_px=0.0), solver=SolverConfig(observation_px=0.2))
-DEFAULT = TrackerConfig(solver=SolverConfig(observation_px=0.2))
+# Exact events, though few of them: corners are observed as well.
+CORNERS = CornerConfig(max_corners=32)
+STEADY = TrackerConfig(
+    corners=CORNERS, motion=MotionConfig(acceleration_s=0.0), solver=SolverConfig(observation_px=0.2, acceleration_in_window=False)
+)
+ALWAYS = TrackerConfig(corners=CORNERS, motion=MotionConfig(acceleration_px=0.0), solver=SolverConfig(observation_px=0.2))
+DEFAULT = TrackerConfig(corners=CORNERS, solver=SolverConfig(observation_px=0.2))
 COUNT = 20
 # Windows after the start.
 SWINGING = slice(4, COUNT)

@@ -38,7 +38,7 @@ def detect(last_event_us, regions, *, config=None, window_s=1.0, surface_config=
     surface = time_surface(last_event_us, now, regions, surface_config.tau_s, dtype)
     window = torch.full((streams,), window_s, dtype=dtype)
     table = pixel_table(streams, height, width, dtype)
-    return detect_corners(surface, regions, last_event_us, now, window, table, surface_config, config or CornerConfig())
+    return detect_corners(surface, regions, last_event_us, now, window, table, surface_config, config or CornerConfig(max_corners=32))
 
 
 def found(corners, number=0):
@@ -66,7 +66,7 @@ def square_of_events(u0, v0, u1, v1, t_us=NOW_US, width=96, height=96):
 def test_the_corners_of_a_square_are_found_and_nothing_else(square):
     u0, v0, u1, v1 = square
     response = corner_response(squares((*square, 1.0)), SURFACE)
-    pixels, mask = select_corners(response, region(96, 96), CornerConfig(relative_threshold=0.05), FILTER_PX)
+    pixels, mask = select_corners(response, region(96, 96), CornerConfig(max_corners=32, relative_threshold=0.05), FILTER_PX)
     places = pixels[mask]
     assert len(places) == 4
     for corner in ((u0, v0), (u1, v0), (u0, v1), (u1, v1)):
@@ -102,12 +102,12 @@ def test_corners_are_the_strongest_and_at_most_as_many_as_asked_for():
 def test_weak_responses_are_no_corners():
     response = torch.zeros(1, 96, 96)
     response[0, 30, 30], response[0, 60, 60], response[0, 30, 60], response[0, 60, 30] = 1.0, 2e-3, 0.5e-3, -1.0
-    pixels, mask = select_corners(response, region(96, 96), CornerConfig(relative_threshold=1e-3), FILTER_PX)
+    pixels, mask = select_corners(response, region(96, 96), CornerConfig(max_corners=32, relative_threshold=1e-3), FILTER_PX)
     assert {tuple(pixel) for pixel in pixels[mask].tolist()} == {(30, 30), (60, 60)}
 
 
 def test_a_surface_without_anything_has_no_corners():
-    _, mask = select_corners(torch.zeros(1, 64, 64), region(64, 64), CornerConfig(relative_threshold=0), FILTER_PX)
+    _, mask = select_corners(torch.zeros(1, 64, 64), region(64, 64), CornerConfig(max_corners=32, relative_threshold=0), FILTER_PX)
     assert not mask.any()
 
 
@@ -136,7 +136,7 @@ def test_what_the_filters_reach_from_beyond_the_region_is_left_out(filter_size_p
 
 
 def test_cells_larger_than_the_region_give_no_corners():
-    _, mask = select_corners(torch.rand((1, 32, 32), generator=generator()), region(32, 32), CornerConfig(cell_px=64), FILTER_PX)
+    _, mask = select_corners(torch.rand((1, 32, 32), generator=generator()), region(32, 32), CornerConfig(max_corners=32, cell_px=64), FILTER_PX)
     assert not mask.any()
 
 
@@ -166,7 +166,7 @@ def test_snapping_stays_on_the_sensor_and_in_its_stream():
 def test_detected_corners_lie_on_the_newest_event_beside_them():
     last = square_of_events(30, 30, 60, 60, t_us=NOW_US - 8_000)
     last[0, 30:61, 30] = NOW_US - 1_000
-    corners = detect(last, region(96, 96), config=CornerConfig(relative_threshold=0.05))
+    corners = detect(last, region(96, 96), config=CornerConfig(max_corners=32, relative_threshold=0.05))
     left = corners.sensor_pixels[0][corners.mask[0] & (corners.sensor_pixels[0, :, 0] < 40)]
     assert len(left) >= 2
     assert (left[:, 0] == 30).all()
@@ -177,7 +177,7 @@ def test_detected_corners_lie_on_the_newest_event_beside_them():
 @pytest.mark.parametrize("fresh_only", [True, False])
 def test_stale_corners_are_dropped_where_asked_for(fresh_only):
     last = torch.maximum(square_of_events(20, 20, 40, 40, t_us=NOW_US - 6_000), square_of_events(60, 60, 80, 80, t_us=NOW_US - 2_000))
-    config = CornerConfig(relative_threshold=0.05, fresh_only=fresh_only)
+    config = CornerConfig(max_corners=32, relative_threshold=0.05, fresh_only=fresh_only)
     corners = detect(last, region(96, 96), config=config, window_s=5e-3)
     ages = corners.age_s[corners.mask]
     assert bool((ages < 5e-3).any())
@@ -192,7 +192,7 @@ def test_an_event_at_the_start_of_the_window_is_of_the_one_before():
 
 def test_without_events_there_are_no_corners():
     assert not detect(empty_last_event(1, 96, 96), region(96, 96)).mask.any()
-    assert not detect(empty_last_event(1, 96, 96), region(96, 96), config=CornerConfig(fresh_only=False)).mask.any()
+    assert not detect(empty_last_event(1, 96, 96), region(96, 96), config=CornerConfig(max_corners=32, fresh_only=False)).mask.any()
 
 
 def test_corners_of_nothing():
@@ -206,15 +206,15 @@ def test_ideal_pixels_come_from_the_table_of_the_stream():
     last = square_of_events(30, 30, 60, 60)
     table = pixel_table(1, 96, 96) * 2 + 1
     surface = time_surface(last, torch.tensor([NOW_US]), region(96, 96), SURFACE.tau_s, torch.float32)
-    corners = detect_corners(surface, region(96, 96), last, torch.tensor([NOW_US]), torch.ones(1), table, SURFACE, CornerConfig())
+    corners = detect_corners(surface, region(96, 96), last, torch.tensor([NOW_US]), torch.ones(1), table, SURFACE, CornerConfig(max_corners=32))
     assert corners.mask.any()
     torch.testing.assert_close(corners.pixels, corners.sensor_pixels * 2.0 + 1)
 
 
 def test_a_region_beyond_the_border_of_the_sensor_finds_the_same_corners():
     last = square_of_events(14, 14, 44, 44)
-    inner = detect(last, region(96, 96), config=CornerConfig(relative_threshold=0.05))
-    beyond = detect(last, region(128, 128, origin=(-24, -24)), config=CornerConfig(relative_threshold=0.05))
+    inner = detect(last, region(96, 96), config=CornerConfig(max_corners=32, relative_threshold=0.05))
+    beyond = detect(last, region(128, 128, origin=(-24, -24)), config=CornerConfig(max_corners=32, relative_threshold=0.05))
     assert len(found(inner)) >= 4
     assert found(inner) <= found(beyond)
     assert (beyond.sensor_pixels >= 0).all()

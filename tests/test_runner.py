@@ -3,6 +3,7 @@ import json
 import os
 import signal
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -276,6 +277,16 @@ def test_overlay_and_alignment_are_written_when_asked_for(sequence_path, tmp_pat
     measured = summary.objects["box"].more["alignment"]
     assert measured["tracked"]["median_px"] < 1
     assert measured["tracked"]["share_near"] > 0.9
+
+
+@pytest.mark.parametrize("preset", ["default", "line", "nns"])
+def test_an_overlay_shows_events_and_corners_whatever_the_tracker_makes_use_of(sequence_path, tmp_path, preset):
+    run(RunConfig(source=sequence_path, output=tmp_path / "out", preset=preset, overlay={"stills": 1}))
+    (still,) = (tmp_path / "out").glob("overlay_*.png")
+    blue, green, red = cv2.imread(str(still)).reshape(-1, 3).astype(int).T
+    grey, yellow = (red == green) & (green == blue) & (red > 60) & (red < 200), (green > 150) & (red > 150) & (blue < 90)
+    assert grey.sum() > 100
+    assert yellow.sum() > 20
 
 
 def test_planar_shapes_of_a_real_recording(data_dir, tmp_path):

@@ -69,7 +69,7 @@ def test_a_tracker_can_be_saved_and_loaded(tmp_path):
 @pytest.mark.parametrize(
     "config",
     [
-        TrackerConfig(corners=CornerConfig(max_corners=0)),
+        TrackerConfig(corners=CornerConfig(max_corners=32)),
         TrackerConfig(solver=SolverConfig(prior=False, iterations=2)),
         TrackerConfig(solver=SolverConfig(loss="huber")),
         TrackerConfig(contours=ContourConfig(remove_hidden=False)),
@@ -77,10 +77,10 @@ def test_a_tracker_can_be_saved_and_loaded(tmp_path):
         TrackerConfig(contours=ContourConfig(exact_faces=0, depth_cell_px=2)),
         TrackerConfig(matching=MatchingConfig(index_cell_px=1)),
         TrackerConfig(matching=MatchingConfig(gates_px=(4.0, 2.0))),
-        TrackerConfig(surface=SurfaceConfig(filters="kornia")),
+        TrackerConfig(corners=CornerConfig(max_corners=32), surface=SurfaceConfig(filters="kornia")),
         TrackerConfig(motion=MotionConfig(model="hold")),
     ],
-    ids=["no_corners", "no_prior", "huber", "all_contours", "refreshed", "buffer", "fine_index", "two_rounds", "kornia", "held"],
+    ids=["corners", "no_prior", "huber", "all_contours", "refreshed", "buffer", "fine_index", "two_rounds", "kornia", "held"],
 )
 def test_a_box_is_tracked_with_other_settings(config):
     trajectory, events = moving_box(pose(), 10)
@@ -94,7 +94,8 @@ def test_a_box_is_tracked_with_other_settings(config):
 
 def test_without_events_beside_the_corners_the_corners_are_all_that_is_observed():
     # Few corners share a patch of the image: one has to be enough to explain it.
-    config = TrackerConfig(matching=MatchingConfig(max_events=0), quality=QualityConfig(min_observations=6, min_on_contour=1))
+    quality = QualityConfig(min_observations=6, min_on_contour=1)
+    config = TrackerConfig(corners=CornerConfig(max_corners=32), matching=MatchingConfig(max_events=0), quality=quality)
     _, _, result, _, _ = started(config=config)
     assert 6 <= int(result.observation_count) <= int(result.corners.mask.sum())
 

@@ -6,6 +6,7 @@ import torch
 import trimesh
 from helpers import SMALL_CAMERA, box_model, pose, random_pose
 
+from torchtrack import visibility
 from torchtrack.camera import Camera
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import group_by_model
@@ -252,6 +253,39 @@ def test_the_depth_buffer_holds_the_nearest_surface_and_whose_it_is():
         assert float(depth_m[round(v / 4) + 1, round(u / 4) + 1]) == pytest.approx(depth, abs=1e-4)
         assert int(owner[round(v / 4) + 1, round(u / 4) + 1]) == who
     assert float(depth_m[2, 2]) > 1e6
+
+
+def places(*positions):
+    """Poses of objects at these places (m)."""
+    return torch.stack([pose((0.3, -0.4, 0.2), position) for position in positions])
+
+
+@pytest.mark.parametrize(
+    ("positions", "drawn"),
+    [
+        ([(-0.1, 0.0, 0.5), (0.1, 0.0, 0.5)], [False, False]),
+        ([(-0.1, 0.0, 0.5), (0.1, 0.0, 0.5), (0.06, 0.02, 0.4)], [False, True, True]),
+        ([(0.0, 0.0, 0.3), (0.0, 0.0, 0.7)], [True, True]),
+        # Partly behind the camera: not all of its outline is in the image.
+        ([(-0.1, 0.0, 0.5), (0.1, 0.0, 0.02)], [True, True]),
+    ],
+    ids=["apart", "two_of_three", "one_before_the_other", "at_the_camera"],
+)
+def test_only_objects_beside_others_are_drawn_and_nothing_else_changes(monkeypatch, positions, drawn):
+    asked, models, T = [], [box_model((0.06, 0.08, 0.05))] * len(positions), places(*positions)
+    beside_others = visibility._beside_others
+    monkeypatch.setattr(visibility, "_beside_others", lambda *scene: asked.append(beside_others(*scene)) or asked[-1])
+    _, found = extracted(models, T)
+    assert asked[-1].tolist() == drawn
+    monkeypatch.setattr(visibility, "_beside_others", lambda scene, *_: torch.ones_like(scene.stream_index, dtype=torch.bool))
+    assert torch.equal(found.mask, extracted(models, T)[1].mask)
+
+
+def test_objects_of_other_streams_are_not_beside_one_another():
+    models, T = [box_model()] * 2, places((0.0, 0.0, 0.3), (0.0, 0.0, 0.7))
+    _, alone = extracted(models[:1], T[1:])
+    _, found = extracted([*models, box_model()], torch.cat([T, places((0.01, 0.0, 0.3))]), streams=[0, 1, 0])
+    assert torch.equal(found.mask[1, : alone.mask.shape[1]], alone.mask[0])
 
 
 def test_no_input_is_changed():

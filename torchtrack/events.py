@@ -162,7 +162,8 @@ def windows_by_time(chunks: Iterable[EventBatch], duration_us: int | Callable[[]
     """
     if not callable(duration_us) and duration_us < 1:
         raise EventDataError(f"a window must last at least 1 µs, got {duration_us}.")
-    pending, end_us = EventBatch.empty(), None
+    pending: list[EventBatch] = []
+    end_us = None
     for chunk in chunks:
         if len(chunk) == 0:
             continue
@@ -170,18 +171,18 @@ def windows_by_time(chunks: Iterable[EventBatch], duration_us: int | Callable[[]
             t_start_us = int(chunk.t_us[0]) - 1
         if end_us is None:
             end_us = t_start_us + _next(duration_us)
-        pending = concatenate([pending, chunk]) if len(pending) else chunk
-        newest_us = int(pending.t_us[-1])
+        newest_us = int(chunk.t_us[-1])
         # Only what is after the start counts; later on, nothing else is left.
-        pending = pending[int(torch.searchsorted(pending.t_us, t_start_us, right=True)) :]
+        left = chunk[int(torch.searchsorted(chunk.t_us, t_start_us, right=True)) :]
         # A window is complete only once an event after its end has been seen.
         while end_us < newest_us:
-            cut = int(torch.searchsorted(pending.t_us, end_us, right=True))
-            yield EventWindow(pending[:cut], t_start_us, end_us)
-            pending, t_start_us = pending[cut:], end_us
+            cut = int(torch.searchsorted(left.t_us, end_us, right=True))
+            yield EventWindow(concatenate([*pending, left[:cut]]) if pending else left[:cut], t_start_us, end_us)
+            pending, left, t_start_us = [], left[cut:], end_us
             end_us = t_start_us + _next(duration_us)
-    if len(pending) and t_start_us is not None and end_us is not None:
-        yield EventWindow(pending, t_start_us, end_us)
+        pending += [left] if len(left) else []
+    if pending and t_start_us is not None and end_us is not None:
+        yield EventWindow(concatenate(pending) if len(pending) > 1 else pending[0], t_start_us, end_us)
 
 
 def _next(duration_us: int | Callable[[], int]) -> int:

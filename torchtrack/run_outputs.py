@@ -67,7 +67,7 @@ class RunOutputs:
         folder = self._files.enter_context(output_folder(config.output, OUTPUT_FILES))
         self._files.enter_context(self._writing)
         own: list[Sink] = [self._record, PoseFiles(folder, session.labels, self._record)]
-        own += [Overlay(folder, session, config.overlay, config.tracker.flow)] if config.overlay.enabled else []
+        own += [Overlay(folder, session, config.overlay, config.tracker)] if config.overlay.enabled else []
         own += [AlignmentRecord(session)] if config.alignment else []
         self._sinks = [self._writing.enter_context(closing(sink)) for sink in (*own, *self._further)]
         return folder

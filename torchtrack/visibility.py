@@ -25,6 +25,8 @@ _MOST_TESTS = 2**19
 # Depths are compared in whole micrometres, with the object's number in the low bits.
 _DEPTH_STEPS_PER_M, _OBJECT_BITS = 1e6, 20
 _NOTHING = 2**62
+# Images that are farther apart than this have no cell in common.
+_BESIDE_CELLS = 2
 # So many surface samples for each cell of the square around an object leave no holes: its outline fills half of it, seen from both sides.
 _SAMPLES_PER_CELL = 8
 
@@ -64,17 +66,16 @@ def hidden_by_faces(
     turn = (sides[:, :, 0] * triangles_cam[:, :, 2]).sum(-1)[..., None, None].sign()
     plane = (normals_cam * triangles_cam[:, :, 0]).sum(-1)
     away = plane.sign()[..., None] * normals_cam
-    tests = torch.cat([sides * turn, away[:, :, None]], 2).flatten(1, 2)
-    limits = torch.nn.functional.pad(-(plane.abs() + tolerance_m[:, None])[..., None], (3, 0)).flatten(1, 2)[..., None]
+    limits = torch.nn.functional.pad(-(plane.abs() + tolerance_m[:, None])[..., None], (3, 0))
+    tests = torch.cat([torch.cat([sides * turn, away[:, :, None]], 2), limits[..., None]], 3).flatten(1, 2)
+    rows = torch.nn.functional.pad(points_cam.transpose(1, 2), (0, 0, 0, 1), value=1.0)
     at_once = max(_MOST_TESTS // (tests.shape[1] * points_cam.shape[1] + 1), 1) if readback.read_at_once(points_cam) else len(points_cam)
-    parts = zip(tests.split(at_once), points_cam.split(at_once), limits.split(at_once), strict=True)
-    return torch.cat([_hidden_by(*part) for part in parts])
+    return torch.cat([_hidden_by(*part) for part in zip(tests.split(at_once), rows.split(at_once), strict=True)])
 
 
-def _hidden_by(tests: Float[Tensor, "b t 3"], points_cam: Float[Tensor, "b m 3"], limits: Float[Tensor, "b t 1"]) -> Bool[Tensor, "b m"]:
+def _hidden_by(tests: Float[Tensor, "b t 4"], points: Float[Tensor, "b 4 m"]) -> Bool[Tensor, "b m"]:
     """Which points pass all four tests of one of the triangles: they lie within its edges, and behind its plane by its limit."""
-    values = torch.baddbmm(limits, tests, points_cam.transpose(1, 2)).unflatten(1, (-1, 4))
-    return (values.amin(2) > 0).any(1)
+    return torch.bmm(tests, points).unflatten(1, (-1, 4)).amin(2).amax(1) > 0
 
 
 def _hidden_by_self(scene: Scene, contours: Contours) -> Tensor:
@@ -102,16 +103,21 @@ def _places_in_use(mask: Bool[Tensor, "b m"]) -> int:
     return int(used[-1]) + 1 if len(used) else 0
 
 
-def depth_buffer(scene: Scene, cell_px: int) -> tuple[Float[Tensor, "s p"], Int[Tensor, "s p"], tuple[int, int]]:
+def depth_buffer(
+    scene: Scene, cell_px: int, drawn: Bool[Tensor, "b"] | None = None
+) -> tuple[Float[Tensor, "s p"], Int[Tensor, "s p"], tuple[int, int]]:
     """Least depth (m) of any surface sample in each cell, the object it belongs to, and (rows, columns) of cells.
 
     Samples outside the image fall into border cells; cells without samples are infinitely far.
+
+    Args:
+        drawn: the objects whose samples are taken; all when not given.
     """
     streams, height, width = scene.image_shape
     grid = (-(-height // cell_px) + 3, -(-width // cell_px) + 3)
     cells, keys = [], []
     for model in scene.models:
-        for members, samples, taken in _samples(model, scene, cell_px):
+        for members, samples, taken in _samples(model, drawn, scene, cell_px):
             points = transform_points(scene.T_cam_obj[members], samples.expand(len(members), -1, -1))
             cell = _cell(project(points, scene.intrinsics[members]), grid, cell_px)
             depth = (points[..., 2] * _DEPTH_STEPS_PER_M).long()
@@ -119,18 +125,20 @@ def depth_buffer(scene: Scene, cell_px: int) -> tuple[Float[Tensor, "s p"], Int[
             cells.append((cell + scene.stream_index[members, None] * (grid[0] * grid[1])).flatten())
             keys.append(torch.where((points[..., 2] > MIN_DEPTH_M) & taken, key, _NOTHING).flatten())
     buffer = torch.full((streams * grid[0] * grid[1],), _NOTHING, device=scene.T_cam_obj.device)
-    nearest = buffer.scatter_reduce(0, torch.cat(cells), torch.cat(keys), "amin").view(streams, -1)
+    if cells:
+        buffer = buffer.scatter_reduce(0, torch.cat(cells), torch.cat(keys), "amin")
+    nearest = buffer.view(streams, -1)
     depth_m = (nearest >> _OBJECT_BITS).to(scene.T_cam_obj.dtype) / _DEPTH_STEPS_PER_M
     return depth_m, nearest & ((1 << _OBJECT_BITS) - 1), grid
 
 
-def _samples(model: ContourModel, scene: Scene, cell_px: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """The objects that have a model, its surface samples, and which of them count.
+def _samples(model: ContourModel, drawn: Tensor | None, scene: Scene, cell_px: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """The objects that have a model and are drawn, its surface samples, and which of them count.
 
     Of objects that are small in the image, every second, fourth and so on does. On a GPU, which would have to be waited for to know
     how small they are, the others are carried along.
     """
-    members, points = model.members, model.surface_points
+    members, points = model.members if drawn is None else model.members[drawn[model.members]], model.surface_points
     depth_m = scene.T_cam_obj[members, 2, 3].clamp(min=MIN_DEPTH_M)
     size_cells = scene.diameters_m[members] * scene.intrinsics[members, 0] / depth_m / cell_px
     spare = len(points) / (_SAMPLES_PER_CELL * size_cells.square()).clamp(min=1)
@@ -159,17 +167,34 @@ def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -
     Beside the limb of a curved surface that surface is nearer, in the same cell even; beyond it, it ends. So a point is
     hidden only where it is also behind what lies a cell to each side of its contour.
     """
-    depth_m, owner, grid = depth_buffer(scene, config.depth_cell_px)
-    stream, cell_px = scene.stream_index, config.depth_cell_px
+    exact, cell_px = _tested_exactly(scene), config.depth_cell_px
+    drawn = ~exact[:, 0] | _beside_others(scene, contours, cell_px)
+    if readback.none_of(drawn):
+        return torch.zeros_like(contours.mask)
+    depth_m, owner, grid = depth_buffer(scene, cell_px, drawn if readback.read_at_once(drawn) else None)
     _, height, width = scene.image_shape
     u, v = contours.pixels.unbind(-1)
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     sides = torch.stack([contours.pixels + side * contours.normals for side in (0, -cell_px, cell_px)], 1)
-    cell = _cell(sides, grid, cell_px) + (stream * depth_m.shape[1])[:, None, None]
-    other = owner.take(cell) != torch.arange(len(stream), device=stream.device)[:, None, None]
+    cell = _cell(sides, grid, cell_px) + (scene.stream_index * depth_m.shape[1])[:, None, None]
+    other = owner.take(cell) != torch.arange(len(drawn), device=drawn.device)[:, None, None]
     farthest_m = contours.points_cam[..., 2] - config.depth_margin * scene.diameters_m[:, None]
-    behind = (farthest_m[:, None] > depth_m.take(cell)) & (other | ~_tested_exactly(scene)[:, None])
+    behind = (farthest_m[:, None] > depth_m.take(cell)) & (other | ~exact[:, None])
     return inside & behind.all(1)
+
+
+def _beside_others(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tensor, "b"]:
+    """Which objects may share a cell with another one of their stream: where the boxes around their outlines meet."""
+    if not scene.shared:
+        return torch.zeros_like(scene.stream_index, dtype=torch.bool)
+    seen, far = contours.mask[..., None], _BESIDE_CELLS * cell_px
+    low = torch.where(seen, contours.pixels, torch.inf).amin(1) - far
+    high = torch.where(seen, contours.pixels, -torch.inf).amax(1)
+    # The outline of what reaches behind the camera is not all in its image; then no point is farther away than the diameter.
+    close = torch.where(contours.mask, contours.points_cam[..., 2], torch.inf).amin(1) < scene.diameters_m
+    meet = ((low[:, None] <= high) & (low <= high[:, None])).all(-1) | close[:, None] | close
+    stream, itself = scene.stream_index, torch.eye(len(close), dtype=torch.bool, device=close.device)
+    return (meet & (stream[:, None] == stream) & ~itself).any(1)
 
 
 def _tested_exactly(scene: Scene) -> Tensor:

@@ -55,7 +55,7 @@ class SurfaceConfig(Settings):
 class CornerConfig(Settings):
     """Harris corners of the filtered surface."""
 
-    max_corners: int = Field(32, ge=0, le=2000, description="Corners per object; 0 switches corners off.")
+    max_corners: int = Field(0, ge=0, le=2000, description="Corners per object that are observed beside the events; 0 switches corners off.")
     cell_px: int = Field(8, ge=3, le=64, description="At most one corner in a cell of this side (px): corners are spread evenly.")
     relative_threshold: float = Field(1e-3, ge=0, le=1, description="Least Harris response, as a share of the region's largest.")
     snap: bool = Field(True, description="Move each corner to the newest event of its 3x3 neighbourhood.")

@@ -4,22 +4,32 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
-from torchtrack.camera import undistortion_table
 from torchtrack.config.run import OverlayConfig
-from torchtrack.config.tracker import FlowConfig
-from torchtrack.flow import estimate_flow
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.sensors import Sensors, sensor_tables
 from torchtrack.session import Session
-from torchtrack.state import StepResult
+from torchtrack.state import StepResult, each_tensor
 from torchtrack.stepping import Step
+from torchtrack.time_surface import empty_last_event, update_last_event
 from torchtrack.viz import OverlayWriter, draw_overlay, overlay_objects
+
+# Corners that are drawn of each object, where the tracker makes no use of any.
+_CORNERS = 32
 
 
 class Overlay:
-    """Draws the windows that the video has a frame for into ``overlay.mp4``, with the flow of their corners."""
+    """Draws the windows that the video has a frame for into ``overlay.mp4``.
 
-    def __init__(self, folder: Path, session: Session, config: OverlayConfig, flow: FlowConfig) -> None:
-        self._session, self._flow, self._ideal_pixels = session, flow, undistortion_table(session.camera)[None]
+    Time surface, corners and their flow are found here: not every tracker needs them.
+    """
+
+    def __init__(self, folder: Path, session: Session, config: OverlayConfig, tracker: TrackerConfig) -> None:
+        self._session, self._config = session, _with_flow_of_corners(tracker)
+        first_stream = torch.zeros(len(session.models), dtype=torch.int64)
+        self._sensors = Sensors(*sensor_tables([session.camera]), stream_index=first_stream, tiles=None)
+        self._last_event_us = empty_last_event(1, *self._sensors.image_size)
         self._writer = OverlayWriter(
             folder / "overlay.mp4", frames_per_second=config.frames_per_second, slow_motion=config.slow_motion, stills=config.stills
         )
@@ -27,20 +37,26 @@ class Overlay:
     def add(self, step: Step) -> None:
         """Draw one step, if it is due."""
         t_us, session = step.window.t_end_us, self._session
+        self._last_event_us = update_last_event(self._last_event_us, step.window.events)
         if not self._writer.is_due(t_us):
             return
-        at = torch.tensor([t_us])
-        truth = [trajectory.at(at)[0] if trajectory is not None else None for trajectory in session.ground_truth]
-        objects = overlay_objects(self._with_flow(step), session.models, session.camera, names=session.labels, true_poses=truth)
-        self._writer.add(t_us, draw_overlay(step.state.last_event_us[0], t_us, session.camera, objects))
+        truth = [trajectory.at(torch.tensor([t_us]))[0] if trajectory is not None else None for trajectory in session.ground_truth]
+        objects = overlay_objects(self._with_corners(step), session.models, session.camera, names=session.labels, true_poses=truth)
+        self._writer.add(t_us, draw_overlay(self._last_event_us[0], t_us, session.camera, objects))
 
-    def _with_flow(self, step: Step) -> StepResult:
-        """The result of a step with the flow of its corners, which the tracker leaves out where it makes no use of it."""
-        corners, last_event_us = step.result.corners, step.state.last_event_us
-        stream_index = torch.zeros(len(corners.mask), dtype=torch.int64, device=last_event_us.device)
-        ideal_pixels = self._ideal_pixels.to(corners.pixels)
-        return replace(step.result, corners=estimate_flow(corners, last_event_us, step.state.t_us, stream_index, ideal_pixels, self._flow))
+    def _with_corners(self, step: Step) -> StepResult:
+        """The result of a step with the corners around its contours and their flow."""
+        result, window = each_tensor(Tensor.cpu, step.result), step.window
+        window_s = torch.tensor([1e-6 * (window.t_end_us - window.t_start_us)])
+        corners = self._sensors.corners(result.contours, self._last_event_us, torch.tensor([window.t_end_us]), window_s, self._config)
+        return replace(result, corners=corners)
 
     def close(self) -> None:
         """Finish the video."""
         self._writer.close()
+
+
+def _with_flow_of_corners(config: TrackerConfig) -> TrackerConfig:
+    """The settings with corners and their flow switched on."""
+    corners = config.corners.model_copy(update={"max_corners": config.corners.max_corners or _CORNERS})
+    return config.model_copy(update={"corners": corners, "flow": config.flow.model_copy(update={"always": True})})
