@@ -15,7 +15,7 @@ from torchtrack.lie import retract_about
 from torchtrack.quality import Status
 
 # The box fires few events: with corners beside them, enough is observed of one that slipped to say more than that it is too little.
-SEARCHED = TrackerConfig(corners=CornerConfig(max_corners=32), search=SearchConfig(doubt_us=10_000))
+SEARCHED = TrackerConfig(corners=CornerConfig(max_corners=32), search=SearchConfig(doubt_us=10_000, drift_diameters_s=4))
 NEVER_ADRIFT = TrackerConfig(corners=CornerConfig(max_corners=32), search=SearchConfig(doubt_us=0))
 # Twenty degrees, onto other edges: farther than a pose that is sure of itself is looked for.
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
@@ -93,11 +93,22 @@ def test_of_those_whose_place_is_not_known_events_need_not_gather():
 
 def test_who_drifts_off_is_the_less_certain_the_longer_it_lasts():
     _, prediction, _, found, _ = in_motion()
-    contours, config = found.fit.contours, SearchConfig(drift_px_s=200)
+    contours, config = found.fit.contours, SearchConfig(drift_px_s=200, drift_diameters_s=100)
     sigma_px = [float(drifted(prediction, doubt([1.0], adrift=True, doubted_s=t), config).sigma_px(contours)) for t in (0.05, 0.1, 0.4, 5.0)]
     # Turning and moving together carry contours farther than either.
     assert all(20 * n < px < 40 * n for px, n in zip(sigma_px, (0.5, 1, 4, 4), strict=True))
     assert sigma_px[2] == sigma_px[3]
+
+
+def test_what_is_small_in_the_image_drifts_no_faster_for_its_size():
+    _, prediction, _, found, _ = in_motion()
+    sigma_px = [
+        float(drifted(prediction, doubt([1.0], adrift=True, doubted_s=0.2), config).sigma_px(found.fit.contours))
+        for config in (SearchConfig(drift_px_s=1e6, drift_diameters_s=1.0), SearchConfig(drift_px_s=1e6, drift_diameters_s=2.0))
+    ]
+    size_px = float(prediction.objects.size_px(prediction.T_cam_obj))
+    assert 0.2 * size_px < sigma_px[0] < 0.4 * size_px
+    assert sigma_px[1] == pytest.approx(2 * sigma_px[0], rel=0.1)
 
 
 def test_a_drift_is_one_velocity_that_explains_where_the_pose_is():

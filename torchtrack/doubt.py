@@ -95,7 +95,7 @@ def is_adrift(doubted_s: Float[Tensor, "b"], due: Bool[Tensor, "b"], config: Sea
 def drifted(prediction: Prediction, doubt: Doubt, config: SearchConfig) -> Prediction:
     """The prediction, of objects that are adrift so uncertain as if they had moved otherwise, at some constant velocity, since the doubt began."""
     objects = prediction.objects
-    speed_m_s = (config.drift_px_s / objects.px_per_m(prediction.T_cam_obj)).double()
+    speed_m_s = torch.minimum(config.drift_px_s / objects.px_per_m(prediction.T_cam_obj), config.drift_diameters_s * objects.diameter_m).double()
     velocity = rim_and_centre(speed_m_s[:, None], objects.diameter_m.double()[:, None])
     lasted_s = doubt.doubted_s.clamp(max=_LONGEST_S).double()[:, None]
     # Pose and velocity are off together: one such velocity explains both.
