@@ -13,7 +13,7 @@ from torchtrack.baselines.line import corrected, predicted_covariance
 from torchtrack.contours import Contours
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.object_model import ObjectModel
-from torchtrack.pose_solver import Linearisation
+from torchtrack.pose_problem import Linearisation
 from torchtrack.quality import Status
 
 COUNT = 8

@@ -11,7 +11,9 @@ from torchtrack import pose_solver
 from torchtrack.camera import project
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.lie import retract_about, se3_exp, small_difference_about, transform_points
-from torchtrack.pose_solver import PoseProblem, pose_jacobian, robust_cost, robust_loss, robust_weight, solve_pose, solve_positive
+from torchtrack.pose_problem import PoseProblem
+from torchtrack.pose_solver import pose_jacobian, robust_cost, solve_pose, solve_positive
+from torchtrack.robust_loss import robust_loss, robust_weight
 
 LOSSES = ["tukey", "huber", "none"]
 THOROUGH = SolverConfig(iterations=20)

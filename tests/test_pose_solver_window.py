@@ -9,7 +9,8 @@ from helpers import SMALL_CAMERA, generator, pose_errors, random_pose
 from torchtrack.camera import project
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.lie import retract_about, transform_points
-from torchtrack.pose_solver import PoseProblem, WindowTerms, robust_cost, solve_pose
+from torchtrack.pose_problem import PoseProblem, WindowTerms
+from torchtrack.pose_solver import robust_cost, solve_pose
 
 THOROUGH = SolverConfig(iterations=20)
 WINDOW_S = 0.01

@@ -14,7 +14,7 @@ from torchtrack import Status, Tracker, TrackerConfig
 from torchtrack.camera import project
 from torchtrack.config.tracker import MatchingConfig, SearchConfig, SolverConfig
 from torchtrack.lie import cayley, se3_exp, se3_log, transform_points
-from torchtrack.pose_solver import robust_loss
+from torchtrack.robust_loss import robust_loss
 
 # One round that converges: its problem is that of the whole window.
 ONE_ROUND = TrackerConfig(

@@ -13,7 +13,8 @@ from torchtrack.contours import Contours, reproject
 from torchtrack.implicit_gradient import with_gradient
 from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
 from torchtrack.observations import Observations
-from torchtrack.pose_solver import Linearisation, PoseProblem, WindowTerms, solve_pose
+from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
+from torchtrack.pose_solver import solve_pose
 from torchtrack.prediction import Prediction
 from torchtrack.readback import Answer
 

@@ -16,7 +16,8 @@ from torch import Tensor
 from torchtrack import readback
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.lie import cayley, move_about, small_difference_about
-from torchtrack.pose_solver import Linearisation, PoseProblem, WindowTerms, robust_cost, solve_positive
+from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
+from torchtrack.pose_solver import robust_cost, solve_positive
 
 # Relative rounding of a cost in float64, with room for the length of its sum.
 _ROUNDING = 1e-12

@@ -15,114 +15,15 @@ from torch import Tensor
 from torchtrack import readback
 from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.constants import constant, one
+from torchtrack.constants import constant
 from torchtrack.lie import small_difference_about, turned
+from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
+from torchtrack.robust_loss import robust_loss, robust_weight
 
 # Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
 _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
 # A cost, which is a long sum, is known to this many units of rounding.
 _ROUNDINGS = 8
-
-
-@dataclass(frozen=True)
-class WindowTerms:
-    """What observations tell of beside the pose, which the solver then finds with it.
-
-    An observation that is older than the pose tells of the velocity: the two are found together, so that a velocity
-    that was predicted wrong neither biases the pose nor is learned one window late. And all limbs of an object may stand
-    out of its outline, or within it, by one unknown way, as smooth shading makes them: without it, depth would be
-    believed to be seen far better than it is.
-
-    Args:
-        age_s: time from each observation to the pose (s).
-        velocity: offset from the predicted velocity that the targets were moved with (rad/s, m/s).
-        outward: 1 where the outline's swelling counts along the direction, 0 where not.
-        rate_hz: acceleration in the window for each unit of velocity beyond the predicted one (1/s); zero where it is the same all along.
-    """
-
-    age_s: Float[Tensor, "b n"]
-    velocity: Float[Tensor, "b 6"]
-    outward: Float[Tensor, "b n"]
-    rate_hz: Float[Tensor, "b 6"]
-
-
-@dataclass(frozen=True)
-class PoseProblem:
-    """Observations and prior of each object.
-
-    Args:
-        points_obj: matched contour points in the object's frame (m).
-        targets: ideal pixels where they were observed.
-        directions: unit directions along which the distance counts.
-        weights: weight of each observation; 0 for padding.
-        intrinsics: ``[fx, fy, cx, cy]``.
-        centre_obj: centre of rotation in the object's frame (m).
-        scale_px: scale of the robust loss, per object.
-        T_prior: pose the prior draws to.
-        prior_information: information of the prior in the solver's chart; zero for no prior.
-        window: further unknowns; then the chart is ``[pose 6, velocity 6, swelling (px) 1]`` instead of the pose alone.
-    """
-
-    points_obj: Float[Tensor, "b n 3"]
-    targets: Float[Tensor, "b n 2"]
-    directions: Float[Tensor, "b n 2"]
-    weights: Float[Tensor, "b n"]
-    intrinsics: Float[Tensor, "b 4"]
-    centre_obj: Float[Tensor, "b 3"]
-    scale_px: Float[Tensor, "b"]
-    T_prior: Float[Tensor, "b 4 4"]
-    prior_information: Float[Tensor, "b k k"]
-    window: WindowTerms | None = None
-
-
-@dataclass(frozen=True)
-class Linearisation:
-    """The problem at a pose, in the solver's chart.
-
-    Args:
-        T_cam_obj: the pose.
-        gradient, hessian: of the robust cost, prior included; the Hessian is Gauss-Newton's.
-        from_prior: offset from the prior: rotation and move of the centre, and the further unknowns where there are.
-    """
-
-    T_cam_obj: Float[Tensor, "b 4 4"]
-    gradient: Float[Tensor, "b k"]
-    hessian: Float[Tensor, "b k k"]
-    from_prior: Float[Tensor, "b k"]
-
-
-def robust_loss(
-    residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss: str, weight: Float[Tensor, "b n"] | None = None
-) -> Float[Tensor, "b n"]:
-    """Loss ``ρ(r)`` of each residual, equal to least squares, ``r²/2``, near zero.
-
-    ``loss`` is ``"tukey"`` (constant beyond ``scale``), ``"huber"`` or ``"none"``; ``weight`` is that of :func:`robust_weight`,
-    where it is known.
-    """
-    if loss == "none":
-        return 0.5 * residuals.square()
-    c = scale[:, None]
-    if loss == "huber":
-        size = residuals.abs()
-        return torch.where(size <= c, 0.5 * residuals.square(), c * (size - 0.5 * c))
-    cubed = _inside(residuals, c) ** 3 if weight is None else weight * weight.sqrt()
-    return c.square() / 6 * (1 - cubed)
-
-
-def robust_weight(residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss: str) -> Float[Tensor, "b n"]:
-    """Weight ``ρ'(r) / r`` of each residual (the paper's Eq. 8 for ``"tukey"``): 1 near zero."""
-    if loss == "none":
-        return torch.ones_like(residuals)
-    c = scale[:, None]
-    if loss == "huber":
-        return (c / residuals.abs().clamp(min=1e-12)).clamp(max=1)
-    return _inside(residuals, c).square()
-
-
-def _inside(residuals: Tensor, c: Tensor) -> Tensor:
-    """``1 - (r/c)²``, not below zero."""
-    relative = residuals / c
-    return torch.addcmul(one(c), relative, relative, value=-1).clamp(min=0)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from torchtrack.doubt import Doubt, drifted
 from torchtrack.hypotheses import event_density, promising
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.once import once
-from torchtrack.pose_solver import Linearisation
+from torchtrack.pose_problem import Linearisation
 from torchtrack.prediction import Prediction
 from torchtrack.readback import Answer
 

@@ -24,7 +24,8 @@ from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.matching import Matches
 from torchtrack.motion import left_covariance
 from torchtrack.object_model import ObjectModel
-from torchtrack.pose_solver import Linearisation, PoseProblem, solve_pose
+from torchtrack.pose_problem import Linearisation, PoseProblem
+from torchtrack.pose_solver import solve_pose
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.time_surface import update_last_event
 from torchtrack.tracker import Tracker

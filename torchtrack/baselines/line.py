@@ -19,7 +19,8 @@ from torch import Tensor
 
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.events import EventBatch
-from torchtrack.pose_solver import Linearisation, solve_positive
+from torchtrack.pose_problem import Linearisation
+from torchtrack.pose_solver import solve_positive
 from torchtrack.state import StepResult, TrackerState
 
 # Deviation of the distance between an event and its line (px): much is common to the events of a line, so it is not small.
