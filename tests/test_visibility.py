@@ -13,7 +13,7 @@ from torchtrack.contour_model import group_by_model
 from torchtrack.contours import mesh_contours
 from torchtrack.object_model import ObjectModel
 from torchtrack.quality import visible_share
-from torchtrack.visibility import Scene, depth_buffer, hidden_by_faces, remove_hidden
+from torchtrack.visibility import DepthGrid, Scene, depth_buffer, hidden_by_faces, remove_hidden
 
 CONFIG = ContourConfig()
 LARGE_CAMERA = Camera(fx=600.0, fy=600.0, cx=319.5, cy=239.5, width=640, height=480)
@@ -247,8 +247,8 @@ def test_the_depth_buffer_holds_the_nearest_surface_and_whose_it_is():
     groups = group_by_model(models, CONFIG)
     diameters = torch.tensor([model.diameter_m for model in models])
     scene = Scene(groups, T.float(), SMALL_CAMERA.intrinsics().expand(2, 4), torch.tensor([0, 0]), diameters, (1, 150, 200), True)
-    depth_m, owner, (rows, columns) = depth_buffer(scene, 4)
-    depth_m, owner = depth_m.view(rows, columns), owner.view(rows, columns)
+    grid = DepthGrid.whole(scene, 4)
+    depth_m, owner = (values.view(grid.size) for values in depth_buffer(scene, grid))
     for (u, v), depth, who in (((100, 75), 0.4, 1), ((64, 75), 0.6, 0), ((130, 100), 0.6, 0)):
         assert float(depth_m[round(v / 4) + 1, round(u / 4) + 1]) == pytest.approx(depth, abs=1e-4)
         assert int(owner[round(v / 4) + 1, round(u / 4) + 1]) == who

@@ -103,33 +103,70 @@ def _places_in_use(mask: Bool[Tensor, "b m"]) -> int:
     return int(used[-1]) + 1 if len(used) else 0
 
 
-def depth_buffer(
-    scene: Scene, cell_px: int, drawn: Bool[Tensor, "b"] | None = None
-) -> tuple[Float[Tensor, "s p"], Int[Tensor, "s p"], tuple[int, int]]:
-    """Least depth (m) of any surface sample in each cell, the object it belongs to, and (rows, columns) of cells.
+@dataclass(frozen=True)
+class DepthGrid:
+    """The cells of a depth buffer: of each stream's part of the image as many; what lies outside falls into the outermost.
 
-    Samples outside the image fall into border cells; cells without samples are infinitely far.
+    Args:
+        first: the first cell (column, row) of each stream's part; cell (0, 0) is centred at pixel (0, 0).
+        size: rows and columns.
+        cell_px: side of a cell.
+    """
+
+    first: Float[Tensor, "s 2"]
+    size: tuple[int, int]
+    cell_px: int
+
+    @classmethod
+    def whole(cls, scene: Scene, cell_px: int) -> "DepthGrid":
+        """The whole image, with a border."""
+        streams, height, width = scene.image_shape
+        first = torch.full((streams, 2), -1.0, dtype=scene.intrinsics.dtype, device=scene.intrinsics.device)
+        return cls(first, (-(-height // cell_px) + 3, -(-width // cell_px) + 3), cell_px)
+
+    @classmethod
+    def around(cls, scene: Scene, pixels: Float[Tensor, "b m 2"], mask: Bool[Tensor, "b m"], cell_px: int) -> "DepthGrid":
+        """What is asked for at some pixels, and a cell beside them; on a GPU, where sizes cannot hang on values, the whole image."""
+        if not readback.read_at_once(mask):
+            return cls.whole(scene, cell_px)
+        streams, seen = scene.stream_index[:, None].expand(-1, 2), mask[..., None]
+        none = pixels.new_full((scene.image_shape[0], 2), torch.inf)
+        low = none.scatter_reduce(0, streams, torch.where(seen, pixels, torch.inf).amin(1), "amin")
+        high = (-none).scatter_reduce(0, streams, torch.where(seen, pixels, -torch.inf).amax(1), "amax")
+        # Beside the pixels, and one more that takes what lies outside.
+        first, last = (low / cell_px).floor() - 2, (high / cell_px).ceil() + 2
+        columns, rows = (last - first).clamp(min=0).amax(0).tolist()
+        return cls(torch.where(first.isfinite(), first, 0), (int(rows) + 1, int(columns) + 1), cell_px)
+
+    def cell(self, pixels: Float[Tensor, "b *n 2"], stream_index: Int[Tensor, "b"]) -> Int[Tensor, "b *n"]:
+        """Number of the cell, among those of all streams, that each pixel falls into."""
+        rows, columns = self.size
+        to_all = (-1, *[1] * (pixels.dim() - 2))
+        # Clamped before the conversion: a far-off pixel does not fit an integer, nor does what is not a number.
+        u, v = ((pixels / self.cell_px).round() - self.first[stream_index].view(*to_all, 2)).nan_to_num_(0.0).unbind(-1)
+        row = v.clamp(0, rows - 1).long() + (stream_index * rows).view(to_all)
+        return row * columns + u.clamp(0, columns - 1).long()
+
+
+def depth_buffer(scene: Scene, grid: DepthGrid, drawn: Bool[Tensor, "b"] | None = None) -> tuple[Float[Tensor, "p"], Int[Tensor, "p"]]:
+    """Least depth (m) of any surface sample in each cell of all streams, and the object it belongs to; without samples, infinitely far.
 
     Args:
         drawn: the objects whose samples are taken; all when not given.
     """
-    streams, height, width = scene.image_shape
-    grid = (-(-height // cell_px) + 3, -(-width // cell_px) + 3)
     cells, keys = [], []
     for model in scene.models:
-        for members, samples, taken in _samples(model, drawn, scene, cell_px):
+        for members, samples, taken in _samples(model, drawn, scene, grid.cell_px):
             points = transform_points(scene.T_cam_obj[members], samples.expand(len(members), -1, -1))
-            cell = _cell(project(points, scene.intrinsics[members]), grid, cell_px)
-            depth = (points[..., 2] * _DEPTH_STEPS_PER_M).long()
-            key = (depth << _OBJECT_BITS) + members[:, None]
-            cells.append((cell + scene.stream_index[members, None] * (grid[0] * grid[1])).flatten())
+            cells.append(grid.cell(project(points, scene.intrinsics[members]), scene.stream_index[members]).flatten())
+            key = ((points[..., 2] * _DEPTH_STEPS_PER_M).long() << _OBJECT_BITS) + members[:, None]
             keys.append(torch.where((points[..., 2] > MIN_DEPTH_M) & taken, key, _NOTHING).flatten())
-    buffer = torch.full((streams * grid[0] * grid[1],), _NOTHING, device=scene.T_cam_obj.device)
+    rows, columns = grid.size
+    nearest = torch.full((len(grid.first) * rows * columns,), _NOTHING, device=scene.T_cam_obj.device)
     if cells:
-        buffer = buffer.scatter_reduce(0, torch.cat(cells), torch.cat(keys), "amin")
-    nearest = buffer.view(streams, -1)
+        nearest.scatter_reduce_(0, torch.cat(cells), torch.cat(keys), "amin")
     depth_m = (nearest >> _OBJECT_BITS).to(scene.T_cam_obj.dtype) / _DEPTH_STEPS_PER_M
-    return depth_m, nearest & ((1 << _OBJECT_BITS) - 1), grid
+    return depth_m, nearest & ((1 << _OBJECT_BITS) - 1)
 
 
 def _samples(model: ContourModel, drawn: Tensor | None, scene: Scene, cell_px: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
@@ -152,15 +189,6 @@ def _samples(model: ContourModel, drawn: Tensor | None, scene: Scene, cell_px: i
         yield members[halvings == times], points[:: 2**times], all_of_them
 
 
-def _cell(pixels: Tensor, grid: tuple[int, int], cell_px: int) -> Tensor:
-    """Flat index of the cell that each pixel falls into; one border cell on each side takes what lies outside."""
-    rows, columns = grid
-    # Clamped before the conversion: a far-off pixel does not fit an integer.
-    u = (pixels[..., 0] / cell_px).round().clamp(-1, columns - 2).long() + 1
-    v = (pixels[..., 1] / cell_px).round().clamp(-1, rows - 2).long() + 1
-    return v * columns + u
-
-
 def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -> Tensor:
     """Points behind another surface in the depth buffer; an object's own counts where it has too many faces for the exact test.
 
@@ -171,12 +199,13 @@ def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -
     drawn = ~exact[:, 0] | _beside_others(scene, contours, cell_px)
     if readback.none_of(drawn):
         return torch.zeros_like(contours.mask)
-    depth_m, owner, grid = depth_buffer(scene, cell_px, drawn if readback.read_at_once(drawn) else None)
     _, height, width = scene.image_shape
     u, v = contours.pixels.unbind(-1)
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    grid = DepthGrid.around(scene, contours.pixels, contours.mask & inside, cell_px)
+    depth_m, owner = depth_buffer(scene, grid, drawn if readback.read_at_once(drawn) else None)
     sides = torch.stack([contours.pixels + side * contours.normals for side in (0, -cell_px, cell_px)], 1)
-    cell = _cell(sides, grid, cell_px) + (scene.stream_index * depth_m.shape[1])[:, None, None]
+    cell = grid.cell(sides, scene.stream_index)
     other = owner.take(cell) != torch.arange(len(drawn), device=drawn.device)[:, None, None]
     farthest_m = contours.points_cam[..., 2] - config.depth_margin * scene.diameters_m[:, None]
     behind = (farthest_m[:, None] > depth_m.take(cell)) & (other | ~exact[:, None])
