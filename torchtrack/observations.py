@@ -1,4 +1,4 @@
-"""What is matched with contours: the corners, and recent events near the contours."""
+"""What is matched with contours: recent events near them, and corners where there are any."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

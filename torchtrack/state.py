@@ -94,7 +94,7 @@ class StepResult:
         status: :class:`torchtrack.quality.Status` of each object.
         quality: share of the moving contour that events explain.
         contours: visible contours at the pose.
-        corners: corners and their flow.
+        corners: corners and their flow, where the settings ask for any.
         observation_count: matched observations of each object.
     """
 
