@@ -81,6 +81,15 @@ def test_only_some_objects_are_looked_up_finely(dtype):
     assert not torch.equal(finely[1], roughly[1])
 
 
+def test_few_places_are_looked_up_as_finely_as_many(dtype):
+    index, finely = index_contours(random_contours(3, 300, dtype=dtype), IMAGE_SIZE, 7, 2), torch.ones(3, dtype=torch.bool)
+    places = torch.rand((3, 5000, 2), generator=generator(1), dtype=torch.float64).to(dtype) * torch.tensor([200, 150], dtype=dtype)
+    few = torch.cat([index.look_up(some, finely) for some in places.split(500, 1)], 1)
+    # Of many, a table is made of what every cell knows.
+    assert 4 * 500 < index.size[0] * index.size[1] < 4 * 5000
+    assert torch.equal(index.look_up(places, finely), few)
+
+
 def test_of_edges_that_share_a_cell_the_nearer_one_is_found():
     # Two upright lines, closer than a cell; every place between them belongs to the nearer one.
     rows = torch.arange(40.0, 80.0, 0.5, dtype=torch.float64)

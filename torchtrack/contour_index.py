@@ -67,25 +67,30 @@ class ContourIndex:
         rows, columns = self.size
         column, row = pixels.div(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
         first = self._flat(column.clamp(0, columns - 2), row.clamp(0, rows - 2))
-        known = torch.where(self.nearest[..., None] >= 0, take_points(self.pixels, self.nearest.clamp(min=0)), _FAR_PX)
-        best, least = first, _squared_way(known, first, pixels)
+        # A table of the places that cells know, where these are fewer than the places asked for.
+        table = self._places(self.nearest) if rows * columns <= 4 * pixels.shape[1] else None
+        best, least = first, self._squared_way(first, pixels, table)
         # One after the other: what is in memory at a time is then a quarter, and a search for the least of four takes longer still.
         for step in (1, columns, columns + 1):
             cell = first + step
-            away = _squared_way(known, cell, pixels)
+            away = self._squared_way(cell, pixels, table)
             nearer = away < least
             best, least = torch.where(nearer, cell, best), torch.minimum(away, least)
         return self.nearest.gather(1, best)
 
+    def _squared_way(self, cell: Int[Tensor, "b n"], pixels: Float[Tensor, "b n 2"], table: Tensor | None) -> Float[Tensor, "b n"]:
+        """From each pixel to what the cell knows, squared (px²)."""
+        known = self._places(self.nearest.gather(1, cell)) if table is None else take_points(table, cell)
+        u, v = (known - pixels).unbind(-1)
+        return torch.addcmul(u * u, v, v)
+
+    def _places(self, number: Int[Tensor, "b k"]) -> Float[Tensor, "b k 2"]:
+        """Where contour points were when the index was made; far away for none."""
+        return torch.where(number[..., None] >= 0, take_points(self.pixels, number.clamp(min=0)), _FAR_PX)
+
     def _flat(self, column: Float[Tensor, "b n"], row: Float[Tensor, "b n"]) -> Int[Tensor, "b n"]:
         """Numbers of cells. The region's border is empty: whatever lies outside finds nothing there, nor does what is not a number."""
         return torch.add(column, row, alpha=self.size[1]).nan_to_num_(0.0).long()
-
-
-def _squared_way(known: Float[Tensor, "b p 2"], cell: Int[Tensor, "b n"], pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n"]:
-    """From each pixel to what the cell knows, squared (px²)."""
-    u, v = (take_points(known, cell) - pixels).unbind(-1)
-    return torch.addcmul(u * u, v, v)
 
 
 def index_contours(
