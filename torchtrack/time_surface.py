@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchtrack import readback
+from torchtrack.bounds import bounds
 from torchtrack.constants import constant
 from torchtrack.events import EventBatch
 
@@ -84,10 +85,9 @@ def object_regions(
             what is seen. Of a larger object, the middle is taken.
     """
     limit = constant((sensor_size[1] - 1, sensor_size[0] - 1), pixels.dtype, pixels.device)
-    inside = (mask & ((pixels >= 0) & (pixels <= limit)).all(-1))[..., None]
-    low = torch.where(inside, pixels, torch.inf).amin(1)
-    high = torch.where(inside, pixels, -torch.inf).amax(1)
-    empty = ~inside.any(1)
+    inside = mask & ((pixels >= 0) & (pixels <= limit)).all(-1)
+    low, high = bounds(pixels, inside)
+    empty = ~inside.any(1, keepdim=True)
     low = torch.where(empty, torch.zeros_like(low), low).floor().long() - margin_px
     high = torch.where(empty, torch.zeros_like(high), high).ceil().long() + margin_px
     low = torch.div(low, _GRID_PX, rounding_mode="floor") * _GRID_PX

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import readback
+from torchtrack.bounds import bounds
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourModel
@@ -129,10 +130,9 @@ class DepthGrid:
         """What is asked for at some pixels, and a cell beside them; on a GPU, where sizes cannot hang on values, the whole image."""
         if not readback.read_at_once(mask):
             return cls.whole(scene, cell_px)
-        streams, seen = scene.stream_index[:, None].expand(-1, 2), mask[..., None]
+        streams, (low, high) = scene.stream_index[:, None].expand(-1, 2), bounds(pixels, mask)
         none = pixels.new_full((scene.image_shape[0], 2), torch.inf)
-        low = none.scatter_reduce(0, streams, torch.where(seen, pixels, torch.inf).amin(1), "amin")
-        high = (-none).scatter_reduce(0, streams, torch.where(seen, pixels, -torch.inf).amax(1), "amax")
+        low, high = none.scatter_reduce(0, streams, low, "amin"), (-none).scatter_reduce(0, streams, high, "amax")
         # Beside the pixels, and one more that takes what lies outside.
         first, last = (low / cell_px).floor() - 2, (high / cell_px).ceil() + 2
         columns, rows = (last - first).clamp(min=0).amax(0).tolist()
@@ -216,9 +216,8 @@ def _beside_others(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tenso
     """Which objects may share a cell with another one of their stream: where the boxes around their outlines meet."""
     if not scene.shared:
         return torch.zeros_like(scene.stream_index, dtype=torch.bool)
-    seen, far = contours.mask[..., None], _BESIDE_CELLS * cell_px
-    low = torch.where(seen, contours.pixels, torch.inf).amin(1) - far
-    high = torch.where(seen, contours.pixels, -torch.inf).amax(1)
+    low, high = bounds(contours.pixels, contours.mask)
+    low = low - _BESIDE_CELLS * cell_px
     # The outline of what reaches behind the camera is not all in its image; then no point is farther away than the diameter.
     close = torch.where(contours.mask, contours.points_cam[..., 2], torch.inf).amin(1) < scene.diameters_m
     meet = ((low[:, None] <= high) & (low <= high[:, None])).all(-1) | close[:, None] | close
