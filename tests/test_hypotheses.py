@@ -6,8 +6,9 @@ from helpers import SMALL_CAMERA, generator, pose_errors
 from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
-from torchtrack.hypotheses import draw_offsets, drawn_around, event_density, mark, outlines_at, promising, thinned
+from torchtrack.hypotheses import draw_offsets, event_density, mark, promising
 from torchtrack.lie import retract_about
+from torchtrack.views import outlines_at, thinned
 
 IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
 
@@ -78,7 +79,7 @@ def test_the_true_pose_is_marked_best(dtype):
         away[2 * axis + 1, axis], away[2 * axis + 2, axis] = (0.15, -0.15) if axis < 3 else (0.015, -0.015)
     # Depth moves contours least.
     away[11:] *= 4
-    marks = mark(prediction, thinned(found.fit.contours), away, (density.clamp(max=3), 0))
+    marks = mark(prediction, thinned(found.fit.contours), away, density.clamp(max=3))
     assert int(marks.argmax()) == 0
     assert float(marks[0]) > 1.5 * float(marks[1:].max())
 
@@ -87,41 +88,13 @@ def test_marks_of_poses_behind_the_camera_are_numbers():
     _, prediction, seen, found, _ = in_motion()
     offsets = torch.zeros(2, 13)
     offsets[1, 5] = -2.0
-    seen_there = event_density(seen.pixels, seen.mask, IMAGE_SIZE), 0
-    assert torch.isfinite(mark(prediction, thinned(found.fit.contours), offsets, seen_there)).all()
+    density = event_density(seen.pixels, seen.mask, IMAGE_SIZE)
+    assert torch.isfinite(mark(prediction, thinned(found.fit.contours), offsets, density)).all()
+    poses = retract_about(prediction.T_cam_obj.expand(2, 4, 4), offsets[:, :6], prediction.objects.centre_obj.expand(2, 3))
+    assert torch.isfinite(mark(prediction, outlines_at(prediction, poses, TrackerConfig()), offsets, density)).all()
 
 
-def test_thinned_contours_are_some_of_the_visible_ones():
-    _, _, _, found, _ = in_motion()
-    contours, few = found.fit.contours, thinned(found.fit.contours)
-    assert few.mask.sum() == min(int(contours.mask.sum()), 200)
-    visible = {tuple(row) for row in contours.pixels[contours.mask].tolist()}
-    assert {tuple(row) for row in few.pixels[few.mask].tolist()} <= visible
-
-
-# ---- nearer and nearer
-
-
-def test_others_are_drawn_around_each_pose_with_a_share_of_the_spread():
-    covariance = random_covariance()
-    middles = 10 * draw_offsets(covariance, 300).float()
-    around = drawn_around(middles, 0.5, covariance).view(300, 16, 13)
-    torch.testing.assert_close(around[:, 0], middles)
-    steps = (around - middles[:, None])[:, 1:, :6].flatten(0, 1).double()
-    expected = 0.25 * covariance[:6, :6]
-    scale = expected.diagonal().sqrt()
-    assert float(((steps.T @ steps / len(steps) - expected) / (scale[:, None] * scale)).abs().max()) < 0.1
-
-
-def test_outlines_are_those_of_their_own_poses():
-    _, prediction, _, _, _ = in_motion()
-    offsets = torch.zeros(2, 13)
-    offsets[1, 1] = 0.6
-    one, other = (outlines_at(prediction, offsets[k : k + 1], TrackerConfig()) for k in range(2))
-    both = outlines_at(prediction, offsets, TrackerConfig())
-    for number, alone in enumerate((one, other)):
-        assert torch.equal(both.mask[number], alone.mask[0])
-        torch.testing.assert_close(both.points_obj[number], alone.points_obj[0])
+# ---- what is promising
 
 
 def nearest(offsets, prediction, T_true):
@@ -131,26 +104,44 @@ def nearest(offsets, prediction, T_true):
     return float(sum(pose_errors(poses.double(), T_true.expand(count, 4, 4))).min())
 
 
-@pytest.mark.parametrize("rotation_rad", [0.15, 0.3])
-def test_a_pose_near_the_true_one_is_among_the_promising(rotation_rad):
+def places_of(prediction, seen):
+    """Where events are at the window's end, and which of them exist."""
+    return prediction.carried(seen.pixels, seen.age_s), seen.mask
+
+
+@pytest.mark.parametrize("rotation_rad", [0.15, 0.3, 0.45])
+def test_a_pose_near_the_true_one_is_among_the_promising(rotation_rad, dtype):
     displaced = torch.tensor([[rotation_rad, -rotation_rad, rotation_rad, 0.02, -0.02, 0.01]], dtype=torch.float64)
-    tracker, prediction, seen, found, T_true = in_motion(displaced=displaced)
+    tracker, prediction, seen, found, T_true = in_motion(displaced=displaced, dtype=dtype)
     sigma = torch.tensor([rotation_rad] * 3 + [0.03] * 3 + [1.0] * 3 + [0.1] * 3, dtype=torch.float64)
-    density = event_density(seen.pixels + prediction.plane_velocity(seen.pixels) * seen.age_s[..., None], seen.mask, IMAGE_SIZE)
     once = TrackerConfig(search=SearchConfig(wide_sigma_px=100.0))
-    nearer, at_once = (
-        promising(prediction, found.fit.contours, torch.diag(sigma.square()), 30.0, density, config) for config in (tracker.config, once)
-    )
-    assert nearer.shape == at_once.shape == (24, 13)
-    assert not nearer[0].any()
-    assert nearest(nearer, prediction, T_true) < min(15, 0.7 * nearest(at_once, prediction, T_true))
+    places, covariance = places_of(prediction, seen), torch.diag(sigma.square())
+    shifted, drawn = (promising(prediction, found.fit.contours, covariance, 30.0, places, config) for config in (tracker.config, once))
+    assert shifted.shape == drawn.shape == (24, 13)
+    assert shifted.dtype == dtype
+    assert not shifted[0].any()
+    assert nearest(shifted, prediction, T_true) < min(10, 0.7 * nearest(drawn, prediction, T_true))
+
+
+def test_as_many_are_promising_as_are_to_be_tried_or_kept():
+    _, prediction, seen, found, _ = in_motion()
+    covariance = 1e-2 * torch.eye(12, dtype=torch.float64)
+    for few, count in ((SearchConfig(hypotheses=5, turns=40), 5), (SearchConfig(kept=3, turns=2), 4), (SearchConfig(hypotheses=1), 1)):
+        config = TrackerConfig(search=few)
+        assert len(promising(prediction, found.fit.contours, covariance, 30.0, places_of(prediction, seen), config)) == count
+
+
+def test_without_events_what_is_promising_is_still_finite():
+    _, prediction, seen, found, _ = in_motion()
+    covariance = 1e-2 * torch.eye(12, dtype=torch.float64)
+    nothing = seen.pixels, torch.zeros_like(seen.mask)
+    assert torch.isfinite(promising(prediction, found.fit.contours, covariance, 30.0, nothing, TrackerConfig())).all()
 
 
 def test_where_the_prediction_is_good_only_what_it_allows_is_promising():
     tracker, prediction, seen, found, _ = in_motion()
     covariance = 1e-6 * torch.eye(12, dtype=torch.float64)
-    density = event_density(seen.pixels, seen.mask, IMAGE_SIZE)
-    offsets = promising(prediction, found.fit.contours, covariance, 3.0, density, tracker.config)
+    offsets = promising(prediction, found.fit.contours, covariance, 3.0, (seen.pixels, seen.mask), tracker.config)
     drawn = draw_offsets(covariance, SearchConfig().drawn).float()
     assert ((offsets[:, None] == drawn).all(-1).any(-1)).all()
     assert float(offsets[:, :6].abs().max()) < 5e-3

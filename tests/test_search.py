@@ -12,7 +12,7 @@ from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
-from torchtrack.search import _likeliest, explained_at_rest, search
+from torchtrack.search import _is_likely, _likeliest, explained_at_rest, search
 
 SEARCHED = TrackerConfig()
 UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
@@ -69,6 +69,15 @@ def test_of_poses_that_explain_as_much_the_most_expected_is_taken():
     assert _likeliest(share, from_prior, covariance).tolist() == [1]
     assert _likeliest(share, from_prior.index_fill(0, torch.tensor([1]), torch.nan), covariance).tolist() == [3]
     assert _likeliest(torch.tensor([0.9, 0.8, 0.6, 0.0]), from_prior, covariance).tolist() == [0]
+
+
+def test_what_a_prediction_does_not_allow_is_not_likely():
+    """In standard deviations; what is not a number is none."""
+    offsets = torch.zeros(5, 13)
+    offsets[1, 0], offsets[2, 0], offsets[3, :6], offsets[4, 2] = 0.4, 0.42, 0.18, torch.nan
+    assert _is_likely(offsets, 1e-2 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True, False, False, False]
+    wide = torch.full((1, 13), 5.0)
+    assert _is_likely(torch.cat([offsets[:1], wide]), 25.0 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True]
 
 
 def test_what_is_no_better_by_the_margin_is_left():

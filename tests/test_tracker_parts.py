@@ -45,6 +45,18 @@ def test_an_object_whose_motion_is_known_is_taken_whole(monkeypatch):
     assert_same(tracker.step(state, events, end_us), calm.step(state, events, end_us))
 
 
+def test_an_object_whose_place_is_not_known_either_is_looked_for_by_all_events_of_a_window():
+    tracker, state, _, (_, end_us), _ = started()
+    # Its motion alone is not known, and then its place too.
+    wild, lost = (variance * torch.eye(12, dtype=torch.float64)[None] for variance in (1e-4, 0.3))
+    wild[:, 6:, 6:] *= 1e6
+    for covariance, parted in ((state.covariance, False), (wild, True), (lost, False)):
+        unknown = window_parts.of_unknown_motion(
+            replace(state, covariance=covariance), torch.full_like(state.t_us, end_us), tracker.objects, tracker.config
+        )
+        assert unknown.tolist() == [parted]
+
+
 def test_a_neighbour_in_parts_changes_nothing():
     _, left = moving_box(pose(), 3)
     _, right = moving_box(pose(), 3, seed=1, stream=1, **FAST)

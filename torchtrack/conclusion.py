@@ -16,6 +16,8 @@ from torchtrack.prediction import Prediction
 from torchtrack.search import Found
 from torchtrack.state import StepResult, TrackerState
 
+# An object whose first gate has to be this many times wider may be anywhere.
+_ANYWHERE = 2.0
 # Share of a new window in the usual quality.
 _USUAL_GAIN = 0.1
 # And in the full one where it is less: what is hidden for a while is not seen well.
@@ -41,7 +43,9 @@ def conclude(
     objects, contours, share = prediction.objects, found.fit.contours, found.share
     solution = found.fit.solution
     in_view = quality.visible_share(contours, objects.image_size)
-    status = quality.judge(share, found.count, in_view, solution.from_prior[:, :6], objects.diameter_m, config.quality, widening)
+    # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
+    step = solution.from_prior[:, :6] * ~(found.elsewhere & (widening >= _ANYWHERE))[:, None]
+    status = quality.judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening)
     status = torch.where(prediction.usable, status, int(quality.Status.DIVERGED))
     failed = status >= int(quality.Status.LOST)
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
@@ -59,7 +63,7 @@ def conclude(
     result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
     state = replace(state, T_cam_obj=T_cam_obj, velocity=velocity, acceleration=acceleration, covariance=covariance)
     # One good window among bad ones does not end a doubt.
-    doubted_s = torch.where(failed, 0, state.doubted_s + torch.where(doubted, dt_s, -dt_s)).clamp(min=0)
+    doubted_s = (state.doubted_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0)
     state = replace(state, doubted_s=doubted_s)
     return _with_scores(state, found, failed), result
 

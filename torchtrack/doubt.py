@@ -15,8 +15,8 @@ from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.motion import rim_and_centre
 from torchtrack.prediction import Prediction
 
-# An object is not looked for farther away than it can have drifted in this time (s).
-_LONGEST_S = 0.4
+# An object is not looked for farther away than it can have drifted in this time (s), nor turned farther than in this.
+_LONGEST_S, _LONGEST_TURN_S = 0.4, 1.0
 # Events that gather less than this share of how far they do when an object is seen well are smeared.
 _SMEARED = 0.8
 
@@ -97,8 +97,8 @@ def drifted(prediction: Prediction, doubt: Doubt, config: SearchConfig) -> Predi
     objects = prediction.objects
     speed_m_s = torch.minimum(config.drift_px_s / objects.px_per_m(prediction.T_cam_obj), config.drift_diameters_s * objects.diameter_m).double()
     velocity = rim_and_centre(speed_m_s[:, None], objects.diameter_m.double()[:, None])
-    lasted_s = doubt.doubted_s.clamp(max=_LONGEST_S).double()[:, None]
+    turned_s, moved_s = (doubt.doubted_s.clamp(max=longest_s).double()[:, None].expand(-1, 3) for longest_s in (_LONGEST_TURN_S, _LONGEST_S))
     # Pose and velocity are off together: one such velocity explains both.
-    pose, rate = (torch.diag_embed(part) for part in (velocity * lasted_s, velocity))
+    pose, rate = (torch.diag_embed(part) for part in (velocity * torch.cat([turned_s, moved_s], 1), velocity))
     root = torch.cat([pose, rate], 1)
     return replace(prediction, covariance=prediction.covariance + doubt.adrift[:, None, None] * (root @ root.mT))

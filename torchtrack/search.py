@@ -14,7 +14,7 @@ from torchtrack.alignment import Fit, align, gate_widening, index_for
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours
 from torchtrack.doubt import Doubt, drifted
-from torchtrack.hypotheses import event_density, promising
+from torchtrack.hypotheses import promising
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.once import once
 from torchtrack.pose_problem import Linearisation
@@ -23,6 +23,8 @@ from torchtrack.readback import Answer
 
 # Shares that differ by less are the same: which of them is larger is chance.
 _AS_MUCH = 0.02
+# The 99th percentile of the squared distance of a pose, of six dimensions, in standard deviations (chi-square).
+_LIKELY = 16.8
 # From this share of how far they do when an object is seen well, events gather in full.
 _AS_GATHERED = 0.9
 
@@ -130,21 +132,33 @@ def search(
     widened_px = max(sigma_px, settings.least_sigma_px)
     covariance = prediction.covariance[number] * (widened_px / max(sigma_px, 1e-6)) ** 2
     one, seen = prediction.copies(number, 1), events.of(number)
-    density = event_density(one.carried(seen.pixels, seen.age_s), seen.mask, prediction.objects.image_size)
-    offsets = promising(one, found.fit.contours.of(number), covariance, widened_px, density, config)
+    places = one.carried(seen.pixels, seen.age_s), seen.mask
+    offsets = promising(one, found.fit.contours.of(number), covariance, widened_px, places, config)
     tried = _align_all(prediction.copies(number, len(offsets)), offsets, seen, config, found.full_gathered[number])
-    score = torch.where(tried.count >= config.quality.min_observations, tried.score, 0)
-    best = _likeliest(score, tried.fit.solution.from_prior, prediction.covariance[number])
+    offset = tried.fit.solution.from_prior
+    counts = (tried.count >= config.quality.min_observations) & _is_likely(offset, covariance)
+    score = torch.where(counts, tried.score, 0)
+    best = _likeliest(score, offset, prediction.covariance[number])
     mine = torch.where(found.count[number] >= config.quality.min_observations, found.score[number], 0.0)
     margin, needed = least.unbind()
     better = score.index_select(0, best) > torch.maximum(mine + margin, needed)
     return found if readback.none_of(better) else _replaced(found, number, tried, best, better)
 
 
+def _is_likely(from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Bool[Tensor, "n"]:
+    """Which poses lie where all but one in a hundred of a covariance do: edges of what hides an object explain much of it, farther away."""
+    return _squared_deviations(from_prior[:, :6], covariance[:6, :6]) < _LIKELY
+
+
+def _squared_deviations(offsets: Float[Tensor, "n k"], covariance: Float[Tensor, "k k"]) -> Float[Tensor, "n"]:
+    """Squared distance of offsets in standard deviations (Mahalanobis)."""
+    root = torch.linalg.cholesky_ex(covariance).L
+    return torch.linalg.solve_triangular(root, offsets.to(root.dtype).T, upper=False).square().sum(0)
+
+
 def _likeliest(score: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Int[Tensor, "1"]:
     """Of the poses that explain as much as the best does, the one that the prediction expects most: a turn of a vase explains nothing."""
-    root = torch.linalg.cholesky_ex(covariance).L
-    away = torch.linalg.solve_triangular(root, from_prior[:, :12].to(root.dtype).T, upper=False).square().sum(0)
+    away = _squared_deviations(from_prior[:, :12], covariance)
     return torch.where(score >= score.max() - _AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]
 
 

@@ -47,6 +47,8 @@ def of_unknown_motion(state: TrackerState, t_us: Int[Tensor, "s"], objects: Obje
     if window.parts == 1 or not config.solver.prior:
         return torch.zeros_like(objects.stream_index, dtype=torch.bool)
     unknown_m_s = unknown_speed(state.covariance, objects.diameter_m).to(objects.intrinsics.dtype)
-    depth_m = objects.depth_m(state.T_cam_obj.to(unknown_m_s.dtype))
+    px_per_m = objects.px_per_m(state.T_cam_obj.to(unknown_m_s.dtype))
     window_s = ((t_us - state.t_us) * 1e-6)[objects.stream_index]
-    return unknown_m_s * window_s * objects.intrinsics[:, 0] / depth_m > window.max_unknown_px
+    # What is not known to be anywhere is looked for by all events of a window, and with the motion that leads to each place.
+    sigma_px = px_per_m * state.covariance.diagonal(dim1=1, dim2=2)[:, 3:5].mean(1).sqrt().to(px_per_m.dtype)
+    return (unknown_m_s * window_s * px_per_m > window.max_unknown_px) & (sigma_px <= config.search.wide_sigma_px)

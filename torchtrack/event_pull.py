@@ -1,0 +1,85 @@
+"""Poses pulled onto the events: contour points look for them along their normals.
+
+What is aligned later lets events look for contours, the nearest ones, and no farther than some pixels. Of a pose that is farther
+off than that, contours find events better than events find contours: those in between belong to nothing, but hardly any
+contour is without events (as in Harris and Stennett's RAPiD, 1990, there with edges of an image).
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.config.tracker import SolverConfig, TrackerConfig
+from torchtrack.constants import constant
+from torchtrack.contours import Contours, reproject
+from torchtrack.lie import difference_about
+from torchtrack.motion import inverse
+from torchtrack.pose_problem import PoseProblem
+from torchtrack.pose_solver import solve_pose
+from torchtrack.prediction import Prediction
+from torchtrack.views import outlines_at
+
+# How far contour points look (px), a step of the solver each; outlines are taken anew for every row.
+_REACHES_PX = ((12.0, 8.4, 5.9), (7.2, 5.0, 3.5))
+# Places that each looks at, on both sides.
+_LOOKS = 17
+# Standard deviation of what a contour point with one event finds (px), with its share of what all have in common.
+_FIND_PX = 10.0
+_SOLVER = SolverConfig(iterations=1, loss="huber")
+
+
+def pulled(
+    prediction: Prediction,
+    T_cam_obj: Float[Tensor, "k 4 4"],
+    image: Float[Tensor, "h w"],
+    border_px: int,
+    covariance: Float[Tensor, "6 6"],
+    config: TrackerConfig,
+) -> Float[Tensor, "k 4 4"]:
+    """Poses of one object, each moved to where its contours lie on events.
+
+    Args:
+        prediction: of the object, with the ``covariance`` of its pose.
+        T_cam_obj: where each begins.
+        image: how many events there are at every pixel of the image, with a border.
+    """
+    information = (_FIND_PX**2 * inverse(covariance[None])).to(T_cam_obj.dtype)
+    for reaches_px in _REACHES_PX:
+        outlines = outlines_at(prediction, T_cam_obj, config)
+        for reach_px in reaches_px:
+            outlines = reproject(outlines, T_cam_obj, prediction.objects.intrinsics.expand(len(T_cam_obj), 4))
+            targets, weights = _found(outlines, image, border_px, reach_px)
+            problem = _problem(prediction, outlines, targets, weights, reach_px, information)
+            offset = difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
+            T_cam_obj = solve_pose(problem, T_cam_obj, _SOLVER, offset).T_cam_obj
+    return T_cam_obj
+
+
+def _found(outlines: Contours, image: Float[Tensor, "h w"], border_px: int, reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
+    """Where each contour point finds most events along its normal, rather near by, and how much that counts."""
+    steps_px = torch.linspace(-reach_px, reach_px, _LOOKS, dtype=image.dtype, device=image.device)
+    looked_at = outlines.pixels[:, :, None] + steps_px[:, None] * outlines.normals[:, :, None]
+    limit = constant((image.shape[1] - 1, image.shape[0] - 1), image.dtype, image.device)
+    # Clamped before the conversion: a far-off pixel does not fit an integer, nor does what is not a number.
+    u, v = torch.minimum((looked_at.round() + border_px).nan_to_num(0.0).clamp(min=0), limit).long().unbind(-1)
+    there = image.flatten()[v * image.shape[1] + u] * (1 - steps_px.abs() / (reach_px + 1))
+    most, place = there.max(-1)
+    return torch.addcmul(outlines.pixels, outlines.normals, steps_px[place][..., None]), most * outlines.mask
+
+
+def _problem(
+    prediction: Prediction, outlines: Contours, targets: Tensor, weights: Tensor, reach_px: float, information: Float[Tensor, "1 6 6"]
+) -> PoseProblem:
+    """The least squares problem of contour points and what they found."""
+    objects, count = prediction.objects, len(targets)
+    return PoseProblem(
+        points_obj=outlines.points_obj,
+        targets=targets,
+        directions=outlines.normals,
+        weights=weights,
+        intrinsics=objects.intrinsics.expand(count, 4),
+        centre_obj=objects.centre_obj.expand(count, 3),
+        scale_px=torch.full_like(weights[:, 0], reach_px),
+        T_prior=prediction.T_cam_obj.expand(count, 4, 4),
+        prior_information=information.expand(count, 6, 6),
+    )

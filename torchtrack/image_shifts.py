@@ -1,0 +1,109 @@
+"""All shifts in the image at once: where the contours of an object, turned this way and that, lie on most events.
+
+A pose has six unknowns, and thousands of draws from all of them come near a given pose but rarely. Two of them, the moves across
+the image, need not be drawn: the correlation of an outline with the events tells of every shift what lies on it. What is
+left to draw are turns and depths, of which some hundreds are enough.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.fft import irfft2, rfft2
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.lie import retract_about
+from torchtrack.prediction import Prediction
+from torchtrack.views import outlines_by_view
+
+# Cells a side of the square in which events and outlines are compared.
+_SIDE = 96
+# Shifts are looked for within this many standard deviations, around an object that takes this many diameters.
+_SIGMAS, _DIAMETERS = 2.5, 1.3
+# Cells to each side that events are blurred over, and that what is beside them is taken from.
+_BLUR, _BESIDE = 1, 3
+# Shifts that are kept of each turn, the best within so many cells to each side.
+_SHIFTS, _APART = 3, 2
+# What is no shift at all: less than any correlation.
+_NONE = -9.0
+
+
+@dataclass(frozen=True)
+class _Square:
+    """A part of the image, in cells.
+
+    Args:
+        middle: pixel in its middle.
+        cell_px: side of a cell.
+    """
+
+    middle: Float[Tensor, "2"]
+    cell_px: Float[Tensor, ""]
+
+    def counts(self, pixels: Float[Tensor, "k n 2"], mask: Bool[Tensor, "k n"]) -> Float[Tensor, "k h w"]:
+        """How many of the pixels of each row are in each cell."""
+        place = ((pixels - self.middle) / self.cell_px + _SIDE // 2).round().nan_to_num(-1.0)
+        inside = mask & (place >= 0).all(-1) & (place < _SIDE).all(-1)
+        u, v = torch.where(inside[..., None], place, 0).long().unbind(-1)
+        cells = pixels.new_zeros(len(pixels), _SIDE**2)
+        return cells.scatter_add(1, v * _SIDE + u, inside.to(pixels.dtype)).unflatten(1, (_SIDE, _SIDE))
+
+
+def shifted(
+    prediction: Prediction, steps: Float[Tensor, "n 6"], sigma_m: Float[Tensor, ""], places: tuple[Tensor, Tensor], config: TrackerConfig
+) -> Float[Tensor, "k 6"]:
+    """Offsets of one object's pose at which its contours lie on most events: ``search.kept`` of them, the best first.
+
+    Args:
+        prediction: of the object.
+        steps: offsets to try; of their moves, the way towards the camera alone.
+        sigma_m: standard deviation of the moves across the image.
+        places: pixels ``[1, e, 2]`` of the events at the window's end, and which of them exist.
+    """
+    objects, centre = prediction.objects, prediction.centre_cam[0]
+    focal = objects.intrinsics[0, :2]
+    ray, sigma_px = centre / centre[2], sigma_m * focal[0] / centre[2]
+    cell_px = (_DIAMETERS * objects.size_px(prediction.T_cam_obj)[0] + 2 * _SIGMAS * sigma_px) / _SIDE
+    square = _Square(ray[:2] * focal + objects.intrinsics[0, 2:], cell_px)
+    steps = torch.cat([steps[:, :3], steps[:, 5:] * ray], 1)
+    count = len(steps)
+    poses = retract_about(prediction.T_cam_obj.expand(count, 4, 4), steps, objects.centre_obj.expand(count, 3))
+    outlines = outlines_by_view(prediction, poses, config)
+    fit = _correlation(square.counts(*places)[0] / cell_px, square.counts(outlines.pixels, outlines.mask))
+    number, shift = _best(fit, sigma_px / cell_px, config.search.kept)
+    moved_m = shift * cell_px * ((centre[2] + steps[number, 5:]) / focal)
+    return torch.cat([steps[number, :3], steps[number, 3:5] + moved_m, steps[number, 5:]], 1)
+
+
+def _correlation(events: Float[Tensor, "h w"], outlines: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
+    """How much more events there are on each outline than around it, for every shift; none at all is in the middle.
+
+    Args:
+        events: their number, of which one for each pixel of a contour through the cell is enough.
+        outlines: the number of contour points.
+    """
+    enough = events.clamp(max=1)
+    denser = _blurred(enough, _BLUR) - _blurred(enough, _BESIDE)
+    shares = outlines / outlines.sum((1, 2), keepdim=True).clamp(min=1)
+    fit = irfft2(rfft2(denser) * rfft2(shares).conj(), s=(_SIDE, _SIDE))
+    return fit.roll((_SIDE // 2, _SIDE // 2), (1, 2))
+
+
+def _blurred(cells: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
+    """The mean over so many cells to each side, one way after the other."""
+    side = 2 * radius + 1
+    return avg_pool2d(avg_pool2d(cells[None], (side, 1), 1, (radius, 0)), (1, side), 1, (0, radius))[0]
+
+
+def _best(fit: Float[Tensor, "n h w"], sigma_cells: Float[Tensor, ""], count: int) -> tuple[Tensor, Float[Tensor, "k 2"]]:
+    """Numbers of the outlines that fit best, and their shifts (cells)."""
+    step = torch.arange(_SIDE, dtype=fit.dtype, device=fit.device) - _SIDE // 2
+    allowed = step[:, None].square() + step.square() <= (_SIGMAS * sigma_cells).square()
+    fit = torch.where(allowed, fit, _NONE)
+    highest = fit >= max_pool2d(fit[:, None], 2 * _APART + 1, 1, _APART)[:, 0]
+    best, place = torch.where(highest, fit, _NONE).flatten(1).topk(_SHIFTS)
+    chosen = best.flatten().topk(min(count, best.numel())).indices
+    place = place.flatten()[chosen]
+    return chosen // _SHIFTS, torch.stack([step[place % _SIDE], step[place // _SIDE]], -1)
