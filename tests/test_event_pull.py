@@ -7,9 +7,8 @@ from torch.nn.functional import avg_pool2d
 from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.event_image import event_density
 from torchtrack.event_pull import pulled
-from torchtrack.hypotheses import event_density
-from torchtrack.lie import retract_about
 
 IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
 LOOSE = torch.diag(torch.tensor([0.3] * 3 + [0.05] * 3, dtype=torch.float64).square())
@@ -23,15 +22,13 @@ def of_box(dtype=torch.float32):
 
 
 def displaced(prediction, *offsets):
-    offsets = torch.tensor(offsets, dtype=prediction.T_cam_obj.dtype)
-    count = len(offsets)
-    return retract_about(prediction.T_cam_obj.expand(count, 4, 4), offsets, prediction.objects.centre_obj.expand(count, 3))
+    return prediction.poses_at(torch.tensor(offsets, dtype=prediction.T_cam_obj.dtype))
 
 
 def test_poses_farther_off_than_events_look_for_contours_are_pulled_near(dtype):
     prediction, image, T_true = of_box(dtype)
     poses = displaced(prediction, [0.12, -0.1, 0.12, 0.01, -0.01, 0.01], [-0.1, 0.15, 0.0, -0.015, 0.01, -0.02], [0.0, 0.0, -0.2, 0.02, 0.015, 0.0])
-    found = pulled(prediction, poses, image, 2, LOOSE, TrackerConfig())
+    found = pulled(prediction, poses, image, LOOSE, TrackerConfig())
     assert found.dtype == dtype
     before, after = (pose_errors(at.double(), T_true.expand(3, 4, 4)) for at in (poses, found))
     assert float(before[0].min()) > 9
@@ -42,7 +39,7 @@ def test_poses_farther_off_than_events_look_for_contours_are_pulled_near(dtype):
 def test_without_events_only_the_prediction_pulls():
     prediction, image, _ = of_box()
     poses = displaced(prediction, [0.1, 0.0, 0.0, 0.01, 0.0, 0.0])
-    found = pulled(prediction, poses, torch.zeros_like(image), 2, LOOSE, TrackerConfig())
+    found = pulled(prediction, poses, torch.zeros_like(image), LOOSE, TrackerConfig())
     torch.testing.assert_close(found, prediction.T_cam_obj, atol=2e-3, rtol=0)
 
 
@@ -52,5 +49,5 @@ def test_a_pose_that_is_none_or_behind_the_camera_spoils_no_other(bad):
     poses = displaced(prediction, [0.1, 0.0, 0.0, 0.01, 0.0, 0.0], [0.0, 0.1, 0.0, 0.0, 0.01, 0.0])
     spoilt = torch.cat([poses[:1], poses[:1], poses[1:]])
     spoilt[1, 2, 3] = bad
-    found = pulled(prediction, spoilt, image, 2, LOOSE, TrackerConfig())
-    assert torch.equal(found[[0, 2]], pulled(prediction, poses, image, 2, LOOSE, TrackerConfig()))
+    found = pulled(prediction, spoilt, image, LOOSE, TrackerConfig())
+    assert torch.equal(found[[0, 2]], pulled(prediction, poses, image, LOOSE, TrackerConfig()))

@@ -6,8 +6,8 @@ from helpers import SMALL_CAMERA, generator, pose_errors
 from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
-from torchtrack.hypotheses import draw_offsets, event_density, mark, promising
-from torchtrack.lie import retract_about
+from torchtrack.event_image import event_density
+from torchtrack.hypotheses import draw_offsets, mark, promising
 from torchtrack.views import outlines_at, thinned
 
 IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
@@ -90,8 +90,7 @@ def test_marks_of_poses_behind_the_camera_are_numbers():
     offsets[1, 5] = -2.0
     density = event_density(seen.pixels, seen.mask, IMAGE_SIZE)
     assert torch.isfinite(mark(prediction, thinned(found.fit.contours), offsets, density)).all()
-    poses = retract_about(prediction.T_cam_obj.expand(2, 4, 4), offsets[:, :6], prediction.objects.centre_obj.expand(2, 3))
-    assert torch.isfinite(mark(prediction, outlines_at(prediction, poses, TrackerConfig()), offsets, density)).all()
+    assert torch.isfinite(mark(prediction, outlines_at(prediction, prediction.poses_at(offsets[:, :6]), TrackerConfig()), offsets, density)).all()
 
 
 # ---- what is promising
@@ -99,9 +98,7 @@ def test_marks_of_poses_behind_the_camera_are_numbers():
 
 def nearest(offsets, prediction, T_true):
     """The smallest error of poses at some offsets, one degree being as bad as a millimetre."""
-    count = len(offsets)
-    poses = retract_about(prediction.T_cam_obj.expand(count, 4, 4), offsets[:, :6], prediction.objects.centre_obj.expand(count, 3))
-    return float(sum(pose_errors(poses.double(), T_true.expand(count, 4, 4))).min())
+    return float(sum(pose_errors(prediction.poses_at(offsets[:, :6]).double(), T_true.expand(len(offsets), 4, 4))).min())
 
 
 def places_of(prediction, seen):

@@ -6,7 +6,6 @@ from helpers import generator
 from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.lie import retract_about
 from torchtrack.views import outlines_at, outlines_by_view, thinned, view_directions
 
 
@@ -23,7 +22,7 @@ def turned_poses(prediction, count, seed=0):
     """Poses of the box, turned anyhow where it is."""
     steps = torch.zeros(count, 6)
     steps[:, :3] = 2 * torch.randn((count, 3), generator=generator(seed))
-    return retract_about(prediction.T_cam_obj.expand(count, 4, 4), steps.to(prediction.T_cam_obj), prediction.objects.centre_obj.expand(count, 3))
+    return prediction.poses_at(steps.to(prediction.T_cam_obj))
 
 
 def test_outlines_of_views_lie_near_the_contours(dtype):
@@ -40,24 +39,16 @@ def test_outlines_of_views_lie_near_the_contours(dtype):
         assert float(away_px.min(0).values.quantile(0.7)) < 2
 
 
-def test_a_pose_has_the_same_outline_whatever_others_there_are():
+@pytest.mark.parametrize("outlines", [outlines_at, outlines_by_view])
+def test_a_pose_has_its_own_outline_whatever_others_there_are(outlines):
     _, prediction, _, _, _ = in_motion()
     poses = turned_poses(prediction, 6)
-    together = outlines_by_view(prediction, poses, TrackerConfig())
+    together = outlines(prediction, poses, TrackerConfig())
     for number in range(6):
-        alone = outlines_by_view(prediction, poses[number : number + 1], TrackerConfig())
+        alone = outlines(prediction, poses[number : number + 1], TrackerConfig())
         assert torch.equal(alone.mask[0], together.mask[number])
+        torch.testing.assert_close(alone.points_obj[0], together.points_obj[number])
         torch.testing.assert_close(alone.pixels[0][alone.mask[0]], together.pixels[number][together.mask[number]], atol=1e-3, rtol=0)
-
-
-def test_outlines_are_those_of_their_own_poses():
-    _, prediction, _, _, _ = in_motion()
-    poses = turned_poses(prediction, 2)
-    both = outlines_at(prediction, poses, TrackerConfig())
-    for number in range(2):
-        alone = outlines_at(prediction, poses[number : number + 1], TrackerConfig())
-        assert torch.equal(both.mask[number], alone.mask[0])
-        torch.testing.assert_close(both.points_obj[number], alone.points_obj[0])
 
 
 def test_thinned_contours_are_some_of_the_visible_ones():

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -20,6 +20,8 @@ from torchtrack.readback import Answer
 
 # The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).
 _INDEX_MARGIN_PX = 2
+# What has to be looked for with a gate this many times wider may be anywhere.
+_ANYWHERE = 2.0
 # Standard deviation of a swelling that is switched off (px).
 _NO_SWELLING_PX = 1e-3
 
@@ -44,6 +46,11 @@ def gate_widening(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[
     matching = config.matching
     first_px = matching.gates_px[0]
     return (matching.gate_sigmas * sigma_px / first_px).clamp(1, max(matching.max_gate_px / first_px, 1))
+
+
+def may_be_anywhere(widening: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
+    """Objects of whose place hardly anything was known, by the widening of their first gates."""
+    return widening >= _ANYWHERE
 
 
 def index_radius(widening: Float[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:

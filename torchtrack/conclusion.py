@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack import lie, quality
+from torchtrack.alignment import may_be_anywhere
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import reproject
 from torchtrack.corners import Corners
@@ -16,8 +17,6 @@ from torchtrack.prediction import Prediction
 from torchtrack.search import Found
 from torchtrack.state import StepResult, TrackerState
 
-# An object whose first gate has to be this many times wider may be anywhere.
-_ANYWHERE = 2.0
 # Share of a new window in the usual quality.
 _USUAL_GAIN = 0.1
 # And in the full one where it is less: what is hidden for a while is not seen well.
@@ -44,7 +43,7 @@ def conclude(
     solution = found.fit.solution
     in_view = quality.visible_share(contours, objects.image_size)
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
-    step = solution.from_prior[:, :6] * ~(found.elsewhere & (widening >= _ANYWHERE))[:, None]
+    step = solution.from_prior[:, :6] * ~(found.elsewhere & may_be_anywhere(widening))[:, None]
     status = quality.judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening)
     status = torch.where(prediction.usable, status, int(quality.Status.DIVERGED))
     failed = status >= int(quality.Status.LOST)

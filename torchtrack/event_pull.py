@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.config.tracker import SolverConfig, TrackerConfig
-from torchtrack.constants import constant
 from torchtrack.contours import Contours, reproject
+from torchtrack.event_image import look_up
 from torchtrack.lie import difference_about
 from torchtrack.motion import inverse
 from torchtrack.pose_problem import PoseProblem
@@ -32,7 +32,6 @@ def pulled(
     prediction: Prediction,
     T_cam_obj: Float[Tensor, "k 4 4"],
     image: Float[Tensor, "h w"],
-    border_px: int,
     covariance: Float[Tensor, "6 6"],
     config: TrackerConfig,
 ) -> Float[Tensor, "k 4 4"]:
@@ -41,28 +40,25 @@ def pulled(
     Args:
         prediction: of the object, with the ``covariance`` of its pose.
         T_cam_obj: where each begins.
-        image: how many events there are at every pixel of the image, with a border.
+        image: how many events there are at every pixel, as :mod:`torchtrack.event_image` has it.
     """
     information = (_FIND_PX**2 * inverse(covariance[None])).to(T_cam_obj.dtype)
     for reaches_px in _REACHES_PX:
         outlines = outlines_at(prediction, T_cam_obj, config)
         for reach_px in reaches_px:
             outlines = reproject(outlines, T_cam_obj, prediction.objects.intrinsics.expand(len(T_cam_obj), 4))
-            targets, weights = _found(outlines, image, border_px, reach_px)
+            targets, weights = _found(outlines, image, reach_px)
             problem = _problem(prediction, outlines, targets, weights, reach_px, information)
             offset = difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
             T_cam_obj = solve_pose(problem, T_cam_obj, _SOLVER, offset).T_cam_obj
     return T_cam_obj
 
 
-def _found(outlines: Contours, image: Float[Tensor, "h w"], border_px: int, reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
+def _found(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
     """Where each contour point finds most events along its normal, rather near by, and how much that counts."""
     steps_px = torch.linspace(-reach_px, reach_px, _LOOKS, dtype=image.dtype, device=image.device)
     looked_at = outlines.pixels[:, :, None] + steps_px[:, None] * outlines.normals[:, :, None]
-    limit = constant((image.shape[1] - 1, image.shape[0] - 1), image.dtype, image.device)
-    # Clamped before the conversion: a far-off pixel does not fit an integer, nor does what is not a number.
-    u, v = torch.minimum((looked_at.round() + border_px).nan_to_num(0.0).clamp(min=0), limit).long().unbind(-1)
-    there = image.flatten()[v * image.shape[1] + u] * (1 - steps_px.abs() / (reach_px + 1))
+    there = look_up(image, looked_at) * (1 - steps_px.abs() / (reach_px + 1))
     most, place = there.max(-1)
     return torch.addcmul(outlines.pixels, outlines.normals, steps_px[place][..., None]), most * outlines.mask
 

@@ -13,18 +13,16 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.constants import constant
 from torchtrack.contours import Contours, assemble
+from torchtrack.event_image import event_density, look_up
 from torchtrack.event_pull import pulled
 from torchtrack.image_shifts import shifted
-from torchtrack.lie import difference_about, retract_about
+from torchtrack.lie import difference_about
 from torchtrack.prediction import Prediction
 from torchtrack.views import outlines_at, thinned
 
 # Events beside a contour are counted this far from it (px), and more than this many of them in one place say no more.
 _BESIDE_PX, _ENOUGH_EVENTS = 4.0, 3.0
-# Pixels around the image that events and contours may lie in.
-_BORDER_PX = 2
 
 
 def promising(
@@ -64,10 +62,8 @@ def _near_events(
     steps = draw_offsets(covariance, config.search.turns)[:, :6].to(prediction.velocity.dtype)
     sigma_m = covariance.diagonal()[3:5].mean().sqrt().to(steps.dtype)
     steps = shifted(prediction, steps, sigma_m, places, config)
-    count = len(steps)
-    poses = retract_about(prediction.T_cam_obj.expand(count, 4, 4), steps, prediction.objects.centre_obj.expand(count, 3))
     around = avg_pool2d(enough[None], 3, 1, 1)[0]
-    return pulled(prediction, poses, around, _BORDER_PX, covariance[:6, :6], config)
+    return pulled(prediction, prediction.poses_at(steps), around, covariance[:6, :6], config)
 
 
 def draw_offsets(covariance: Float[Tensor, "12 12"], count: int) -> Float[Tensor, "n 13"]:
@@ -98,35 +94,20 @@ def _normal(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tenso
         return normal
 
 
-def event_density(pixels: Float[Tensor, "1 e 2"], mask: Bool[Tensor, "1 e"], image_size: tuple[int, int]) -> Float[Tensor, "h w"]:
-    """Events in the 3x3 pixels around every pixel of the image with its border."""
-    height, width = (size + 2 * _BORDER_PX for size in image_size)
-    place = (pixels[0].round() + _BORDER_PX).nan_to_num(-1)
-    inside = mask[0] & (place >= 1).all(-1) & (place[:, 0] < width - 1) & (place[:, 1] < height - 1)
-    u, v = torch.where(inside[:, None], place, 0).long().unbind(-1)
-    image = torch.zeros(height * width, dtype=pixels.dtype, device=pixels.device)
-    image = image.scatter_add(0, v * width + u, inside.to(pixels.dtype)).view(height, width)
-    rows = image[:-2] + image[1:-1] + image[2:]
-    return pad(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:], (1, 1, 1, 1))
-
-
 def mark(prediction: Prediction, outlines: Contours, offsets: Float[Tensor, "n 13"], image: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
     """How much denser events are on the contours of each pose than beside them.
 
     Args:
         prediction: of the one object.
         outlines: the contours of each pose; or one for all, which are moved: over a few degrees they stay contours, even on a smooth surface.
-        image: how many events there are at every pixel, with its border.
+        image: how many events there are at every pixel, as :mod:`torchtrack.event_image` has it.
     """
     count, objects = len(offsets), prediction.objects
-    poses = retract_about(prediction.T_cam_obj.expand(count, 4, 4), offsets[:, :6], objects.centre_obj.expand(count, 3))
     points, tangents, kind, mask = (
         values.expand(count, *values.shape[1:]) for values in (outlines.points_obj, outlines.tangents_obj, outlines.kind, outlines.mask)
     )
-    moved = assemble(points, tangents, kind, mask, poses, objects.intrinsics.expand(count, 4))
-    limit = constant((image.shape[1] - 1, image.shape[0] - 1), image.dtype, image.device)
+    moved = assemble(points, tangents, kind, mask, prediction.poses_at(offsets[:, :6]), objects.intrinsics.expand(count, 4))
     total = image.new_zeros(count)
     for side_px, weight in ((0.0, 1.0), (_BESIDE_PX, -0.5), (-_BESIDE_PX, -0.5)):
-        u, v = torch.minimum(((moved.pixels + side_px * moved.normals).round() + _BORDER_PX).nan_to_num(0.0).clamp(min=0), limit).long().unbind(-1)
-        total = total + weight * (image.flatten()[v * image.shape[1] + u] * moved.mask).sum(-1)
+        total = total + weight * (look_up(image, moved.pixels + side_px * moved.normals) * moved.mask).sum(-1)
     return total / moved.mask.sum(-1).clamp(min=1)

@@ -14,7 +14,6 @@ from torch.fft import irfft2, rfft2
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.lie import retract_about
 from torchtrack.prediction import Prediction
 from torchtrack.views import outlines_by_view
 
@@ -68,9 +67,7 @@ def shifted(
     cell_px = (_DIAMETERS * objects.size_px(prediction.T_cam_obj)[0] + 2 * _SIGMAS * sigma_px) / _SIDE
     square = _Square(ray[:2] * focal + objects.intrinsics[0, 2:], cell_px)
     steps = torch.cat([steps[:, :3], steps[:, 5:] * ray], 1)
-    count = len(steps)
-    poses = retract_about(prediction.T_cam_obj.expand(count, 4, 4), steps, objects.centre_obj.expand(count, 3))
-    outlines = outlines_by_view(prediction, poses, config)
+    outlines = outlines_by_view(prediction, prediction.poses_at(steps), config)
     fit = _correlation(square.counts(*places)[0] / cell_px, square.counts(outlines.pixels, outlines.mask))
     number, shift = _best(fit, sigma_px / cell_px, config.search.kept)
     moved_m = shift * cell_px * ((centre[2] + steps[number, 5:]) / focal)

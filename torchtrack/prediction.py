@@ -91,6 +91,11 @@ class Prediction:
         velocity = self.velocity + offset[:, 6:12] if offset.shape[1] > 6 else self.velocity
         return Prediction(self.objects, T_cam_obj, self.usable, velocity, self.covariance, self.acceleration)
 
+    def poses_at(self, offsets: Float[Tensor, "n 6"]) -> Float[Tensor, "n 4 4"]:
+        """Poses of the one object that this is of, some way from the predicted one."""
+        count = len(offsets)
+        return retract_about(self.T_cam_obj.expand(count, 4, 4), offsets, self.objects.centre_obj.expand(count, 3))
+
     def copies(self, number: int, count: int) -> "Prediction":
         """One object's prediction many times, each in a stream of its own."""
         T_cam_obj, usable, velocity, covariance = (

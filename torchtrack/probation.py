@@ -11,13 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack import readback
+from torchtrack.alignment import may_be_anywhere
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.prediction import Prediction
 from torchtrack.quality import Status
 from torchtrack.state import Probation, StepResult, TrackerState
 
-# Finds of objects whose first gate had to be this many times wider are on probation.
-_WIDE = 2.0
 # A window speaks for a find by its share of what is wanted, as far as it is more than this.
 _NEUTRAL = 0.6
 # Windows' worth of evidence at which a find is kept or taken back.
@@ -34,7 +33,7 @@ def after_probation(
         state, result: after it.
         prediction: of the objects, with ``widening`` of their first gates.
     """
-    concerned = before.probation.runs | (widening >= _WIDE)
+    concerned = before.probation.runs | may_be_anywhere(widening)
     if readback.none_of(concerned):
         return state, result
     probation = _begun(before, result, prediction, widening)
@@ -61,7 +60,7 @@ def after_probation(
 def _begun(before: TrackerState, result: StepResult, prediction: Prediction, widening: Float[Tensor, "b"]) -> Probation:
     """The probation with those objects that were found in this window although hardly anything was known of them."""
     old = before.probation
-    begins = ~old.runs & (widening >= _WIDE) & (result.status < int(Status.LOST))
+    begins = ~old.runs & may_be_anywhere(widening) & (result.status < int(Status.LOST))
     first = begins[:, None, None]
     return Probation(
         runs=old.runs | begins,
