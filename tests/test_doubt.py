@@ -9,14 +9,15 @@ from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, 
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import CornerConfig, SearchConfig, TrackerConfig
-from torchtrack.doubt import Doubt, drifted, gathered_when_known, in_doubt, is_adrift, is_due, may_be_wanted
+from torchtrack.doubt import Doubt, drifted, gathered_when_known, in_doubt, is_adrift, is_due, is_wanted
+from torchtrack.doubt import slipped as as_if_slipped
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
 
 # The box fires few events: with corners beside them, enough is observed of one that slipped to say more than that it is too little.
 SEARCHED = TrackerConfig(corners=CornerConfig(max_corners=32), search=SearchConfig(doubt_us=10_000, drift_diameters_s=4))
-NEVER_ADRIFT = TrackerConfig(corners=CornerConfig(max_corners=32), search=SearchConfig(doubt_us=0))
+NEVER_ADRIFT = TrackerConfig(corners=CornerConfig(max_corners=32), search=SearchConfig(doubt_us=0, slipped_to=0))
 # Twenty degrees, onto other edges: farther than a pose that is sure of itself is looked for.
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
@@ -35,13 +36,25 @@ def test_uncertain_objects_and_those_explained_worse_than_usual_are_searched_for
     score, usual = torch.tensor([0.9, 0.71, 0.73, 0.9, 0.0]), torch.tensor([0.9, 0.9, 0.9, 0.9, 0.0])
     asked = doubt([1.0, 1.0, 1.0, 4.1, 1.0], score, usual).asks(score, config)
     assert asked.tolist() == [False, True, False, True, False]
+    # One window that is a little worse is no reason.
+    assert not doubt([1.0], 0.9, 0.9).asks(torch.tensor([0.65]), config).any()
+
+
+def test_what_is_sure_of_its_place_and_explains_far_less_may_have_slipped_at_once():
+    settings, score = SearchConfig(slipped_to=0.7, slip_sigma_px=6.0), torch.tensor([0.62, 0.64, 0.62, 0.62, 0.62])
+    elsewhere = {"starting": torch.tensor([False] * 3 + [True, False]), "adrift": torch.tensor([False] * 4 + [True])}
+    state = doubt([1.0, 1.0, 6.1, 1.0, 1.0], 0.9, 0.9, **elsewhere)
+    assert state.slips(score, settings).tolist() == [True, False, False, False, False]
+    assert bool(is_wanted(state, score, TrackerConfig(search=settings))[0])
+    assert not state.slips(score, SearchConfig(slipped_to=0)).any()
+    assert not is_wanted(state, score, TrackerConfig(search=SearchConfig(hypotheses=0))).any()
 
 
 @pytest.mark.parametrize("at_start", [True, False])
 def test_objects_whose_motion_is_not_known_are_searched_for(at_start):
     start = doubt([1.0, 1.0], starting=torch.tensor([True, False]), due=False)
     config = TrackerConfig(search=SearchConfig(at_start=at_start))
-    assert start.asks(start.last_score, config.search).tolist() == may_be_wanted(start, config).tolist() == [at_start, False]
+    assert start.asks(start.last_score, config.search).tolist() == is_wanted(start, start.last_score, config).tolist() == [at_start, False]
 
 
 def test_very_uncertain_objects_wait_until_it_is_time_and_others_do_not():
@@ -53,8 +66,8 @@ def test_very_uncertain_objects_wait_until_it_is_time_and_others_do_not():
 
 def test_objects_adrift_are_searched_for_however_certain_they_are():
     adrift = doubt([0.5, 0.5], adrift=torch.tensor([True, False]))
-    assert adrift.asks(torch.ones(2), SearchConfig()).tolist() == may_be_wanted(adrift, TrackerConfig()).tolist() == [True, False]
-    assert not may_be_wanted(adrift, TrackerConfig(search=SearchConfig(hypotheses=0))).any()
+    assert adrift.asks(torch.ones(2), SearchConfig()).tolist() == is_wanted(adrift, torch.ones(2), TrackerConfig()).tolist() == [True, False]
+    assert not is_wanted(adrift, torch.ones(2), TrackerConfig(search=SearchConfig(hypotheses=0))).any()
 
 
 def test_it_is_time_once_in_every_interval_whatever_the_windows():
@@ -146,6 +159,15 @@ def slipped(config, count=10, streams=1, displaced=0):
     state = replace(state, T_cam_obj=T_cam_obj, full_share=known, full_gathered=known)
     after, results = follow(tracker, state, batches[10:])
     return after, results, tracks[0][0].at(results[-1].t_us)
+
+
+def test_of_what_slipped_one_is_less_certain_in_all_ways_and_of_others_as_before():
+    _, prediction, *_ = in_motion()
+    two = prediction.copies(0, 2)
+    covariance = as_if_slipped(two, 1, 5.0).covariance
+    torch.testing.assert_close(covariance[1], 25 * two.covariance[1])
+    assert torch.equal(covariance[0], two.covariance[0])
+    torch.testing.assert_close(two.covariance[1], prediction.covariance[0])
 
 
 def test_a_pose_that_slipped_is_in_doubt_and_found_again():

@@ -212,6 +212,7 @@ def test_a_steady_step_says_when_it_does_not_hold(nothing_is_read, monkeypatch, 
         uncertain[:, 6:, 6:] += torch.eye(6) * 4.0
     elif reason in ("searched", "far away"):
         uncertain[:, :6, :6] += torch.eye(6) * (0.05 if reason == "searched" else 0.005) ** 2
-    last_score = torch.zeros(1) if reason == "lost" else state.score
-    *_, wrong = boxes.steady_step(replace(state, covariance=uncertain, score=last_score), *window)
+    # No window explains twice as much as all there is.
+    usual_score = state.usual_score + (2 if reason == "lost" else 0)
+    *_, wrong = boxes.steady_step(replace(state, covariance=uncertain, usual_score=usual_score), *window)
     assert wrong

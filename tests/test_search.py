@@ -12,7 +12,7 @@ from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
-from torchtrack.search import _is_likely, _likeliest, explained_at_rest, search
+from torchtrack.search import _is_likely, _likeliest, _search_slipped, explained_at_rest, search
 
 SEARCHED = TrackerConfig()
 UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
@@ -125,6 +125,31 @@ def test_a_lost_box_is_found_again_and_without_the_search_it_is_not():
     assert float(millimetres) < 2.0
     assert int(with_search[-1].status) == Status.TRACKING
     assert float(pose_errors(without[-1].T_cam_obj, T_true)[0]) > 3
+
+
+@pytest.mark.parametrize("farther", [1.0, 1.3, 1.5])
+def test_a_box_that_slipped_is_found_within_a_window_however_sure_it_is_of_itself(farther):
+    """Ten to fifteen degrees off, with the covariance of one that is tracked well; held by that, no search finds it."""
+    slips, never = (TrackerConfig(search=SearchConfig(doubt_us=0, slipped_to=to)) for to in (SearchConfig().slipped_to, 0))
+    found, T_true = displaced_runs(slips, 1.0, displaced=farther * DISPLACED)
+    held, _ = displaced_runs(never, 1.0, displaced=farther * DISPLACED)
+    assert int(found[0].status) == int(found[-1].status) == Status.TRACKING
+    degrees, millimetres = pose_errors(found[-1].T_cam_obj, T_true)
+    assert float(degrees) < 0.3 and float(millimetres) < 0.5
+    assert [int(result.status) for result in held[:5]] == [Status.TOO_FEW_EVENTS] * 5
+
+
+def test_what_slipped_goes_on_as_certain_as_if_it_had_been_predicted():
+    """No less than what the prediction told, and events beside: the loose prior of the search is not left in it."""
+    tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
+    least = torch.tensor([0.1, 0.0])
+    better = _search_slipped(0, prediction, float(prediction.sigma_px(found.fit.contours)), least, seen, found, tracker.config)
+    assert better.elsewhere.tolist() == [True] and found.elsewhere.tolist() == [False]
+    told = tracker.config.solver.observation_px**2 * prediction.information[0]
+    beside = better.fit.solution.hessian[0, :12, :12].double() - told
+    scale = told.diagonal().rsqrt()
+    assert float(torch.linalg.eigvalsh(beside * scale[:, None] * scale).min()) > -1e-3
+    assert _search_slipped(0, prediction, 1.0, torch.tensor([0.1, 1.1]), seen, found, tracker.config) is found
 
 
 @pytest.mark.parametrize("config", [UNSEARCHED, SEARCHED.model_copy(update={"solver": SEARCHED.solver.model_copy(update={"prior": False})})])

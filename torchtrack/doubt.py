@@ -27,7 +27,7 @@ class Doubt:
 
     Args:
         sigma_px: standard deviation of each object's prediction in the image.
-        last_score: in the window before: one bad window alone is no reason.
+        last_score: in the window before: one window that is a little worse is no reason.
         usual_score: as a rule.
         starting: objects whose motion is not known yet.
         due: objects that it is time for, should they be very uncertain: what is hidden is not found by looking more often.
@@ -49,7 +49,13 @@ class Doubt:
         """Which objects are to be searched for: uncertain ones, those whose score stays below the usual, and those long in doubt."""
         starting = self.starting if config.at_start else torch.zeros_like(self.starting)
         due = self.due | (self.sigma_px <= config.wide_sigma_px)
-        return starting | self.adrift | (due & ((self.sigma_px > config.from_sigma_px) | (score < config.dropped_to * self.usual_score)))
+        stays_low = torch.maximum(score, self.last_score) < config.dropped_to * self.usual_score
+        return starting | self.adrift | (due & ((self.sigma_px > config.from_sigma_px) | stays_low))
+
+    def slips(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+        """Which objects may have slipped: those that are sure of their place, and explain far less all at once."""
+        sure = ~self.starting & ~self.adrift & (self.sigma_px < config.slip_sigma_px)
+        return sure & (score < config.slipped_to * self.usual_score)
 
 
 def is_due(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], interval_us: int) -> Bool[Tensor, "s"]:
@@ -58,11 +64,11 @@ def is_due(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], interval_us: int)
     return t_us // interval_us > since_us // interval_us
 
 
-def may_be_wanted(doubt: Doubt, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """Which objects a search can turn out to be wanted for, as far as is known before the window is aligned."""
+def is_wanted(doubt: Doubt, score: Float[Tensor, "b"], config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Which objects a search is wanted for, as ``score`` tells once the window is aligned."""
     if config.search.hypotheses == 0 or not config.solver.prior:
         return torch.zeros_like(doubt.starting)
-    return doubt.asks(doubt.last_score, config.search)
+    return doubt.asks(score, config.search) | doubt.slips(score, config.search)
 
 
 def in_doubt(
@@ -102,3 +108,13 @@ def drifted(prediction: Prediction, doubt: Doubt, config: SearchConfig) -> Predi
     pose, rate = (torch.diag_embed(part) for part in (velocity * torch.cat([turned_s, moved_s], 1), velocity))
     root = torch.cat([pose, rate], 1)
     return replace(prediction, covariance=prediction.covariance + doubt.adrift[:, None, None] * (root @ root.mT))
+
+
+def slipped(prediction: Prediction, number: int, times: float) -> Prediction:
+    """The prediction, of the object ``number`` so many times less certain.
+
+    A pose that slipped was sure of itself all the while: its covariance tells the directions it can be off in, but not how far.
+    """
+    covariance = prediction.covariance.clone()
+    covariance[number] *= times**2
+    return replace(prediction, covariance=covariance)

@@ -3,7 +3,8 @@
 On the CPU a value is there once it is computed: sizes are exact, and a decision is taken where it comes up. A GPU works off
 a queue, and to read a value from it is to wait until the queue is empty, with nothing new in it. There, sizes are bounds
 that the settings and the image give, and what must be decided is asked for early (:class:`Answer`): its copy is begun in
-the middle of a window's work, and looked at once much more has been queued behind it.
+the middle of a window's work, and looked at once much more has been queued behind it. One decision cannot wait for
+that: whether a pose slipped, which its own window tells, and late.
 
 So the queue does not run dry, though the CPU is never a whole window ahead, and every decision is the one that the CPU
 takes. The flag of the window before would be there already, but objects would be searched for a window late. To

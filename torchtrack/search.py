@@ -11,10 +11,11 @@ from torch import Tensor
 
 from torchtrack import quality, readback
 from torchtrack.alignment import Fit, align, gate_widening, index_for
-from torchtrack.config.tracker import TrackerConfig
+from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.contours import Contours
-from torchtrack.doubt import Doubt, drifted
+from torchtrack.doubt import Doubt, drifted, slipped
 from torchtrack.hypotheses import promising
+from torchtrack.motion import inverse
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.once import once
 from torchtrack.pose_problem import Linearisation
@@ -93,29 +94,55 @@ def explained_at_rest(widening: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
 def search_wanted(
     prediction: Prediction, doubt: Doubt, events: WindowEvents, found: Found, widening: Float[Tensor, "b"], config: TrackerConfig
 ) -> tuple[Found, Prediction, Float[Tensor, "b"]]:
-    """Try other poses for the objects that need it, one object after the other.
+    """Try other poses for the objects that need it, one object after the other: beside the prediction, and then where it may have slipped to.
 
     Returns:
         What was found, the prediction that it is to be weighed against, and the widening of the first gates: of an object that had
         drifted off, those of one as uncertain as it turned out to be.
     """
-    if config.search.hypotheses == 0 or not config.solver.prior:
-        return found, prediction, widening
     # Without events no pose is better than another.
     enough = events.mask.sum(-1) >= config.quality.min_observations
-    tried = enough & doubt.asks(torch.maximum(found.score, doubt.last_score), config.search)
-    margin = torch.where(doubt.starting, config.search.start_margin, config.search.margin)
-    # What is far away has to explain about as much as usual.
-    needed = torch.where(doubt.adrift, config.search.adrift_share * doubt.full_share, 0)
+    tried, slips = enough & doubt.asks(found.score, config.search), enough & doubt.slips(found.score, config.search)
+    least = _least(doubt, config.search)
     uncertain = drifted(prediction, doubt, config.search)
     sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
-    answers = Answer.to(tried), Answer.to(sigma_px)
-    for number, (is_tried, own_sigma_px) in enumerate(zip(*(answer.numbers() for answer in answers), strict=True)):
+    answers = (Answer.to(values).numbers() for values in (tried, slips, sigma_px))
+    for number, (is_tried, may_have_slipped, own_sigma_px) in enumerate(zip(*answers, strict=True)):
         if is_tried:
-            found = search(number, uncertain, own_sigma_px, torch.stack([margin, needed])[:, number], events, found, config)
+            found = search(number, uncertain, own_sigma_px, least[:2, number], events, found, config)
+        if may_have_slipped:
+            found = _search_slipped(number, uncertain, own_sigma_px, least[2:, number], events, found, config)
     was_adrift = doubt.adrift & found.elsewhere
     prediction = replace(prediction, covariance=torch.where(was_adrift[:, None, None], uncertain.covariance, prediction.covariance))
     return found, prediction, torch.where(was_adrift, gate_widening(sigma_px, config), widening)
+
+
+def _least(doubt: Doubt, config: SearchConfig) -> Float[Tensor, "4 b"]:
+    """By how much other poses must explain more, and how much they must explain; and both of where an object may have slipped to."""
+    margin = torch.where(doubt.starting, config.start_margin, config.margin)
+    # What is far away has to explain about as much as usual; so has what is found step by step, while a motion is lost, ever farther away.
+    needed = torch.where(doubt.adrift | doubt.starting, config.adrift_share * doubt.full_share, 0)
+    return torch.stack([margin, needed, torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share])
+
+
+def _search_slipped(
+    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "2"], events: WindowEvents, found: Found, config: TrackerConfig
+) -> Found:
+    """:func:`search` for an object that is sure of where it is, and may be farther off than that.
+
+    Held by its prediction, no pose some pixels away is found, however much it explains. What is found goes on as certain as
+    if it had been predicted: who is not held at all wanders off from one find to the next.
+    """
+    loose = slipped(prediction, number, config.search.slip_sigma_px / max(sigma_px, 1e-6))
+    other = search(number, loose, config.search.slip_sigma_px, least, events, found, config)
+    if other is found:
+        return found
+    solution = other.fit.solution
+    held, let_go = (inverse(of.covariance[number][None])[0] for of in (prediction, loose))
+    hessian = solution.hessian.clone()
+    is_taken = (solution.T_cam_obj[number] != found.fit.solution.T_cam_obj[number]).any()
+    hessian[number, :12, :12] += (config.solver.observation_px**2 * (held - let_go) * is_taken).to(hessian.dtype)
+    return replace(other, fit=replace(other.fit, solution=replace(solution, hessian=hessian)))
 
 
 def search(

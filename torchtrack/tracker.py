@@ -17,7 +17,7 @@ from torchtrack.camera import Camera
 from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.doubt import Doubt, gathered_when_known, is_adrift, is_due, may_be_wanted
+from torchtrack.doubt import Doubt, gathered_when_known, is_adrift, is_due, is_wanted
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.learned_contours import LearnedContours
@@ -222,7 +222,6 @@ class Tracker(TrackedObjects):
         widening = gate_widening(sigma_px, config)
         # Asked for here: a GPU answers while corners are looked for.
         radius_px = questions.ask(index_radius(widening, config), usual_index_radius(config))
-        in_doubt = questions.ask(may_be_wanted(doubt, config), False)
         corners = sensors.corners(contours, last_event_us, t_us, window_s, config)
         index = index_for(contours, self.image_size, config, widening, radius_px)
         observations = corner_observations(corners)
@@ -234,7 +233,9 @@ class Tracker(TrackedObjects):
             observations = judged(evidence, self.weigher)
         fit = align(recorded, contours, index, widening, observations, config)
         found = judge_fit(prediction, fit, config, explained_at_rest(widening), gathered_when_known(doubt, state.full_gathered, config.search))
-        if in_doubt.any():
+        # A GPU is waited for: a pose that begins to slip is farther off a window later.
+        wanted = questions.ask(is_wanted(doubt, found.score, config), False)
+        if wanted.any():
             found, recorded, widening = search_wanted(recorded, doubt, seen, found, widening, config)
             prediction = recorded.detached()
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)

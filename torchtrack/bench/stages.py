@@ -34,7 +34,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "reprojection": ("alignment:reproject", "conclusion:reproject"),
     "alignment, rest": ("tracker:align",),
     "quality": ("tracker:judge_fit",),
-    "search": ("tracker:may_be_wanted", "tracker:search_wanted"),
+    "search": ("tracker:is_wanted", "tracker:search_wanted"),
     "conclusion": ("tracker:conclude",),
     "learning": ("tracker:learned_after",),
     "rest": ("tracker:Tracker.step",),

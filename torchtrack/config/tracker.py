@@ -214,8 +214,10 @@ class SearchConfig(Settings):
     wide_sigma_px: float = Field(10.0, gt=0, description="Standard deviation of the prediction in the image from which that is so (px).")
     interval_us: int = Field(10_000, ge=0, description="A very uncertain object is searched for once in this time (µs); 0 for in every window.")
     from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
-    dropped_to: float = Field(0.8, ge=0, le=1, description="Share of the usual quality below which others are tried.")
+    dropped_to: float = Field(0.8, ge=0, le=1, description="Share of the usual quality below which others are tried, two windows in a row.")
+    slipped_to: float = Field(0.7, ge=0, le=1, description="Share of the usual quality below which a pose may have slipped; 0 for never.")
     least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
+    slip_sigma_px: float = Field(6.0, gt=0, description="The same of what may have slipped, however sure it is of itself (px).")
     at_start: bool = Field(True, description="Others are also tried while an object's motion is not known: dense print fits many.")
     probation: bool = Field(True, description="What was found of a very uncertain object is taken back unless it explains as much as usual soon.")
     by_gathering: bool = Field(True, description="Poses are also compared by how far the events around contours gather on them: slips smear them.")
@@ -226,6 +228,8 @@ class SearchConfig(Settings):
     adrift_share: float = Field(0.65, ge=0, le=1, description="Share of what an object explains when seen well that is asked of a find farther away.")
     start_margin: float = Field(0.02, ge=0, le=1, description="By how much the quality of another pose must be better then.")
     margin: float = Field(0.1, ge=0, le=1, description="By how much the quality of another pose must be better.")
+    slip_margin: float = Field(0.15, ge=0, le=1, description="The same where a pose may have slipped.")
+    slip_share: float = Field(0.9, ge=0, le=1, description="Share of what an object explains when seen well that is asked of a pose then.")
 
 
 class QualityConfig(Settings):
