@@ -8,9 +8,9 @@ import trimesh
 from helpers import random_pose
 from tiny_sequence import write_tiny_sequence
 
-from torchtrack.config.evaluate import EvaluateConfig
+from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
 from torchtrack.errors import ConfigError, MissingFileError
-from torchtrack.eval.evaluate import evaluate
+from torchtrack.eval.evaluate import evaluate, measure
 from torchtrack.eval.metrics import PoseErrors, pose_errors, summarise
 from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table
@@ -134,6 +134,86 @@ def write_ball_and_box(folder):
     path = write_tiny_sequence(folder, "mixed", labels=("ball", "box"), duration_us=20_000)
     trimesh.creation.icosphere(subdivisions=3, radius=0.06).export(folder / "mixed_ball.ply")
     return path
+
+
+# ---- taken up again
+
+
+METHODS = {"default": {}, "line": {"preset": "line"}}
+
+
+def broken_off(paths, tmp_path, after):
+    """The configuration of an evaluation that was interrupted after so many sequences."""
+    config = EvaluateConfig(paths=paths, methods=METHODS, jobs=1, output=tmp_path / "out")
+    done = []
+
+    def interrupt(job):
+        done.append(job)
+        if len(done) == after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(config, interrupt)
+    return config
+
+
+def measured_by(monkeypatch):
+    """Names and methods of the sequences that are really tracked from now on."""
+    tracked = []
+
+    def watched(jobs, tell, limits):
+        tracked.extend((job.path.stem, job.method) for job in jobs)
+        return measure(jobs, tell, limits)
+
+    monkeypatch.setattr("torchtrack.eval.evaluate.measure", watched)
+    return tracked
+
+
+def figures(evaluation):
+    """All that was measured but the times."""
+    rows = [[entry.sequence, entry.object, entry.method, finite(entry.metrics.as_dict()), entry.status] for entry in evaluation.results]
+    return rows, [entry.as_json() for entry in evaluation.not_applicable], [entry.errors.rotation_deg.tolist() for entry in evaluation.results]
+
+
+def test_an_evaluation_that_was_broken_off_is_taken_up_again(folder, tmp_path, monkeypatch):
+    (tmp_path / "mixed").mkdir()
+    config = broken_off((folder, write_ball_and_box(tmp_path / "mixed")), tmp_path, 3)
+    tracked, done = measured_by(monkeypatch), []
+    resumed = evaluate(config.model_copy(update={"resume": True}), done.append)
+    assert len(tracked) == 3 and len(done) == 6
+    anew = evaluate(config.model_copy(update={"output": tmp_path / "anew"}))
+    assert len(tracked) == 9
+    assert figures(resumed) == figures(anew)
+    assert (tmp_path / "out" / "errors.csv").read_text() == (tmp_path / "anew" / "errors.csv").read_text()
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["errors.csv", "metrics.json"]
+
+
+def test_all_is_measured_anew_unless_it_is_to_be_resumed(folder, tmp_path, monkeypatch):
+    config = broken_off((folder,), tmp_path, 3)
+    tracked = measured_by(monkeypatch)
+    evaluate(config)
+    assert len(tracked) == 4
+
+
+def test_what_was_measured_otherwise_or_not_to_the_end_is_measured_anew(folder, tmp_path, monkeypatch):
+    config = broken_off((folder,), tmp_path, 3).model_copy(update={"resume": True})
+    journal = tmp_path / "out" / "outcomes.jsonl"
+    journal.write_text(journal.read_text()[:-20])
+    tracked = measured_by(monkeypatch)
+    slower = MethodConfig.model_validate({"preset": "line", "tracker": {"window": {"duration_us": 2500}}})
+    evaluate(config.model_copy(update={"methods": {**config.methods, "line": slower}}))
+    assert tracked == [("one", "line"), ("two", "default"), ("two", "line")]
+
+
+def test_what_failed_is_tried_again(folder, tmp_path, monkeypatch):
+    bad = tmp_path / "bad.npz"
+    bad.write_bytes(b"no archive")
+    config = EvaluateConfig(paths=(bad, folder / "two.npz"), jobs=1, output=tmp_path / "out")
+    assert len(evaluate(config).failures) == 1
+    tracked = measured_by(monkeypatch)
+    evaluation = evaluate(config.model_copy(update={"resume": True}))
+    assert tracked == [("bad", "default")]
+    assert len(evaluation.failures) == 1 and len(evaluation.results) == 2
 
 
 def test_an_object_that_a_method_is_not_made_for_is_no_failure(tmp_path):

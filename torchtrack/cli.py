@@ -104,6 +104,8 @@ class Evaluate:
     """Sequences that each tracks at once, as one batch."""
     report: Annotated[Literal["sequences", "compact"] | None, _option("sequences|compact")] = None
     """A row per sequence, object and method; or one per method, also as Markdown, LaTeX, CSV and JSON."""
+    resume: bool = False
+    """Take up an evaluation into the same folder that was broken off: what it measured with the same settings is kept."""
     estimate_latency: bool = False
     """Track nothing; find how late the events of each sequence are against its ground truth."""
     quiet: bool = False
@@ -119,7 +121,7 @@ class Evaluate:
                 raise ConfigError(f"command line: {', '.join(useless)}: not with --estimate-latency, which takes one sequence after the other.")
             return show_latency(self.paths)
         chosen = self.methods.split(",") if self.methods else None
-        given = _given(self, ("config", "methods", "quiet", "paths", "estimate_latency"))
+        given = _given(self, ("config", "methods", "quiet", "paths", "estimate_latency", "resume")) | ({"resume": True} if self.resume else {})
         if self.paths:
             given["paths"] = [CommandLineText(path) for path in self.paths]
         return evaluate(self.config, given, overrides, chosen, quiet=self.quiet)

@@ -55,6 +55,7 @@ class EvaluateConfig(Settings):
     output: ConfigPath = Field(
         default_factory=lambda: Path.cwd() / "outputs" / "evaluate", description="Folder for the results; by default in the working folder."
     )
+    resume: bool = Field(False, description="Take up an evaluation that was broken off: what is measured already is not measured again.")
     lost_rotation_deg: float = Field(10.0, gt=0, le=180, description="A window with a larger rotation error counts as lost (°).")
     lost_translation_cm: float = Field(5.0, gt=0, description="A window with a larger translation error counts as lost (cm).")
 

@@ -11,6 +11,7 @@ from torchtrack.config.run import RunConfig
 from torchtrack.errors import EventDataError
 from torchtrack.eval.compact import compact_report
 from torchtrack.eval.grid import Report
+from torchtrack.eval.journal import Journal, Measured, identity
 from torchtrack.eval.metrics import PoseErrors, summarise
 from torchtrack.eval.paper import check_cells, paper_report
 from torchtrack.eval.results import Evaluation, Failure, NotApplicable, ObjectResult, write_results
@@ -48,7 +49,7 @@ class Plan:
 
 
 # What became of one job: what was measured and what the method is not made for, or why it failed.
-Outcome = Sequence[ObjectResult | NotApplicable] | Failure
+Outcome = Measured | Failure
 
 
 def plan(config: EvaluateConfig, simulating: Told = lambda name, share: None) -> Plan:
@@ -70,7 +71,8 @@ def plan(config: EvaluateConfig, simulating: Told = lambda name, share: None) ->
 def evaluate(config: EvaluateConfig, on_done: Callable[[Job], None] = lambda job: None, planned: Plan | None = None) -> Evaluation:
     """Track every sequence with every method; write ``metrics.json``, ``errors.csv`` and the report's tables into the output folder.
 
-    A sequence that fails is reported; the others go on.
+    A sequence that fails is reported; the others go on. Until all is done without a failure, ``outcomes.jsonl`` beside the results
+    keeps what was measured, for ``config.resume``.
 
     Args:
         config: what to do.
@@ -82,11 +84,8 @@ def evaluate(config: EvaluateConfig, on_done: Callable[[Job], None] = lambda job
         MissingFileError: if a path that is named is not there.
     """
     planned = planned or plan(config)
-    outcomes: dict[int, Outcome] = {}
-    for index, outcome in _outcomes(planned.jobs, config):
-        outcomes[index] = outcome
-        on_done(planned.jobs[index])
-    ordered = [outcomes[index] for index in range(len(planned.jobs))]
+    journal = Journal(config.output / "outcomes.jsonl", _limits(config))
+    ordered = _measured_once(planned.jobs, config, journal, on_done)
     entries = [entry for outcome in ordered if not isinstance(outcome, Failure) for entry in outcome]
     evaluation = Evaluation(
         tuple(entry for entry in entries if isinstance(entry, ObjectResult)),
@@ -96,7 +95,31 @@ def evaluate(config: EvaluateConfig, on_done: Callable[[Job], None] = lambda job
     write_results(evaluation, config.output)
     if report := report_of(evaluation, config, planned):
         report.write(config.output)
+    if not evaluation.failures:
+        journal.remove()
     return evaluation
+
+
+def _measured_once(jobs: Sequence[Job], config: EvaluateConfig, journal: Journal, on_done: Callable[[Job], None]) -> list[Outcome]:
+    """The outcome of every job; what the journal knows is not measured again, where that is asked for."""
+    names = [identity(job.path, job.method, job.config, _limits(config)) for job in jobs]
+    known = {name: measured for name, measured in (journal.read() if config.resume else {}).items() if name in names}
+    journal.begin(known)
+    outcomes: dict[int, Outcome] = {number: known[name] for number, name in enumerate(names) if name in known}
+    for number in outcomes:
+        on_done(jobs[number])
+    left = [number for number in range(len(jobs)) if number not in outcomes]
+    for index, outcome in _outcomes([jobs[number] for number in left], config):
+        outcomes[left[index]] = outcome
+        if not isinstance(outcome, Failure):
+            journal.add(names[left[index]], outcome)
+        on_done(jobs[left[index]])
+    return [outcomes[number] for number in range(len(jobs))]
+
+
+def _limits(config: EvaluateConfig) -> tuple[float, float]:
+    """From which rotation (degrees) and translation (cm) on a window counts as lost."""
+    return config.lost_rotation_deg, config.lost_translation_cm
 
 
 def report_of(evaluation: Evaluation, config: EvaluateConfig, planned: Plan) -> Report | None:
@@ -114,7 +137,7 @@ def _run_config(path: Path, method: MethodConfig, config: EvaluateConfig) -> Run
 
 def _outcomes(jobs: Sequence[Job], config: EvaluateConfig) -> Iterator[tuple[int, Outcome]]:
     """The outcome of each job as it comes, with its number."""
-    function = partial(measure, limits=(config.lost_rotation_deg, config.lost_translation_cm))
+    function = partial(measure, limits=_limits(config))
     for numbers, outcomes in run_in_groups(function, jobs, [job.method for job in jobs], config.streams, config.executor, config.jobs):
         for number, outcome in zip(numbers, outcomes, strict=True):
             job = jobs[number]

@@ -1,0 +1,79 @@
+"""What an evaluation has measured so far, a line of JSON each: one that was broken off can be taken up again."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import torchtrack
+from torchtrack.config.run import RunConfig
+from torchtrack.eval.metrics import PoseErrors, summarise
+from torchtrack.eval.results import NotApplicable, ObjectResult
+
+Measured = Sequence[ObjectResult | NotApplicable]
+"""What was measured of one sequence under one method."""
+
+
+def identity(path: Path, method: str, config: RunConfig, limits: tuple[float, float]) -> str:
+    """What tells a measurement from others: the sequence as it is on disk, the method with all its settings, and the version of this package."""
+    there = path.stat() if path.exists() else None
+    file = (str(path.resolve()), there and there.st_size, there and there.st_mtime_ns)
+    told = json.dumps([file, method, config.model_dump(mode="json"), limits, torchtrack.__version__], sort_keys=True)
+    return hashlib.sha256(told.encode()).hexdigest()
+
+
+class Journal:
+    """Measurements by their :func:`identity`, in a file that grows by a line with each.
+
+    Args:
+        path: of the file.
+        limits: from which rotation (degrees) and translation (cm) on a window counts as lost.
+    """
+
+    def __init__(self, path: Path, limits: tuple[float, float]) -> None:
+        self._path, self._limits = path, limits
+
+    def read(self) -> dict[str, Measured]:
+        """All that is in the file; of a line that was not written to its end, nothing."""
+        if not self._path.exists():
+            return {}
+        lines = self._path.read_text(encoding="utf-8").split("\n")
+        # What stands after the last line's end was broken off.
+        whole = [json.loads(line) for line in lines[:-1] if line]
+        return {line["identity"]: [self._entry(values) for values in line["measured"]] for line in whole}
+
+    def begin(self, known: Mapping[str, Measured]) -> None:
+        """Begin the file anew, with what is known already."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._path.write_text("".join(_line(name, measured) for name, measured in known.items()), encoding="utf-8")
+
+    def add(self, name: str, measured: Measured) -> None:
+        """Write one measurement."""
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(_line(name, measured))
+
+    def remove(self) -> None:
+        """Take the file away: all is done."""
+        self._path.unlink(missing_ok=True)
+
+    def _entry(self, values: dict[str, Any]) -> ObjectResult | NotApplicable:
+        if "reason" in values:
+            return NotApplicable(**values)
+        errors = values.pop("errors")
+        t_us, *measures = errors["t_us"], errors["rotation_deg"], errors["translation_cm"]
+        of_windows = PoseErrors(torch.tensor(t_us, dtype=torch.int64), *(torch.tensor(values, dtype=torch.float64) for values in measures))
+        return ObjectResult(errors=of_windows, metrics=summarise(of_windows, *self._limits), **values)
+
+
+def _line(name: str, measured: Measured) -> str:
+    return json.dumps({"identity": name, "measured": [_as_json(entry) for entry in measured]}) + "\n"
+
+
+def _as_json(entry: ObjectResult | NotApplicable) -> dict[str, Any]:
+    if isinstance(entry, NotApplicable):
+        return dict(vars(entry))
+    errors = {name: values.tolist() for name, values in vars(entry.errors).items()}
+    return {name: value for name, value in vars(entry).items() if name != "metrics"} | {"errors": errors}
