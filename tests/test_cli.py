@@ -179,3 +179,11 @@ def test_outline_makes_a_model(tmp_path, capsys):
     assert len(json.loads((tmp_path / "model.json").read_text())["polylines"]) == 1
     assert command(*arguments, "--tracker.flow.iterations", 3) == 2
     assert "takes no settings" in capsys.readouterr().err
+
+
+def test_the_package_is_run_as_the_command_is(tmp_path):
+    there, nowhere = (
+        subprocess.run([sys.executable, "-m", "torchtrack", *rest], capture_output=True, text=True) for rest in (["--help"], ["info", "nowhere.raw"])
+    )
+    assert there.returncode == 0 and "usage: torchtrack" in there.stdout
+    assert nowhere.returncode == 1 and "nowhere.raw" in nowhere.stderr

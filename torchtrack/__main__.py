@@ -1,0 +1,7 @@
+"""``python -m torchtrack`` is ``torchtrack``, where the environment's scripts are not on the path."""
+
+import sys
+
+from torchtrack.cli import main
+
+sys.exit(main())
