@@ -34,7 +34,8 @@ class Journal:
     """
 
     def __init__(self, path: Path, limits: tuple[float, float]) -> None:
-        self._path, self._limits = path, limits
+        self._path, self._limits, self._before = path, limits, ""
+        self._begun = False
 
     def read(self) -> dict[str, Measured]:
         """All that is in the file; of a line that was not written to its end, nothing."""
@@ -46,14 +47,15 @@ class Journal:
         return {line["identity"]: [self._entry(values) for values in line["measured"]] for line in whole}
 
     def begin(self, known: Mapping[str, Measured]) -> None:
-        """Begin the file anew, with what is known already."""
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._path.write_text("".join(_line(name, measured) for name, measured in known.items()), encoding="utf-8")
+        """Have the file begin anew with what is known already, once there is more to write: what cannot even start leaves nothing behind."""
+        self._before, self._begun = "".join(_line(name, measured) for name, measured in known.items()), False
 
     def add(self, name: str, measured: Measured) -> None:
         """Write one measurement."""
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(_line(name, measured))
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.open("a" if self._begun else "w", encoding="utf-8") as file:
+            file.write(_line(name, measured) if self._begun else self._before + _line(name, measured))
+        self._begun = True
 
     def remove(self) -> None:
         """Take the file away: all is done."""
