@@ -9,8 +9,7 @@ from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, 
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import CornerConfig, SearchConfig, TrackerConfig
-from torchtrack.doubt import Doubt, drifted, gathered_when_known, in_doubt, is_adrift, is_due, is_wanted
-from torchtrack.doubt import slipped as as_if_slipped
+from torchtrack.doubt import Doubt, drifted, gathered_when_known, in_doubt, is_adrift, is_due, is_wanted, less_certain
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
@@ -164,7 +163,7 @@ def slipped(config, count=10, streams=1, displaced=0):
 def test_of_what_slipped_one_is_less_certain_in_all_ways_and_of_others_as_before():
     _, prediction, *_ = in_motion()
     two = prediction.copies(0, 2)
-    covariance = as_if_slipped(two, 1, 5.0).covariance
+    covariance = less_certain(two, 1, 0.5, 2.5).covariance
     torch.testing.assert_close(covariance[1], 25 * two.covariance[1])
     assert torch.equal(covariance[0], two.covariance[0])
     torch.testing.assert_close(two.covariance[1], prediction.covariance[0])

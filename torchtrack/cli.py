@@ -73,7 +73,7 @@ class Track:
 
         if not self.configs:
             raise ConfigError("command line: track needs a config file or a source.")
-        given = _given(self, ("configs", "quiet", "compiled", *_OF_MANY)) | ({"compiled": True} if self.compiled else {}) | overrides
+        given = _given(self, ("configs", "quiet", *_OF_MANY)) | overrides
         of_many = {name: getattr(self, name) for name in _OF_MANY if getattr(self, name) is not None}
         if len(self.configs) > 1:
             return track_many(self.configs, given, **of_many, quiet=self.quiet)
@@ -121,7 +121,7 @@ class Evaluate:
                 raise ConfigError(f"command line: {', '.join(useless)}: not with --estimate-latency, which takes one sequence after the other.")
             return show_latency(self.paths)
         chosen = self.methods.split(",") if self.methods else None
-        given = _given(self, ("config", "methods", "quiet", "paths", "estimate_latency", "resume")) | ({"resume": True} if self.resume else {})
+        given = _given(self, ("config", "methods", "quiet", "paths", "estimate_latency"))
         if self.paths:
             given["paths"] = [CommandLineText(path) for path in self.paths]
         return evaluate(self.config, given, overrides, chosen, quiet=self.quiet)
@@ -286,7 +286,8 @@ def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]
 
 def _given(command: Any, without: tuple[str, ...]) -> dict[str, Any]:
     """The options of a command that were given and are settings, ready to be laid over a config file."""
-    values = {name: value for name, value in vars(command).items() if name not in without and value is not None}
+    # A flag that is not there says nothing: the file may set it.
+    values = {name: value for name, value in vars(command).items() if name not in without and value is not None and value is not False}
     return {name: CommandLineText(value) if isinstance(value, str) else value for name, value in values.items()}
 
 

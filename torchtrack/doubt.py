@@ -110,11 +110,11 @@ def drifted(prediction: Prediction, doubt: Doubt, config: SearchConfig) -> Predi
     return replace(prediction, covariance=prediction.covariance + doubt.adrift[:, None, None] * (root @ root.mT))
 
 
-def slipped(prediction: Prediction, number: int, times: float) -> Prediction:
-    """The prediction, of the object ``number`` so many times less certain.
+def less_certain(prediction: Prediction, number: int, sigma_px: float, wider_px: float) -> Prediction:
+    """The prediction, of the object ``number`` as if its standard deviation in the image, ``sigma_px``, were ``wider_px``.
 
     A pose that slipped was sure of itself all the while: its covariance tells the directions it can be off in, but not how far.
     """
     covariance = prediction.covariance.clone()
-    covariance[number] *= times**2
+    covariance[number] *= (wider_px / max(sigma_px, 1e-6)) ** 2
     return replace(prediction, covariance=covariance)

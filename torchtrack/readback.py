@@ -3,11 +3,10 @@
 On the CPU a value is there once it is computed: sizes are exact, and a decision is taken where it comes up. A GPU works off
 a queue, and to read a value from it is to wait until the queue is empty, with nothing new in it. There, sizes are bounds
 that the settings and the image give, and what must be decided is asked for early (:class:`Answer`): its copy is begun in
-the middle of a window's work, and looked at once much more has been queued behind it. One decision cannot wait for
-that: whether a pose slipped, which its own window tells, and late.
+the middle of a window's work, and looked at once much more has been queued behind it. One is not: whether to search hangs
+on what the window's own alignment explains, and there the queue runs dry once.
 
-So the queue does not run dry, though the CPU is never a whole window ahead, and every decision is the one that the CPU
-takes. The flag of the window before would be there already, but objects would be searched for a window late. To
+So the CPU is never a whole window ahead, and every decision is the one that the CPU takes. The flag of the window before would be there already, but objects would be searched for a window late. To
 ``torch.cuda.set_sync_debug_mode`` an answer is no synchronisation: it reports what waits for all that is queued.
 """
 

@@ -13,9 +13,8 @@ from torchtrack import quality, readback
 from torchtrack.alignment import Fit, align, gate_widening, index_for
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.contours import Contours
-from torchtrack.doubt import Doubt, drifted, slipped
+from torchtrack.doubt import Doubt, drifted, less_certain
 from torchtrack.hypotheses import promising
-from torchtrack.motion import inverse
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.once import once
 from torchtrack.pose_problem import Linearisation
@@ -133,15 +132,15 @@ def _search_slipped(
     Held by its prediction, no pose some pixels away is found, however much it explains. What is found goes on as certain as
     if it had been predicted: who is not held at all wanders off from one find to the next.
     """
-    loose = slipped(prediction, number, config.search.slip_sigma_px / max(sigma_px, 1e-6))
-    other = search(number, loose, config.search.slip_sigma_px, least, events, found, config)
+    slip_px = config.search.slip_sigma_px
+    other = search(number, less_certain(prediction, number, sigma_px, slip_px), slip_px, least, events, found, config)
     if other is found:
         return found
     solution = other.fit.solution
-    held, let_go = (inverse(of.covariance[number][None])[0] for of in (prediction, loose))
+    let_go = config.solver.observation_px**2 * (1 - (sigma_px / slip_px) ** 2) * prediction.information[number]
     hessian = solution.hessian.clone()
     is_taken = (solution.T_cam_obj[number] != found.fit.solution.T_cam_obj[number]).any()
-    hessian[number, :12, :12] += (config.solver.observation_px**2 * (held - let_go) * is_taken).to(hessian.dtype)
+    hessian[number, :12, :12] += (let_go * is_taken).to(hessian.dtype)
     return replace(other, fit=replace(other.fit, solution=replace(solution, hessian=hessian)))
 
 
@@ -157,7 +156,7 @@ def search(
     """
     settings = config.search
     widened_px = max(sigma_px, settings.least_sigma_px)
-    covariance = prediction.covariance[number] * (widened_px / max(sigma_px, 1e-6)) ** 2
+    covariance = less_certain(prediction, number, sigma_px, widened_px).covariance[number]
     one, seen = prediction.copies(number, 1), events.of(number)
     places = one.carried(seen.pixels, seen.age_s), seen.mask
     offsets = promising(one, found.fit.contours.of(number), covariance, widened_px, places, config)

@@ -34,8 +34,9 @@ class Journal:
     """
 
     def __init__(self, path: Path, limits: tuple[float, float]) -> None:
-        self._path, self._limits, self._before = path, limits, ""
-        self._begun = False
+        self._path, self._limits = path, limits
+        # What stands before the first line that is added; none once that is written.
+        self._before: str | None = ""
 
     def read(self) -> dict[str, Measured]:
         """All that is in the file; of a line that was not written to its end, nothing."""
@@ -48,14 +49,14 @@ class Journal:
 
     def begin(self, known: Mapping[str, Measured]) -> None:
         """Have the file begin anew with what is known already, once there is more to write: what cannot even start leaves nothing behind."""
-        self._before, self._begun = "".join(_line(name, measured) for name, measured in known.items()), False
+        self._before = "".join(_line(name, measured) for name, measured in known.items())
 
     def add(self, name: str, measured: Measured) -> None:
         """Write one measurement."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("a" if self._begun else "w", encoding="utf-8") as file:
-            file.write(_line(name, measured) if self._begun else self._before + _line(name, measured))
-        self._begun = True
+        with self._path.open("a" if self._before is None else "w", encoding="utf-8") as file:
+            file.write((self._before or "") + _line(name, measured))
+        self._before = None
 
     def remove(self) -> None:
         """Take the file away: all is done."""
