@@ -6,8 +6,9 @@ that the settings and the image give, and what must be decided is asked for earl
 the middle of a window's work, and looked at once much more has been queued behind it. One is not: whether to search hangs
 on what the window's own alignment explains, and there the queue runs dry once.
 
-So the CPU is never a whole window ahead, and every decision is the one that the CPU takes. The flag of the window before would be there already, but objects would be searched for a window late. To
-``torch.cuda.set_sync_debug_mode`` an answer is no synchronisation: it reports what waits for all that is queued.
+So the CPU is never a whole window ahead, and every decision is the one that the CPU takes. The flag of the window before
+would be there already, but objects would be searched for a window late. To ``torch.cuda.set_sync_debug_mode`` an answer is
+no synchronisation: it reports what waits for all that is queued.
 """
 
 from dataclasses import dataclass
