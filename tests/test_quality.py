@@ -36,7 +36,7 @@ def matches_at(targets, near=None, offsets=0.0):
     nothing = torch.zeros(near.shape, dtype=torch.int64)
     points = torch.zeros(*near.shape, 3, dtype=torch.float64)
     directions, zeros = torch.zeros_like(targets), torch.zeros_like(offsets)
-    return Matches(nothing, torch.zeros_like(near), torch.ones_like(offsets), zeros, points, targets, directions, offsets, near, zeros)
+    return Matches(nothing, torch.zeros_like(near), torch.ones_like(offsets), zeros, points, targets, directions, offsets, near, zeros, zeros)
 
 
 def upright_line(u=80.0, count=80, first=20.0):

@@ -11,7 +11,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_index import ContourIndex, index_contours
 from torchtrack.contours import Contours, reproject
 from torchtrack.implicit_gradient import with_gradient
-from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
+from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest, told_by_each
 from torchtrack.observations import Observations
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
 from torchtrack.pose_solver import solve_pose
@@ -150,7 +150,7 @@ def _believed(matches: Matches, observations: Observations, config: TrackerConfi
     if observations.trust is not None:
         weights = weights * observations.trust
     enough = weights.sum(-1, keepdim=True) >= config.quality.min_observations
-    return replace(matches, mask=matches.mask & enough, weights=weights * enough)
+    return replace(matches, mask=matches.mask & enough, weights=weights * enough * told_by_each(matches.beside, config.solver))
 
 
 def _problem(

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.linalg import vecdot
 
 from torchtrack.bursts import without_tail
-from torchtrack.config.tracker import MatchingConfig
+from torchtrack.config.tracker import MatchingConfig, SolverConfig
 from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contour_model import ContourKind
@@ -45,6 +45,7 @@ class Matches:
         offsets: distance of each observation from its contour along the normal, in px over the widening of the gate.
         near: which observations have a contour so near that ``offsets`` says something, matched or not.
         limb: 1 where the contour is the limb of a smooth surface, 0 where not.
+        beside: how many observations are on the contour in the patch of the image that each lies in.
     """
 
     contour: Int[Tensor, "b n"]
@@ -57,6 +58,7 @@ class Matches:
     offsets: Float[Tensor, "b n"]
     near: Bool[Tensor, "b n"]
     limb: Float[Tensor, "b n"]
+    beside: Float[Tensor, "b n"]
 
 
 @dataclass(frozen=True)
@@ -125,12 +127,12 @@ def match_nearest(
     near = observations.mask & (found >= 0)
     matched = near & (vecdot(difference, difference) < (gate_px * wider)[:, None].square())
     offsets = vecdot(difference, normals) / wider[:, None]
-    weights = _weights(offsets, targets, near, dark * oriented, config)
+    weights, beside = _weights(offsets, targets, near, dark * oriented, config)
     if config.print_polarity:
         weights = weights * _agreeing(dark * printed, config)
     if config.mutual_px:
         weights = weights * mutual_agreement(pixels, offsets, matched, config.mutual_px)
-    matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb)
+    matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb, beside)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)
 
@@ -140,15 +142,13 @@ def _leading(speed_px_s: Tensor) -> Tensor:
     return speed_px_s / (speed_px_s.abs() + constant((_SLOW_PX_S,), speed_px_s.dtype, speed_px_s.device))
 
 
-def _weights(offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, config: MatchingConfig) -> Tensor:
-    """How far each observation is to be trusted, by those around it."""
-    if not (config.concentration or config.polarity):
-        return torch.ones_like(offsets)
+def _weights(offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, config: MatchingConfig) -> tuple[Tensor, Tensor]:
+    """How far each observation is to be trusted, by those around it, and how many of these are on the contour."""
     cell, on_and_near = patch(targets), on_and_around(offsets, near)
     values = torch.cat([on_and_near, on_and_near[:, :1] * dark[:, None]], 1)
     on_count, near_count, votes = patch_sums(cell, values).gather(2, cell[:, None].expand(-1, 3, -1)).unbind(1)
     weights = concentration(on_count, near_count, config) if config.concentration else torch.ones_like(offsets)
-    return weights * polarity_agreement(dark, votes, on_count, config) if config.polarity else weights
+    return weights * polarity_agreement(dark, votes, on_count, config) if config.polarity else weights, on_count
 
 
 def concentration(on_count: Float[Tensor, "b n"], near_count: Float[Tensor, "b n"], config: MatchingConfig) -> Float[Tensor, "b n"]:
@@ -207,6 +207,19 @@ def mutual_agreement(
     return torch.addcmul(one(known), known, relative * relative).reciprocal()
 
 
+def told_by_each(beside: Float[Tensor, "b n"], config: SolverConfig) -> Float[Tensor, "b n"]:
+    """What each of so many observations in one place of the image tells, of what it would tell alone.
+
+    Side by side they err alike: the model, the lens and shading put a whole piece of contour off, so that the mean of n has a
+    variance of ``common_px² + observation_px² / n``. Otherwise a pose would follow the places with the most events, and what
+    is seen of an object that is half hidden would seem to tell all.
+
+    Args:
+        beside: how many observations are on the contour in the place of each.
+    """
+    return torch.add(one(beside), beside, alpha=(config.common_px / config.observation_px) ** 2).reciprocal()
+
+
 def _two(like: Tensor) -> Tensor:
     return constant((2.0,), like.dtype, like.device)
 
@@ -254,7 +267,8 @@ def match_along_flow(observations: Observations, contours: Contours, objects: Mo
     mask = observations.mask & observations.has_flow & torch.isfinite(distance)
     offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
     limb = (contours.kind == int(ContourKind.LIMB)).gather(1, contour).to(offsets.dtype)
-    return Matches(contour, mask, torch.ones_like(offsets), observations.age_s, points_obj, targets, directions, offsets, mask, limb)
+    alone = torch.zeros_like(offsets)
+    return Matches(contour, mask, torch.ones_like(offsets), observations.age_s, points_obj, targets, directions, offsets, mask, limb, alone)
 
 
 def both_coordinates(matches: Matches) -> Matches:

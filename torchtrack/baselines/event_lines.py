@@ -177,6 +177,7 @@ class EventLineTracker(Tracker):
                 offsets=((take_points(contours.pixels, point) - targets) * take_points(contours.normals, point)).sum(-1),
                 near=near.mask & belongs,
                 limb=torch.zeros_like(near.age_s),
+                beside=torch.zeros_like(near.age_s),
             )
             solution = solve_pose(self._problem(window, matches, information, gate_px), T_cam_obj, self.config.solver)
             T_cam_obj = solution.T_cam_obj
