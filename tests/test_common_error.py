@@ -1,13 +1,16 @@
 """What observations that lie side by side have in common: many of them do not tell as much more."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
-from tracked_boxes import in_motion, started
+from tracked_boxes import in_motion
 
 from torchtrack.alignment import align, gate_widening, index_for
 from torchtrack.config.tracker import MatchingConfig, SolverConfig, TrackerConfig
 from torchtrack.contour_index import index_contours
+from torchtrack.contour_model import ContourKind
 from torchtrack.matching import ContourTable, match_nearest, told_by_each
 from torchtrack.observations import join, select_events
 
@@ -38,10 +41,11 @@ def test_observations_are_counted_by_patch_where_they_are_on_a_contour():
     assert matches.beside[0].tolist() == [30] * 30 + [5] * 5 + [30] * 8
 
 
-def solved(times, config):
-    """The solution of a box's window with each of its events observed so many times."""
+def solved(times, config, kind=ContourKind.LIMB):
+    """A window of a box whose edges are taken for those of ``kind``, with each of its events observed so many times."""
     tracker, prediction, events, _, _ = in_motion(config)
     contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
+    contours = replace(contours, kind=torch.full_like(contours.kind, int(kind)))
     tight = gate_widening(torch.zeros(1), tracker.config)
     index = index_for(contours, tracker.image_size, tracker.config, tight)
     once = observations = select_events(events, index, prediction.plane_velocity(events.pixels), 1000)
@@ -50,24 +54,27 @@ def solved(times, config):
     return prediction, align(prediction, contours, index, tight, observations, tracker.config).solution
 
 
-def told(times, config):
+def told(times, config, kind=ContourKind.LIMB):
     """How much these tell of the pose, beside what was predicted: the trace of the information, by the prediction's covariance."""
-    prediction, solution = solved(times, config)
+    prediction, solution = solved(times, config, kind)
     observed = solution.hessian[0, :6, :6].double() / config.solver.observation_px**2 - prediction.information[0, :6, :6]
     return float((observed @ prediction.covariance[0, :6, :6]).trace())
 
 
-def test_events_seen_many_times_over_tell_little_more():
+def test_events_of_a_limb_seen_many_times_over_tell_little_more():
     assert told(8, WITHOUT) / told(1, WITHOUT) == pytest.approx(8, rel=0.2)
     assert 1 < told(8, TrackerConfig()) / told(1, TrackerConfig()) < 5
 
 
+@pytest.mark.parametrize("kind", [ContourKind.CREASE, ContourKind.TEXTURE, ContourKind.SEGMENT, ContourKind.LEARNED])
+def test_what_is_no_limb_has_nothing_in_common(kind):
+    for theirs, ours in zip(*(vars(solved(2, config, kind)[1]).values() for config in (WITHOUT, TrackerConfig())), strict=True):
+        assert torch.equal(theirs, ours)
+
+
 def test_what_is_in_common_leaves_exact_poses_alone():
-    for config in (WITHOUT, TrackerConfig()):
-        *_, trajectory = started(config=config)
-        _, solution = solved(1, config)
-        truth = trajectory.at(torch.tensor([30_000]))
-        assert float((solution.T_cam_obj.double() - truth).abs().max()) < 3e-3
+    *_, truth = in_motion()
+    assert float((solved(1, TrackerConfig())[1].T_cam_obj.double() - truth).abs().max()) < 3e-3
 
 
 def test_a_displaced_place_with_many_events_pulls_less_with_an_error_in_common():

@@ -150,7 +150,7 @@ def _believed(matches: Matches, observations: Observations, config: TrackerConfi
     if observations.trust is not None:
         weights = weights * observations.trust
     enough = weights.sum(-1, keepdim=True) >= config.quality.min_observations
-    return replace(matches, mask=matches.mask & enough, weights=weights * enough * told_by_each(matches.beside, config.solver))
+    return replace(matches, mask=matches.mask & enough, weights=weights * enough * told_by_each(matches.beside * matches.limb, config.solver))
 
 
 def _problem(

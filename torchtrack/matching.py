@@ -210,12 +210,12 @@ def mutual_agreement(
 def told_by_each(beside: Float[Tensor, "b n"], config: SolverConfig) -> Float[Tensor, "b n"]:
     """What each of so many observations in one place of the image tells, of what it would tell alone.
 
-    Side by side they err alike: the model, the lens and shading put a whole piece of contour off, so that the mean of n has a
-    variance of ``common_px² + observation_px² / n``. Otherwise a pose would follow the places with the most events, and what
-    is seen of an object that is half hidden would seem to tell all.
+    Side by side they err alike, those of the limb of a smooth surface above all: its model, which has facets, and its shading put
+    a whole piece off. So the mean of n has a variance of ``common_px² + observation_px² / n``. Otherwise a pose would follow the
+    places with the most events, and what is seen of an object that is half hidden would seem to tell all.
 
     Args:
-        beside: how many observations are on the contour in the place of each.
+        beside: how many observations are on the contour in the place of each; zero for what has nothing in common.
     """
     return torch.add(one(beside), beside, alpha=(config.common_px / config.observation_px) ** 2).reciprocal()
 

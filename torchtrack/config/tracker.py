@@ -149,8 +149,10 @@ class SolverConfig(Settings):
     gradient_iterations: int = Field(1, ge=0, le=100, description="Newton steps to the optimum where gradients of the pose are asked for.")
     damping: float = Field(1e-6, ge=0, description="Initial damping, as a share of the Hessian's diagonal.")
     prior: bool = Field(True, description="Weigh the observations against the prediction by its covariance, and find the velocity with the pose.")
-    observation_px: float = Field(1.2, gt=0, description="Standard deviation of one observation (px), with its share of what all have in common.")
-    common_px: float = Field(0.2, ge=0, le=10, description="The same of what observations in one place of the image have in common beside it (px).")
+    observation_px: float = Field(1.5, gt=0, description="Standard deviation of one observation (px), with its share of what all have in common.")
+    common_px: float = Field(
+        0.25, ge=0, le=10, description="The same of what observations of a smooth limb in one place of the image have in common beside it (px)."
+    )
     velocity_in_window: bool = Field(True, description="Older observations tell of the velocity: pose and velocity are found together.")
     acceleration_in_window: bool = Field(
         True, description="A velocity that is other than predicted became so steadily over the window, as far as it was certain."
