@@ -9,7 +9,7 @@ from helpers import random_pose
 from tiny_sequence import write_tiny_sequence
 
 from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
-from torchtrack.errors import ConfigError, MissingFileError
+from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
 from torchtrack.eval.evaluate import evaluate, measure
 from torchtrack.eval.metrics import PoseErrors, pose_errors, summarise
 from torchtrack.eval.sources import find_sequences
@@ -203,6 +203,17 @@ def test_what_was_measured_otherwise_or_not_to_the_end_is_measured_anew(folder, 
     slower = MethodConfig.model_validate({"preset": "line", "tracker": {"window": {"duration_us": 2500}}})
     evaluate(config.model_copy(update={"methods": {**config.methods, "line": slower}}))
     assert tracked == [("one", "line"), ("two", "default"), ("two", "line")]
+
+
+@pytest.mark.parametrize("line", ["no json", "{}", '{"identity": "a"}', '{"identity": "a", "measured": [{}]}', "[1]", "\x00"])
+def test_a_file_of_measurements_that_is_none_is_told_and_kept(folder, tmp_path, line):
+    config = broken_off((folder,), tmp_path, 2).model_copy(update={"resume": True})
+    journal = tmp_path / "out" / "outcomes.jsonl"
+    spoilt = journal.read_text() + line + "\n"
+    journal.write_text(spoilt)
+    with pytest.raises(UnknownFormatError, match=r"line 3 of '.*outcomes\.jsonl' is not a measurement .*without --resume"):
+        evaluate(config)
+    assert journal.read_text() == spoilt
 
 
 def test_what_failed_is_tried_again(folder, tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ import torch
 
 import torchtrack
 from torchtrack.config.run import RunConfig
+from torchtrack.errors import UnknownFormatError
 from torchtrack.eval.metrics import PoseErrors, summarise
 from torchtrack.eval.results import NotApplicable, ObjectResult
 
@@ -39,13 +40,16 @@ class Journal:
         self._before: str | None = ""
 
     def read(self) -> dict[str, Measured]:
-        """All that is in the file; of a line that was not written to its end, nothing."""
+        """All that is in the file; of a line that was not written to its end, nothing.
+
+        Raises:
+            UnknownFormatError: if any other line is no measurement.
+        """
         if not self._path.exists():
             return {}
-        lines = self._path.read_text(encoding="utf-8").split("\n")
+        lines = self._path.read_bytes().split(b"\n")
         # What stands after the last line's end was broken off.
-        whole = [json.loads(line) for line in lines[:-1] if line]
-        return {line["identity"]: [self._entry(values) for values in line["measured"]] for line in whole}
+        return dict(self._measurement(number, line) for number, line in enumerate(lines[:-1], 1) if line)
 
     def begin(self, known: Mapping[str, Measured]) -> None:
         """Have the file begin anew with what is known already, once there is more to write: what cannot even start leaves nothing behind."""
@@ -61,6 +65,16 @@ class Journal:
     def remove(self) -> None:
         """Take the file away: all is done."""
         self._path.unlink(missing_ok=True)
+
+    def _measurement(self, number: int, line: bytes) -> tuple[str, Measured]:
+        try:
+            told = json.loads(line)
+            return told["identity"], [self._entry(values) for values in told["measured"]]
+        except (ValueError, KeyError, TypeError) as error:
+            raise UnknownFormatError(
+                f"line {number} of '{self._path}' is not a measurement that this version of torchtrack writes: "
+                "delete the file, or measure all anew, without --resume."
+            ) from error
 
     def _entry(self, values: dict[str, Any]) -> ObjectResult | NotApplicable:
         if "reason" in values:
