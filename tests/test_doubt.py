@@ -21,9 +21,9 @@ NEVER_ADRIFT = TrackerConfig(corners=CornerConfig(max_corners=32), search=Search
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
 
-def doubt(sigma_px, score=0.9, usual=0.9, starting=False, due=True, adrift=False, doubted_s=0.0, full=0.9):
+def doubt(sigma_px, score=0.9, usual=0.9, starting=False, due=True, adrift=False, doubted_s=0.0, full=0.9, far_due=False, symmetric=False):
     sigma_px = torch.as_tensor(sigma_px)
-    spread = (torch.as_tensor(value).expand_as(sigma_px) for value in (score, usual, starting, due, adrift, doubted_s, full))
+    spread = (torch.as_tensor(value).expand_as(sigma_px) for value in (score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric))
     return Doubt(sigma_px, *spread)
 
 
@@ -67,6 +67,27 @@ def test_objects_adrift_are_searched_for_however_certain_they_are():
     adrift = doubt([0.5, 0.5], adrift=torch.tensor([True, False]))
     assert adrift.asks(torch.ones(2), SearchConfig()).tolist() == is_wanted(adrift, torch.ones(2), TrackerConfig()).tolist() == [True, False]
     assert not is_wanted(adrift, torch.ones(2), TrackerConfig(search=SearchConfig(hypotheses=0))).any()
+
+
+def test_what_has_a_plane_of_symmetry_and_does_not_explain_all_may_be_mirrored_when_it_is_time():
+    settings, score = SearchConfig(mirrored_to=0.8, slip_sigma_px=6.0), torch.tensor([0.7, 0.73, 0.7, 0.7, 0.7, 0.7])
+    flags = {name: torch.tensor([at != number for at in range(6)]) for name, number in (("far_due", 2), ("symmetric", 3))}
+    state = doubt([1.0] * 4 + [6.1, 1.0], 0.7, starting=torch.tensor([False] * 5 + [True]), **flags)
+    assert state.is_mirrored(score, settings).tolist() == [True] + [False] * 5
+    # One window that is a little worse is no reason.
+    assert not replace(state, last_score=torch.full((6,), 0.73)).is_mirrored(score, settings).any()
+    only_mirrors = {"slipped_to": 0, "dropped_to": 0, "from_sigma_px": 9.0, "at_start": False}
+    assert is_wanted(state, score, TrackerConfig(search=SearchConfig(**only_mirrors))).tolist() == [True] + [False] * 5
+    for never in ({"mirrored_to": 0}, {"doubt_us": 0}):
+        assert not state.is_mirrored(score, SearchConfig(**never)).any()
+
+
+def test_what_is_adrift_or_very_uncertain_is_looked_for_as_it_was_last_seen_when_it_is_time():
+    config = SearchConfig(wide_sigma_px=10.0)
+    state = doubt([1.0, 1.0, 11.0, 11.0], adrift=torch.tensor([True, False, False, False]), far_due=torch.tensor([True, True, True, False]))
+    assert state.has_run_off(config).tolist() == [True, False, True, False]
+    for never in ({"as_last_seen": False}, {"doubt_us": 0}):
+        assert not state.has_run_off(config.model_copy(update=never)).any()
 
 
 def test_it_is_time_once_in_every_interval_whatever_the_windows():

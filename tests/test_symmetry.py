@@ -9,7 +9,7 @@ from torchtrack.eval.metrics import pose_errors
 from torchtrack.io import Trajectory
 from torchtrack.lie import se3_exp, so3_exp
 from torchtrack.object_model import ObjectModel
-from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axes, revolution_axis
+from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axes, revolution_axis, symmetry_planes
 from torchtrack.sim.curved import vase
 
 SEEN_AXIS = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -101,3 +101,47 @@ def test_axes_of_many_objects_are_those_of_each():
     assert torch.equal(axes[0], revolution_axis(can).direction_obj)
     assert torch.equal(axes[0], axes[2])
     assert torch.equal(axes[1], torch.zeros(3, dtype=torch.float64))
+
+
+# ---- planes
+
+
+def l_shape():
+    """A bracket, the same on both sides of z = 0, which is its only plane of symmetry."""
+    parts = [trimesh.creation.box((0.1, 0.02, 0.05)), trimesh.creation.box((0.02, 0.06, 0.05))]
+    parts[1].apply_translation((-0.04, 0.04, 0))
+    return trimesh.util.concatenate(parts)
+
+
+def planes_of(mesh):
+    point, normals = symmetry_planes(ObjectModel.from_mesh(mesh))
+    return point, normals
+
+
+def test_planes_of_a_box_are_those_across_its_sides_wherever_it_lies():
+    T = se3_exp(torch.tensor([0.4, -0.9, 0.3, 0.2, -0.1, 0.3], dtype=torch.float64))
+    mesh = trimesh.creation.box((0.05, 0.08, 0.12))
+    mesh.apply_transform(T.numpy())
+    point, normals = planes_of(mesh)
+    assert len(normals) == 3
+    assert float((normals @ T[:3, :3]).abs().max(1).values.min()) > 0.999
+    assert float((point - T[:3, 3]).norm()) < 0.002
+
+
+def test_the_plane_of_a_bracket_is_the_only_one():
+    _, normals = planes_of(l_shape())
+    assert normals.shape == (1, 3)
+    assert abs(float(normals[0, 2])) > 0.999
+
+
+def test_a_body_without_symmetry_has_no_plane_and_polylines_have_none():
+    lump = trimesh.creation.box((0.03, 0.04, 0.1))
+    lump.apply_translation((0.03, 0.03, 0.06))
+    assert planes_of(trimesh.util.concatenate([l_shape(), lump]))[1].shape == (0, 3)
+    square = ObjectModel.from_polylines([[[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0, 0]]], name="square")
+    assert symmetry_planes(square)[1].shape == (0, 3)
+
+
+def test_the_same_shape_has_the_same_planes_every_time():
+    first, again = (planes_of(l_shape()) for _ in range(2))
+    assert torch.equal(first[0], again[0]) and torch.equal(first[1], again[1])

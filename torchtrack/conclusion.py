@@ -64,6 +64,8 @@ def conclude(
     # One good window among bad ones does not end a doubt.
     doubted_s = (state.doubted_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0)
     state = replace(state, doubted_s=doubted_s)
+    certain = seen_well & (status == int(quality.Status.TRACKING))
+    state = replace(state, T_last_seen=torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen))
     return _with_scores(state, found, failed), result
 
 

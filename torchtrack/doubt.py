@@ -34,6 +34,8 @@ class Doubt:
         adrift: objects that have been in doubt for long, and which it is time for.
         doubted_s: for how long each has been in doubt (s).
         full_share: explained when the object is seen well.
+        far_due: objects that it is time to look for farther away, should there be reason to.
+        has_symmetry: objects with a plane of symmetry.
     """
 
     sigma_px: Float[Tensor, "b"]
@@ -44,6 +46,8 @@ class Doubt:
     adrift: Bool[Tensor, "b"]
     doubted_s: Float[Tensor, "b"]
     full_share: Float[Tensor, "b"]
+    far_due: Bool[Tensor, "b"]
+    has_symmetry: Bool[Tensor, "b"]
 
     def asks(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects are to be searched for: uncertain ones, those whose score stays below the usual, and those long in doubt."""
@@ -57,6 +61,19 @@ class Doubt:
         sure = ~self.starting & ~self.adrift & (self.sigma_px < config.slip_sigma_px)
         return sure & (score < config.slipped_to * self.usual_score)
 
+    def is_mirrored(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+        """Which objects may be in a pose that has the outline of the right one: those that are sure of it, and do not explain all."""
+        sure = ~self.starting & (self.sigma_px < config.slip_sigma_px)
+        low = torch.maximum(score, self.last_score) < config.mirrored_to * self.full_share
+        return sure & low & self._far_due(config) & self.has_symmetry
+
+    def has_run_off(self, config: SearchConfig) -> Bool[Tensor, "b"]:
+        """Which objects are also looked for as they were last seen well."""
+        return self._far_due(config) & config.as_last_seen & (self.adrift | (self.sigma_px > config.wide_sigma_px))
+
+    def _far_due(self, config: SearchConfig) -> Bool[Tensor, "b"]:
+        return self.far_due & (config.doubt_us > 0)
+
 
 def is_due(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], interval_us: int) -> Bool[Tensor, "s"]:
     """Streams in which it is time for what is done once in an interval: by the clock, whatever the windows."""
@@ -68,7 +85,8 @@ def is_wanted(doubt: Doubt, score: Float[Tensor, "b"], config: TrackerConfig) ->
     """Which objects a search is wanted for, as ``score`` tells once the window is aligned."""
     if config.search.hypotheses == 0 or not config.solver.prior:
         return torch.zeros_like(doubt.starting)
-    return doubt.asks(score, config.search) | doubt.slips(score, config.search)
+    # Those that have run off are asked for already, as uncertain ones or as those in doubt.
+    return doubt.asks(score, config.search) | doubt.slips(score, config.search) | doubt.is_mirrored(score, config.search)
 
 
 def in_doubt(

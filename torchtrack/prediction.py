@@ -1,6 +1,6 @@
 """Where objects are expected at a window's end, how they move, and how certain that is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -103,6 +103,20 @@ class Prediction:
         )
         acceleration = None if self.acceleration is None else self.acceleration.each(lambda value: repeat_row(value, number, count))
         return Prediction(self.objects.copies(number, count), T_cam_obj, usable, velocity, covariance, acceleration)
+
+    def exchanged(self, number: int, other: "Prediction", taken: Bool[Tensor, ""]) -> "Prediction":
+        """The prediction with that of one object, ``other``, in the place of its own, where that is ``taken``."""
+
+        def put(mine: Tensor, theirs: Tensor) -> Tensor:
+            value = mine.clone()
+            value[number] = torch.where(taken, theirs[0], mine[number])
+            return value
+
+        acceleration = self.acceleration
+        if acceleration is not None and other.acceleration is not None:
+            acceleration = replace(acceleration, expected=put(acceleration.expected, other.acceleration.expected))
+        T_cam_obj, velocity, covariance = (put(getattr(self, name), getattr(other, name)) for name in ("T_cam_obj", "velocity", "covariance"))
+        return Prediction(self.objects, T_cam_obj, self.usable, velocity, covariance, acceleration)
 
     def sigma_px(self, contours: Contours) -> Float[Tensor, "b"]:
         """Standard deviation of the contours across themselves in the image (px), in the mean over them."""

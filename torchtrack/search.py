@@ -17,6 +17,7 @@ from torchtrack.doubt import Doubt, drifted, less_certain
 from torchtrack.hypotheses import promising
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.once import once
+from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
 from torchtrack.pose_problem import Linearisation
 from torchtrack.prediction import Prediction
 from torchtrack.readback import Answer
@@ -91,9 +92,20 @@ def explained_at_rest(widening: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
 
 
 def search_wanted(
-    prediction: Prediction, doubt: Doubt, events: WindowEvents, found: Found, widening: Float[Tensor, "b"], config: TrackerConfig
+    prediction: Prediction,
+    doubt: Doubt,
+    events: WindowEvents,
+    found: Found,
+    widening: Float[Tensor, "b"],
+    config: TrackerConfig,
+    T_last_seen: Float[Tensor, "b 4 4"],
+    planes: SymmetryPlanes,
 ) -> tuple[Found, Prediction, Float[Tensor, "b"]]:
-    """Try other poses for the objects that need it, one object after the other: beside the prediction, and then where it may have slipped to.
+    """Try other poses for the objects that need it, one object after the other: beside the prediction, where it may have slipped to, and so on.
+
+    Args:
+        T_last_seen: poses of the objects when they were last seen well.
+        planes: of symmetry.
 
     Returns:
         What was found, the prediction that it is to be weighed against, and the widening of the first gates: of an object that had
@@ -101,27 +113,35 @@ def search_wanted(
     """
     # Without events no pose is better than another.
     enough = events.mask.sum(-1) >= config.quality.min_observations
-    tried, slips = enough & doubt.asks(found.score, config.search), enough & doubt.slips(found.score, config.search)
+    reasons = (doubt.asks(found.score, config.search), doubt.slips(found.score, config.search), doubt.has_run_off(config.search))
+    reasons = (*reasons, doubt.is_mirrored(found.score, config.search))
     least = _least(doubt, config.search)
     uncertain = drifted(prediction, doubt, config.search)
     sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
-    answers = (Answer.to(values).numbers() for values in (tried, slips, sigma_px))
-    for number, (is_tried, may_have_slipped, own_sigma_px) in enumerate(zip(*answers, strict=True)):
+    answers = (Answer.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px))
+    for number, (is_tried, may_have_slipped, has_run_off, is_mirrored, own_sigma_px) in enumerate(zip(*answers, strict=True)):
         if is_tried:
             found = search(number, uncertain, own_sigma_px, least[:2, number], events, found, config)
         if may_have_slipped:
-            found = _search_slipped(number, uncertain, own_sigma_px, least[2:, number], events, found, config)
+            found = _search_slipped(number, uncertain, own_sigma_px, least[2:4, number], events, found, config)
+        if has_run_off:
+            other = as_last_seen(uncertain.copies(number, 1), T_last_seen[number])
+            found, prediction = _search_from(number, other, own_sigma_px, least[4:, number], events, found, prediction, config)
+        for plane in planes.of(number) if is_mirrored else ():
+            other = less_certain(mirrored(_as_found(number, prediction, found), *plane), 0, own_sigma_px, config.search.slip_sigma_px)
+            found, prediction = _search_from(number, other, config.search.slip_sigma_px, least[2:4, number], events, found, prediction, config)
     was_adrift = doubt.adrift & found.elsewhere
     prediction = replace(prediction, covariance=torch.where(was_adrift[:, None, None], uncertain.covariance, prediction.covariance))
     return found, prediction, torch.where(was_adrift, gate_widening(sigma_px, config), widening)
 
 
-def _least(doubt: Doubt, config: SearchConfig) -> Float[Tensor, "4 b"]:
-    """By how much other poses must explain more, and how much they must explain; and both of where an object may have slipped to."""
+def _least(doubt: Doubt, config: SearchConfig) -> Float[Tensor, "6 b"]:
+    """By how much other poses must explain more, and how much they must explain; both of where an object may have slipped to, and of what ran off."""
     margin = torch.where(doubt.starting, config.start_margin, config.margin)
     # What is far away has to explain about as much as usual; so has what is found step by step, while a motion is lost, ever farther away.
     needed = torch.where(doubt.adrift | doubt.starting, config.adrift_share * doubt.full_share, 0)
-    return torch.stack([margin, needed, torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share])
+    slipped = torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share
+    return torch.stack([margin, needed, *slipped, torch.full_like(margin, config.margin), config.adrift_share * doubt.full_share])
 
 
 def _search_slipped(
@@ -139,9 +159,35 @@ def _search_slipped(
     solution = other.fit.solution
     let_go = config.solver.observation_px**2 * (1 - (sigma_px / slip_px) ** 2) * prediction.information[number]
     hessian = solution.hessian.clone()
-    is_taken = (solution.T_cam_obj[number] != found.fit.solution.T_cam_obj[number]).any()
-    hessian[number, :12, :12] += (let_go * is_taken).to(hessian.dtype)
+    hessian[number, :12, :12] += (let_go * _is_taken(number, other, found)).to(hessian.dtype)
     return replace(other, fit=replace(other.fit, solution=replace(solution, hessian=hessian)))
+
+
+def _is_taken(number: int, other: Found, found: Found) -> Bool[Tensor, ""]:
+    """Whether a search found the object ``number`` in another pose; a GPU is not waited for to know."""
+    return (other.fit.solution.T_cam_obj[number] != found.fit.solution.T_cam_obj[number]).any()
+
+
+def _as_found(number: int, prediction: Prediction, found: Found) -> Prediction:
+    """The prediction of one object alone, moved to where it was found."""
+    solution = found.fit.solution
+    return prediction.copies(number, 1).at(solution.T_cam_obj[number : number + 1], solution.from_prior[number : number + 1])
+
+
+def _search_from(
+    number: int,
+    other: Prediction,
+    sigma_px: float,
+    least: Float[Tensor, "2"],
+    events: WindowEvents,
+    found: Found,
+    prediction: Prediction,
+    config: TrackerConfig,
+) -> tuple[Found, Prediction]:
+    """:func:`search` around another prediction of the object, which takes the place of its own if it is found there."""
+    outline = other.objects.contours(other.T_cam_obj, config.contours)
+    better = _search_around(number, other, outline, sigma_px, least, events, found, config)
+    return (found, prediction) if better is found else (better, prediction.exchanged(number, other, _is_taken(number, better, found)))
 
 
 def search(
@@ -154,17 +200,29 @@ def search(
         least: by how much another pose must explain more, and how much it must explain.
         events: of all objects.
     """
-    settings = config.search
-    widened_px = max(sigma_px, settings.least_sigma_px)
-    covariance = less_certain(prediction, number, sigma_px, widened_px).covariance[number]
-    one, seen = prediction.copies(number, 1), events.of(number)
+    return _search_around(number, prediction.copies(number, 1), found.fit.contours.of(number), sigma_px, least, events, found, config)
+
+
+def _search_around(
+    number: int,
+    one: Prediction,
+    outline: Contours,
+    sigma_px: float,
+    least: Float[Tensor, "2"],
+    events: WindowEvents,
+    found: Found,
+    config: TrackerConfig,
+) -> Found:
+    """:func:`search` around the prediction of one object alone, with its contours there."""
+    widened_px = max(sigma_px, config.search.least_sigma_px)
+    covariance, seen = less_certain(one, 0, sigma_px, widened_px).covariance[0], events.of(number)
     places = one.carried(seen.pixels, seen.age_s), seen.mask
-    offsets = promising(one, found.fit.contours.of(number), covariance, widened_px, places, config)
-    tried = _align_all(prediction.copies(number, len(offsets)), offsets, seen, config, found.full_gathered[number])
+    offsets = promising(one, outline, covariance, widened_px, places, config)
+    tried = _align_all(one.copies(0, len(offsets)), offsets, seen, config, found.full_gathered[number])
     offset = tried.fit.solution.from_prior
     counts = (tried.count >= config.quality.min_observations) & _is_likely(offset, covariance)
     score = torch.where(counts, tried.score, 0)
-    best = _likeliest(score, offset, prediction.covariance[number])
+    best = _likeliest(score, offset, one.covariance[0])
     mine = torch.where(found.count[number] >= config.quality.min_observations, found.score[number], 0.0)
     margin, needed = least.unbind()
     better = score.index_select(0, best) > torch.maximum(mine + margin, needed)

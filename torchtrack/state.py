@@ -49,6 +49,7 @@ class TrackerState:
         full_share: of the moving contour, what events explain when the object is seen well: rises as fast, but falls slowly.
         full_gathered: the same of how far events near its contours are on them.
         doubted_s: for how long, less the time it was not, the object has been in doubt of being elsewhere (s).
+        T_last_seen: pose of each object when it was last seen well (float64).
         t_us: end of the last window of each stream (µs).
         last_event_us: time of the newest event of every sensor pixel (µs).
         burst_age_us: how long ago the newest burst of every sensor pixel and polarity began (µs).
@@ -66,6 +67,7 @@ class TrackerState:
     full_share: Float[Tensor, "b"]
     full_gathered: Float[Tensor, "b"]
     doubted_s: Float[Tensor, "b"]
+    T_last_seen: Float[Tensor, "b 4 4"]
     t_us: Int[Tensor, "s"]
     last_event_us: Int[Tensor, "s h w"]
     burst_age_us: Int[Tensor, "s 2 h w"]

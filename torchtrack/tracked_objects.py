@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from torchtrack.camera import Camera
 from torchtrack.config.tracker import TrackerConfig
@@ -11,7 +12,8 @@ from torchtrack.contour_model import ContourModel, group_by_model
 from torchtrack.model_trust import element_groups
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
-from torchtrack.object_model.symmetry import revolution_axes
+from torchtrack.object_model.symmetry import revolution_axes, symmetry_planes
+from torchtrack.other_places import SymmetryPlanes
 from torchtrack.prediction import far_pose
 from torchtrack.sensor_tiles import SensorTiles
 from torchtrack.sensors import Sensors, sensor_tables
@@ -30,6 +32,9 @@ class TrackedObjects(nn.Module):
     centre_obj: Tensor
     diameter_m: Tensor
     revolution_axes: Tensor
+    symmetry_points: Tensor
+    symmetry_normals: Tensor
+    has_symmetry: Tensor
     with_surface: Tensor
     far_pose: Tensor
 
@@ -62,6 +67,12 @@ class TrackedObjects(nn.Module):
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
         self.register_buffer("revolution_axes", revolution_axes(objects))
         self.revolves = bool(self.revolution_axes.any())
+        planes = {id(model): symmetry_planes(model) for model in {id(model): model for model in objects}.values()}
+        points, normals = zip(*(planes[id(model)] for model in objects), strict=True)
+        self.symmetry_counts = tuple(len(each) for each in normals)
+        self.register_buffer("symmetry_points", torch.stack(points))
+        self.register_buffer("symmetry_normals", torch.stack([pad(each, (0, 0, 0, 3 - len(each))) for each in normals]))
+        self.register_buffer("has_symmetry", torch.tensor(self.symmetry_counts) > 0)
         self.register_buffer("far_pose", far_pose(self.centre_obj))
         self.weigher = TrustNetwork.shipped() if weigher is None and self.config.matching.learned_trust else weigher
         # On dense meshes no line of sight is followed.
@@ -82,6 +93,11 @@ class TrackedObjects(nn.Module):
         """The objects as one batch."""
         shape = (self.streams, *self.image_size)
         return ObjectBatch(self.models, self.intrinsics, self.centre_obj, self.diameter_m, self.stream_index, shape, self._shared)
+
+    @property
+    def planes(self) -> SymmetryPlanes:
+        """The planes of symmetry of the objects."""
+        return SymmetryPlanes(self.symmetry_points, self.symmetry_normals, self.symmetry_counts)
 
     @property
     def sensors(self) -> Sensors:

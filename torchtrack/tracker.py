@@ -92,7 +92,7 @@ class Tracker(TrackedObjects):
         trust = ModelTrust.none(self.element_groups, velocity) if self.judges else None
         probation = Probation.none(T_cam_obj, covariance)
         motion, shares = (velocity, velocity, covariance), (nothing,) * 5
-        return TrackerState(T_cam_obj.clone(), *motion, *shares, times, last_event_us, burst_age_us, probation, learned, trust)
+        return TrackerState(T_cam_obj.clone(), *motion, *shares, T_cam_obj.clone(), times, last_event_us, burst_age_us, probation, learned, trust)
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """:meth:`step`, as a layer of a network: what comes in first."""
@@ -236,7 +236,7 @@ class Tracker(TrackedObjects):
         # A GPU is waited for: a pose that begins to slip is farther off a window later.
         wanted = questions.ask(is_wanted(doubt, found.score, config), False)
         if wanted.any():
-            found, recorded, widening = search_wanted(recorded, doubt, seen, found, widening, config)
+            found, recorded, widening = search_wanted(recorded, doubt, seen, found, widening, config, state.T_last_seen, self.planes)
             prediction = recorded.detached()
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
         if config.search.probation:
@@ -277,7 +277,8 @@ class Tracker(TrackedObjects):
         config = self.config.search
         due, far_due = (is_due(state.t_us, t_us, interval_us)[self.stream_index] for interval_us in (config.interval_us, config.doubt_us))
         adrift = is_adrift(state.doubted_s, far_due, config)
-        return Doubt(sigma_px, state.score, state.usual_score, starting, due, adrift, state.doubted_s, state.full_share)
+        scores = state.score, state.usual_score
+        return Doubt(sigma_px, *scores, starting, due, adrift, state.doubted_s, state.full_share, far_due, self.has_symmetry)
 
     @torch.no_grad()
     def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:

@@ -219,6 +219,10 @@ class SearchConfig(Settings):
     from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")
     dropped_to: float = Field(0.8, ge=0, le=1, description="Share of the usual quality below which others are tried, two windows in a row.")
     slipped_to: float = Field(0.7, ge=0, le=1, description="Share of the usual quality below which a pose may have slipped; 0 for never.")
+    mirrored_to: float = Field(
+        0.8, ge=0, le=1, description="Share of what an object explains when seen well below which it may be mirrored in depth; 0 for never."
+    )
+    as_last_seen: bool = Field(True, description="What is looked for far away is so too as it was turned when it was last seen well.")
     least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
     slip_sigma_px: float = Field(6.0, gt=0, description="The same of what may have slipped, however sure it is of itself (px).")
     at_start: bool = Field(True, description="Others are also tried while an object's motion is not known: dense print fits many.")

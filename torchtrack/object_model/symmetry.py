@@ -1,10 +1,11 @@
-"""Surfaces of revolution, such as bottles and bowls: turned about their axis they look the same."""
+"""Surfaces of revolution, such as bottles and bowls, which turned about their axis look the same; and planes of symmetry."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchtrack.lie import quaternion_from_rotation, so3_exp
@@ -15,6 +16,8 @@ from torchtrack.object_model.model import ObjectModel
 _SLIP, _KEEPING = 0.14, 0.995
 # A ball, which can be turned about every axis, has none: any other turn moves a surface of unit diameter by this much more (squared).
 _DISTINCT = 1e-4
+# A surface is its own mirror image when samples of the image lie this near to it, in the mean (diameters).
+_MIRRORED = 0.02
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,22 @@ def revolution_axis(model: ObjectModel) -> RevolutionAxis | None:
     if values[1] < values[0] + _DISTINCT or (area * keeps).sum() < _KEEPING:
         return None
     return RevolutionAxis(middle, direction)
+
+
+def symmetry_planes(model: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tensor, "k 3"]]:
+    """The middle of the surface, and unit normals of the planes through it that mirror the surface onto itself, or nearly so (float64).
+
+    Planes across a principal axis are looked at: every plane of symmetry is one, unless axes are not distinct, as a cube's.
+    """
+    points = model.surface_points.double()
+    if len(points) == 0:
+        return torch.zeros(3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
+    middle = points.mean(0)
+    arms = points - middle
+    axes, surface = torch.linalg.eigh(arms.mT @ arms).eigenvectors.mT, cKDTree(arms.numpy())
+    images = (arms - 2 * (arms @ axis)[:, None] * axis for axis in axes)
+    apart_m = torch.tensor([surface.query(image.numpy())[0].mean() for image in images])
+    return middle, axes[apart_m < _MIRRORED * model.diameter_m]
 
 
 def revolution_axes(models: Sequence[ObjectModel]) -> Float[Tensor, "b 3"]:

@@ -1,0 +1,173 @@
+"""Where else an object may be: in the pose with the same outline, and as it was last seen well."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import SMALL_CAMERA, box_model, pose, pose_errors, random_pose
+from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, windows
+
+from torchtrack import Tracker
+from torchtrack.camera import project
+from torchtrack.config.tracker import CornerConfig, SearchConfig, TrackerConfig
+from torchtrack.lie import difference_about, retract_about, rotation_angle_deg, transform_points
+from torchtrack.motion import Acceleration
+from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
+from torchtrack.prediction import Prediction
+from torchtrack.quality import Status
+
+MIDDLE = torch.tensor([0.01, -0.02, 0.005], dtype=torch.float64)
+ACROSS = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64), dim=0)
+
+
+def predicted(T_cam_obj=None, seed=0):
+    """A prediction of one box, at some pose, turning and moving."""
+    _, prediction, *_ = in_motion(dtype=torch.float64)
+    generator = torch.Generator().manual_seed(seed)
+    root = torch.randn((12, 12), generator=generator, dtype=torch.float64)
+    acceleration = Acceleration(*torch.rand((3, 1, 6), generator=generator, dtype=torch.float64).unbind(0))
+    velocity = torch.randn((1, 6), generator=generator, dtype=torch.float64)
+    T_cam_obj = random_pose(1, seed=seed) if T_cam_obj is None else T_cam_obj
+    return replace(prediction, T_cam_obj=T_cam_obj, velocity=velocity, covariance=(root @ root.T)[None], acceleration=acceleration)
+
+
+def symmetric_points(count=50):
+    """Points in pairs, mirrored in the plane."""
+    points = torch.randn((count, 3), generator=torch.Generator().manual_seed(4), dtype=torch.float64) * 0.03
+    other = points - 2 * ((points - MIDDLE) @ ACROSS)[:, None] * ACROSS
+    return points, other
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_seen_from_afar_the_mirrored_pose_looks_the_same(seed):
+    T_cam_obj = random_pose(1, seed=seed)
+    T_cam_obj[:, :3, 3] *= 1000
+    prediction = predicted(T_cam_obj, seed)
+    other = mirrored(prediction, MIDDLE, ACROSS)
+    points, images = symmetric_points()
+    far_camera = torch.tensor([[250_000.0, 250_000.0, 99.5, 74.5]], dtype=torch.float64)
+    seen, seen_mirrored = (project(transform_points(T, p[None]), far_camera) for T, p in ((T_cam_obj, points), (other.T_cam_obj, images)))
+    # Over some 60 pixels.
+    assert float((seen - seen_mirrored).abs().max()) < 0.05
+    rotation = other.T_cam_obj[0, :3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64))
+    assert float(torch.linalg.det(rotation)) == pytest.approx(1)
+    assert float(rotation_angle_deg(rotation[None], T_cam_obj[:, :3, :3])) > 1
+
+
+def test_mirrored_twice_it_is_as_it_was():
+    prediction = predicted()
+    twice = mirrored(mirrored(prediction, MIDDLE, ACROSS), MIDDLE, ACROSS)
+    for name in ("T_cam_obj", "velocity", "covariance"):
+        torch.testing.assert_close(getattr(twice, name), getattr(prediction, name))
+    torch.testing.assert_close(twice.acceleration.expected, prediction.acceleration.expected)
+
+
+def test_the_mirrored_pose_turns_so_that_it_stays_mirrored():
+    """A millisecond later, the mirror image of the pose is where the mirrored pose has gone to; and what it is off by is mirrored alike."""
+    prediction = predicted()
+    # About a centre in the plane, whose ray the object does not leave.
+    objects = replace(prediction.objects, centre_obj=MIDDLE[None])
+    prediction = replace(prediction, objects=objects, velocity=prediction.velocity * torch.tensor([1.0, 1, 1, 0, 0, 0]))
+    other = mirrored(prediction, MIDDLE, ACROSS)
+    later, other_later = (replace(p, T_cam_obj=retract_about(p.T_cam_obj, 1e-3 * p.velocity, MIDDLE[None])) for p in (prediction, other))
+    torch.testing.assert_close(mirrored(later, MIDDLE, ACROSS).T_cam_obj, other_later.T_cam_obj, rtol=0, atol=1e-5)
+    for axis in range(3):
+        step = torch.zeros(1, 6, dtype=torch.float64)
+        step[0, axis] = 1e-4
+        moved = mirrored(replace(prediction, T_cam_obj=retract_about(prediction.T_cam_obj, step, MIDDLE[None])), MIDDLE, ACROSS)
+        change = difference_about(other.T_cam_obj, moved.T_cam_obj, MIDDLE[None])[0, :3]
+        narrow = torch.zeros(1, 12, 12, dtype=torch.float64)
+        narrow[0, axis, axis] = 1.0
+        covariance = mirrored(replace(prediction, covariance=narrow), MIDDLE, ACROSS).covariance[0, :3, :3]
+        torch.testing.assert_close(1e8 * change[:, None] * change, covariance, rtol=0, atol=1e-4)
+
+
+def test_as_last_seen_it_is_turned_and_as_far_away_as_then_in_the_place_of_now():
+    prediction, then = predicted(seed=1), random_pose(seed=2)
+    other = as_last_seen(prediction, then)
+    torch.testing.assert_close(other.T_cam_obj[0, :3, :3], then[:3, :3])
+    centre_then = then[:3, :3] @ prediction.objects.centre_obj[0] + then[:3, 3]
+    assert float(other.centre_cam[0, 2]) == pytest.approx(float(centre_then[2]))
+    torch.testing.assert_close(*(p.centre_cam[0, :2] / p.centre_cam[0, 2] for p in (other, prediction)))
+    assert torch.equal(other.covariance, prediction.covariance) and torch.equal(other.velocity, prediction.velocity)
+
+
+def test_one_prediction_takes_the_place_of_another_where_it_is_taken():
+    one, other = predicted(seed=1), mirrored(predicted(seed=1), MIDDLE, ACROSS)
+    three = one.copies(0, 3)
+    for taken in (True, False):
+        now = three.exchanged(1, other, torch.tensor(taken))
+        expected = [one, other if taken else one, one]
+        for name in ("T_cam_obj", "velocity", "covariance"):
+            assert torch.equal(getattr(now, name), torch.cat([getattr(p, name) for p in expected])), name
+        assert torch.equal(now.acceleration.expected, torch.cat([p.acceleration.expected for p in expected]))
+        assert torch.equal(now.acceleration.variance, three.acceleration.variance)
+
+
+def test_planes_are_handed_out_object_by_object():
+    points, normals = torch.rand(2, 3), torch.rand(2, 3, 3)
+    planes = SymmetryPlanes(points, normals, (2, 0))
+    assert [(point.tolist(), normal.tolist()) for point, normal in planes.of(0)] == [(points[0].tolist(), normals[0, k].tolist()) for k in range(2)]
+    assert list(planes.of(1)) == []
+
+
+# ---- in the tracker
+
+
+def runs_on(config, change, count=8):
+    """Results of a box in full motion whose state was changed, and its true poses; windows end when it is time to look far away."""
+    tracker = Tracker([box_model()], SMALL_CAMERA, config)
+    trajectory, events = moving_box(pose(), count + 5)
+    state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 5))
+    state = change(tracker, replace(state, full_share=state.usual_score))
+    _, results = follow(tracker, state, windows(events, count, 5 * WINDOW_US))
+    return results, trajectory
+
+
+def mirrored_state(tracker, state):
+    """The state of a box that follows the mirror image of its pose."""
+    prediction = Prediction(tracker.objects, state.T_cam_obj.float(), torch.ones(1, dtype=torch.bool), state.velocity, state.covariance)
+    other = mirrored(prediction, *next(iter(tracker.planes.of(0))))
+    assert float(rotation_angle_deg(other.T_cam_obj[:, :3, :3].double(), state.T_cam_obj[:, :3, :3])) > 20
+    return replace(state, T_cam_obj=other.T_cam_obj.double(), velocity=other.velocity, covariance=other.covariance)
+
+
+@pytest.mark.parametrize("mirrored_to", [0.0, 0.8])
+def test_a_box_that_followed_its_mirror_image_is_found(mirrored_to):
+    search = SearchConfig(doubt_us=10_000, mirrored_to=mirrored_to, slipped_to=0, adrift_share=1, as_last_seen=False, dropped_to=0)
+    results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), search=search), mirrored_state)
+    degrees, millimetres = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
+    if mirrored_to:
+        assert float(degrees) < 1 and float(millimetres) < 2
+        assert int(results[-1].status) == Status.TRACKING
+    else:
+        assert float(degrees) > 5
+
+
+@pytest.mark.parametrize("as_last_seen", [False, True])
+def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(as_last_seen):
+    """Turned off by a right angle and far away: much farther than it is looked for from there."""
+
+    def run_off(tracker, state):
+        away = torch.tensor([[0.0, 1.6, 0.0, 0.0, 0.0, 0.15]], dtype=torch.float64)
+        T_cam_obj = retract_about(state.T_cam_obj, away, tracker.centre_obj.double())
+        return replace(state, T_cam_obj=T_cam_obj, doubted_s=torch.full((1,), 0.1), velocity=torch.zeros_like(state.velocity))
+
+    search = SearchConfig(doubt_us=10_000, mirrored_to=0, as_last_seen=as_last_seen)
+    results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), search=search), run_off)
+    degrees, _ = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
+    assert (float(degrees) < 1) == as_last_seen
+
+
+def test_where_an_object_was_last_seen_well_is_remembered_and_not_where_it_was_not():
+    tracker, trajectory, events = Tracker([box_model()], SMALL_CAMERA), *moving_box(pose(), 8)
+    state = tracker.init(pose()[None], 0)
+    assert torch.equal(state.T_last_seen, state.T_cam_obj)
+    state, results = follow(tracker, state, windows(events, 8))
+    assert int(results[-1].status) == Status.TRACKING
+    assert torch.equal(state.T_last_seen, state.T_cam_obj)
+    later, results = follow(tracker, state, windows(events[:0], 2, 8 * WINDOW_US))
+    assert int(results[-1].status) == Status.TOO_FEW_EVENTS
+    assert torch.equal(later.T_last_seen, state.T_last_seen) and not torch.equal(later.T_cam_obj, state.T_cam_obj)
+    assert trajectory.at(state.t_us).shape == state.T_last_seen.shape

@@ -1,0 +1,77 @@
+"""Where an object may be, if not where it is predicted: mirrored in depth, or turned as when it was last seen well.
+
+Seen from afar, all points of a body may be mirrored in the plane through its middle that faces the camera, and none moves in the
+image. Mirrored in its own plane of symmetry as well, the body is as it was, but turned: both poses have the same outline, and
+where they meet, as the body turns, a tracker may follow either. Perspective, and what is seen within the outline, tell them apart.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torchtrack.prediction import Prediction
+
+
+@dataclass(frozen=True)
+class SymmetryPlanes:
+    """Planes of symmetry of each object, padded.
+
+    Args:
+        points_obj: a point that all planes of the object go through (m).
+        normals_obj: their unit normals.
+        counts: how many there are.
+    """
+
+    points_obj: Float[Tensor, "b 3"]
+    normals_obj: Float[Tensor, "b k 3"]
+    counts: tuple[int, ...]
+
+    def of(self, number: int) -> Iterator[tuple[Float[Tensor, "3"], Float[Tensor, "3"]]]:
+        """Point and normal of each plane of one object."""
+        return ((self.points_obj[number], self.normals_obj[number, plane]) for plane in range(self.counts[number]))
+
+
+def mirrored(prediction: Prediction, point_obj: Float[Tensor, "3"], normal_obj: Float[Tensor, "3"]) -> Prediction:
+    """The prediction, of one object, in the pose of the same outline; it turns as it has to for that to stay so.
+
+    With the reflections ``D``, in the plane that faces the camera, and ``S``, in that of symmetry, it is ``R' = D R S``: a
+    rotation. Turns, which are axial vectors, become ``-D ω``, and the middle goes on as it did.
+
+    Args:
+        point_obj, normal_obj: of the plane of symmetry.
+    """
+    T_cam_obj = prediction.T_cam_obj[0]
+    rotation = T_cam_obj[:3, :3]
+    middle_cam = rotation @ point_obj + T_cam_obj[:3, 3]
+    in_depth = _reflection(normalize(middle_cam, dim=0))
+    other = T_cam_obj.clone()
+    other[:3, :3] = in_depth @ rotation @ _reflection(normal_obj)
+    other[:3, 3] = middle_cam - other[:3, :3] @ point_obj
+    change = torch.block_diag(-in_depth, torch.eye(3, dtype=in_depth.dtype, device=in_depth.device))
+    of_both = torch.block_diag(change, change).to(prediction.covariance.dtype)
+    acceleration = prediction.acceleration
+    if acceleration is not None:
+        acceleration = replace(acceleration, expected=acceleration.expected @ change.T)
+    covariance = of_both @ prediction.covariance @ of_both.T
+    return Prediction(prediction.objects, other[None], prediction.usable, prediction.velocity @ change.T, covariance, acceleration)
+
+
+def _reflection(normal: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The reflection in a plane with a unit normal (Householder)."""
+    return torch.eye(3, dtype=normal.dtype, device=normal.device) - 2 * normal[:, None] * normal
+
+
+def as_last_seen(prediction: Prediction, T_last_seen: Float[Tensor, "4 4"]) -> Prediction:
+    """The prediction, of one object, turned and as far away as when it was last seen well, in the place of the image where it is predicted.
+
+    What slips runs off in depth and turns on; in the image it is held by what it slipped onto.
+    """
+    centre_obj, then = prediction.objects.centre_obj[0], T_last_seen.to(prediction.T_cam_obj.dtype)
+    now_cam, then_cam = prediction.centre_cam[0], then[:3, :3] @ centre_obj + then[:3, 3]
+    T_cam_obj = then.clone()
+    T_cam_obj[:3, 3] += now_cam * (then_cam[2] / now_cam[2]) - then_cam
+    return replace(prediction, T_cam_obj=T_cam_obj[None])
