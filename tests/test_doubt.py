@@ -21,10 +21,12 @@ NEVER_ADRIFT = TrackerConfig(corners=CornerConfig(max_corners=32), search=Search
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
 
-def doubt(sigma_px, score=0.9, usual=0.9, starting=False, due=True, adrift=False, doubted_s=0.0, full=0.9, far_due=False, symmetric=False):
+def doubt(
+    sigma_px, score=0.9, usual=0.9, starting=False, due=True, adrift=False, doubted_s=0.0, full=0.9, far_due=False, symmetric=False, unseen_s=1.0
+):
     sigma_px = torch.as_tensor(sigma_px)
-    spread = (torch.as_tensor(value).expand_as(sigma_px) for value in (score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric))
-    return Doubt(sigma_px, *spread)
+    values = score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric, unseen_s
+    return Doubt(sigma_px, *(torch.as_tensor(value).expand_as(sigma_px) for value in values))
 
 
 # ---- when
@@ -86,7 +88,8 @@ def test_what_is_adrift_or_very_uncertain_is_looked_for_as_it_was_last_seen_when
     config = SearchConfig(wide_sigma_px=10.0)
     state = doubt([1.0, 1.0, 11.0, 11.0], adrift=torch.tensor([True, False, False, False]), far_due=torch.tensor([True, True, True, False]))
     assert state.has_run_off(config).tolist() == [True, False, True, False]
-    for never in ({"as_last_seen": False}, {"doubt_us": 0}):
+    assert replace(state, unseen_s=torch.tensor([0.21, 0.21, 0.19, 0.21])).has_run_off(config).tolist() == [True, False, False, False]
+    for never in ({"unseen_us": 0}, {"doubt_us": 0}):
         assert not state.has_run_off(config.model_copy(update=never)).any()
 
 

@@ -135,7 +135,7 @@ def mirrored_state(tracker, state):
 
 @pytest.mark.parametrize("mirrored_to", [0.0, 0.8])
 def test_a_box_that_followed_its_mirror_image_is_found(mirrored_to):
-    search = SearchConfig(doubt_us=10_000, mirrored_to=mirrored_to, slipped_to=0, adrift_share=1, as_last_seen=False, dropped_to=0)
+    search = SearchConfig(doubt_us=10_000, mirrored_to=mirrored_to, slipped_to=0, adrift_share=1, unseen_us=0, dropped_to=0)
     results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), search=search), mirrored_state)
     degrees, millimetres = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
     if mirrored_to:
@@ -145,19 +145,21 @@ def test_a_box_that_followed_its_mirror_image_is_found(mirrored_to):
         assert float(degrees) > 5
 
 
-@pytest.mark.parametrize("as_last_seen", [False, True])
-def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(as_last_seen):
+@pytest.mark.parametrize("unseen_us", [0, 200_000])
+def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(unseen_us):
     """Turned off by a right angle and far away: much farther than it is looked for from there."""
 
     def run_off(tracker, state):
         away = torch.tensor([[0.0, 1.6, 0.0, 0.0, 0.0, 0.15]], dtype=torch.float64)
         T_cam_obj = retract_about(state.T_cam_obj, away, tracker.centre_obj.double())
-        return replace(state, T_cam_obj=T_cam_obj, doubted_s=torch.full((1,), 0.1), velocity=torch.zeros_like(state.velocity))
+        return replace(
+            state, T_cam_obj=T_cam_obj, doubted_s=torch.full((1,), 0.1), unseen_s=torch.full((1,), 0.2), velocity=torch.zeros_like(state.velocity)
+        )
 
-    search = SearchConfig(doubt_us=10_000, mirrored_to=0, as_last_seen=as_last_seen)
+    search = SearchConfig(doubt_us=10_000, mirrored_to=0, unseen_us=unseen_us)
     results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), search=search), run_off)
     degrees, _ = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
-    assert (float(degrees) < 1) == as_last_seen
+    assert (float(degrees) < 1) == (unseen_us > 0)
 
 
 def test_where_an_object_was_last_seen_well_is_remembered_and_not_where_it_was_not():
@@ -169,5 +171,6 @@ def test_where_an_object_was_last_seen_well_is_remembered_and_not_where_it_was_n
     assert torch.equal(state.T_last_seen, state.T_cam_obj)
     later, results = follow(tracker, state, windows(events[:0], 2, 8 * WINDOW_US))
     assert int(results[-1].status) == Status.TOO_FEW_EVENTS
+    assert float(state.unseen_s) == 0 and float(later.unseen_s) == pytest.approx(0.01)
     assert torch.equal(later.T_last_seen, state.T_last_seen) and not torch.equal(later.T_cam_obj, state.T_cam_obj)
     assert trajectory.at(state.t_us).shape == state.T_last_seen.shape

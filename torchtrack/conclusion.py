@@ -65,7 +65,8 @@ def conclude(
     doubted_s = (state.doubted_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0)
     state = replace(state, doubted_s=doubted_s)
     certain = seen_well & (status == int(quality.Status.TRACKING))
-    state = replace(state, T_last_seen=torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen))
+    T_last_seen = torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen)
+    state = replace(state, T_last_seen=T_last_seen, unseen_s=torch.where(certain, 0, state.unseen_s + dt_s))
     return _with_scores(state, found, failed), result
 
 

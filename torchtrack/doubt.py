@@ -36,6 +36,7 @@ class Doubt:
         full_share: explained when the object is seen well.
         far_due: objects that it is time to look for farther away, should there be reason to.
         has_symmetry: objects with a plane of symmetry.
+        unseen_s: how long ago each was last seen well (s).
     """
 
     sigma_px: Float[Tensor, "b"]
@@ -48,6 +49,7 @@ class Doubt:
     full_share: Float[Tensor, "b"]
     far_due: Bool[Tensor, "b"]
     has_symmetry: Bool[Tensor, "b"]
+    unseen_s: Float[Tensor, "b"]
 
     def asks(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects are to be searched for: uncertain ones, those whose score stays below the usual, and those long in doubt."""
@@ -69,7 +71,8 @@ class Doubt:
 
     def has_run_off(self, config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects are also looked for as they were last seen well."""
-        return self._far_due(config) & config.as_last_seen & (self.adrift | (self.sigma_px > config.wide_sigma_px))
+        long = (self.unseen_s >= 1e-6 * config.unseen_us) & (config.unseen_us > 0)
+        return self._far_due(config) & long & (self.adrift | (self.sigma_px > config.wide_sigma_px))
 
     def _far_due(self, config: SearchConfig) -> Bool[Tensor, "b"]:
         return self.far_due & (config.doubt_us > 0)

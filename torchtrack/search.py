@@ -123,25 +123,24 @@ def search_wanted(
         if is_tried:
             found = search(number, uncertain, own_sigma_px, least[:2, number], events, found, config)
         if may_have_slipped:
-            found = _search_slipped(number, uncertain, own_sigma_px, least[2:4, number], events, found, config)
+            found = _search_slipped(number, uncertain, own_sigma_px, least[2:, number], events, found, config)
         if has_run_off:
             other = as_last_seen(uncertain.copies(number, 1), T_last_seen[number])
-            found, prediction = _search_from(number, other, own_sigma_px, least[4:, number], events, found, prediction, config)
+            found, prediction = _search_from(number, other, own_sigma_px, least[2:, number], events, found, prediction, config)
         for plane in planes.of(number) if is_mirrored else ():
             other = less_certain(mirrored(_as_found(number, prediction, found), *plane), 0, own_sigma_px, config.search.slip_sigma_px)
-            found, prediction = _search_from(number, other, config.search.slip_sigma_px, least[2:4, number], events, found, prediction, config)
+            found, prediction = _search_from(number, other, config.search.slip_sigma_px, least[2:, number], events, found, prediction, config)
     was_adrift = doubt.adrift & found.elsewhere
     prediction = replace(prediction, covariance=torch.where(was_adrift[:, None, None], uncertain.covariance, prediction.covariance))
     return found, prediction, torch.where(was_adrift, gate_widening(sigma_px, config), widening)
 
 
-def _least(doubt: Doubt, config: SearchConfig) -> Float[Tensor, "6 b"]:
-    """By how much other poses must explain more, and how much they must explain; both of where an object may have slipped to, and of what ran off."""
+def _least(doubt: Doubt, config: SearchConfig) -> Float[Tensor, "4 b"]:
+    """By how much other poses must explain more, and how much they must explain; and both of where an object is not predicted at all."""
     margin = torch.where(doubt.starting, config.start_margin, config.margin)
     # What is far away has to explain about as much as usual; so has what is found step by step, while a motion is lost, ever farther away.
     needed = torch.where(doubt.adrift | doubt.starting, config.adrift_share * doubt.full_share, 0)
-    slipped = torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share
-    return torch.stack([margin, needed, *slipped, torch.full_like(margin, config.margin), config.adrift_share * doubt.full_share])
+    return torch.stack([margin, needed, torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share])
 
 
 def _search_slipped(

@@ -91,8 +91,8 @@ class Tracker(TrackedObjects):
         learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
         trust = ModelTrust.none(self.element_groups, velocity) if self.judges else None
         probation = Probation.none(T_cam_obj, covariance)
-        motion, shares = (velocity, velocity, covariance), (nothing,) * 5
-        return TrackerState(T_cam_obj.clone(), *motion, *shares, T_cam_obj.clone(), times, last_event_us, burst_age_us, probation, learned, trust)
+        motion, shares, seen = (velocity, velocity, covariance), (nothing,) * 5, (T_cam_obj.clone(), nothing)
+        return TrackerState(T_cam_obj.clone(), *motion, *shares, *seen, times, last_event_us, burst_age_us, probation, learned, trust)
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """:meth:`step`, as a layer of a network: what comes in first."""
@@ -278,7 +278,7 @@ class Tracker(TrackedObjects):
         due, far_due = (is_due(state.t_us, t_us, interval_us)[self.stream_index] for interval_us in (config.interval_us, config.doubt_us))
         adrift = is_adrift(state.doubted_s, far_due, config)
         scores = state.score, state.usual_score
-        return Doubt(sigma_px, *scores, starting, due, adrift, state.doubted_s, state.full_share, far_due, self.has_symmetry)
+        return Doubt(sigma_px, *scores, starting, due, adrift, state.doubted_s, state.full_share, far_due, self.has_symmetry, state.unseen_s)
 
     @torch.no_grad()
     def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:

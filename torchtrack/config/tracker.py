@@ -222,7 +222,9 @@ class SearchConfig(Settings):
     mirrored_to: float = Field(
         0.8, ge=0, le=1, description="Share of what an object explains when seen well below which it may be mirrored in depth; 0 for never."
     )
-    as_last_seen: bool = Field(True, description="What is looked for far away is so too as it was turned when it was last seen well.")
+    unseen_us: int = Field(
+        200_000, ge=0, description="What may be far away and was not seen well for so long is also looked for as it was then (µs); 0 for never."
+    )
     least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
     slip_sigma_px: float = Field(6.0, gt=0, description="The same of what may have slipped, however sure it is of itself (px).")
     at_start: bool = Field(True, description="Others are also tried while an object's motion is not known: dense print fits many.")
@@ -235,7 +237,7 @@ class SearchConfig(Settings):
     adrift_share: float = Field(0.65, ge=0, le=1, description="Share of what an object explains when seen well that is asked of a find farther away.")
     start_margin: float = Field(0.02, ge=0, le=1, description="By how much the quality of another pose must be better then.")
     margin: float = Field(0.1, ge=0, le=1, description="By how much the quality of another pose must be better.")
-    slip_margin: float = Field(0.15, ge=0, le=1, description="The same where a pose may have slipped.")
+    slip_margin: float = Field(0.15, ge=0, le=1, description="The same where a pose may have slipped, be mirrored, or be as last seen well.")
     slip_share: float = Field(0.9, ge=0, le=1, description="Share of what an object explains when seen well that is asked of a pose then.")
 
 
