@@ -21,6 +21,8 @@ from torchtrack.state import StepResult, TrackerState
 _USUAL_GAIN = 0.1
 # And in the full one where it is less: what is hidden for a while is not seen well.
 _FALL_GAIN = 0.005
+# A pose that explains this share of what it does when seen well is remembered as one: most that slipped explain less.
+_CERTAIN = 0.9
 
 
 def conclude(
@@ -64,7 +66,7 @@ def conclude(
     # One good window among bad ones does not end a doubt.
     doubted_s = (state.doubted_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0)
     state = replace(state, doubted_s=doubted_s)
-    certain = seen_well & (status == int(quality.Status.TRACKING))
+    certain = (share >= _CERTAIN * state.full_share) & (status == int(quality.Status.TRACKING))
     T_last_seen = torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen)
     state = replace(state, T_last_seen=T_last_seen, unseen_s=torch.where(certain, 0, state.unseen_s + dt_s))
     return _with_scores(state, found, failed), result

@@ -113,13 +113,13 @@ def search_wanted(
     """
     # Without events no pose is better than another.
     enough = events.mask.sum(-1) >= config.quality.min_observations
-    reasons = (doubt.asks(found.score, config.search), doubt.slips(found.score, config.search), doubt.has_run_off(config.search))
-    reasons = (*reasons, doubt.is_mirrored(found.score, config.search))
+    ask = (doubt.asks, doubt.slips, doubt.is_mirrored)
+    reasons = (*(reason(found.score, config.search) for reason in ask), doubt.has_run_off(config.search))
     least = _least(doubt, config.search)
     uncertain = drifted(prediction, doubt, config.search)
     sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
     answers = (Answer.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px))
-    for number, (is_tried, may_have_slipped, has_run_off, is_mirrored, own_sigma_px) in enumerate(zip(*answers, strict=True)):
+    for number, (is_tried, may_have_slipped, is_mirrored, has_run_off, own_sigma_px) in enumerate(zip(*answers, strict=True)):
         if is_tried:
             found = search(number, uncertain, own_sigma_px, least[:2, number], events, found, config)
         if may_have_slipped:
