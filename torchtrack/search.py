@@ -118,8 +118,8 @@ def search_wanted(
     least = _least(doubt, config.search)
     uncertain = drifted(prediction, doubt, config.search)
     sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
-    answers = (Answer.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px))
-    for number, (is_tried, may_have_slipped, is_mirrored, has_run_off, own_sigma_px) in enumerate(zip(*answers, strict=True)):
+    answers = (Answer.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px, doubt.sigma_px))
+    for number, (is_tried, may_have_slipped, is_mirrored, has_run_off, own_sigma_px, predicted_px) in enumerate(zip(*answers, strict=True)):
         if is_tried:
             found = search(number, uncertain, own_sigma_px, least[:2, number], events, found, config)
         if may_have_slipped:
@@ -128,7 +128,7 @@ def search_wanted(
             other = as_last_seen(uncertain.copies(number, 1), T_last_seen[number])
             found, prediction = _search_from(number, other, own_sigma_px, least[2:, number], events, found, prediction, config)
         for plane in planes.of(number) if is_mirrored else ():
-            other = less_certain(mirrored(_as_found(number, prediction, found), *plane), 0, own_sigma_px, config.search.slip_sigma_px)
+            other = less_certain(mirrored(_as_found(number, prediction, found), *plane), 0, predicted_px, config.search.slip_sigma_px)
             found, prediction = _search_from(number, other, config.search.slip_sigma_px, least[2:, number], events, found, prediction, config)
     was_adrift = doubt.adrift & found.elsewhere
     prediction = replace(prediction, covariance=torch.where(was_adrift[:, None, None], uncertain.covariance, prediction.covariance))
