@@ -62,13 +62,13 @@ def conclude(
     contours = reproject(contours, T_cam_obj.to(velocity.dtype), objects.intrinsics)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
-    state = replace(state, T_cam_obj=T_cam_obj, velocity=velocity, acceleration=acceleration, covariance=covariance)
     # One good window among bad ones does not end a doubt.
     doubted_s = (state.doubted_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0)
-    state = replace(state, doubted_s=doubted_s)
     certain = (share >= _CERTAIN * state.full_share) & (status == int(quality.Status.TRACKING))
     T_last_seen = torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen)
-    state = replace(state, T_last_seen=T_last_seen, unseen_s=torch.where(certain, 0, state.unseen_s + dt_s))
+    unseen_s = torch.where(certain, 0, state.unseen_s + dt_s)
+    state = replace(state, T_cam_obj=T_cam_obj, velocity=velocity, acceleration=acceleration, covariance=covariance)
+    state = replace(state, doubted_s=doubted_s, T_last_seen=T_last_seen, unseen_s=unseen_s)
     return _with_scores(state, found, failed), result
 
 

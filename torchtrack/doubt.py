@@ -51,6 +51,10 @@ class Doubt:
     has_symmetry: Bool[Tensor, "b"]
     unseen_s: Float[Tensor, "b"]
 
+    def reasons(self, score: Float[Tensor, "b"], config: SearchConfig) -> tuple[Bool[Tensor, "b"], ...]:
+        """Which objects a search is wanted for: beside the prediction, where they may have slipped to, and mirrored."""
+        return self.asks(score, config), self.slips(score, config), self.is_mirrored(score, config)
+
     def asks(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects are to be searched for: uncertain ones, those whose score stays below the usual, and those long in doubt."""
         starting = self.starting if config.at_start else torch.zeros_like(self.starting)
@@ -89,7 +93,8 @@ def is_wanted(doubt: Doubt, score: Float[Tensor, "b"], config: TrackerConfig) ->
     if config.search.hypotheses == 0 or not config.solver.prior:
         return torch.zeros_like(doubt.starting)
     # Those that have run off are asked for already, as uncertain ones or as those in doubt.
-    return doubt.asks(score, config.search) | doubt.slips(score, config.search) | doubt.is_mirrored(score, config.search)
+    asks, slips, is_mirrored = doubt.reasons(score, config.search)
+    return asks | slips | is_mirrored
 
 
 def in_doubt(

@@ -113,8 +113,7 @@ def search_wanted(
     """
     # Without events no pose is better than another.
     enough = events.mask.sum(-1) >= config.quality.min_observations
-    ask = (doubt.asks, doubt.slips, doubt.is_mirrored)
-    reasons = (*(reason(found.score, config.search) for reason in ask), doubt.has_run_off(config.search))
+    reasons = (*doubt.reasons(found.score, config.search), doubt.has_run_off(config.search))
     least = _least(doubt, config.search)
     uncertain = drifted(prediction, doubt, config.search)
     sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)

@@ -1,7 +1,8 @@
 """Surfaces of revolution, such as bottles and bowls, which turned about their axis look the same; and planes of symmetry."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -18,6 +19,8 @@ _SLIP, _KEEPING = 0.14, 0.995
 _DISTINCT = 1e-4
 # A surface is its own mirror image when samples of the image lie this near to it, in the mean (diameters).
 _MIRRORED = 0.02
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -83,9 +86,14 @@ def symmetry_planes(model: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tenso
 
 def revolution_axes(models: Sequence[ObjectModel]) -> Float[Tensor, "b 3"]:
     """Direction of the :func:`revolution_axis` of each object (float64); zero where there is none."""
-    found = {number: revolution_axis(model) for number, model in {id(model): model for model in models}.items()}
-    axes = [found[id(model)] for model in models]
+    axes = of_each(models, revolution_axis)
     return torch.stack([torch.zeros(3, dtype=torch.float64) if axis is None else axis.direction_obj for axis in axes])
+
+
+def of_each(models: Sequence[ObjectModel], look: Callable[[ObjectModel], T]) -> list[T]:
+    """What is found of each model; one that several objects have is looked at once."""
+    found = {number: look(model) for number, model in {id(model): model for model in models}.items()}
+    return [found[id(model)] for model in models]
 
 
 def _corners(triangles: Float[Tensor, "f 3 3"]) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"], Float[Tensor, "p"]]:
