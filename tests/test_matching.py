@@ -19,7 +19,7 @@ from torchtrack.observations import Observations
 
 def matching(**settings):
     """Settings without what corrects and weights the matches, unless it is asked for."""
-    return MatchingConfig(**{"dark_shift_px": 0.0, "concentration": False, "polarity": False, **settings})
+    return MatchingConfig(**{"dark_shift_px": 0.0, "limb_dark_shift_px": 0.0, "concentration": False, "polarity": False, **settings})
 
 
 def nearest(observations, contours, *, velocity=(0.0, 0.0), believed=None, gate_px=3.0, index=None, cell_px=1, **settings):
@@ -207,10 +207,16 @@ def test_events_are_moved_back_from_the_dark_side(polarity, speed, shift):
     assert matches.targets[0, 0].tolist() == pytest.approx([80.0 + shift, 60.0])
 
 
-def test_the_limb_of_a_smooth_surface_has_no_dark_side():
-    contours = upright_line(80.0, kind=ContourKind.LIMB)
-    matches, _ = nearest(seen([[[80.0, 60.0]]], polarity=1.0), contours, velocity=(490.0, 0.0), dark_shift_px=1.0)
-    assert matches.targets[0, 0].tolist() == [80.0, 60.0]
+@pytest.mark.parametrize(("kind", "shift"), [(ContourKind.LIMB, -0.49), (ContourKind.CREASE, -0.98), (ContourKind.TEXTURE, -0.98)])
+def test_the_limb_of_a_smooth_surface_has_a_shift_of_its_own(kind, shift, dtype):
+    contours = upright_line(80.0, kind=kind, dtype=dtype)
+    seen_there = seen([[[80.0, 60.0]]], polarity=1.0, dtype=dtype)
+    matches, _ = nearest(seen_there, contours, velocity=(490.0, 0.0), dark_shift_px=1.0, limb_dark_shift_px=0.5)
+    assert matches.targets[0, 0].tolist() == pytest.approx([80.0 + shift, 60.0])
+
+
+def test_a_limb_is_shifted_less_than_a_step_by_default():
+    assert 0 < MatchingConfig().limb_dark_shift_px < MatchingConfig().dark_shift_px
 
 
 def test_the_dark_side_does_not_depend_on_the_sign_of_the_normal(dtype):

@@ -78,6 +78,30 @@ def test_events_of_a_curved_object_lie_on_its_outline(ball, lens, background):
     assert float((sequence.source == 0).double().mean()) > 0.995
 
 
+@pytest.mark.parametrize(("luminance", "outside_is_dark"), [(0.05, True), (0.9, False)], ids=["before dark", "before bright"])
+def test_events_of_a_lit_limb_lie_to_its_dark_side(ball, luminance, outside_is_dark):
+    """By less than of a sharp edge, and whatever the motion: what ``matching.limb_dark_shift_px`` takes back."""
+    sequence = simulate(ball_scene(ball, background=BackgroundConfig(luminance=luminance), render={}))
+    events = sequence.events
+    chosen = torch.linspace(0, len(events) - 1, 600).long()
+    poses = sequence.trajectories[0].at(events.t_us[chosen])
+    before = sequence.trajectories[0].at(events.t_us[chosen] - 2000)
+    outward, leads = [], []
+    for centre, moved, x, y in zip(
+        poses[:, :3, 3], (poses - before)[:, :2, 3].numpy(), events.x[chosen].tolist(), events.y[chosen].tolist(), strict=True
+    ):
+        outline = outline_of_ball(centre, sequence.camera)
+        middle = outline.mean(0)
+        nearest = outline[np.linalg.norm(outline - [x, y], axis=1).argmin()] - middle
+        outward.append(np.linalg.norm([x, y] - middle) - np.linalg.norm(nearest))
+        leads.append(moved @ nearest > 0)
+    distance, leads = np.array(outward), np.array(leads)
+    near = np.abs(distance) < 1.5
+    # Both sides count alike: what leads and what trails lag the same way.
+    shift = np.mean([distance[near & side].mean() for side in (leads, ~leads)])
+    assert 0.03 < (shift if outside_is_dark else -shift) < 0.25
+
+
 def test_events_of_a_print_lie_on_edges_of_the_image():
     """Where the true image has a steep edge, at the time of the event."""
     item = ObjectConfig(label="card", shape="planar", motion=MotionConfig(position_m=(0, 0, 0.45)))

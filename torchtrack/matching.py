@@ -77,18 +77,17 @@ class ContourTable:
     def of(cls, contours: Contours, index: ContourIndex) -> "ContourTable":
         """The table of contours and their index.
 
-        Limbs of smooth surfaces are no step, as their shading fades towards them. The normals of the mesh's own edges
-        are oriented: they point outwards. Those of print point to its darker side.
+        The normals of the mesh's own edges are oriented: they point outwards. Those of print point to its darker side.
         """
         limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
-        marks = torch.stack([limb, ~limb, limb | crease, texture], -1).to(contours.pixels.dtype)
+        marks = torch.stack([limb, limb | crease, texture], -1).to(contours.pixels.dtype)
         values = (contours.points_obj, contours.normals, index.pixels, marks)
         return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index)
 
-    def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Of contour points: places on the object, normals, pixels when indexed, whether a limb, whether a step, whether oriented, whether print."""
+    def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Of contour points: places on the object, normals, pixels when indexed, whether a limb, whether oriented, whether print."""
         taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
-        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 4), -1)
+        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 3), -1)
         return points_obj, normals, indexed, *marks.unbind(-1)
 
 
@@ -113,7 +112,7 @@ def match_nearest(
     """
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
     found = table.index.look_up(place, finely)
-    points_obj, normals, indexed, limb, step, oriented, printed = table.take(contour := found.clamp(min=0))
+    points_obj, normals, indexed, limb, oriented, printed = table.take(contour := found.clamp(min=0))
     pixels, velocity, change = objects.show(points_obj)
     crossing_px_s = vecdot(normals, velocity)
     dark = observations.polarity * _leading(crossing_px_s)
@@ -122,7 +121,7 @@ def match_nearest(
     if change is not None:
         # It had moved less, or more, when it was slower or faster.
         carried = torch.addcmul(carried, change, age_s[..., None].square(), value=-0.5)
-    targets = torch.addcmul(carried, normals, (dark * step)[..., None], value=-config.dark_shift_px)
+    targets = torch.addcmul(carried, normals, (dark * _dark_shift_px(limb, config))[..., None], value=-1)
     difference = pixels - targets
     near = observations.mask & (found >= 0)
     matched = near & (vecdot(difference, difference) < (gate_px * wider)[:, None].square())
@@ -140,6 +139,11 @@ def match_nearest(
 def _leading(speed_px_s: Tensor) -> Tensor:
     """Whether a contour moves along its normal or against it: 1 or -1, and less where it is slow."""
     return speed_px_s / (speed_px_s.abs() + constant((_SLOW_PX_S,), speed_px_s.dtype, speed_px_s.device))
+
+
+def _dark_shift_px(limb: Tensor, config: MatchingConfig) -> Tensor:
+    """How far events lie to the dark side of their edge: a step's, or, less, that of a limb, towards which shading fades."""
+    return torch.add(constant((config.dark_shift_px,), limb.dtype, limb.device), limb, alpha=config.limb_dark_shift_px - config.dark_shift_px)
 
 
 def _weights(offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, config: MatchingConfig) -> tuple[Tensor, Tensor]:

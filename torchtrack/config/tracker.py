@@ -127,6 +127,7 @@ class MatchingConfig(Settings):
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
+    limb_dark_shift_px: float = Field(0.06, ge=0, le=2, description="The same of the limb of a smooth surface, towards which its shading fades (px).")
     burst_px: float = Field(
         1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow circuits fire on (px)."
     )
