@@ -205,6 +205,14 @@ def test_what_was_measured_otherwise_or_not_to_the_end_is_measured_anew(folder, 
     assert tracked == [("one", "line"), ("two", "default"), ("two", "line")]
 
 
+def test_what_counts_as_lost_may_change_before_it_is_resumed(folder, tmp_path, monkeypatch):
+    config = broken_off((folder,), tmp_path, 3).model_copy(update={"resume": True, "lost_rotation_deg": 1e-9})
+    tracked = measured_by(monkeypatch)
+    resumed = evaluate(config)
+    assert len(tracked) == 1
+    assert all(result.metrics.lost_fraction == 1 for result in resumed.results)
+
+
 @pytest.mark.parametrize("line", ["no json", "{}", '{"identity": "a"}', '{"identity": "a", "measured": [{}]}', "[1]", "\x00"])
 def test_a_file_of_measurements_that_is_none_is_told_and_kept(folder, tmp_path, line):
     config = broken_off((folder,), tmp_path, 2).model_copy(update={"resume": True})

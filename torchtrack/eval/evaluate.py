@@ -102,7 +102,7 @@ def evaluate(config: EvaluateConfig, on_done: Callable[[Job], None] = lambda job
 
 def _measured_once(jobs: Sequence[Job], config: EvaluateConfig, journal: Journal, on_done: Callable[[Job], None]) -> list[Outcome]:
     """The outcome of every job; what the journal knows is not measured again, where that is asked for."""
-    names = [identity(job.path, job.method, job.config, _limits(config)) for job in jobs]
+    names = [identity(job.path, job.method, job.config) for job in jobs]
     asked = set(names)
     known = {name: measured for name, measured in (journal.read() if config.resume else {}).items() if name in asked}
     journal.begin(known)

@@ -18,11 +18,14 @@ Measured = Sequence[ObjectResult | NotApplicable]
 """What was measured of one sequence under one method."""
 
 
-def identity(path: Path, method: str, config: RunConfig, limits: tuple[float, float]) -> str:
-    """What tells a measurement from others: the sequence as it is on disk, the method with all its settings, and the version of this package."""
+def identity(path: Path, method: str, config: RunConfig) -> str:
+    """What tells a measurement from others: the sequence as it is on disk, the method with all its settings, and the version of this package.
+
+    From which error on a window counts as lost is asked when a measurement is read.
+    """
     there = path.stat() if path.exists() else None
     file = (str(path.resolve()), there and there.st_size, there and there.st_mtime_ns)
-    told = json.dumps([file, method, config.model_dump(mode="json"), limits, torchtrack.__version__], sort_keys=True)
+    told = json.dumps([file, method, config.model_dump(mode="json"), torchtrack.__version__], sort_keys=True)
     return hashlib.sha256(told.encode()).hexdigest()
 
 
