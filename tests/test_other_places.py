@@ -12,6 +12,7 @@ from torchtrack.camera import project
 from torchtrack.config.tracker import CornerConfig, SearchConfig, TrackerConfig
 from torchtrack.lie import difference_about, retract_about, rotation_angle_deg, transform_points
 from torchtrack.motion import Acceleration
+from torchtrack.object_model.symmetry import symmetry_planes
 from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
 from torchtrack.prediction import Prediction
 from torchtrack.quality import Status
@@ -115,6 +116,13 @@ def test_planes_are_handed_out_object_by_object():
 # ---- in the tracker
 
 
+@pytest.mark.parametrize(("changes", "count"), [({}, 3), ({"search": {"mirrored_to": 0}}, 0), ({"search": {"hypotheses": 0}}, 0)])
+def test_planes_are_looked_for_only_where_mirrored_poses_are_tried(changes, count):
+    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig.model_validate(changes))
+    assert len(list(tracker.planes.of(0))) == count
+    assert bool(tracker.has_symmetry) == (count > 0)
+
+
 def runs_on(config, change, count=8):
     """Results of a box in full motion whose state was changed, and its true poses; windows end when it is time to look far away."""
     tracker = Tracker([box_model()], SMALL_CAMERA, config)
@@ -128,7 +136,8 @@ def runs_on(config, change, count=8):
 def mirrored_state(tracker, state):
     """The state of a box that follows the mirror image of its pose."""
     prediction = Prediction(tracker.objects, state.T_cam_obj.float(), torch.ones(1, dtype=torch.bool), state.velocity, state.covariance)
-    other = mirrored(prediction, *next(iter(tracker.planes.of(0))))
+    point, normals = symmetry_planes(box_model())
+    other = mirrored(prediction, point.float(), normals[0].float())
     assert float(rotation_angle_deg(other.T_cam_obj[:, :3, :3].double(), state.T_cam_obj[:, :3, :3])) > 20
     return replace(state, T_cam_obj=other.T_cam_obj.double(), velocity=other.velocity, covariance=other.covariance)
 

@@ -88,9 +88,19 @@ def is_due(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], interval_us: int)
     return t_us // interval_us > since_us // interval_us
 
 
+def searches(config: TrackerConfig) -> bool:
+    """Whether other poses are ever tried."""
+    return config.search.hypotheses > 0 and config.solver.prior
+
+
+def mirrors(config: TrackerConfig) -> bool:
+    """Whether they are mirrored ones, too."""
+    return searches(config) and config.search.mirrored_to > 0
+
+
 def is_wanted(doubt: Doubt, score: Float[Tensor, "b"], config: TrackerConfig) -> Bool[Tensor, "b"]:
     """Which objects a search is wanted for, as ``score`` tells once the window is aligned."""
-    if config.search.hypotheses == 0 or not config.solver.prior:
+    if not searches(config):
         return torch.zeros_like(doubt.starting)
     # Those that have run off are asked for already, as uncertain ones or as those in doubt.
     asks, slips, is_mirrored = doubt.reasons(score, config.search)

@@ -9,10 +9,11 @@ from torch.nn.functional import pad
 from torchtrack.camera import Camera
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_model import ContourModel, group_by_model
+from torchtrack.doubt import mirrors
 from torchtrack.model_trust import element_groups
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
-from torchtrack.object_model.symmetry import of_each, revolution_axes, symmetry_planes
+from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, symmetry_planes
 from torchtrack.other_places import SymmetryPlanes
 from torchtrack.prediction import far_pose
 from torchtrack.sensor_tiles import SensorTiles
@@ -67,7 +68,8 @@ class TrackedObjects(nn.Module):
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
         self.register_buffer("revolution_axes", revolution_axes(objects))
         self.revolves = bool(self.revolution_axes.any())
-        points, normals = zip(*of_each(objects, symmetry_planes), strict=True)
+        # Looking for planes takes as long as some windows.
+        points, normals = zip(*of_each(objects, symmetry_planes if mirrors(self.config) else no_planes), strict=True)
         self.symmetry_counts = tuple(len(each) for each in normals)
         self.register_buffer("symmetry_points", torch.stack(points))
         self.register_buffer("symmetry_normals", torch.stack([pad(each, (0, 0, 0, 3 - len(each))) for each in normals]))

@@ -75,13 +75,18 @@ def symmetry_planes(model: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tenso
     """
     points = model.surface_points.double()
     if len(points) == 0:
-        return torch.zeros(3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
+        return no_planes(model)
     middle = points.mean(0)
     arms = points - middle
     axes, surface = torch.linalg.eigh(arms.mT @ arms).eigenvectors.mT, cKDTree(arms.numpy())
     images = (arms - 2 * (arms @ axis)[:, None] * axis for axis in axes)
     apart_m = torch.tensor([surface.query(image.numpy())[0].mean() for image in images])
     return middle, axes[apart_m < _MIRRORED * model.diameter_m]
+
+
+def no_planes(_: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tensor, "0 3"]]:
+    """What :func:`symmetry_planes` gives of a model without any."""
+    return torch.zeros(3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
 
 
 def revolution_axes(models: Sequence[ObjectModel]) -> Float[Tensor, "b 3"]:
