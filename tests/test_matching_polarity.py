@@ -83,8 +83,8 @@ def weights_on_a_line(polarity, *, speed=500.0, kind=ContourKind.CREASE, polarit
     v = 32 + 15 * torch.rand(len(polarity), generator=generator(), dtype=torch.float64)
     places = torch.stack([torch.full_like(v, 80.0), v], -1)[None]
     observations = seen(places, polarity=torch.tensor(polarity, dtype=torch.float64)[None])
-    table = ContourTable.of(contours, index_contours(contours, IMAGE_SIZE, 8, 1))
-    config = MatchingConfig(concentration=False, dark_shift_px=0.0, limb_dark_shift_px=0.0, polarity=polarity_counts, print_polarity=print_counts)
+    table = ContourTable.of(contours, index_contours(contours, IMAGE_SIZE, 8, 1), of_print=print_counts)
+    config = MatchingConfig(concentration=False, dark_shift_px=0.0, limb_dark_shift_px=0.0, polarity=polarity_counts)
     return match_nearest(observations, table, places, moving_objects((speed, 0.0)), 3.0, config)[0].weights[0]
 
 

@@ -35,8 +35,9 @@ def matches_at(targets, near=None, offsets=0.0):
     offsets = torch.as_tensor(offsets, dtype=torch.float64).expand(near.shape)
     nothing = torch.zeros(near.shape, dtype=torch.int64)
     points = torch.zeros(*near.shape, 3, dtype=torch.float64)
-    directions, zeros = torch.zeros_like(targets), torch.zeros_like(offsets)
-    return Matches(nothing, torch.zeros_like(near), torch.ones_like(offsets), zeros, points, targets, directions, offsets, near, zeros, zeros)
+    directions, zeros, ones = torch.zeros_like(targets), torch.zeros_like(offsets), torch.ones_like(offsets)
+    place = points, targets, directions, offsets, near
+    return Matches(nothing, torch.zeros_like(near), ones, zeros, *place, limb=zeros, beside=zeros, dark=zeros, as_expected=ones)
 
 
 def upright_line(u=80.0, count=80, first=20.0):

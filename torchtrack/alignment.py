@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.tracker import TrackerConfig
+from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.contour_index import ContourIndex, index_contours
 from torchtrack.contours import Contours, reproject
 from torchtrack.implicit_gradient import with_gradient
 from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest, told_by_each
+from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import Observations
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
 from torchtrack.pose_solver import solve_pose
@@ -98,13 +99,13 @@ def align(
     begin = prediction if offset is None else prediction.moved(offset)
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
     place = _first_place(begin, observations, config)
-    table = ContourTable.of(contours, index)
+    table = _table(contours, index, objects, matching)
     # One that may be far off would settle on the first edges that it is nearest to.
     small = (objects.size_px(begin.T_cam_obj).detach() < matching.fine_below_px) & (widening <= 1)
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, _narrowing(widening, len(matching.gates_px)), strict=True)):
         if number and number in config.contours.refresh_rounds:
             contours = objects.contours(begin.T_cam_obj, config.contours)
-            table = ContourTable.of(contours, index_for(contours, objects.image_size, config, widening, index.radius_px))
+            table = _table(contours, index_for(contours, objects.image_size, config, widening, index.radius_px), objects, matching)
             place = _first_place(begin, observations, config)
         moving = begin.moving(compensated=matching.motion_compensation, offset=offset if config.solver.acceleration_in_window else None)
         if matching.along_flow:
@@ -118,6 +119,11 @@ def align(
         begin, offset = prediction.at(solution.T_cam_obj, solution.from_prior), solution.from_prior
     solution = with_gradient(problem, solution, config.solver)
     return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
+
+
+def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config: MatchingConfig) -> ContourTable:
+    """What observations take from their contours, with the polarity that is expected of them."""
+    return ContourTable.of(contours, index, objects.polarity, of_print=config.print_polarity)
 
 
 def _narrowing(widening: Float[Tensor, "b"], rounds: int) -> Iterable[Float[Tensor, "b"]]:

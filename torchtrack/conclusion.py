@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import lie, quality
@@ -12,7 +12,9 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import reproject
 from torchtrack.corners import Corners
 from torchtrack.doubt import in_doubt
+from torchtrack.matching import ON_CONTOUR_PX
 from torchtrack.motion import fade, found_acceleration, inverse, left_covariance, with_dropped
+from torchtrack.polarity_memory import is_seen_well, remembered
 from torchtrack.prediction import Prediction
 from torchtrack.search import Found
 from torchtrack.state import StepResult, TrackerState
@@ -68,8 +70,22 @@ def conclude(
     T_last_seen = torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen)
     unseen_s = torch.where(certain, 0, state.unseen_s + dt_s)
     state = replace(state, T_cam_obj=T_cam_obj, velocity=velocity, acceleration=acceleration, covariance=covariance)
-    state = replace(state, doubted_s=doubted_s, T_last_seen=T_last_seen, unseen_s=unseen_s)
+    darker_outside = _darker_outside(state, found, status, dt_s, config)
+    state = replace(state, doubted_s=doubted_s, T_last_seen=T_last_seen, unseen_s=unseen_s, darker_outside=darker_outside)
     return _with_scores(state, found, failed), result
+
+
+def _darker_outside(
+    state: TrackerState, found: Found, status: Int[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
+) -> Float[Tensor, "b 8"]:
+    """Which side of contours is the darker one, with what the events on those of objects that are seen well say of it."""
+    if not config.matching.polarity_memory_s:
+        return state.darker_outside
+    matches = found.fit.matches
+    # What a search found stands on other matches than these.
+    known = (status == int(quality.Status.TRACKING)) & is_seen_well(found.share, state.full_share) & ~found.elsewhere
+    weights = matches.weights * (matches.offsets.abs() < ON_CONTOUR_PX) * known[:, None]
+    return remembered(state.darker_outside, matches.directions, matches.dark, weights, dt_s, config.matching.polarity_memory_s)
 
 
 def _with_scores(state: TrackerState, found: Found, failed: Bool[Tensor, "b"]) -> TrackerState:

@@ -19,6 +19,7 @@ from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours, take_points
 from torchtrack.image_motion import MovingObjects
 from torchtrack.observations import Observations
+from torchtrack.polarity_memory import octant
 
 # An edge this parallel to the flow (|n·f| below) is not crossed by it.
 _MIN_CROSSING = 0.3
@@ -46,6 +47,8 @@ class Matches:
         near: which observations have a contour so near that ``offsets`` says something, matched or not.
         limb: 1 where the contour is the limb of a smooth surface, 0 where not.
         beside: how many observations are on the contour in the patch of the image that each lies in.
+        dark: 1 where an event says that the outer side of its contour is the darker one, -1 the inner one; 0 where that is not known.
+        as_expected: how far that is what it is expected to say, 0 to 1.
     """
 
     contour: Int[Tensor, "b n"]
@@ -59,6 +62,8 @@ class Matches:
     near: Bool[Tensor, "b n"]
     limb: Float[Tensor, "b n"]
     beside: Float[Tensor, "b n"]
+    dark: Float[Tensor, "b n"]
+    as_expected: Float[Tensor, "b n"]
 
 
 @dataclass(frozen=True)
@@ -74,18 +79,25 @@ class ContourTable:
     index: ContourIndex
 
     @classmethod
-    def of(cls, contours: Contours, index: ContourIndex) -> "ContourTable":
+    def of(cls, contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_print: bool = True) -> "ContourTable":
         """The table of contours and their index.
 
         The normals of the mesh's own edges are oriented: they point outwards. Those of print point to its darker side.
+
+        Args:
+            polarity: expected of the mesh's own edges, by the octant that they face (:func:`torchtrack.polarity_memory.expected_polarity`).
+            of_print: whether anything is expected of print.
         """
         limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
-        marks = torch.stack([limb, limb | crease, texture], -1).to(contours.pixels.dtype)
+        oriented, expected = limb | crease, (texture & of_print).to(contours.pixels.dtype)
+        if polarity is not None:
+            expected = torch.where(oriented, polarity.gather(1, octant(contours.normals)), expected)
+        marks = torch.stack([limb.to(expected.dtype), oriented.to(expected.dtype), expected], -1)
         values = (contours.points_obj, contours.normals, index.pixels, marks)
         return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index)
 
     def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Of contour points: places on the object, normals, pixels when indexed, whether a limb, whether oriented, whether print."""
+        """Of contour points: places on the object, normals, pixels when indexed, whether a limb, whether oriented, the darker side expected."""
         taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
         points_obj, normals, indexed, marks = taken.split((3, 2, 2, 3), -1)
         return points_obj, normals, indexed, *marks.unbind(-1)
@@ -112,7 +124,7 @@ def match_nearest(
     """
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
     found = table.index.look_up(place, finely)
-    points_obj, normals, indexed, limb, oriented, printed = table.take(contour := found.clamp(min=0))
+    points_obj, normals, indexed, limb, oriented, expected = table.take(contour := found.clamp(min=0))
     pixels, velocity, change = objects.show(points_obj)
     crossing_px_s = vecdot(normals, velocity)
     dark = observations.polarity * _leading(crossing_px_s)
@@ -126,12 +138,11 @@ def match_nearest(
     near = observations.mask & (found >= 0)
     matched = near & (vecdot(difference, difference) < (gate_px * wider)[:, None].square())
     offsets = vecdot(difference, normals) / wider[:, None]
-    weights, beside = _weights(offsets, targets, near, dark * oriented, config)
-    if config.print_polarity:
-        weights = weights * _agreeing(dark * printed, config)
+    as_expected, dark = _agreeing(dark * expected, config), dark * oriented
+    weights, beside = _weights(offsets, targets, near, dark, as_expected, config)
     if config.mutual_px:
         weights = weights * mutual_agreement(pixels, offsets, matched, config.mutual_px)
-    matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb, beside)
+    matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb, beside, dark, as_expected)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)
 
@@ -146,12 +157,12 @@ def _dark_shift_px(limb: Tensor, config: MatchingConfig) -> Tensor:
     return torch.add(constant((config.dark_shift_px,), limb.dtype, limb.device), limb, alpha=config.limb_dark_shift_px - config.dark_shift_px)
 
 
-def _weights(offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, config: MatchingConfig) -> tuple[Tensor, Tensor]:
+def _weights(offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, as_expected: Tensor, config: MatchingConfig) -> tuple[Tensor, Tensor]:
     """How far each observation is to be trusted, by those around it, and how many of these are on the contour."""
-    cell, on_and_near = patch(targets), on_and_around(offsets, near)
+    cell, on_and_near = patch(targets), on_and_around(offsets, near) * as_expected[:, None]
     values = torch.cat([on_and_near, on_and_near[:, :1] * dark[:, None]], 1)
     on_count, near_count, votes = patch_sums(cell, values).gather(2, cell[:, None].expand(-1, 3, -1)).unbind(1)
-    weights = concentration(on_count, near_count, config) if config.concentration else torch.ones_like(offsets)
+    weights = as_expected * concentration(on_count, near_count, config) if config.concentration else as_expected
     return weights * polarity_agreement(dark, votes, on_count, config) if config.polarity else weights, on_count
 
 
@@ -271,8 +282,9 @@ def match_along_flow(observations: Observations, contours: Contours, objects: Mo
     mask = observations.mask & observations.has_flow & torch.isfinite(distance)
     offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
     limb = (contours.kind == int(ContourKind.LIMB)).gather(1, contour).to(offsets.dtype)
-    alone = torch.zeros_like(offsets)
-    return Matches(contour, mask, torch.ones_like(offsets), observations.age_s, points_obj, targets, directions, offsets, mask, limb, alone)
+    none, all_of_it = torch.zeros_like(offsets), torch.ones_like(offsets)
+    told = observations.age_s, points_obj, targets, directions, offsets, mask
+    return Matches(contour, mask, all_of_it, *told, limb, beside=none, dark=none, as_expected=all_of_it)
 
 
 def both_coordinates(matches: Matches) -> Matches:

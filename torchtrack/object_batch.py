@@ -52,6 +52,7 @@ class ObjectBatch:
         shared: whether any stream has more than one object.
         learned: contour points beside those of the models; none when not given.
         shown: which elements of the models are taken for contours; all when not given.
+        polarity: the darker side expected of contours, by the octant that they face (:mod:`torchtrack.polarity_memory`); nothing when not given.
     """
 
     models: Sequence[ContourModel]
@@ -63,6 +64,7 @@ class ObjectBatch:
     shared: bool
     learned: LearnedPoints | None = None
     shown: Bool[Tensor, "b k"] | None = None
+    polarity: Float[Tensor, "b 8"] | None = None
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -117,8 +119,8 @@ class ObjectBatch:
         model.numbers, model._buffers = tuple(range(count)), {**has_it._buffers, "members": streams}
         intrinsics, centre_obj, diameter_m = (repeat_row(value, number, count) for value in (self.intrinsics, self.centre_obj, self.diameter_m))
         learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))
-        shown = None if self.shown is None else repeat_row(self.shown, number, count)
-        return ObjectBatch([model], intrinsics, centre_obj, diameter_m, streams, (count, *self.image_size), False, learned, shown)
+        shown, polarity = (None if values is None else repeat_row(values, number, count) for values in (self.shown, self.polarity))
+        return ObjectBatch([model], intrinsics, centre_obj, diameter_m, streams, (count, *self.image_size), False, learned, shown, polarity)
 
 
 def repeat_row(values: Tensor, number: int, count: int) -> Tensor:

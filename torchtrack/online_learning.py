@@ -10,6 +10,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.model_trust import judge_elements
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import WindowEvents
+from torchtrack.polarity_memory import expected_polarity
 from torchtrack.prediction import Prediction
 from torchtrack.quality import Status
 from torchtrack.search import Found
@@ -20,7 +21,9 @@ from torchtrack.surface_learning import Surroundings, learn_after
 def objects_as_known(
     objects: ObjectBatch, state: TrackerState, element_groups: Int[Tensor, "b k"], on_surfaces: bool, config: TrackerConfig
 ) -> ObjectBatch:
-    """The objects with the contours learned on them that count by now, and without those parts of their models that are not seen.
+    """The objects with the contours learned on them that count by now, without those parts of their models that are not seen.
+
+    And with the polarity of their contours, where it is needed.
 
     Args:
         element_groups: the group of each element of the objects' models.
@@ -34,6 +37,11 @@ def objects_as_known(
         shown = state.model_trust.of_width(element_groups.shape[1]).shown(element_groups, config.model_trust)
         if not readback.read_at_once(shown) or not bool(shown.all()):
             objects = replace(objects, shown=shown)
+    if config.matching.polarity_memory_s:
+        expected = expected_polarity(state.darker_outside, state.score.detach(), state.full_share.detach())
+        # Of objects that are seen well nothing is asked.
+        if not readback.none_of(expected != 0):
+            objects = replace(objects, polarity=expected)
     return objects
 
 

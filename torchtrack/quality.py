@@ -48,7 +48,7 @@ def measured_share(
     A patch of the image explains its contours when most of the observations near them are on them: a few of those that
     chance scatters around a contour always are.
     """
-    counts = patch_sums(patch(matches.targets), on_and_around(matches.offsets, matches.near))
+    counts = patch_sums(patch(matches.targets), on_and_around(matches.offsets, matches.near) * matches.as_expected[:, None])
     on, near = counts.gather(2, patch(contours.pixels)[:, None].expand(-1, 2, -1)).unbind(1)
     explained = (on >= config.min_on_contour) & (on + 1 > _LEAST_SHARE * (near + 2))
     speed = (contours.normals * contour_velocity).sum(-1).abs()

@@ -26,6 +26,7 @@ from torchtrack.motion import initial_covariance, next_acceleration, predict_cov
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
+from torchtrack.polarity_memory import nothing_remembered
 from torchtrack.prediction import Prediction, before_camera
 from torchtrack.probation import after_probation
 from torchtrack.search import explained_at_rest, judge_fit, search_wanted
@@ -91,7 +92,7 @@ class Tracker(TrackedObjects):
         learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
         trust = ModelTrust.none(self.element_groups, velocity) if self.judges else None
         probation = Probation.none(T_cam_obj, covariance)
-        motion, shares, seen = (velocity, velocity, covariance), (nothing,) * 5, (T_cam_obj.clone(), nothing)
+        motion, shares, seen = (velocity, velocity, covariance), (nothing,) * 5, (T_cam_obj.clone(), nothing, nothing_remembered(velocity))
         return TrackerState(T_cam_obj.clone(), *motion, *shares, *seen, times, last_event_us, burst_age_us, probation, learned, trust)
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:

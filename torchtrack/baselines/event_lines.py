@@ -178,6 +178,8 @@ class EventLineTracker(Tracker):
                 near=near.mask & belongs,
                 limb=torch.zeros_like(near.age_s),
                 beside=torch.zeros_like(near.age_s),
+                dark=torch.zeros_like(near.age_s),
+                as_expected=torch.ones_like(near.age_s),
             )
             solution = solve_pose(self._problem(window, matches, information, gate_px), T_cam_obj, self.config.solver)
             T_cam_obj = solution.T_cam_obj

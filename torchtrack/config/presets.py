@@ -35,7 +35,14 @@ def _paper() -> TrackerConfig:
         flow=FlowConfig(radius_px=6, iterations=10),
         contours=ContourConfig(source="splat", texture=False, creases=False),
         matching=MatchingConfig(
-            along_flow=True, residual="point", gates_px=(8.0, 8.0, 8.0), motion_compensation=False, max_events=0, concentration=False, polarity=False
+            along_flow=True,
+            residual="point",
+            gates_px=(8.0, 8.0, 8.0),
+            motion_compensation=False,
+            max_events=0,
+            concentration=False,
+            polarity=False,
+            polarity_memory_s=0.0,
         ),
         solver=SolverConfig(iterations=5, loss="none", damping=1e-3, prior=False),
         motion=MotionConfig(model="hold", without_events="hold"),
@@ -73,7 +80,7 @@ def _nns() -> TrackerConfig:
     return TrackerConfig(
         window=WindowConfig(duration_us=3_000),
         corners=CornerConfig(max_corners=400, cell_px=5),
-        matching=MatchingConfig(along_flow=False, residual="normal", gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False, polarity=False),
+        matching=MatchingConfig(gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False, polarity=False, polarity_memory_s=0.0),
         solver=SolverConfig(iterations=2),
         learning=LearningConfig(points=0),
         quality=QualityConfig(min_observations=10, min_on_contour=1),

@@ -116,6 +116,13 @@ class MatchingConfig(Settings):
     least_trust: float = Field(0.02, ge=0, le=1, description="What a smeared patch still counts.")
     polarity: bool = Field(True, description="Trust events less whose polarity is not that of most others on the contour around them.")
     print_polarity: bool = Field(True, description="Trust events on print less whose polarity is not that of its darker side.")
+    polarity_memory_s: float = Field(
+        0.05,
+        ge=0,
+        le=10,
+        description="Which side of contours is darker is remembered for so long; while less is seen of an object, what says the opposite "
+        "counts less (s); 0 for not at all.",
+    )
     polarity_gain: float = Field(1.5, ge=0, description="How fast trust falls with the majority of the others.")
     least_agreement: float = Field(0.05, ge=0, le=1, description="What an event of the wrong polarity still counts.")
     mutual_px: float = Field(

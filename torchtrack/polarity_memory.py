@@ -1,0 +1,73 @@
+"""Which side of an object's contours is the darker one, remembered by the direction that they face in the image.
+
+In one light, and before one background, it stays as it was. Edges of what passes before an object lie on its contours by chance,
+move with them for a while, and gather on them as its own events do; but half of them have their darker side where its contours
+never had it. So while less is seen of an object than usual, events that say so count little: for the pose, for what the others
+around them are worth, and for what is explained.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+# Directions that are told apart.
+_OCTANTS = 8
+
+# An object that explains a smaller share than this when it is seen best is taken for one that is never seen well.
+_LEAST_FULL = 0.6
+# Shares of what is explained when seen well, from which a window is remembered, and below which the memory counts: at last, in full.
+_SEEN_WELL, _SEEN, _HARDLY_SEEN = 0.8, 0.9, 0.6
+# So much evidence of a direction in a window makes it count by a half.
+_LITTLE_EVIDENCE = 3.0
+
+
+def nothing_remembered(like: Float[Tensor, "b _"]) -> Float[Tensor, "b 8"]:
+    """What is remembered of as many objects as ``like`` has rows, before anything is."""
+    return like.new_zeros(len(like), _OCTANTS)
+
+
+def octant(directions: Float[Tensor, "*n 2"]) -> Int[Tensor, "*n"]:
+    """The eighth of the plane that each direction points to."""
+    u, v = directions.unbind(-1)
+    return (u > 0).long() + 2 * (v > 0) + 4 * (u.abs() > v.abs())
+
+
+def expected_polarity(darker_outside: Float[Tensor, "b 8"], score: Float[Tensor, "b"], full_share: Float[Tensor, "b"]) -> Float[Tensor, "b 8"]:
+    """What events on contours are expected to say of their darker side: 1 for the outer one, -1 for the inner one, 0 for nothing.
+
+    Args:
+        darker_outside: from :func:`remembered`; where it was now this and now that, nothing is expected.
+        score: of each object, in the window before.
+        full_share: explained when the object is seen well.
+    """
+    seen = score / full_share.clamp(min=_LEAST_FULL)
+    counts = ((_SEEN - seen) / (_SEEN - _HARDLY_SEEN)).clamp(0, 1)
+    return counts[:, None] * darker_outside * darker_outside.abs()
+
+
+def is_seen_well(share: Float[Tensor, "b"], full_share: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
+    """Which objects explain enough for their contours' sides to be remembered."""
+    return share >= _SEEN_WELL * full_share.clamp(min=_LEAST_FULL)
+
+
+def remembered(
+    darker_outside: Float[Tensor, "b 8"],
+    directions: Float[Tensor, "b n 2"],
+    dark: Float[Tensor, "b n"],
+    weights: Float[Tensor, "b n"],
+    window_s: Float[Tensor, "b"],
+    memory_s: float,
+) -> Float[Tensor, "b 8"]:
+    """What is remembered with a window more: the mean, fading with ``memory_s``, of what events said, by the octant that contours face.
+
+    Args:
+        directions: outward normals of the events' contours.
+        dark: 1 where an event says that the outer side is the darker one, -1 the inner one, 0 unknown.
+        weights: of the events; zero where nothing is to be learned.
+    """
+    weights = weights * dark.abs()
+    values = torch.stack([weights * dark.sign(), weights], 1)
+    sums = values.new_zeros(len(values), 2, _OCTANTS).scatter_add_(2, octant(directions)[:, None].expand_as(values), values)
+    total, evidence = sums.detach().unbind(1)
+    gain = (1 - torch.exp(-window_s / memory_s))[:, None] * evidence / (evidence + _LITTLE_EVIDENCE)
+    return torch.lerp(darker_outside, total / evidence.clamp(min=1e-3), gain)
