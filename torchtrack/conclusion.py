@@ -84,7 +84,8 @@ def _darker_outside(
     matches = found.fit.matches
     # What a search found stands on other matches than these.
     known = (status == int(quality.Status.TRACKING)) & is_seen_well(found.share, state.full_share) & ~found.elsewhere
-    weights = matches.weights * (matches.offsets.abs() < ON_CONTOUR_PX) * known[:, None]
+    # Chosen, not multiplied: what is not a number would stay.
+    weights = torch.where(known[:, None] & (matches.offsets.abs() < ON_CONTOUR_PX), matches.weights, 0)
     return remembered(state.darker_outside, matches.directions, matches.dark, weights, dt_s, config.matching.polarity_memory_s)
 
 

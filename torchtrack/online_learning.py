@@ -21,9 +21,9 @@ from torchtrack.surface_learning import Surroundings, learn_after
 def objects_as_known(
     objects: ObjectBatch, state: TrackerState, element_groups: Int[Tensor, "b k"], on_surfaces: bool, config: TrackerConfig
 ) -> ObjectBatch:
-    """The objects with the contours learned on them that count by now, without those parts of their models that are not seen.
+    """The objects with the contours learned on them that count by now, and without those parts of their models that are not seen.
 
-    And with the polarity of their contours, where it is needed.
+    Where less is seen of any than usual, they know which side of their contours is the darker one.
 
     Args:
         element_groups: the group of each element of the objects' models.

@@ -65,8 +65,7 @@ def remembered(
         dark: 1 where an event says that the outer side is the darker one, -1 the inner one, 0 unknown.
         weights: of the events; zero where nothing is to be learned.
     """
-    weights = weights * dark.abs()
-    values = torch.stack([weights * dark.sign(), weights], 1)
+    values = weights[:, None] * torch.stack([dark, dark.abs()], 1)
     sums = values.new_zeros(len(values), 2, _OCTANTS).scatter_add_(2, octant(directions)[:, None].expand_as(values), values)
     total, evidence = sums.detach().unbind(1)
     gain = (1 - torch.exp(-window_s / memory_s))[:, None] * evidence / (evidence + _LITTLE_EVIDENCE)
