@@ -11,7 +11,7 @@ from tracked_boxes import WINDOW_US, follow, started, windows
 
 from torchtrack import Tracker
 from torchtrack.config.presets import preset
-from torchtrack.config.tracker import CornerConfig, MotionConfig, SolverConfig, TrackerConfig
+from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig, SolverConfig, TrackerConfig
 from torchtrack.events import EventBatch
 from torchtrack.image_motion import MovingObjects
 from torchtrack.lie import so3_exp
@@ -178,7 +178,8 @@ def test_what_is_not_seen_has_no_acceleration():
 
 
 def test_an_object_that_is_partly_hidden_has_none_either():
-    tracker, state, _, (events, end_us), _ = started()
+    # What is hidden is also matched with an eye on polarities, if these are remembered.
+    tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(matching=MatchingConfig(polarity_memory_s=0.0)))
     seen, hidden = (tracker.step(replace(state, full_share=torch.full_like(state.score, full)), events, end_us) for full in (1.0, 10.0))
     assert seen[0].acceleration.any()
     assert not hidden[0].acceleration.any()
