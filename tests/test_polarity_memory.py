@@ -41,18 +41,18 @@ def test_each_eighth_of_the_plane_is_an_octant_of_its_own(dtype):
         assert (octant(turned(angle_deg + torch.linspace(-22, 22, 12), dtype)) == number).all()
 
 
-def after(dark, *, weights=1.0, window_s=0.005, memory_s=0.05, before=0.0, angle_deg=10.0, batch=1, dtype=torch.float64):
+def after(dark, *, weights=1.0, window_s=0.005, before=0.0, dtype=torch.float64):
     """What is remembered after one window of events with so many contours in one direction."""
-    dark = torch.as_tensor(dark, dtype=dtype).expand(batch, -1)
-    directions = turned(torch.full(dark.shape, angle_deg, dtype=dtype), dtype)
+    dark = torch.as_tensor(dark, dtype=dtype)[None]
+    directions = turned(torch.full(dark.shape, 10.0, dtype=dtype), dtype)
     weights = torch.as_tensor(weights, dtype=dtype).expand(dark.shape)
-    sides = torch.full((batch, 8), before, dtype=dtype)
-    return remembered(sides, directions, dark, weights, torch.full((batch,), window_s, dtype=dtype), memory_s)
+    sides = torch.full((1, 8), before, dtype=dtype)
+    return remembered(sides, directions, dark, weights, torch.full((1,), window_s, dtype=dtype), 0.05)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_what_many_events_say_is_learned_with_the_time_constant(sign, dtype):
-    found = after([sign] * 3000, window_s=0.05, memory_s=0.05, dtype=dtype)
+    found = after([sign] * 3000, window_s=0.05, dtype=dtype)
     mine = int(octant(turned(10.0)))
     assert float(found[0, mine]) == pytest.approx(sign * (1 - math.exp(-1)), rel=2e-3)
     assert (found[0, [other for other in range(8) if other != mine]] == 0).all()
@@ -98,7 +98,7 @@ def test_what_was_never_seen_well_is_measured_against_a_least_share():
 # ---- what events count by it
 
 
-def matched(dark, *, expected=1.0, kind=ContourKind.LIMB, speed=500.0, config=None):
+def matched(dark, *, expected=1.0, kind=ContourKind.LIMB):
     """Matches of events on the line at 80 px, whose normal (1, 0) it moves along: ``dark`` is their polarity."""
     contours = upright_line(80.0, kind=kind)
     v = 32 + 15 * torch.rand(len(dark), generator=generator(), dtype=torch.float64)
@@ -106,8 +106,8 @@ def matched(dark, *, expected=1.0, kind=ContourKind.LIMB, speed=500.0, config=No
     polarity = None if expected is None else torch.zeros(1, 8, dtype=torch.float64).index_fill(1, torch.tensor([RIGHT]), expected)
     table = ContourTable.of(contours, index_contours(contours, IMAGE_SIZE, 8, 1), polarity)
     observations = seen(places, polarity=torch.tensor(dark, dtype=torch.float64)[None])
-    config = config or MatchingConfig(concentration=False, dark_shift_px=0.0, limb_dark_shift_px=0.0)
-    return contours, match_nearest(observations, table, places, moving_objects((speed, 0.0)), 3.0, config)[0]
+    config = MatchingConfig(concentration=False, dark_shift_px=0.0, limb_dark_shift_px=0.0)
+    return contours, match_nearest(observations, table, places, moving_objects((500.0, 0.0)), 3.0, config)[0]
 
 
 @pytest.mark.parametrize("kind", [ContourKind.LIMB, ContourKind.CREASE])
