@@ -12,7 +12,7 @@ from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
-from torchtrack.search import _is_likely, _likeliest, _search_slipped, explained_at_rest, search
+from torchtrack.search import _is_likely, _least, _likeliest, _search_slipped, explained_at_rest, search
 
 SEARCHED = TrackerConfig()
 UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
@@ -21,8 +21,8 @@ IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
 DISPLACED = torch.tensor([[0.09, -0.06, 0.12, 0.008, -0.006, 0.0]], dtype=torch.float64)
 
 
-# By how much another pose must explain more, and how much it must explain.
-LEAST = torch.tensor([0.1, 0.0])
+# By how much another pose must explain more, how much it must explain, and how much of the events around it it must gather.
+LEAST = torch.tensor([0.1, 0.0, 0.0])
 
 
 def test_rest_explains_nothing_of_what_was_looked_for_in_many_places():
@@ -89,9 +89,31 @@ def test_what_is_no_better_by_the_margin_is_left():
 def test_what_explains_too_little_for_being_far_away_is_left():
     tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
     prediction = replace(prediction, covariance=1e2 * prediction.covariance)
-    assert search(0, prediction, 8.0, torch.tensor([0.1, 1.1]), seen, found, tracker.config) is found
+    assert search(0, prediction, 8.0, torch.tensor([0.1, 1.1, 0.0]), seen, found, tracker.config) is found
     better = search(0, prediction, 8.0, LEAST, seen, found, tracker.config)
     assert better.elsewhere.tolist() == [True] and found.elsewhere.tolist() == [False]
+
+
+@pytest.mark.parametrize("gathered", [0.3, torch.nan])
+def test_what_smears_events_more_than_it_may_is_left(gathered):
+    """Where it cannot be told how far events gather, nothing speaks against a pose."""
+    tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
+    prediction = replace(prediction, covariance=1e2 * prediction.covariance)
+    assert search(0, prediction, 8.0, torch.tensor([0.1, 0.0, 1.01]), seen, found, tracker.config) is found
+    better = search(0, prediction, 8.0, torch.tensor([0.1, 0.0, gathered]), seen, found, tracker.config)
+    assert better.elsewhere.tolist() == [True]
+    assert float(better.gathered) > 0.3
+
+
+def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
+    """Of any two poses, dense print explains about as much."""
+    tracker, state, _, _, _ = started()
+    _, _, _, found, _ = in_motion()
+    doubts = [tracker._doubt(state, state.t_us, torch.ones(1), torch.tensor([starting])) for starting in (True, False)]
+    least = [_least(doubt, found, tracker.config.search) for doubt in doubts]
+    assert 0.5 < float(least[0][2]) < float(found.gathered) < float(least[0][2]) + 0.05
+    assert least[1][2].tolist() == least[0][5].tolist() == [0.0]
+    assert _least(doubts[0], replace(found, gathered=torch.full((1,), torch.nan)), tracker.config.search)[2] <= 0
 
 
 def test_a_search_leaves_what_it_was_given_as_it_was():
@@ -142,14 +164,13 @@ def test_a_box_that_slipped_is_found_within_a_window_however_sure_it_is_of_itsel
 def test_what_slipped_goes_on_as_certain_as_if_it_had_been_predicted():
     """No less than what the prediction told, and events beside: the loose prior of the search is not left in it."""
     tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
-    least = torch.tensor([0.1, 0.0])
-    better = _search_slipped(0, prediction, float(prediction.sigma_px(found.fit.contours)), least, seen, found, tracker.config)
+    better = _search_slipped(0, prediction, float(prediction.sigma_px(found.fit.contours)), LEAST, seen, found, tracker.config)
     assert better.elsewhere.tolist() == [True] and found.elsewhere.tolist() == [False]
     told = tracker.config.solver.observation_px**2 * prediction.information[0]
     beside = better.fit.solution.hessian[0, :12, :12].double() - told
     scale = told.diagonal().rsqrt()
     assert float(torch.linalg.eigvalsh(beside * scale[:, None] * scale).min()) > -1e-3
-    assert _search_slipped(0, prediction, 1.0, torch.tensor([0.1, 1.1]), seen, found, tracker.config) is found
+    assert _search_slipped(0, prediction, 1.0, torch.tensor([0.1, 1.1, 0.0]), seen, found, tracker.config) is found
 
 
 @pytest.mark.parametrize("config", [UNSEARCHED, SEARCHED.model_copy(update={"solver": SEARCHED.solver.model_copy(update={"prior": False})})])

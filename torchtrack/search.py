@@ -114,36 +114,41 @@ def search_wanted(
     # Without events no pose is better than another.
     enough = events.mask.sum(-1) >= config.quality.min_observations
     reasons = (*doubt.reasons(found.score, config.search), doubt.has_run_off(config.search))
-    least = _least(doubt, config.search)
+    least = _least(doubt, found, config.search)
     uncertain = drifted(prediction, doubt, config.search)
     sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
     answers = (Answer.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px, doubt.sigma_px))
     for number, (is_tried, may_have_slipped, is_mirrored, has_run_off, own_sigma_px, predicted_px) in enumerate(zip(*answers, strict=True)):
         if is_tried:
-            found = search(number, uncertain, own_sigma_px, least[:2, number], events, found, config)
+            found = search(number, uncertain, own_sigma_px, least[:3, number], events, found, config)
         if may_have_slipped:
-            found = _search_slipped(number, uncertain, own_sigma_px, least[2:, number], events, found, config)
+            found = _search_slipped(number, uncertain, own_sigma_px, least[3:, number], events, found, config)
         if has_run_off:
             other = as_last_seen(uncertain.copies(number, 1), T_last_seen[number])
-            found, prediction = _search_from(number, other, own_sigma_px, least[2:, number], events, found, prediction, config)
+            found, prediction = _search_from(number, other, own_sigma_px, least[3:, number], events, found, prediction, config)
         for plane in planes.of(number) if is_mirrored else ():
             other = less_certain(mirrored(_as_found(number, prediction, found), *plane), 0, predicted_px, config.search.slip_sigma_px)
-            found, prediction = _search_from(number, other, config.search.slip_sigma_px, least[2:, number], events, found, prediction, config)
+            found, prediction = _search_from(number, other, config.search.slip_sigma_px, least[3:, number], events, found, prediction, config)
     was_adrift = doubt.adrift & found.elsewhere
     prediction = replace(prediction, covariance=torch.where(was_adrift[:, None, None], uncertain.covariance, prediction.covariance))
     return found, prediction, torch.where(was_adrift, gate_widening(sigma_px, config), widening)
 
 
-def _least(doubt: Doubt, config: SearchConfig) -> Float[Tensor, "4 b"]:
-    """By how much other poses must explain more, and how much they must explain; and both of where an object is not predicted at all."""
+def _least(doubt: Doubt, found: Found, config: SearchConfig) -> Float[Tensor, "6 b"]:
+    """By how much other poses must explain more, how much they must explain and gather; and the same of where an object is not predicted at all.
+
+    While a motion is not known nothing says how far events gather when all is well, and dense print explains as much of many poses:
+    one that smears the events more than the prediction's own is not better.
+    """
     margin = torch.where(doubt.starting, config.start_margin, config.margin)
     # What is far away has to explain about as much as usual; so has what is found step by step, while a motion is lost, ever farther away.
     needed = torch.where(doubt.adrift | doubt.starting, config.adrift_share * doubt.full_share, 0)
-    return torch.stack([margin, needed, torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share])
+    gathered, anyhow = torch.where(doubt.starting, found.gathered.nan_to_num(0.0) - _AS_MUCH, 0), torch.zeros_like(margin)
+    return torch.stack([margin, needed, gathered, torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share, anyhow])
 
 
 def _search_slipped(
-    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "2"], events: WindowEvents, found: Found, config: TrackerConfig
+    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "3"], events: WindowEvents, found: Found, config: TrackerConfig
 ) -> Found:
     """:func:`search` for an object that is sure of where it is, and may be farther off than that.
 
@@ -176,7 +181,7 @@ def _search_from(
     number: int,
     other: Prediction,
     sigma_px: float,
-    least: Float[Tensor, "2"],
+    least: Float[Tensor, "3"],
     events: WindowEvents,
     found: Found,
     prediction: Prediction,
@@ -189,13 +194,13 @@ def _search_from(
 
 
 def search(
-    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "2"], events: WindowEvents, found: Found, config: TrackerConfig
+    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "3"], events: WindowEvents, found: Found, config: TrackerConfig
 ) -> Found:
     """Try other poses for the object ``number``; ``found`` with the best of them in its place, if that is better.
 
     Args:
         sigma_px: standard deviation of the object's prediction in the image.
-        least: by how much another pose must explain more, and how much it must explain.
+        least: by how much another pose must explain more, how much it must explain, and how much of the events around it it must gather.
         events: of all objects.
     """
     return _search_around(number, prediction.copies(number, 1), found.fit.contours.of(number), sigma_px, least, events, found, config)
@@ -206,7 +211,7 @@ def _search_around(
     one: Prediction,
     outline: Contours,
     sigma_px: float,
-    least: Float[Tensor, "2"],
+    least: Float[Tensor, "3"],
     events: WindowEvents,
     found: Found,
     config: TrackerConfig,
@@ -217,12 +222,12 @@ def _search_around(
     places = one.carried(seen.pixels, seen.age_s), seen.mask
     offsets = promising(one, outline, covariance, widened_px, places, config)
     tried = _align_all(one.copies(0, len(offsets)), offsets, seen, config, found.full_gathered[number])
-    offset = tried.fit.solution.from_prior
-    counts = (tried.count >= config.quality.min_observations) & _is_likely(offset, covariance)
+    offset, (margin, needed, gathered) = tried.fit.solution.from_prior, least
+    # Written so that what does not tell how far it gathers counts.
+    counts = (tried.count >= config.quality.min_observations) & _is_likely(offset, covariance) & ~(tried.gathered < gathered)
     score = torch.where(counts, tried.score, 0)
     best = _likeliest(score, offset, one.covariance[0])
     mine = torch.where(found.count[number] >= config.quality.min_observations, found.score[number], 0.0)
-    margin, needed = least.unbind()
     better = score.index_select(0, best) > torch.maximum(mine + margin, needed)
     return found if readback.none_of(better) else _replaced(found, number, tried, best, better)
 
