@@ -111,9 +111,9 @@ def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
     _, _, _, found, _ = in_motion()
     doubts = [tracker._doubt(state, state.t_us, torch.ones(1), torch.tensor([starting])) for starting in (True, False)]
     least = [_least(doubt, found, tracker.config.search) for doubt in doubts]
-    assert 0.5 < float(least[0][2]) < float(found.gathered) < float(least[0][2]) + 0.05
-    assert least[1][2].tolist() == least[0][5].tolist() == [0.0]
-    assert _least(doubts[0], replace(found, gathered=torch.full((1,), torch.nan)), tracker.config.search)[2] <= 0
+    assert 0.5 < float(least[0][0, 2]) < float(found.gathered) < float(least[0][0, 2]) + 0.05
+    assert least[1][0, 2].tolist() == least[0][1, 2].tolist() == [0.0]
+    assert _least(doubts[0], replace(found, gathered=torch.full((1,), torch.nan)), tracker.config.search)[0, 2] <= 0
 
 
 def test_a_search_leaves_what_it_was_given_as_it_was():

@@ -23,7 +23,7 @@ _FEW_EDGES = 512
 _MAX_ACTIVE_EDGES = 8192
 # Tangents that the image shows shorter than this (px/m) have no direction in it.
 _MIN_PX_PER_M = 1e-3
-# Texture seen at a grazing angle (cosine below this) is foreshortened beyond use. Above it, it fires, and draws what is beside it.
+# Texture seen at a grazing angle (cosine below this) is foreshortened beyond use. What fires and is left out draws what is beside it.
 _MIN_TEXTURE_COSINE = 0.02
 # Points and tangents (object frame), kinds and mask; where it was said which elements are shown, the element of each as well.
 _Points = tuple[Tensor, ...]

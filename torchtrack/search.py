@@ -114,27 +114,27 @@ def search_wanted(
     # Without events no pose is better than another.
     enough = events.mask.sum(-1) >= config.quality.min_observations
     reasons = (*doubt.reasons(found.score, config.search), doubt.has_run_off(config.search))
-    least = _least(doubt, found, config.search)
+    least_near, least_far = _least(doubt, found, config.search)
     uncertain = drifted(prediction, doubt, config.search)
     sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
     answers = (Answer.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px, doubt.sigma_px))
     for number, (is_tried, may_have_slipped, is_mirrored, has_run_off, own_sigma_px, predicted_px) in enumerate(zip(*answers, strict=True)):
         if is_tried:
-            found = search(number, uncertain, own_sigma_px, least[:3, number], events, found, config)
+            found = search(number, uncertain, own_sigma_px, least_near[:, number], events, found, config)
         if may_have_slipped:
-            found = _search_slipped(number, uncertain, own_sigma_px, least[3:, number], events, found, config)
+            found = _search_slipped(number, uncertain, own_sigma_px, least_far[:, number], events, found, config)
         if has_run_off:
             other = as_last_seen(uncertain.copies(number, 1), T_last_seen[number])
-            found, prediction = _search_from(number, other, own_sigma_px, least[3:, number], events, found, prediction, config)
+            found, prediction = _search_from(number, other, own_sigma_px, least_far[:, number], events, found, prediction, config)
         for plane in planes.of(number) if is_mirrored else ():
             other = less_certain(mirrored(_as_found(number, prediction, found), *plane), 0, predicted_px, config.search.slip_sigma_px)
-            found, prediction = _search_from(number, other, config.search.slip_sigma_px, least[3:, number], events, found, prediction, config)
+            found, prediction = _search_from(number, other, config.search.slip_sigma_px, least_far[:, number], events, found, prediction, config)
     was_adrift = doubt.adrift & found.elsewhere
     prediction = replace(prediction, covariance=torch.where(was_adrift[:, None, None], uncertain.covariance, prediction.covariance))
     return found, prediction, torch.where(was_adrift, gate_widening(sigma_px, config), widening)
 
 
-def _least(doubt: Doubt, found: Found, config: SearchConfig) -> Float[Tensor, "6 b"]:
+def _least(doubt: Doubt, found: Found, config: SearchConfig) -> Float[Tensor, "2 3 b"]:
     """By how much other poses must explain more, how much they must explain and gather; and the same of where an object is not predicted at all.
 
     While a motion is not known nothing says how far events gather when all is well, and dense print explains as much of many poses:
@@ -143,8 +143,9 @@ def _least(doubt: Doubt, found: Found, config: SearchConfig) -> Float[Tensor, "6
     margin = torch.where(doubt.starting, config.start_margin, config.margin)
     # What is far away has to explain about as much as usual; so has what is found step by step, while a motion is lost, ever farther away.
     needed = torch.where(doubt.adrift | doubt.starting, config.adrift_share * doubt.full_share, 0)
-    gathered, anyhow = torch.where(doubt.starting, found.gathered.nan_to_num(0.0) - _AS_MUCH, 0), torch.zeros_like(margin)
-    return torch.stack([margin, needed, gathered, torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share, anyhow])
+    gathered = torch.where(doubt.starting, found.gathered.nan_to_num(0.0) - _AS_MUCH, 0)
+    elsewhere = torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share, torch.zeros_like(margin)
+    return torch.stack([margin, needed, gathered, *elsewhere]).unflatten(0, (2, 3))
 
 
 def _search_slipped(
@@ -222,7 +223,8 @@ def _search_around(
     places = one.carried(seen.pixels, seen.age_s), seen.mask
     offsets = promising(one, outline, covariance, widened_px, places, config)
     tried = _align_all(one.copies(0, len(offsets)), offsets, seen, config, found.full_gathered[number])
-    offset, (margin, needed, gathered) = tried.fit.solution.from_prior, least
+    offset = tried.fit.solution.from_prior
+    margin, needed, gathered = least.unbind()
     # Written so that what does not tell how far it gathers counts.
     counts = (tried.count >= config.quality.min_observations) & _is_likely(offset, covariance) & ~(tried.gathered < gathered)
     score = torch.where(counts, tried.score, 0)
