@@ -139,6 +139,12 @@ def test_importing_the_package_loads_nothing_heavy():
     assert "Tracker" in result.stdout
 
 
+def test_importing_a_tracker_leaves_the_compiler_alone():
+    """It takes as long to load as PyTorch itself."""
+    code = "import sys, torchtrack.tracker, torchtrack.executor.on_ray; assert 'torch._dynamo' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+
 def test_public_names_are_all_there():
     assert [name for name in torchtrack.__all__ if getattr(torchtrack, name, None) is None] == []
     assert set(torchtrack.__all__) <= set(dir(torchtrack))

@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchtrack.bursts import update_bursts
+from torchtrack.constants import cells_within
 from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.online_learning import learning_is_due
@@ -122,6 +123,8 @@ def _compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
     """The function as a graph of its own."""
     # All that it hangs on is fixed with the tracker: to look whether it is takes a tenth of a step.
     options = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe, _WITHOUT_PYTHON[device.type]: True}
+    # Not where it is defined: that would import the compiler, which takes as long as PyTorch itself, wherever a tracker is.
+    torch.compiler.assume_constant_result(cells_within)
     # Without guards, no two functions may share what is compiled.
     how: dict[str, Any] = {"fullgraph": True, "dynamic": False, "options": options, "isolate_recompiles": True}
     graph: Callable[P, R] = torch.compile(function, **how)

@@ -29,12 +29,11 @@ def _kept(values: Numbers, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 def disc(radius: float | int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Offsets ``[2, d]`` (column, row) of the cells whose middles lie within a radius of one's own, row by row."""
-    return constant(_within(radius), dtype, device).T
+    return constant(cells_within(radius), dtype, device).T
 
 
-@torch.compiler.assume_constant_result
-def _within(radius: float | int) -> Numbers:
-    """The cells as numbers; apart from how they are kept, as a compiler does not look into that."""
+def cells_within(radius: float | int) -> Numbers:
+    """The cells as numbers; apart from how they are kept, as a compiler does not look into that, and takes this for a constant."""
     return _cells(radius)
 
 
