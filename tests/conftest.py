@@ -1,19 +1,29 @@
-"""Fixtures that every test may use. Shapes and types of the whole package are checked while tests run."""
+"""Fixtures that every test may use. Shapes and types of the whole package are checked while tests run, but for long ones."""
 
 import importlib.util
 import os
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import torch
-from jaxtyping import install_import_hook
 
 # Must come before the first import of torchtrack: it wraps the package's functions as they are loaded.
-install_import_hook("torchtrack", "beartype.beartype")
+jaxtyping.install_import_hook("torchtrack", "beartype.beartype")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs ray: pip install 'torchtrack[cluster]'")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    """Runs a test and its fixtures; of many windows, nearly two thirds of the time would be checks that other tests make as well."""
+    jaxtyping.config.update("jaxtyping_disable", item.get_closest_marker("many_windows") is not None)
+    try:
+        return (yield)
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session", autouse=True)

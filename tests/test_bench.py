@@ -70,6 +70,7 @@ def simulator():
     pytest.importorskip("numba", reason="the simulator needs numba: pip install 'torchtrack[sim]'")
 
 
+@pytest.mark.many_windows
 def test_pipeline(tiny, simulator, tmp_path, capsys):
     assert bench("pipeline", tmp_path) == ExitCode.DONE
     content = written(tmp_path, "pipeline")
@@ -127,6 +128,7 @@ def test_flow(tiny, tmp_path):
         assert float(note.split("median error ")[1].split("%")[0]) < 5
 
 
+@pytest.mark.many_windows
 def test_scaling(tiny, simulator, tmp_path):
     assert bench("scaling", tmp_path) == ExitCode.DONE
     content = written(tmp_path, "scaling")
@@ -136,6 +138,7 @@ def test_scaling(tiny, simulator, tmp_path):
     assert (tmp_path / "bench_scaling_latency.png").is_file() and (tmp_path / "bench_scaling_throughput.png").is_file()
 
 
+@pytest.mark.many_windows
 def test_all_parts_but_those_whose_libraries_are_missing(tiny, simulator, tmp_path, monkeypatch, capsys):
     def without(setup):
         raise MissingExtraError("numba", "sim", "the simulator")

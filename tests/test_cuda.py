@@ -125,6 +125,7 @@ def test_what_does_not_wait_is_not_found(mode):
     assert found == []
 
 
+@pytest.mark.many_windows
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("config", [None, SEARCHED], ids=["steady", "searched"])
 def test_a_step_reads_nothing_back(monkeypatch, scene, config):
