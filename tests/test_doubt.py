@@ -8,7 +8,7 @@ from helpers import SMALL_CAMERA, box_model, pose, pose_errors
 from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, windows
 
 from torchtrack import Tracker
-from torchtrack.config.tracker import CornerConfig, MatchingConfig, SearchConfig, TrackerConfig
+from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig, SearchConfig, TrackerConfig
 from torchtrack.doubt import Doubt, drifted, gathered_when_known, in_doubt, is_adrift, is_due, is_wanted, less_certain
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
@@ -17,8 +17,12 @@ from torchtrack.quality import Status
 # The box fires few events: with corners beside them, enough is observed of one that slipped to say more than that it is too little.
 # Polarities of these events are drawn by lot: there is nothing to remember of them.
 FORGETFUL = MatchingConfig(polarity_memory_s=0.0)
-SEARCHED = TrackerConfig(corners=CornerConfig(max_corners=32), matching=FORGETFUL, search=SearchConfig(doubt_us=10_000, drift_diameters_s=4))
-NEVER_ADRIFT = TrackerConfig(corners=CornerConfig(max_corners=32), matching=FORGETFUL, search=SearchConfig(doubt_us=0, slipped_to=0))
+# What slips turns on: with turns that die away it would be drawn back.
+TURNING = MotionConfig(turn_s=0)
+SEARCHED = TrackerConfig(
+    corners=CornerConfig(max_corners=32), matching=FORGETFUL, motion=TURNING, search=SearchConfig(doubt_us=10_000, drift_diameters_s=4)
+)
+NEVER_ADRIFT = TrackerConfig(corners=CornerConfig(max_corners=32), matching=FORGETFUL, motion=TURNING, search=SearchConfig(doubt_us=0, slipped_to=0))
 # Twenty degrees, onto other edges: farther than a pose that is sure of itself is looked for.
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 

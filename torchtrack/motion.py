@@ -196,6 +196,18 @@ def fade(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], failed: Bool[
     return torch.where(failed[:, None], velocity * torch.exp(-dt_s / config.coast_s)[:, None], velocity)
 
 
+def expected_velocity(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 6"]:
+    """The velocity after ``dt_s``, before any acceleration: turns die away slowly (an Ornstein-Uhlenbeck process).
+
+    Events that show a turn hold it up: what dies away in a window is a quarter of the change that is to be expected in it.
+    One that hardly any show, because what would is hidden, feeds on the facets of the mesh, and would grow.
+    """
+    if not config.turn_s:
+        return velocity
+    turning, moving = velocity.split(3, 1)
+    return torch.cat([turning * torch.exp(-dt_s / config.turn_s)[:, None], moving], 1)
+
+
 def without_spin(
     velocity: Float[Tensor, "b 6"],
     covariance: Float[Tensor, "b 12 12"],

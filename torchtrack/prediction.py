@@ -7,9 +7,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.camera import MIN_DEPTH_M
-from torchtrack.contours import Contours, select_ranked, take_points
+from torchtrack.config.tracker import ContourConfig
+from torchtrack.contours import Contours, assemble, select_ranked, take_points
 from torchtrack.image_motion import MovingObjects, object_plane_velocity, pixel_velocity
-from torchtrack.lie import retract_about, transform_points
+from torchtrack.lie import cayley, move_about, retract_about, transform_points
 from torchtrack.motion import Acceleration, inverse
 from torchtrack.object_batch import ObjectBatch, repeat_row
 from torchtrack.once import once
@@ -81,6 +82,21 @@ class Prediction:
     def contour_velocity(self, contours: Contours) -> Float[Tensor, "b m 2"]:
         """Image velocity of contour points (px/s)."""
         return pixel_velocity(contours.points_cam, self.velocity, self.centre_cam, self.objects.intrinsics)
+
+    def contours(self, dt_s: Float[Tensor, "b"], config: ContourConfig) -> Contours:
+        """The contours that show within a window of length ``dt_s``, placed as at its end, where the prediction is.
+
+        They are those that show in its middle: an edge that has just come before another has hardly fired, and draws the events
+        of that one; what has turned out of sight has. And the limb of a smooth surface, which moves on over it, is then half a
+        window's motion off at most.
+        """
+        if config.source == "splat" or not config.mid_window:
+            return self.objects.contours(self.T_cam_obj, config)
+        back = self.velocity * (-0.5 * dt_s)[:, None]
+        middle = move_about(self.T_cam_obj, cayley(back[:, :3]), back[:, 3:], self.objects.centre_obj)
+        middle, _ = before_camera(middle, self.objects.centre_obj, self.T_cam_obj)
+        seen = self.objects.contours(middle, config)
+        return assemble(seen.points_obj, seen.tangents_obj, seen.kind, seen.mask, self.T_cam_obj, self.objects.intrinsics)
 
     def moved(self, offset: Float[Tensor, "b k"]) -> "Prediction":
         """The prediction with its pose and velocity moved; the covariance stays."""

@@ -22,7 +22,7 @@ from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.learned_contours import LearnedContours
 from torchtrack.model_trust import ModelTrust
-from torchtrack.motion import initial_covariance, next_acceleration, predict_covariance, with_dropped, without_spin
+from torchtrack.motion import expected_velocity, initial_covariance, next_acceleration, predict_covariance, with_dropped, without_spin
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
@@ -216,7 +216,7 @@ class Tracker(TrackedObjects):
         prediction = recorded.detached()
         nearby = self._near(events, prediction, dt_s)
         seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, t_us - state.t_us, config.matching.burst_us)
-        contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
+        contours = prediction.contours(dt_s, config.contours)
         sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(self.diameter_m)
         starting = torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
         doubt = self._doubt(state, t_us, sigma_px, starting)
@@ -255,14 +255,14 @@ class Tracker(TrackedObjects):
 
     def _predict(self, state: TrackerState, dt_s: Tensor) -> Prediction:
         """Predicted pose and motion, and how certain they are."""
-        velocity, covariance = state.velocity, state.covariance
-        if self.config.motion.model == "hold":
+        motion, covariance = self.config.motion, state.covariance
+        velocity = expected_velocity(state.velocity, dt_s, motion)
+        if motion.model == "hold":
             velocity, covariance = torch.zeros_like(velocity), with_dropped(covariance, velocity)
-        if self.revolves and self.config.motion.spin_fades:
+        if self.revolves and motion.spin_fades:
             axes_cam = (state.T_cam_obj[:, :3, :3].to(velocity.dtype) @ self.revolution_axes[..., None])[..., 0]
-            velocity, covariance = without_spin(velocity, covariance, axes_cam, dt_s, self.config.motion)
-        motion, before = self.config.motion, velocity.detach()
-        px_per_m = self.objects.px_per_m(state.T_cam_obj.detach().to(before.dtype)).detach()
+            velocity, covariance = without_spin(velocity, covariance, axes_cam, dt_s, motion)
+        before, px_per_m = velocity.detach(), self.objects.px_per_m(state.T_cam_obj.detach().to(velocity.dtype)).detach()
         covariance = predict_covariance(covariance.detach(), before, dt_s, self.diameter_m, motion)
         acceleration = next_acceleration(state.acceleration, before, covariance, dt_s, self.diameter_m, px_per_m, motion)
         gained = acceleration.expected * dt_s[:, None]

@@ -91,6 +91,9 @@ class ContourConfig(Settings):
     depth_cell_px: int = Field(4, ge=1, le=16, description="Cell of the depth buffer (px).")
     depth_margin: float = Field(0.06, ge=0, le=1, description="A contour is hidden by what is nearer by this share of the object's diameter.")
     splat_radius_px: int = Field(3, ge=1, le=16, description="Closing radius of the splatted point cloud (px).")
+    mid_window: bool = Field(
+        True, description="Contours are those that show in the middle of a window: what comes into sight at its end has not fired."
+    )
     refresh_rounds: tuple[int, ...] = Field((0,), description="Rounds of matching before which contours are extracted anew.")
 
 
@@ -185,6 +188,9 @@ class MotionConfig(Settings):
     )
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
     coast_s: float = Field(0.2, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
+    turn_s: float = Field(
+        0.2, ge=0, le=10, description="A turn that events hardly show dies away with this time constant (s), not to run away; 0 for not at all."
+    )
     spin_fades: bool = Field(True, description="So does the spin of a surface of revolution about its axis, which no event can show.")
 
 
