@@ -217,8 +217,9 @@ def test_a_pose_that_slipped_is_in_doubt_and_found_again():
 def test_finding_one_that_slipped_changes_nothing_for_its_neighbour():
     _, alone, _ = slipped(SEARCHED, streams=2, displaced=-1)
     _, beside, _ = slipped(SEARCHED, streams=2, displaced=0)
-    assert torch.equal(poses_of(alone, 1), poses_of(beside, 1))
-    assert not torch.equal(poses_of(alone), poses_of(beside))
+    # Sums over as many columns as the fullest of the two has are rounded otherwise.
+    torch.testing.assert_close(poses_of(alone, 1), poses_of(beside, 1), rtol=0, atol=1e-7)
+    assert float((poses_of(alone) - poses_of(beside)).abs().max()) > 1e-3
 
 
 def test_what_is_tracked_well_is_never_in_doubt():
