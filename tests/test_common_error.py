@@ -1,17 +1,20 @@
 """What observations that lie side by side have in common: many of them do not tell as much more."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
+from helpers import IMAGE_SIZE, contours_at, generator, moving_objects, seen, upright_line
 from tracked_boxes import in_motion
 
 from torchtrack.alignment import align, gate_widening, index_for
+from torchtrack.common_error import mistaken_px2, told_by_each
 from torchtrack.config.tracker import MatchingConfig, SolverConfig, TrackerConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contour_model import ContourKind
-from torchtrack.matching import ContourTable, match_nearest, told_by_each
+from torchtrack.contours import joined
+from torchtrack.matching import ContourTable, match_nearest
 from torchtrack.observations import join, select_events
 
 WITHOUT = TrackerConfig(solver=SolverConfig(common_px=0.0))
@@ -20,15 +23,15 @@ WITHOUT = TrackerConfig(solver=SolverConfig(common_px=0.0))
 @pytest.mark.parametrize(("observation_px", "common_px"), [(1.0, 0.5), (1.5, 0.2), (0.2, 1.0)])
 def test_the_mean_of_many_has_the_variance_of_what_they_have_in_common(observation_px, common_px, dtype):
     count = torch.tensor([[1.0, 2.0, 10.0, 1e3, 1e6]], dtype=dtype)
-    config = SolverConfig(observation_px=observation_px, common_px=common_px)
-    variance = observation_px**2 / (count * told_by_each(count, config))
+    common_px2 = torch.full_like(count, common_px**2)
+    variance = observation_px**2 / (count * told_by_each(count, common_px2, observation_px))
     torch.testing.assert_close(variance, common_px**2 + observation_px**2 / count)
 
 
 def test_one_alone_and_those_with_nothing_in_common_tell_all(dtype):
     count = torch.arange(50, dtype=dtype)[None]
-    assert (told_by_each(count, WITHOUT.solver) == 1).all()
-    assert (told_by_each(torch.zeros_like(count), SolverConfig()) == 1).all()
+    assert (told_by_each(count, torch.zeros_like(count), 1.5) == 1).all()
+    assert (told_by_each(torch.zeros_like(count), torch.ones_like(count), 1.5) == 1).all()
 
 
 def test_observations_are_counted_by_patch_where_they_are_on_a_contour():
@@ -86,9 +89,59 @@ def test_a_displaced_place_with_many_events_pulls_less_with_an_error_in_common()
     observations, still = seen(torch.stack([columns, rows], -1)[None]), moving_objects((0.0, 0.0), 1, torch.float64)
     matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, MatchingConfig(dark_shift_px=0.0, polarity=False))
     means = []
-    for config in (SolverConfig(common_px=0.0), SolverConfig(observation_px=1.0, common_px=1.0)):
-        weights = matches.weights * told_by_each(matches.beside, config)
+    for common_px2 in (0.0, 1.0):
+        weights = matches.weights * told_by_each(matches.beside, torch.full_like(matches.beside, common_px2), 1.0)
         means.append(float((weights * matches.offsets.abs()).sum() / weights.sum()))
     assert means[0] == pytest.approx(0.455, abs=0.03)
     # Both stretches tell the same.
     assert means[1] == pytest.approx(0.26, abs=0.03)
+
+
+# ---- edges that lie close
+
+
+def two_lines(apart_px, dtype=torch.float64, kind=ContourKind.CREASE):
+    """Two upright lines, of one kind, and the index of both."""
+    contours = joined(upright_line(80.0, dtype, kind=kind), upright_line(80.0 + apart_px, dtype, kind=kind))
+    return contours, index_contours(contours, IMAGE_SIZE, 8, 1)
+
+
+def mistaken(contours, index, close_px=2.0):
+    edges = (contours.kind == int(ContourKind.CREASE)) | (contours.kind == int(ContourKind.LIMB))
+    return mistaken_px2(contours, index, edges, close_px)[0]
+
+
+@pytest.mark.parametrize("apart_px", [1.0, 2.0, 3.0])
+def test_close_edges_are_taken_for_each_other_half_of_the_time_at_most(apart_px, dtype):
+    found = mistaken(*two_lines(apart_px, dtype))
+    expected = 0.5 * math.exp(-((apart_px / 2.0) ** 2)) * apart_px**2
+    torch.testing.assert_close(found, torch.full_like(found, expected))
+    assert expected <= 0.5 * apart_px**2
+
+
+@pytest.mark.parametrize("apart_px", [0.2, 5.0, 12.0])
+def test_what_is_one_edge_or_far_from_the_next_is_not_mistaken(apart_px):
+    assert (mistaken(*two_lines(apart_px)) == 0).all()
+
+
+def test_print_and_edges_that_cross_are_not_mistaken():
+    assert (mistaken(*two_lines(2.0, kind=ContourKind.TEXTURE)) == 0).all()
+    level = torch.stack([torch.arange(60.0, 100.0), torch.full((40,), 70.0)], -1)[None].double()
+    crossing = contours_at(level, normals=torch.tensor([0.0, 1.0]).expand_as(level), kind=ContourKind.CREASE)
+    contours = joined(upright_line(80.0, kind=ContourKind.CREASE), crossing)
+    assert (mistaken(contours, index_contours(contours, IMAGE_SIZE, 8, 1)) == 0).all()
+
+
+def test_edges_that_are_hidden_are_not_mistaken_nor_mistake_others():
+    contours, _ = two_lines(2.0)
+    contours = replace(contours, mask=contours.mask & (contours.pixels[..., 0] < 81))
+    assert (mistaken(contours, index_contours(contours, IMAGE_SIZE, 8, 1)) == 0).all()
+
+
+def test_what_is_seen_between_close_edges_tells_less_where_that_counts():
+    contours, index = two_lines(2.0)
+    observations, still = seen(torch.tensor([[[79.8, 60.0], [82.1, 60.0]]]).double()), moving_objects((0.0, 0.0), 1, torch.float64)
+    for close_px, expected in ((0.0, 0.0), (2.0, 2 * math.exp(-1))):
+        table = ContourTable.of(contours, index, close_px=close_px)
+        matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, MatchingConfig(dark_shift_px=0.0))
+        torch.testing.assert_close(matches.mistaken_px2, torch.full((1, 2), expected, dtype=torch.float64))

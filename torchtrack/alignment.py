@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.common_error import told_by_each
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.contour_index import ContourIndex, index_contours
 from torchtrack.contours import Contours, reproject
 from torchtrack.implicit_gradient import with_gradient
-from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest, told_by_each
+from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import Observations
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
@@ -123,7 +124,7 @@ def align(
 
 def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config: MatchingConfig) -> ContourTable:
     """What observations take from their contours, with the polarity that is expected of them."""
-    return ContourTable.of(contours, index, objects.polarity, of_print=config.print_polarity)
+    return ContourTable.of(contours, index, objects.polarity, of_print=config.print_polarity, close_px=config.close_edges_px)
 
 
 def _narrowing(widening: Float[Tensor, "b"], rounds: int) -> Iterable[Float[Tensor, "b"]]:
@@ -156,7 +157,10 @@ def _believed(matches: Matches, observations: Observations, config: TrackerConfi
     if observations.trust is not None:
         weights = weights * observations.trust
     enough = weights.sum(-1, keepdim=True) >= config.quality.min_observations
-    return replace(matches, mask=matches.mask & enough, weights=weights * enough * told_by_each(matches.beside * matches.limb, config.solver))
+    # The model of a smooth limb, which has facets, and its shading put a whole piece of it off.
+    common_px2 = torch.add(matches.mistaken_px2, matches.limb, alpha=config.solver.common_px**2)
+    told = told_by_each(matches.beside, common_px2, config.solver.observation_px)
+    return replace(matches, mask=matches.mask & enough, weights=weights * enough * told)
 
 
 def _problem(

@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.linalg import vecdot
 
 from torchtrack.bursts import without_tail
-from torchtrack.config.tracker import MatchingConfig, SolverConfig
+from torchtrack.common_error import mistaken_px2
+from torchtrack.config.tracker import MatchingConfig
 from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contour_model import ContourKind
@@ -47,6 +48,7 @@ class Matches:
         near: which observations have a contour so near that ``offsets`` says something, matched or not.
         limb: 1 where the contour is the limb of a smooth surface, 0 where not.
         beside: how many observations are on the contour in the patch of the image that each lies in.
+        mistaken_px2: mean square of how far off each is, should it be of an edge that lies beside its contour (px²).
         dark: 1 where an event says that the outer side of its contour is the darker one, -1 the inner one; 0 where that is not known.
         as_expected: how far that is what it is expected to say, 0 to 1.
     """
@@ -62,6 +64,7 @@ class Matches:
     near: Bool[Tensor, "b n"]
     limb: Float[Tensor, "b n"]
     beside: Float[Tensor, "b n"]
+    mistaken_px2: Float[Tensor, "b n"]
     dark: Float[Tensor, "b n"]
     as_expected: Float[Tensor, "b n"]
 
@@ -79,7 +82,9 @@ class ContourTable:
     index: ContourIndex
 
     @classmethod
-    def of(cls, contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_print: bool = True) -> "ContourTable":
+    def of(
+        cls, contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_print: bool = True, close_px: float = 0.0
+    ) -> "ContourTable":
         """The table of contours and their index.
 
         The normals of the mesh's own edges are oriented: they point outwards. Those of print point to its darker side.
@@ -87,19 +92,21 @@ class ContourTable:
         Args:
             polarity: expected of the mesh's own edges, by the octant that they face (:func:`torchtrack.polarity_memory.expected_polarity`).
             of_print: whether anything is expected of print.
+            close_px: distance from which parallel edges are told apart; 0 for always.
         """
         limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
         oriented, expected = limb | crease, (texture & of_print).to(contours.pixels.dtype)
         if polarity is not None:
             expected = torch.where(oriented, polarity.gather(1, octant(contours.normals)), expected)
-        marks = torch.stack([limb.to(expected.dtype), oriented.to(expected.dtype), expected], -1)
+        mistaken = mistaken_px2(contours, index, oriented, close_px) if close_px else torch.zeros_like(expected)
+        marks = torch.stack([limb.to(expected.dtype), oriented.to(expected.dtype), expected, mistaken], -1)
         values = (contours.points_obj, contours.normals, index.pixels, marks)
         return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index)
 
-    def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Of contour points: places on the object, normals, pixels when indexed, whether a limb, whether oriented, the darker side expected."""
+    def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, ...]:
+        """Of contour points: places on the object, normals, pixels when indexed; limb or not, oriented or not, darker side expected, mistaken."""
         taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
-        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 3), -1)
+        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 4), -1)
         return points_obj, normals, indexed, *marks.unbind(-1)
 
 
@@ -124,7 +131,7 @@ def match_nearest(
     """
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
     found = table.index.look_up(place, finely)
-    points_obj, normals, indexed, limb, oriented, expected = table.take(contour := found.clamp(min=0))
+    points_obj, normals, indexed, limb, oriented, expected, mistaken = table.take(contour := found.clamp(min=0))
     pixels, velocity, change = objects.show(points_obj)
     crossing_px_s = vecdot(normals, velocity)
     dark = observations.polarity * _leading(crossing_px_s)
@@ -142,7 +149,7 @@ def match_nearest(
     weights, beside = _weights(offsets, targets, near, dark, as_expected, config)
     if config.mutual_px:
         weights = weights * mutual_agreement(pixels, offsets, matched, config.mutual_px)
-    matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb, beside, dark, as_expected)
+    matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb, beside, mistaken, dark, as_expected)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)
 
@@ -222,19 +229,6 @@ def mutual_agreement(
     return torch.addcmul(one(known), known, relative * relative).reciprocal()
 
 
-def told_by_each(beside: Float[Tensor, "b n"], config: SolverConfig) -> Float[Tensor, "b n"]:
-    """What each of so many observations in one place of the image tells, of what it would tell alone.
-
-    Side by side they err alike, those of the limb of a smooth surface above all: its model, which has facets, and its shading put
-    a whole piece off. So the mean of n has a variance of ``common_px² + observation_px² / n``. Otherwise a pose would follow the
-    places with the most events, and what is seen of an object that is half hidden would seem to tell all.
-
-    Args:
-        beside: how many observations are on the contour in the place of each; zero for what has nothing in common.
-    """
-    return torch.add(one(beside), beside, alpha=(config.common_px / config.observation_px) ** 2).reciprocal()
-
-
 def _two(like: Tensor) -> Tensor:
     return constant((2.0,), like.dtype, like.device)
 
@@ -284,7 +278,7 @@ def match_along_flow(observations: Observations, contours: Contours, objects: Mo
     limb = (contours.kind == int(ContourKind.LIMB)).gather(1, contour).to(offsets.dtype)
     none, all_of_it = torch.zeros_like(offsets), torch.ones_like(offsets)
     told = observations.age_s, points_obj, targets, directions, offsets, mask
-    return Matches(contour, mask, all_of_it, *told, limb, beside=none, dark=none, as_expected=all_of_it)
+    return Matches(contour, mask, all_of_it, *told, limb, beside=none, mistaken_px2=none, dark=none, as_expected=all_of_it)
 
 
 def both_coordinates(matches: Matches) -> Matches:

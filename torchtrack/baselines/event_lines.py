@@ -178,6 +178,7 @@ class EventLineTracker(Tracker):
                 near=near.mask & belongs,
                 limb=torch.zeros_like(near.age_s),
                 beside=torch.zeros_like(near.age_s),
+                mistaken_px2=torch.zeros_like(near.age_s),
                 dark=torch.zeros_like(near.age_s),
                 as_expected=torch.ones_like(near.age_s),
             )

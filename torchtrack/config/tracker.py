@@ -134,6 +134,9 @@ class MatchingConfig(Settings):
         le=100,
         description="Trust observations less that lie this far from the mean of their bit of contour (px), such as 0.7; 0 for not at all.",
     )
+    close_edges_px: float = Field(
+        1.7, ge=0, le=10, description="Parallel edges closer than about this may be taken for each other, and tell less (px); 0 for never."
+    )
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )

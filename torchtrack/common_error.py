@@ -1,0 +1,59 @@
+"""What observations that lie side by side err by in common: many of them do not tell as much more.
+
+Two things are the same for all around: how far the model of a smooth limb is off, and which of two close edges fired.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.linalg import vecdot
+
+from torchtrack.constants import one
+from torchtrack.contour_index import ContourIndex
+from torchtrack.contours import Contours, take_points
+
+# Where an edge is looked for beside another (px): found as far as twice that.
+_ASIDE_PX = 2.0
+# Contours with normals this parallel (|n·m| above) and this far apart (px) are two edges.
+_PARALLEL, _APART_PX = 0.9, 0.5
+
+
+def told_by_each(beside: Float[Tensor, "b n"], common_px2: Float[Tensor, "b n"], observation_px: float) -> Float[Tensor, "b n"]:
+    """What each of so many observations in one place of the image tells, of what it would tell alone.
+
+    Side by side they err alike, so the mean of n has a variance of ``common_px2 + observation_px² / n``. Otherwise a pose would
+    follow the places with the most events, and what is seen of an object that is half hidden would seem to tell all.
+
+    Args:
+        beside: how many observations are on the contour in the place of each.
+        common_px2: variance of what they have in common (px²).
+        observation_px: standard deviation of what each has alone.
+    """
+    return torch.addcmul(one(beside), beside, common_px2, value=observation_px**-2).reciprocal()
+
+
+def mistaken_px2(contours: Contours, index: ContourIndex, of_edges: Bool[Tensor, "b m"], close_px: float) -> Float[Tensor, "b m"]:
+    """Mean square of how far off what is seen on each contour point is, should it be of the edge beside (px²).
+
+    A face that comes into sight has its new edge beside the old one, and of the two often only one fires, as the other hardly
+    shows. Events around it are then taken for those of the silent edge, too, which they draw to themselves: the face never opens.
+    Of two edges ``s`` apart the wrong one is chosen with a probability of ``exp(-(s / close_px)²) / 2``, and that is ``s`` off.
+
+    Args:
+        contours: with the ``index`` of them.
+        of_edges: points that are on edges of the mesh: of print, both sides fire.
+        close_px: distance from which edges are told apart.
+    """
+    pixels, normals = contours.pixels, contours.normals
+    counts = contours.mask & of_edges
+    mistaken = torch.zeros_like(pixels[..., 0])
+    for aside_px in (-_ASIDE_PX, _ASIDE_PX):
+        found = index.look_up(torch.add(pixels, normals, alpha=aside_px))
+        other = found.clamp(min=0)
+        apart_px = vecdot(take_points(pixels, other) - pixels, normals)
+        is_parallel = vecdot(take_points(normals, other), normals).abs() > _PARALLEL
+        is_edge = (found >= 0) & counts & of_edges.gather(1, other)
+        is_other = is_edge & is_parallel & (apart_px * aside_px > 0) & (apart_px.abs() > _APART_PX)
+        squared = apart_px.square()
+        mistaken = torch.maximum(mistaken, torch.where(is_other, 0.5 * squared * torch.exp(squared * -(close_px**-2)), 0))
+    return mistaken
