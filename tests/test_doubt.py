@@ -16,7 +16,8 @@ from torchtrack.quality import Status
 
 # The box fires few events: with corners beside them, enough is observed of one that slipped to say more than that it is too little.
 # Polarities of these events are drawn by lot: there is nothing to remember of them.
-FORGETFUL = MatchingConfig(polarity_memory_s=0.0)
+# Were close edges taken for each other, it would come back by itself.
+FORGETFUL = MatchingConfig(polarity_memory_s=0.0, close_edges_px=0.0)
 # What slips turns on: with turns that die away it would be drawn back.
 TURNING = MotionConfig(turn_s=0)
 SEARCHED = TrackerConfig(

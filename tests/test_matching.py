@@ -56,7 +56,7 @@ def test_the_index_finds_the_nearest_contour_within_the_radius(cell_px, radius_p
     places = torch.rand((3, 2000, 2), generator=generator(1), dtype=torch.float64).to(dtype) * torch.tensor([200, 150], dtype=dtype)
     found = index.look_up(places, torch.full((3,), finely))
     # What is found is nearest to the place, or to the centre of its cell; to a sixteenth of a squared pixel.
-    centres = places if finely else (places / cell_px).round() * cell_px
+    centres = places if finely else ((places + 2**-8) / cell_px).round() * cell_px
     rounding, reach = 2**-0.5 * cell_px, (2**0.5 if finely else 2**-0.5) * cell_px
     for number in range(3):
         distance = brute_force(contours, centres[number], number)
@@ -79,6 +79,17 @@ def test_only_some_objects_are_looked_up_finely(dtype):
     roughly, finely = index.look_up(places), index.look_up(places, torch.ones(3, dtype=torch.bool))
     assert torch.equal(mixed, torch.stack([finely[0], roughly[1], finely[2]]))
     assert not torch.equal(finely[1], roughly[1])
+
+
+@pytest.mark.parametrize("finely", [False, True])
+def test_roundings_do_not_choose_what_is_found_at_whole_pixels(finely, dtype):
+    """Where events lie, which is on the borders of cells or in the middle of four."""
+    index = index_contours(random_contours(1, 300, dtype=dtype), IMAGE_SIZE, 7, 2)
+    rows, columns = torch.meshgrid(torch.arange(150), torch.arange(200), indexing="ij")
+    places = torch.stack([columns, rows], -1).reshape(1, -1, 2).to(dtype)
+    rounding = 200 * torch.finfo(dtype).eps * (1 - 2 * torch.rand(places.shape, generator=generator(2), dtype=torch.float64)).to(dtype)
+    fine = torch.tensor([finely])
+    assert torch.equal(index.look_up(places + rounding, fine), index.look_up(places, fine))
 
 
 def test_few_places_are_looked_up_as_finely_as_many(dtype):

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.linalg import vecdot
 
-from torchtrack.constants import one
+from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import Contours, take_points
 
@@ -44,16 +44,16 @@ def mistaken_px2(contours: Contours, index: ContourIndex, of_edges: Bool[Tensor,
         of_edges: points that are on edges of the mesh: of print, both sides fire.
         close_px: distance from which edges are told apart.
     """
-    pixels, normals = contours.pixels, contours.normals
+    pixels, normals = contours.pixels[:, None], contours.normals[:, None]
+    aside_px = constant((-_ASIDE_PX, _ASIDE_PX), pixels.dtype, pixels.device)[:, None]
+    found = index.look_up(torch.addcmul(pixels, normals, aside_px[..., None]).flatten(1, 2))
     counts = contours.mask & of_edges
-    mistaken = torch.zeros_like(pixels[..., 0])
-    for aside_px in (-_ASIDE_PX, _ASIDE_PX):
-        found = index.look_up(torch.add(pixels, normals, alpha=aside_px))
-        other = found.clamp(min=0)
-        apart_px = vecdot(take_points(pixels, other) - pixels, normals)
-        is_parallel = vecdot(take_points(normals, other), normals).abs() > _PARALLEL
-        is_edge = (found >= 0) & counts & of_edges.gather(1, other)
-        is_other = is_edge & is_parallel & (apart_px * aside_px > 0) & (apart_px.abs() > _APART_PX)
-        squared = apart_px.square()
-        mistaken = torch.maximum(mistaken, torch.where(is_other, 0.5 * squared * torch.exp(squared * -(close_px**-2)), 0))
-    return mistaken
+    known = torch.cat([contours.pixels, contours.normals, counts[..., None].to(pixels.dtype)], -1)
+    other_pixels, other_normals, is_edge = take_points(known, found.clamp(min=0)).unflatten(1, (2, -1)).split((2, 2, 1), -1)
+    apart_px = vecdot(other_pixels - pixels, normals)
+    is_parallel = vecdot(other_normals, normals).abs() > _PARALLEL
+    # To the side that was looked at, and not the same edge.
+    is_other = (apart_px * aside_px > _APART_PX * _ASIDE_PX) & is_parallel & counts[:, None] & (is_edge[..., 0] > 0)
+    is_other = is_other & (found >= 0).unflatten(1, (2, -1))
+    squared = apart_px.square()
+    return torch.where(is_other, 0.5 * squared * torch.exp(squared * -(close_px**-2)), 0).amax(1)
