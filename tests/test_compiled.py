@@ -69,7 +69,7 @@ def both_ways(config=None, streams=1, count=COUNT, mode=torch.inference_mode):
     cut = [(concatenate([window[0] for window in step]), step[0][1]) for step in zip(*(windows(events, count) for events in parts), strict=True)]
     found = []
     for is_compiled in (False, True):
-        tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, config, list(range(streams)), torch.float64, compiled=is_compiled)
+        tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, config, list(range(streams)), compiled=is_compiled)
         with mode():
             state = tracker.init(pose().expand(streams, 4, 4), 0)
             tracker.prepare(state)
@@ -102,7 +102,11 @@ def test_windows_that_are_learned_from_are_taken_without_a_graph(graphs, config)
     learned = "learned" if config is LEARNING else "model_trust"
     expected, found = (vars(getattr(of, learned)) for of in (state, compiled_state))
     for name, value in expected.items():
-        torch.testing.assert_close(found[name], value, rtol=1e-6, atol=1e-9)
+        if config is LEARNING:
+            assert torch.equal(found[name], value) if torch.is_tensor(value) else found[name] == value
+        else:
+            # Counts of what lies on contours at poses that agree to roundings.
+            torch.testing.assert_close(found[name], value, rtol=5e-6, atol=0)
 
 
 def test_the_graph_of_one_stream_is_prepared(graphs):

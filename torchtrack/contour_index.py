@@ -22,7 +22,7 @@ _DISTANCE_STEPS = 16
 # Points whose distances are written at once: larger temporaries page-fault on the CPU.
 _CHUNK = 2048
 # Events lie at whole pixels, on the borders of cells or in the middle of four: looked up a little aside, roundings choose nothing (px).
-_ASIDE_PX = 2.0**-8
+_OFF_BORDER_PX = 2.0**-8
 # From the middle of a cell to its corner, in cells.
 _HALF_DIAGONAL = 0.5**0.5
 # Farther than any cell of an image, and than any contour is looked for (px).
@@ -58,7 +58,7 @@ class ContourIndex:
         """
         rows, columns = self.size
         # Whole cells first: rounded the same way wherever the region begins.
-        column, row = pixels.add(0.5 * self.cell_px + _ASIDE_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
+        column, row = pixels.add(0.5 * self.cell_px + _OFF_BORDER_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
         nearest = self.nearest.gather(1, self._flat(column.clamp(0, columns - 1), row.clamp(0, rows - 1)))
         if finely is None or readback.none_of(finely):
             return nearest
@@ -67,7 +67,7 @@ class ContourIndex:
     def _nearest_of_four(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
         """The nearest to each pixel of the contour points that the four cells around it know."""
         rows, columns = self.size
-        column, row = pixels.add(_ASIDE_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
+        column, row = pixels.add(_OFF_BORDER_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
         first = self._flat(column.clamp(0, columns - 2), row.clamp(0, rows - 2))
         # A table of the places that cells know, where these are fewer than the places asked for.
         table = self._places(self.nearest) if rows * columns <= 4 * pixels.shape[1] else None
