@@ -17,6 +17,8 @@ from torchtrack.prediction import Prediction
 
 # An object is not looked for farther away than it can have drifted in this time (s), nor turned farther than in this.
 _LONGEST_S, _LONGEST_TURN_S = 0.4, 1.0
+# An object is new while what it explains when seen well, which rises with every window, is below this share of what it explains.
+_NEW = 0.9
 # Events that gather less than this share of how far they do when an object is seen well are smeared.
 _SMEARED = 0.8
 
@@ -56,11 +58,19 @@ class Doubt:
         return self.asks(score, config), self.slips(score, config), self.is_mirrored(score, config)
 
     def asks(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
-        """Which objects are to be searched for: uncertain ones, those whose score stays below the usual, and those long in doubt."""
+        """Which objects are to be searched for: uncertain and new ones, those whose score stays below the usual, and those long in doubt."""
         starting = self.starting if config.at_start else torch.zeros_like(self.starting)
         due = self.due | (self.sigma_px <= config.wide_sigma_px)
         stays_low = torch.maximum(score, self.last_score) < config.dropped_to * self.usual_score
-        return starting | self.adrift | (due & ((self.sigma_px > config.from_sigma_px) | stays_low))
+        return starting | self.adrift | self.is_new(score, config) | (due & ((self.sigma_px > config.from_sigma_px) | stays_low))
+
+    def is_new(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+        """Which objects never explained much more than now, and leave much unexplained: what is usual does not tell yet that they slip.
+
+        Once in a while only: one that begins half hidden is new for long.
+        """
+        new = self.full_share < _NEW * torch.maximum(score, self.last_score)
+        return ~self.starting & self.due & new & (score < config.new_share)
 
     def slips(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects may have slipped: those that are sure of their place, and explain far less all at once."""

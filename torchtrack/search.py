@@ -143,7 +143,10 @@ def _least(doubt: Doubt, found: Found, config: SearchConfig) -> Float[Tensor, "2
     margin = torch.where(doubt.starting, config.start_margin, config.margin)
     # What is far away has to explain about as much as usual; so has what is found step by step, while a motion is lost, ever farther away.
     needed = torch.where(doubt.adrift | doubt.starting, config.adrift_share * doubt.full_share, 0)
-    gathered = torch.where(doubt.starting, found.gathered.nan_to_num(0.0) - _AS_MUCH, 0)
+    # Of a new object, only what explains nearly all is surely better: edges of what hides it explain half.
+    new = doubt.is_new(found.score, config)
+    needed = torch.where(new, config.new_share, needed)
+    gathered = torch.where(doubt.starting | new, found.gathered.nan_to_num(0.0) - _AS_MUCH, 0)
     elsewhere = torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share, torch.zeros_like(margin)
     return torch.stack([margin, needed, gathered, *elsewhere]).unflatten(0, (2, 3))
 
