@@ -16,6 +16,8 @@ from torchtrack.events import EventBatch, concatenate, pad_streams
 from torchtrack.time_surface import empty_last_event, object_regions, time_surface, update_last_event
 
 COUNT = 6
+# In their first windows boxes are searched for as new ones, once in a while: not in all windows.
+STEADY = TrackerConfig(search=SearchConfig(new_share=0))
 
 
 @pytest.fixture
@@ -187,7 +189,7 @@ def test_a_tracker_that_reads_nothing_finds_the_same(nothing_is_read, monkeypatc
 @pytest.mark.parametrize("reading", [True, False])
 def test_a_steady_step_is_a_step(nothing_is_read, scene, reading):
     starts, stream_index, cameras, cut = scene(COUNT)
-    boxes = Tracker([box_model()] * len(starts), cameras, stream_index=stream_index)
+    boxes = Tracker([box_model()] * len(starts), cameras, STEADY, stream_index)
     with torch.inference_mode():
         state, _ = follow(boxes, boxes.init(torch.stack(starts), 0), cut[:-1])
         if not reading:
@@ -202,7 +204,7 @@ def test_a_steady_step_is_a_step(nothing_is_read, scene, reading):
 @pytest.mark.parametrize("reason", ["in parts", "searched", "far away", "lost"])
 def test_a_steady_step_says_when_it_does_not_hold(nothing_is_read, monkeypatch, reason, reading):
     # Made before anything is patched: other tests share it.
-    boxes, state, _, window, _ = started()
+    boxes, state, _, window, _ = started(config=STEADY)
     monkeypatch.setattr(window_parts, "_EVENTS_OF_A_PART", 20)
     *_, wrong = boxes.steady_step(state, *window)
     assert not wrong

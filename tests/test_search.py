@@ -187,7 +187,8 @@ def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     searched = []
     monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
     _, events = moving_box(pose(), 10)
-    tracker = Tracker([box_model()], SMALL_CAMERA)
+    # As a new object it would be, once in a while.
+    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(new_share=0)))
     follow(tracker, tracker.init(pose()[None], 0), windows(events, 10))
     assert len(searched) <= 1
 
@@ -219,7 +220,7 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
 def test_without_enough_events_there_is_nothing_to_search_in(count, times, monkeypatch):
     searched = []
     monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
-    tracker, state, _, _, _ = started(config=TrackerConfig(search=SearchConfig(interval_us=0)))
+    tracker, state, _, _, _ = started(config=TrackerConfig(search=SearchConfig(interval_us=0, new_share=0)))
     noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
     after, result = tracker.step(replace(state, covariance=1e3 * state.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)
     assert len(searched) == times

@@ -246,7 +246,7 @@ class SearchConfig(Settings):
     slip_sigma_px: float = Field(6.0, gt=0, description="The same of what may have slipped, however sure it is of itself (px).")
     at_start: bool = Field(True, description="Others are also tried while an object's motion is not known: dense print fits many.")
     new_share: float = Field(
-        0.0, ge=0, le=1, description="For its first windows, an object that explains less is searched for where this much is explained; 0 for never."
+        0.9, ge=0, le=1, description="For its first windows, an object that explains less is searched for where this much is explained; 0 for never."
     )
     probation: bool = Field(True, description="What was found of a very uncertain object is taken back unless it explains as much as usual soon.")
     by_gathering: bool = Field(True, description="Poses are also compared by how far the events around contours gather on them: slips smear them.")
