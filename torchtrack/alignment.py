@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack import fast_alignment
 from torchtrack.common_error import told_by_each
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.contour_index import ContourIndex, index_contours
@@ -99,11 +100,15 @@ def align(
     information = _information(prediction, config)
     begin = prediction if offset is None else prediction.moved(offset)
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
-    place = _first_place(begin, observations, config)
     table = _table(contours, index, objects, matching)
     # One that may be far off would settle on the first edges that it is nearest to.
     small = (objects.size_px(begin.T_cam_obj).detach() < matching.fine_below_px) & (widening <= 1)
-    for number, (gate_px, wider) in enumerate(zip(matching.gates_px, _narrowing(widening, len(matching.gates_px)), strict=True)):
+    narrowing = _narrowing(widening, len(matching.gates_px))
+    if fast_alignment.applies(config, offset):
+        solution, matches = fast_alignment.align_rounds(prediction, begin.T_cam_obj, offset, information, table, observations, narrowing, small, config)
+        return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
+    place = _first_place(begin, observations, config)
+    for number, (gate_px, wider) in enumerate(zip(matching.gates_px, narrowing, strict=True)):
         if number and number in config.contours.refresh_rounds:
             contours = objects.contours(begin.T_cam_obj, config.contours)
             table = _table(contours, index_for(contours, objects.image_size, config, widening, index.radius_px), objects, matching)

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchtrack import readback
 from torchtrack.constants import constant, disc
 from torchtrack.contours import Contours, take_points
+from torchtrack.kernels.settings import Cells
 
 # Squared distances are compared in these fractions of a pixel².
 _DISTANCE_STEPS = 16
@@ -48,6 +49,11 @@ class ContourIndex:
     nearest: Int[Tensor, "b p"]
     pixels: Float[Tensor, "b m 2"]
     radius_px: readback.Answer
+
+    @property
+    def cells(self) -> Cells:
+        """The layout as kernels know it."""
+        return Cells(*self.size, float(self.cell_px), _OFF_BORDER_PX)
 
     def look_up(self, pixels: Float[Tensor, "b n 2"], finely: Bool[Tensor, "b"] | None = None) -> Int[Tensor, "b n"]:
         """The contour point nearest to the centre of each pixel's cell, -1 where none is near.

@@ -13,12 +13,13 @@ from torch.linalg import vecdot
 
 from torchtrack.bursts import without_tail
 from torchtrack.common_error import mistaken_px2
-from torchtrack.config.tracker import MatchingConfig
+from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours, take_points
 from torchtrack.image_motion import MovingObjects
+from torchtrack.kernels.settings import MatchingSettings
 from torchtrack.observations import Observations
 from torchtrack.polarity_memory import octant
 
@@ -152,6 +153,31 @@ def match_nearest(
     matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb, beside, mistaken, dark, as_expected)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)
+
+
+def matching_settings(config: TrackerConfig) -> MatchingSettings:
+    """What a kernel goes by that matches as :func:`match_nearest` does."""
+    matching = config.matching
+    return MatchingSettings(
+        burst_px=matching.burst_px,
+        dark_shift_px=matching.dark_shift_px,
+        limb_dark_shift_px=matching.limb_dark_shift_px,
+        polarity_gain=matching.polarity_gain,
+        least_agreement=matching.least_agreement,
+        smeared_share=matching.smeared_share,
+        gathered_share=matching.gathered_share,
+        least_trust=matching.least_trust,
+        concentration=matching.concentration,
+        polarity=matching.polarity,
+        slow_px_s=_SLOW_PX_S,
+        on_contour_px=ON_CONTOUR_PX,
+        smear_px=_SMEAR_PX,
+        patch_bits=_PATCH_BITS,
+        patches=_PATCHES,
+        min_observations=config.quality.min_observations,
+        common_px2=config.solver.common_px**2,
+        observation_px=config.solver.observation_px,
+    )
 
 
 def _leading(speed_px_s: Tensor) -> Tensor:

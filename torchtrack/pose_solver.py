@@ -22,6 +22,8 @@ from torchtrack.robust_loss import robust_loss, robust_weight
 
 # Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
 _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
+# What is added to a Hessian's diagonal beside its damping: so much, and this share of its largest entry.
+_LEAST_DIAGONAL, _LEAST_SHARE = 1e-12, 1e-9
 # A cost, which is a long sum, is known to this many units of rounding.
 _ROUNDINGS = 8
 
@@ -172,11 +174,16 @@ def _damped(hessian: Tensor, damping: Tensor) -> Tensor:
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
     # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is, but for rounding. Poses
     # alone may have no prior that holds them: then it has to be above that.
-    least = max(1e-9, torch.finfo(hessian.dtype).eps) if hessian.shape[-1] == 6 else 1e-9
-    floor = torch.add(constant((1e-12,), hessian.dtype, hessian.device), diagonal[:, :6].amax(-1, keepdim=True), alpha=least)
+    least = max(_LEAST_SHARE, torch.finfo(hessian.dtype).eps) if hessian.shape[-1] == 6 else _LEAST_SHARE
+    floor = torch.add(constant((_LEAST_DIAGONAL,), hessian.dtype, hessian.device), diagonal[:, :6].amax(-1, keepdim=True), alpha=least)
     damped = hessian.clone()
     damped.diagonal(dim1=-2, dim2=-1).add_(torch.addcmul(floor, diagonal, damping[:, None]))
     return damped
+
+
+def rounding_floor() -> tuple[float, float]:
+    """What a kernel adds to a Hessian's diagonal beside its damping: so much, and this share of its largest entry."""
+    return _LEAST_DIAGONAL, _LEAST_SHARE
 
 
 def _judged_step(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:

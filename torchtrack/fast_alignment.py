@@ -1,0 +1,94 @@
+"""The rounds of an alignment by a kernel, under the settings that it knows: those of the preset ``default``, and most beside them."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.kernels import switch
+from torchtrack.kernels.settings import RoundSettings
+from torchtrack.matching import ContourTable, Matches, matching_settings
+from torchtrack.observations import Observations
+from torchtrack.pose_problem import Linearisation
+from torchtrack.pose_solver import rounding_floor
+from torchtrack.prediction import Prediction
+
+
+def applies(config: TrackerConfig, values: Tensor) -> bool:
+    """Whether the kernel does all that is set, on tensors like these."""
+    matching, solver = config.matching, config.solver
+    usual = solver.prior and solver.iterations == 1 and solver.loss == "tukey" and not any(config.contours.refresh_rounds)
+    nearest = not matching.along_flow and matching.residual == "normal" and not matching.mutual_px
+    return usual and nearest and switch.apply_to(values)
+
+
+def align_rounds(
+    prediction: Prediction,
+    T_cam_obj: Float[Tensor, "b 4 4"],
+    offset: Float[Tensor, "b 13"],
+    information: Float[Tensor, "b 13 13"],
+    table: ContourTable,
+    observations: Observations,
+    wider: Sequence[Float[Tensor, "b"]],
+    finely: Bool[Tensor, "b"],
+    config: TrackerConfig,
+) -> tuple[Linearisation, Matches]:
+    """The solution and the matches of the last round: what :func:`torchtrack.alignment.align` does in its loop.
+
+    Args:
+        prediction: what the prior draws to.
+        T_cam_obj, offset: where the rounds begin, and how far from the prediction that is.
+        information: of the prior.
+        table: of the contours.
+        wider: by how much each round's gate is wider, for each object.
+        finely: objects whose contours are looked up finely.
+    """
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels import matching as rows
+    from torchtrack.kernels import rounds
+
+    batch, count = observations.mask.shape
+    T_cam_obj, offset = T_cam_obj.clone(memory_format=torch.contiguous_format), offset.clone()
+    gradient, hessian = torch.empty_like(offset), torch.empty_like(information)
+    contour = torch.empty(batch, count, dtype=torch.int64)
+    is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool)
+    matches = torch.empty(batch, rows.ROWS, count, dtype=offset.dtype)
+    rounds.align(
+        *_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
+        table.index.cells,
+        *_arrays(prediction.velocity, *_acceleration(prediction, config), information, prediction.objects.intrinsics, prediction.objects.centre_obj),
+        *_arrays(torch.tensor(config.matching.gates_px, dtype=offset.dtype), torch.stack(list(wider)), finely),
+        matching_settings(config),
+        RoundSettings(config.matching.motion_compensation, config.solver.velocity_in_window, config.solver.damping, *rounding_floor()),
+        *_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
+    )
+    return Linearisation(T_cam_obj, gradient, hessian, offset), _matches(contour, is_near, is_matched, matches)
+
+
+def _arrays(*values: Tensor) -> list[object]:
+    """The tensors as arrays, row by row in memory: the same memory where they are already."""
+    return [value.contiguous().numpy() for value in values]
+
+
+def _seen(observations: Observations) -> Float[Tensor, "b 6 n"]:
+    """Rows of what was observed."""
+    trust = torch.ones_like(observations.age_s) if observations.trust is None else observations.trust
+    return torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.into_burst_s, observations.polarity, trust], 1)
+
+
+def _acceleration(prediction: Prediction, config: TrackerConfig) -> tuple[Tensor, Tensor]:
+    """The acceleration that is expected, and how much of it goes with velocities that were not; none where these do not change."""
+    if prediction.acceleration is None or not config.solver.acceleration_in_window:
+        return torch.zeros_like(prediction.velocity), torch.zeros_like(prediction.velocity)
+    return prediction.acceleration.expected, prediction.acceleration.rate_hz
+
+
+def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 15 n"]) -> Matches:
+    """The matches as the pipeline knows them."""
+    weights, age_s, points, targets, directions, *rest = rows.split((1, 1, 3, 2, 2, 1, 1, 1, 1, 1, 1), 1)
+    offsets, limb, beside, mistaken, dark, as_expected = (value[:, 0] for value in rest)
+    points_obj, targets, directions = (value.transpose(1, 2) for value in (points, targets, directions))
+    told = weights[:, 0], age_s[:, 0], points_obj, targets, directions, offsets
+    return Matches(contour, is_matched, *told, is_near, limb, beside, mistaken, dark, as_expected)

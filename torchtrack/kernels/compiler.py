@@ -1,0 +1,23 @@
+"""How kernels are compiled: when they are first called, and kept on disk where there is a place for it."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+
+Array = np.ndarray
+
+
+def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator: compile with numba; the compiled code is kept on disk where there is a place for it."""
+
+    def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+        function = inspect.unwrap(function)  # a type checker's wrapper cannot be compiled
+        try:
+            return numba.njit(function, cache=True, error_model="numpy", **options)
+        except RuntimeError:  # numba found no folder that it may write to (a read-only installation)
+            return numba.njit(function, error_model="numpy", **options)
+
+    return compiled

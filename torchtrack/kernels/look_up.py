@@ -1,0 +1,48 @@
+"""Looking up the nearest contour point in an index: :meth:`torchtrack.contour_index.ContourIndex.look_up`, one place at a time."""
+
+import numpy as np
+
+from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.settings import Cells
+
+_NOWHERE = 1e30
+
+
+@kernel()
+def nearest(nearest_of_cell: Array, first: Array, u: float, v: float, cells: Cells) -> int:
+    """The contour point that the cell around a place knows, -1 for none.
+
+    Args:
+        nearest_of_cell: ``[p]`` of the object.
+        first: its first cell (column, row).
+    """
+    half = 0.5 * cells.side_px + cells.aside_px
+    column = np.floor((u + half) / cells.side_px) - first[0]
+    row = np.floor((v + half) / cells.side_px) - first[1]
+    # The region's border is empty: what lies outside finds nothing, nor does what is not a number.
+    if not (column >= 0 and row >= 0 and column < cells.columns and row < cells.rows):
+        return -1
+    return nearest_of_cell[int(row) * cells.columns + int(column)]
+
+
+@kernel()
+def nearest_of_four(nearest_of_cell: Array, first: Array, pixels: Array, u: float, v: float, cells: Cells) -> int:
+    """Of the contour points that the four cells around a place know, the one nearest to it; -1 for none.
+
+    Args:
+        pixels: ``[m, k]``, the last two of each row the place of a contour point when it was indexed.
+    """
+    column = np.floor((u + cells.aside_px) / cells.side_px) - first[0]
+    row = np.floor((v + cells.aside_px) / cells.side_px) - first[1]
+    if not (column >= 0 and row >= 0 and column < cells.columns - 1 and row < cells.rows - 1):
+        return -1
+    begin = int(row) * cells.columns + int(column)
+    best, least = -1, _NOWHERE
+    for step in (0, 1, cells.columns, cells.columns + 1):
+        known = nearest_of_cell[begin + step]
+        if known >= 0:
+            du, dv = pixels[known, 0] - u, pixels[known, 1] - v
+            away = du * du + dv * dv
+            if away < least:
+                best, least = known, away
+    return best

@@ -1,0 +1,153 @@
+"""Matching one object's observations with its contours: :func:`torchtrack.matching.match_nearest`, and what its matches come to weigh."""
+
+import numpy as np
+
+from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.look_up import nearest, nearest_of_four
+from torchtrack.kernels.motion import across, inverse_depth, placed
+from torchtrack.kernels.settings import Cells, MatchingSettings
+
+# Rows of what was observed.
+U, V, AGE, INTO_BURST, POLARITY, TRUST = range(6)
+OBSERVED = 6
+# Columns of a contour point: its place on the object, its normal, where it was indexed, and marks.
+X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, LIMB, ORIENTED, EXPECTED, MISTAKEN = range(11)
+COLUMNS = 11
+# Rows of a match.
+WEIGHT, MATCH_AGE, POINT_X, POINT_Y, POINT_Z, TARGET_U, TARGET_V, DIRECTION_U, DIRECTION_V, OFFSET, IS_LIMB, BESIDE, ERROR, DARK, AS_EXPECTED = range(15)
+ROWS = 15
+# Patches of the image: votes of the observations in each.
+_ON, _NEAR, _VOTES = range(3)
+
+
+@kernel()
+def _agreeing(agreement: float, settings: MatchingSettings) -> float:
+    """Trust by how far a polarity is what it should be."""
+    return min(max(1.0 + settings.polarity_gain * agreement, settings.least_agreement), 1.0)
+
+
+@kernel()
+def _patch(u: float, v: float, settings: MatchingSettings) -> int:
+    """The patch of the image that a place lies in."""
+    column = (int(np.floor(u)) >> settings.patch_bits) & (settings.patches - 1)
+    row = (int(np.floor(v)) >> settings.patch_bits) & (settings.patches - 1)
+    return row * settings.patches + column
+
+
+@kernel()
+def match(
+    seen: Array,
+    exists: Array,
+    place: Array,
+    table: Array,
+    nearest_of_cell: Array,
+    first: Array,
+    cells: Cells,
+    T_cam_obj: Array,
+    motion: Array,
+    change: Array,
+    intrinsics: Array,
+    gate_px: float,
+    wider: float,
+    finely: bool,
+    settings: MatchingSettings,
+    contour: Array,
+    is_near: Array,
+    is_matched: Array,
+    matches: Array,
+    votes: Array,
+) -> None:
+    """Match each observation with the contour point that is nearest to its place; ``place`` is moved on.
+
+    Args:
+        seen: ``[OBSERVED, n]``, and which of them exist.
+        place: ``[n, 2]``.
+        table: ``[m, COLUMNS]``.
+        motion, change: of the object, and by its acceleration, from :func:`torchtrack.kernels.motion.drift`.
+        contour, is_near, is_matched, matches: filled; ``[n]``, and ``[ROWS, n]``. Weights are those of ``match_nearest``.
+        votes: room for ``[patches², 3]``.
+    """
+    votes[:] = 0.0
+    for i in range(seen.shape[1]):
+        is_near[i] = is_matched[i] = False
+        contour[i] = 0
+        if not exists[i]:
+            matches[:, i] = 0.0
+            continue
+        if finely:
+            found = nearest_of_four(nearest_of_cell, first, table[:, INDEXED_U : INDEXED_V + 1], place[i, 0], place[i, 1], cells)
+        else:
+            found = nearest(nearest_of_cell, first, place[i, 0], place[i, 1], cells)
+        if found < 0:
+            matches[:, i] = 0.0
+            continue
+        contour[i], is_near[i] = found, True
+        point = table[found]
+        x, y, z = placed(T_cam_obj, point[X], point[Y], point[Z])
+        inverse = inverse_depth(z)
+        u, v = intrinsics[2] + x * inverse * intrinsics[0], intrinsics[3] + y * inverse * intrinsics[1]
+        speed_u, speed_v = across(motion, x, y, z, inverse, intrinsics)
+        change_u, change_v = across(change, x, y, z, inverse, intrinsics)
+        nu, nv = point[NORMAL_U], point[NORMAL_V]
+        crossing = nu * speed_u + nv * speed_v
+        dark = seen[POLARITY, i] * crossing / (abs(crossing) + settings.slow_px_s)
+        age = seen[AGE, i] + max(seen[INTO_BURST, i] - settings.burst_px / max(abs(crossing), 1e-3), 0.0)
+        carried_u = seen[U, i] + age * (speed_u - 0.5 * age * change_u)
+        carried_v = seen[V, i] + age * (speed_v - 0.5 * age * change_v)
+        shift = dark * (settings.dark_shift_px + point[LIMB] * (settings.limb_dark_shift_px - settings.dark_shift_px))
+        target_u, target_v = carried_u - nu * shift, carried_v - nv * shift
+        du, dv = u - target_u, v - target_v
+        is_matched[i] = du * du + dv * dv < (gate_px * wider) ** 2
+        offset = (du * nu + dv * nv) / wider
+        as_expected = _agreeing(dark * point[EXPECTED], settings)
+        dark = dark * point[ORIENTED]
+        matches[WEIGHT, i], matches[MATCH_AGE, i] = as_expected, age
+        matches[POINT_X, i], matches[POINT_Y, i], matches[POINT_Z, i] = point[X], point[Y], point[Z]
+        matches[TARGET_U, i], matches[TARGET_V, i] = target_u, target_v
+        matches[DIRECTION_U, i], matches[DIRECTION_V, i] = nu, nv
+        matches[OFFSET, i], matches[IS_LIMB, i], matches[ERROR, i] = offset, point[LIMB], point[MISTAKEN]
+        matches[DARK, i], matches[AS_EXPECTED, i] = dark, as_expected
+        if is_matched[i]:
+            # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
+            place[i, 0], place[i, 1] = carried_u - (u - point[INDEXED_U]), carried_v - (v - point[INDEXED_V])
+        if abs(offset) < settings.smear_px:
+            cell = _patch(target_u, target_v, settings)
+            votes[cell, _NEAR] += as_expected
+            if abs(offset) < settings.on_contour_px:
+                votes[cell, _ON] += as_expected
+                votes[cell, _VOTES] += as_expected * dark
+    _weigh(is_near, matches, votes, settings)
+
+
+@kernel()
+def _weigh(is_near: Array, matches: Array, votes: Array, settings: MatchingSettings) -> None:
+    """How far each match is to be trusted by those around it, and how many of these are on the contour."""
+    gain = 1.0 / (settings.gathered_share - settings.smeared_share)
+    for i in range(matches.shape[1]):
+        if not is_near[i]:
+            continue
+        cell = _patch(matches[TARGET_U, i], matches[TARGET_V, i], settings)
+        on = votes[cell, _ON]
+        matches[BESIDE, i] = on
+        weight = matches[AS_EXPECTED, i]
+        if settings.concentration:
+            share = (on + 1.0) / (votes[cell, _NEAR] + 2.0)
+            weight *= min(max((share - settings.smeared_share) * gain, settings.least_trust), 1.0)
+        if settings.polarity:
+            weight *= _agreeing(matches[DARK, i] * votes[cell, _VOTES] / (on + 2.0), settings)
+        matches[WEIGHT, i] = weight
+
+
+@kernel()
+def believe(seen: Array, is_matched: Array, matches: Array, settings: MatchingSettings) -> None:
+    """Make weights what there is to be said of each match: none without one, or where an object has too few of them."""
+    total = 0.0
+    for i in range(len(is_matched)):
+        matches[WEIGHT, i] *= is_matched[i] * seen[TRUST, i]
+        total += matches[WEIGHT, i]
+    enough = total >= settings.min_observations
+    for i in range(len(is_matched)):
+        is_matched[i] = is_matched[i] and enough
+        common_px2 = matches[ERROR, i] + settings.common_px2 * matches[IS_LIMB, i]
+        told = 1.0 / (1.0 + matches[BESIDE, i] * common_px2 / settings.observation_px**2)
+        matches[WEIGHT, i] *= enough * told

@@ -1,0 +1,79 @@
+"""Points of a moving object in the image: :class:`torchtrack.image_motion.MovingObjects`, one point at a time."""
+
+import numpy as np
+
+from torchtrack.kernels.compiler import Array, kernel
+
+# As torchtrack.camera.MIN_DEPTH_M: with it, this would be no foundation.
+_MIN_DEPTH_M = 1e-3
+
+
+@kernel()
+def placed(T_cam_obj: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A point of the object in the camera's frame."""
+    return (
+        T_cam_obj[0, 0] * x + T_cam_obj[0, 1] * y + T_cam_obj[0, 2] * z + T_cam_obj[0, 3],
+        T_cam_obj[1, 0] * x + T_cam_obj[1, 1] * y + T_cam_obj[1, 2] * z + T_cam_obj[1, 3],
+        T_cam_obj[2, 0] * x + T_cam_obj[2, 1] * y + T_cam_obj[2, 2] * z + T_cam_obj[2, 3],
+    )
+
+
+@kernel()
+def inverse_depth(z: float) -> float:
+    """One over a depth, of which none is too small."""
+    return 1.0 / max(z, _MIN_DEPTH_M)
+
+
+@kernel()
+def drift(velocity: Array, centre_cam: Array, motion: Array) -> None:
+    """Lay out how points of an object move: those at ``p`` with ``motion[:3] × p + motion[3:]``."""
+    w0, w1, w2 = velocity[0], velocity[1], velocity[2]
+    motion[0], motion[1], motion[2] = w0, w1, w2
+    motion[3] = velocity[3] - (w1 * centre_cam[2] - w2 * centre_cam[1])
+    motion[4] = velocity[4] - (w2 * centre_cam[0] - w0 * centre_cam[2])
+    motion[5] = velocity[5] - (w0 * centre_cam[1] - w1 * centre_cam[0])
+
+
+@kernel()
+def across(motion: Array, x: float, y: float, z: float, inverse: float, intrinsics: Array) -> tuple[float, float]:
+    """Image velocity (px/s) of a point in the camera's frame, by the inverse of its depth."""
+    moving_z = (motion[0] * y - motion[1] * x + motion[5]) * inverse
+    moving_x = (motion[1] * z - motion[2] * y + motion[3]) * inverse
+    moving_y = (motion[2] * x - motion[0] * z + motion[4]) * inverse
+    return (moving_x - x * inverse * moving_z) * intrinsics[0], (moving_y - y * inverse * moving_z) * intrinsics[1]
+
+
+@kernel()
+def at_depth(motion: Array, depth_m: float, u: float, v: float, intrinsics: Array) -> tuple[float, float]:
+    """Image velocity (px/s) that a pixel would have at a depth: :func:`torchtrack.image_motion.object_plane_velocity`."""
+    x, y, inverse = (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], inverse_depth(depth_m)
+    moving_z = motion[0] * y - motion[1] * x + motion[5] * inverse
+    moving_x = motion[1] - motion[2] * y + motion[3] * inverse
+    moving_y = motion[2] * x - motion[0] + motion[4] * inverse
+    return (moving_x - x * moving_z) * intrinsics[0], (moving_y - y * moving_z) * intrinsics[1]
+
+
+@kernel()
+def centre_of(T_cam_obj: Array, centre_obj: Array, centre_cam: Array) -> None:
+    """Where the object's centre is in the camera's frame."""
+    centre_cam[0], centre_cam[1], centre_cam[2] = placed(T_cam_obj, centre_obj[0], centre_obj[1], centre_obj[2])
+
+
+@kernel()
+def turn(rotation: Array, phi: Array, turned: Array) -> None:
+    """Turn a rotation by Cayley's map: :func:`torchtrack.lie.turned`."""
+    a, b, c = 0.5 * phi[0], 0.5 * phi[1], 0.5 * phi[2]
+    factor = 8.0 / (4.0 + phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
+    for k in range(3):
+        x, y, z = rotation[0, k], rotation[1, k], rotation[2, k]
+        # skew @ column, and skew @ that.
+        p, q, r = b * z - c * y, c * x - a * z, a * y - b * x
+        turned[0, k] = x + factor * (p + b * r - c * q)
+        turned[1, k] = y + factor * (q + c * p - a * r)
+        turned[2, k] = z + factor * (r + a * q - b * p)
+
+
+@kernel()
+def is_finite(values: Array) -> bool:
+    """Whether all values are finite."""
+    return np.isfinite(values.sum())
