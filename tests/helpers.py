@@ -168,10 +168,11 @@ def contours_at(pixels, normals=None, kind=ContourKind.CREASE, mask=None, dtype=
 
 def moving_objects(velocity_px_s, batch=1, dtype=torch.float64):
     """Objects that show contours of :func:`contours_at` where they are, and move across the image at ``velocity_px_s``."""
+    centre = torch.tensor([0.0, 0.0, 1.0], dtype=dtype).expand(batch, 3)
     intrinsics = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=dtype).expand(batch, 4)
     velocity = torch.zeros(batch, 6, dtype=dtype)
     velocity[:, 3:5] = torch.as_tensor(velocity_px_s, dtype=dtype)
-    return MovingObjects(torch.eye(4, dtype=dtype).expand(batch, 4, 4), velocity, torch.zeros(batch, 3, dtype=dtype), intrinsics)
+    return MovingObjects(torch.eye(4, dtype=dtype).expand(batch, 4, 4), velocity, centre, intrinsics)
 
 
 def upright_line(u, dtype=torch.float64, **kwargs):

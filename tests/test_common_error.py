@@ -51,7 +51,7 @@ def solved(times, config, kind=ContourKind.LIMB):
     contours = replace(contours, kind=torch.full_like(contours.kind, int(kind)))
     tight = gate_widening(torch.zeros(1), tracker.config)
     index = index_for(contours, tracker.image_size, tracker.config, tight)
-    once = observations = select_events(events, index, prediction.plane_velocity(events.pixels), 1000)
+    once = observations = select_events(events, index, prediction.moving(compensated=True), 1000)
     for _ in range(times - 1):
         observations = join(observations, once)
     return prediction, align(prediction, contours, index, tight, observations, tracker.config).solution

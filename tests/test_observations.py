@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import IMAGE_SIZE, contours_at, generator, seen, upright_line
+from helpers import IMAGE_SIZE, contours_at, generator, moving_objects, seen, upright_line
 
 from torchtrack.contour_index import index_contours
 from torchtrack.observations import WindowEvents, join, select_events
@@ -18,7 +18,7 @@ def numbered(near, count):
     lines = contours_at(upright_line(80.0).pixels.expand(len(near), -1, -1))
     index = index_contours(lines, IMAGE_SIZE, 5, 1)
     events = WindowEvents(pixels, number, number, torch.ones_like(number), torch.ones_like(near))
-    chosen = select_events(events, index, torch.zeros_like(pixels), count)
+    chosen = select_events(events, index, moving_objects((0.0, 0.0), len(near)), count)
     assert chosen.pixels.shape == (len(near), count, 2)
     return [row[mask].long().tolist() for row, mask in zip(chosen.age_s, chosen.mask, strict=True)]
 
@@ -34,10 +34,9 @@ def random_near(seed=0, total=NEAR):
 
 def choose(pixels, contours, *, age_s=0.0, velocity=(0.0, 0.0), count=100, mask=None):
     observations = seen(pixels, age_s=age_s, mask=mask, polarity=1.0)
-    speed = torch.tensor(velocity, dtype=torch.float64).expand_as(observations.pixels)
     index = index_contours(contours, IMAGE_SIZE, 5, 1)
     events = WindowEvents(observations.pixels, observations.age_s, observations.into_burst_s, observations.polarity, observations.mask)
-    return select_events(events, index, speed, count)
+    return select_events(events, index, moving_objects(velocity, len(observations.pixels)), count)
 
 
 def test_events_near_a_contour_are_taken_and_others_left():
@@ -124,7 +123,7 @@ def test_values_go_with_their_events(dtype):
     age_s, polarity = torch.linspace(0, 5e-3, 400, dtype=dtype)[None], torch.where(torch.arange(400) % 2 == 0, 1, -1).to(dtype)[None]
     index = index_contours(upright_line(80.0, dtype), IMAGE_SIZE, 5, 1)
     events = WindowEvents(place, age_s, 2 * age_s, polarity, torch.ones(1, 400, dtype=torch.bool))
-    chosen = select_events(events, index, torch.zeros_like(place), 50)
+    chosen = select_events(events, index, moving_objects((0.0, 0.0), dtype=dtype), 50)
     number = ((chosen.pixels[0, :, 1] - 20) / 99 * 399).round().long()[chosen.mask[0]]
     assert len(number) > 40
     pairs = ((chosen.pixels, place), (chosen.age_s, age_s), (chosen.into_burst_s, 2 * age_s), (chosen.polarity, polarity))

@@ -89,7 +89,7 @@ def in_motion(config=None, displaced=None, dtype=torch.float32):
     contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
     tight = gate_widening(torch.zeros(1, dtype=dtype), tracker.config)
     index = index_for(contours, tracker.image_size, tracker.config, tight)
-    observations = select_events(seen, index, prediction.plane_velocity(seen.pixels), 1000)
+    observations = select_events(seen, index, prediction.moving(compensated=True), 1000)
     found = judge_fit(prediction, align(prediction, contours, index, tight, observations, tracker.config), tracker.config, torch.ones(1, dtype=dtype))
     return tracker, prediction, seen, found, trajectory.at(torch.tensor([end_us]))
 

@@ -32,6 +32,11 @@ def told_by_each(beside: Float[Tensor, "b n"], common_px2: Float[Tensor, "b n"],
     return torch.addcmul(one(beside), beside, common_px2, value=observation_px**-2).reciprocal()
 
 
+def mistaken_constants() -> dict[str, float]:
+    """What a kernel goes by that finds the edge beside as :func:`mistaken_px2` does."""
+    return {"aside_px": _ASIDE_PX, "parallel": _PARALLEL, "apart_px": _APART_PX}
+
+
 def mistaken_px2(contours: Contours, index: ContourIndex, of_edges: Bool[Tensor, "b m"], close_px: float) -> Float[Tensor, "b m"]:
     """Mean square of how far off what is seen on each contour point is, should it be of the edge beside (px²).
 

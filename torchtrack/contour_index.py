@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -16,7 +17,8 @@ from torch import Tensor
 from torchtrack import readback
 from torchtrack.constants import constant, disc
 from torchtrack.contours import Contours, take_points
-from torchtrack.kernels.settings import Cells
+from torchtrack.kernels import switch
+from torchtrack.kernels.settings import Cells, IndexSettings
 
 # Squared distances are compared in these fractions of a pixel².
 _DISTANCE_STEPS = 16
@@ -114,6 +116,8 @@ def index_contours(
     """
     batch, count, _ = contours.pixels.shape
     answer = _radii(radius_px, contours)
+    if switch.apply_to(contours.pixels):
+        return _by_kernel(contours, image_size, answer, cell_px)
     radius, radii_px = answer.on_device, answer.numbers()
     middle = constant((0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)), contours.pixels.dtype, contours.pixels.device)
     inside = contours.mask & ((contours.pixels - middle).abs() < middle + radius[:, None, None]).all(-1)
@@ -137,6 +141,22 @@ def index_contours(
     keys = keys.view(batch, -1)
     nearest = torch.where(keys < ((_DISTANCE_STEPS * radius.square() + 1) * count)[:, None], keys % count, -1).long()
     return ContourIndex(low, (rows, columns), cell_px, nearest, contours.pixels, answer)
+
+
+def _by_kernel(contours: Contours, image_size: tuple[int, int], answer: readback.Answer, cell_px: int) -> ContourIndex:
+    """:func:`index_contours`, point by point."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels import index as kernels
+
+    radius, margin = answer.on_device.numpy(), _reach(max([0, *answer.numbers()]), cell_px) + 2
+    middle = 0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)
+    settings = IndexSettings(*middle, float(cell_px), margin, _DISTANCE_STEPS, _HALF_DIAGONAL, _FAR_CELLS)
+    pixels, mask = contours.pixels.contiguous().numpy(), contours.mask.contiguous().numpy()
+    first, is_inside = contours.pixels.new_empty(len(pixels), 2), np.empty_like(mask)
+    rows, columns = kernels.extents(pixels, mask, radius, settings, is_inside, first.numpy())
+    nearest = torch.empty(len(pixels), rows * columns, dtype=torch.int64)
+    kernels.write(pixels, is_inside, radius, first.numpy(), columns, settings, nearest.numpy())
+    return ContourIndex(first, (rows, columns), cell_px, nearest, contours.pixels, answer)
 
 
 def _radii(radius_px: int | Tensor | readback.Answer, contours: Contours) -> readback.Answer:

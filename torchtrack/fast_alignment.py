@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import RoundSettings
 from torchtrack.matching import ContourTable, Matches, matching_settings
 from torchtrack.observations import Observations
@@ -56,20 +57,15 @@ def align_rounds(
     is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool)
     matches = torch.empty(batch, rows.ROWS, count, dtype=offset.dtype)
     rounds.align(
-        *_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
+        *as_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
         table.index.cells,
-        *_arrays(prediction.velocity, *_acceleration(prediction, config), information, prediction.objects.intrinsics, prediction.objects.centre_obj),
-        *_arrays(torch.tensor(config.matching.gates_px, dtype=offset.dtype), torch.stack(list(wider)), finely),
+        *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, prediction.objects.intrinsics, prediction.objects.centre_obj),
+        *as_arrays(torch.tensor(config.matching.gates_px, dtype=offset.dtype), torch.stack(list(wider)), finely),
         matching_settings(config),
         RoundSettings(config.matching.motion_compensation, config.solver.velocity_in_window, config.solver.damping, *rounding_floor()),
-        *_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
+        *as_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
     )
     return Linearisation(T_cam_obj, gradient, hessian, offset), _matches(contour, is_near, is_matched, matches)
-
-
-def _arrays(*values: Tensor) -> list[object]:
-    """The tensors as arrays, row by row in memory: the same memory where they are already."""
-    return [value.contiguous().numpy() for value in values]
 
 
 def _seen(observations: Observations) -> Float[Tensor, "b 6 n"]:

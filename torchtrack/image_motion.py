@@ -64,6 +64,10 @@ class MovingObjects:
         change = _across_the_ray(ray, torch.baddbmm(drift, turning, points_cam) * inverse_depth, self.intrinsics)
         return pixels.transpose(1, 2), velocity, change
 
+    def plane_velocity(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
+        """Image velocity of pixels at the depth of each object's centre (px/s)."""
+        return object_plane_velocity(pixels, self.velocity, self.centre_cam, self.intrinsics)
+
 
 def object_plane_velocity(
     pixels: Float[Tensor, "b n 2"], velocity: Float[Tensor, "b 6"], centre_cam: Float[Tensor, "b 3"], intrinsics: Float[Tensor, "b 4"]

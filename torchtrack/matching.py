@@ -12,14 +12,16 @@ from torch import Tensor
 from torch.linalg import vecdot
 
 from torchtrack.bursts import without_tail
-from torchtrack.common_error import mistaken_px2
+from torchtrack.common_error import mistaken_constants, mistaken_px2
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours, take_points
 from torchtrack.image_motion import MovingObjects
-from torchtrack.kernels.settings import MatchingSettings
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
+from torchtrack.kernels.settings import MatchingSettings, TableSettings
 from torchtrack.observations import Observations
 from torchtrack.polarity_memory import octant
 
@@ -95,6 +97,8 @@ class ContourTable:
             of_print: whether anything is expected of print.
             close_px: distance from which parallel edges are told apart; 0 for always.
         """
+        if switch.apply_to(contours.pixels):
+            return cls(_rows_by_kernel(contours, index, polarity, of_print=of_print, close_px=close_px), index)
         limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
         oriented, expected = limb | crease, (texture & of_print).to(contours.pixels.dtype)
         if polarity is not None:
@@ -109,6 +113,23 @@ class ContourTable:
         taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
         points_obj, normals, indexed, marks = taken.split((3, 2, 2, 4), -1)
         return points_obj, normals, indexed, *marks.unbind(-1)
+
+
+def _rows_by_kernel(contours: Contours, index: ContourIndex, polarity: Tensor | None, *, of_print: bool, close_px: float) -> Float[Tensor, "b k m"]:
+    """Rows of a :class:`ContourTable`, point by point."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels import table as kernels
+
+    kinds = {kind.name.lower(): int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE)}
+    settings = TableSettings(**kinds, of_print=of_print, close_px=close_px, **mistaken_constants())
+    table = contours.points_obj.new_empty(*contours.mask.shape, kernels.COLUMNS)
+    points, pixels, normals, indexed = (
+        value.transpose(1, 2) for value in (contours.points_obj, contours.pixels, contours.normals, index.pixels)
+    )
+    expected = pixels.new_empty(len(table), 0) if polarity is None else polarity
+    of_index = as_arrays(indexed, index.nearest, index.first)
+    kernels.fill(*as_arrays(points, pixels, normals, contours.kind, contours.mask), *of_index, index.cells, *as_arrays(expected), settings, table.numpy())
+    return table.transpose(1, 2)
 
 
 def match_nearest(

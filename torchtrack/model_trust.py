@@ -154,7 +154,7 @@ def _remembered(trust: ModelTrust, explained: Tensor, expected: Tensor, learning
 def _observed(fitted: Prediction, contours: Contours, index: ContourIndex, events: WindowEvents, config: TrackerConfig) -> Float[Tensor, "b 2 m"]:
     """How many observations lie on each contour point, and around it."""
     matching, moving = config.matching, fitted.moving(compensated=True)
-    seen = select_events(events, index, fitted.plane_velocity(events.pixels), matching.max_events)
+    seen = select_events(events, index, fitted.moving(compensated=True), matching.max_events)
     place = fitted.carried(seen.pixels, seen.age_s)
     table, gate_px = ContourTable.of(contours, index), max(matching.gates_px)
     # Once more from where the first contour's own motion carries it.

@@ -10,6 +10,9 @@ from torch import Tensor
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import select_ranked, take_points
 from torchtrack.corners import Corners
+from torchtrack.image_motion import MovingObjects
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 
 _GOLDEN_RATIO = 0.6180339887498949
 # Lots are drawn for a little less than what there is room for, as their number varies.
@@ -94,21 +97,43 @@ def corner_observations(corners: Corners) -> Observations:
     return Observations(corners.pixels, corners.age_s, unknown, unknown, corners.mask, corners.flow, corners.has_flow)
 
 
-def select_events(events: WindowEvents, index: ContourIndex, plane_velocity: Float[Tensor, "b e 2"], count: int) -> Observations:
+def select_events(events: WindowEvents, index: ContourIndex, objects: MovingObjects, count: int) -> Observations:
     """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time.
 
     Which of them are taken hangs on each event's own number, not on how many come before it: a pose that is a little
     different takes almost the same events.
     """
-    pixels, mask = events.pixels, events.mask
-    near = mask & (index.look_up(torch.addcmul(pixels, plane_velocity, events.age_s[..., None])) >= 0)
-    total = near.sum(-1, keepdim=True)
-    share = torch.where(total > count, _FILL * count / total, 1.0)
-    chosen, exists = events.draw(near, share, count)
-    rows = [pixels.transpose(1, 2), events.age_s[:, None], events.into_burst_s[:, None], events.polarity[:, None]]
-    values = take_points(torch.cat(rows, 1).transpose(1, 2), chosen)
+    if switch.apply_to(events.pixels):
+        values, exists = _selected_by_kernel(events, index, objects, count)
+    else:
+        pixels, mask = events.pixels, events.mask
+        near = mask & (index.look_up(torch.addcmul(pixels, objects.plane_velocity(pixels), events.age_s[..., None])) >= 0)
+        total = near.sum(-1, keepdim=True)
+        share = torch.where(total > count, _FILL * count / total, 1.0)
+        chosen, exists = events.draw(near, share, count)
+        rows = [pixels.transpose(1, 2), events.age_s[:, None], events.into_burst_s[:, None], events.polarity[:, None]]
+        values = take_points(torch.cat(rows, 1).transpose(1, 2), chosen)
     flow = torch.zeros_like(values[..., :2])
     return Observations(values[..., :2], values[..., 2], values[..., 3], values[..., 4], exists, flow, torch.zeros_like(exists))
+
+
+def _selected_by_kernel(
+    events: WindowEvents, index: ContourIndex, objects: MovingObjects, count: int
+) -> tuple[Float[Tensor, "b c 5"], Bool[Tensor, "b c"]]:
+    """What is told of the events that :func:`select_events` takes, and which there are, event by event."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.selection import select
+
+    # Of what many have in common, one row is enough.
+    rows = events.of(0) if events.pixels.stride(0) == 0 else events
+    told = torch.stack([rows.age_s, rows.into_burst_s, rows.polarity], 1)
+    number = torch.arange(told.shape[2]).expand(len(told), -1) if rows.number is None else rows.number
+    batch = len(events.pixels)
+    chosen, exists = told.new_empty(batch, 5, count), torch.empty(batch, count, dtype=torch.bool)
+    moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics, index.nearest, index.first)
+    seen = as_arrays(rows.pixels.transpose(1, 2), told, rows.mask, number)
+    select(*seen, *moving, index.cells, _FILL, _GOLDEN_RATIO, chosen.numpy(), exists.numpy())
+    return chosen.transpose(1, 2), exists
 
 
 def join(first: Observations, second: Observations) -> Observations:

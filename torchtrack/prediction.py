@@ -9,7 +9,7 @@ from torch import Tensor
 from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contours import Contours, assemble, select_ranked, take_points
-from torchtrack.image_motion import MovingObjects, object_plane_velocity, pixel_velocity
+from torchtrack.image_motion import MovingObjects, pixel_velocity
 from torchtrack.lie import cayley, move_about, retract_about, transform_points
 from torchtrack.motion import Acceleration, inverse
 from torchtrack.object_batch import ObjectBatch, repeat_row
@@ -73,7 +73,7 @@ class Prediction:
 
     def plane_velocity(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
         """Image velocity of pixels at the depth of the object's centre (px/s)."""
-        return object_plane_velocity(pixels, self.velocity, self.centre_cam, self.objects.intrinsics)
+        return self.moving(compensated=True).plane_velocity(pixels)
 
     def carried(self, pixels: Float[Tensor, "b n 2"], age_s: Float[Tensor, "b n"]) -> Float[Tensor, "b n 2"]:
         """Where pixels that were seen some time ago have come by the window's end, at the depth of the object's centre."""

@@ -261,7 +261,7 @@ def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: 
     tight = torch.ones_like(offsets[:, 0])
     index = index_for(contours, copies.objects.image_size, config, tight)
     events = seen.repeated(len(offsets))
-    observations = select_events(events, index, begin.plane_velocity(events.pixels), config.matching.max_events)
+    observations = select_events(events, index, begin.moving(compensated=True), config.matching.max_events)
     fit = align(copies, contours, index, tight, observations, config, offsets)
     found = judge_fit(copies, fit, config, torch.zeros_like(tight), full_gathered.expand_as(tight))
     return replace(found, elsewhere=torch.ones_like(found.elsewhere))

@@ -227,7 +227,7 @@ class Tracker(TrackedObjects):
         index = index_for(contours, self.image_size, config, widening, radius_px)
         observations = corner_observations(corners)
         if config.matching.max_events:
-            near = select_events(seen, index, prediction.plane_velocity(seen.pixels), config.matching.max_events)
+            near = select_events(seen, index, prediction.moving(compensated=True), config.matching.max_events)
             observations = join(observations, near)
         if self.weigher is not None:
             evidence = Evidence(observations, seen, prediction, contours, index, sensors.history(last_event_us, t_us))

@@ -49,3 +49,45 @@ class RoundSettings(NamedTuple):
     damping: float
     least_diagonal: float
     least_share: float
+
+
+class IndexSettings(NamedTuple):
+    """What :mod:`torchtrack.kernels.index` goes by: constants of :mod:`torchtrack.contour_index`, and the image.
+
+    Args:
+        middle_u, middle_v: of the image (px).
+        side_px: of a cell.
+        margin: cells around the points of a region.
+        distance_steps: squared distances are compared in so many parts of a pixel².
+        half_diagonal: from the middle of a cell to its corner, in cells.
+        far_cells: where a region without points begins.
+    """
+
+    middle_u: float
+    middle_v: float
+    side_px: float
+    margin: int
+    distance_steps: int
+    half_diagonal: float
+    far_cells: int
+
+
+class TableSettings(NamedTuple):
+    """What :mod:`torchtrack.kernels.table` goes by: settings, and constants of :mod:`torchtrack.common_error`.
+
+    Args:
+        limb, crease, texture: numbers of kinds of contours.
+        of_print: whether anything is expected of print.
+        close_px: distance from which parallel edges are told apart; 0 for always.
+        aside_px: where an edge is looked for beside another.
+        parallel, apart_px: contours this parallel and this far apart are two edges.
+    """
+
+    limb: int
+    crease: int
+    texture: int
+    of_print: bool
+    close_px: float
+    aside_px: float
+    parallel: float
+    apart_px: float
