@@ -5,7 +5,6 @@ import numpy as np
 from torchtrack.kernels.compiler import Array, kernel
 from torchtrack.kernels.settings import IndexSettings
 
-_FAR = 2**31 - 1
 
 
 @kernel()
@@ -47,31 +46,37 @@ def write(pixels: Array, is_inside: Array, radius_px: Array, first: Array, colum
     Args:
         nearest: ``[b, p]``, filled.
     """
-    steps = np.empty(nearest.shape[1], np.int32)
-    nearest[:] = -1
+    cells = nearest.shape[1]
+    steps, number = np.empty(cells, np.float32), np.empty(cells, np.int32)
     for b in range(len(pixels)):
-        steps[:] = _FAR
-        farthest = int(settings.distance_steps * radius_px[b] ** 2)
-        # The cells that reach into the radius around a cell's middle.
-        reach = radius_px[b] / settings.side_px + settings.half_diagonal
+        steps[:] = np.inf
+        farthest = np.floor(settings.distance_steps * radius_px[b] ** 2)
+        # A square of cells that may lie within the radius: what is farther is no match.
+        reach = int(radius_px[b] / settings.side_px + settings.half_diagonal)
+        across = np.empty(2 * reach + 1, np.float32)
         for i in range(pixels.shape[1]):
             if is_inside[b, i]:
-                _write_point(i, pixels[b, i, 0], pixels[b, i, 1], reach, farthest, first[b], columns, settings, steps, nearest[b])
+                _write_point(np.int32(i), pixels[b, i, 0], pixels[b, i, 1], reach, first[b], columns, settings, across, steps, number)
+        for cell in range(cells):
+            nearest[b, cell] = number[cell] if steps[cell] <= farthest else -1
 
 
 @kernel()
 def _write_point(
-    number: int, u: float, v: float, reach: float, farthest: int, first: Array, columns: int, settings: IndexSettings, steps: Array, nearest: Array
+    own: int, u: float, v: float, reach: int, first: Array, columns: int, settings: IndexSettings, across: Array, steps: Array, number: Array
 ) -> None:
     """Write one point into the cells around it that none is nearer to; of points as near, the first stays."""
     column, row = np.rint(u / settings.side_px), np.rint(v / settings.side_px)
     away_u, away_v = settings.side_px * column - u, settings.side_px * row - v
-    middle = int(row - first[1]) * columns + int(column - first[0])
-    for down in range(-int(reach), int(reach) + 1):
-        width = int(np.sqrt(reach * reach - down * down))
-        dv = away_v + settings.side_px * down
-        for right in range(-width, width + 1):
-            du = away_u + settings.side_px * right
-            far, cell = int(settings.distance_steps * (du * du + dv * dv)), middle + down * columns + right
-            if far <= farthest and far < steps[cell]:
-                steps[cell], nearest[cell] = far, number
+    for k in range(len(across)):
+        across[k] = settings.distance_steps * (away_u + settings.side_px * (k - reach)) ** 2
+    # Unsigned, an index needs no look whether it is negative: eight times faster.
+    begin = np.uint64((row - first[1] - reach) * columns + (column - first[0]) - reach)
+    for down in range(-reach, reach + 1):
+        along = np.float32(settings.distance_steps * (away_v + settings.side_px * down) ** 2)
+        for k in range(np.uint64(len(across))):
+            cell, far = begin + k, np.floor(across[k] + along)
+            is_nearer = far < steps[cell]
+            number[cell] = own if is_nearer else number[cell]
+            steps[cell] = far if is_nearer else steps[cell]
+        begin += np.uint64(columns)

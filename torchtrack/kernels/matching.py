@@ -68,48 +68,49 @@ def match(
         votes: room for ``[patches², 3]``.
     """
     votes[:] = 0.0
+    indexed = table[:, INDEXED_U : INDEXED_V + 1]
     for i in range(seen.shape[1]):
         is_near[i] = is_matched[i] = False
         contour[i] = 0
-        if not exists[i]:
-            matches[:, i] = 0.0
-            continue
-        if finely:
-            found = nearest_of_four(nearest_of_cell, first, table[:, INDEXED_U : INDEXED_V + 1], place[i, 0], place[i, 1], cells)
-        else:
-            found = nearest(nearest_of_cell, first, place[i, 0], place[i, 1], cells)
+        found = -1
+        if exists[i]:
+            if finely:
+                found = nearest_of_four(nearest_of_cell, first, indexed, place[i, 0], place[i, 1], cells)
+            else:
+                found = nearest(nearest_of_cell, first, place[i, 0], place[i, 1], cells)
         if found < 0:
-            matches[:, i] = 0.0
+            for k in range(ROWS):
+                matches[k, i] = 0.0
             continue
         contour[i], is_near[i] = found, True
-        point = table[found]
-        x, y, z = placed(T_cam_obj, point[X], point[Y], point[Z])
+        point_x, point_y, point_z = table[found, X], table[found, Y], table[found, Z]
+        x, y, z = placed(T_cam_obj, point_x, point_y, point_z)
         inverse = inverse_depth(z)
         u, v = intrinsics[2] + x * inverse * intrinsics[0], intrinsics[3] + y * inverse * intrinsics[1]
         speed_u, speed_v = across(motion, x, y, z, inverse, intrinsics)
         change_u, change_v = across(change, x, y, z, inverse, intrinsics)
-        nu, nv = point[NORMAL_U], point[NORMAL_V]
+        nu, nv = table[found, NORMAL_U], table[found, NORMAL_V]
         crossing = nu * speed_u + nv * speed_v
         dark = seen[POLARITY, i] * crossing / (abs(crossing) + settings.slow_px_s)
         age = seen[AGE, i] + max(seen[INTO_BURST, i] - settings.burst_px / max(abs(crossing), 1e-3), 0.0)
         carried_u = seen[U, i] + age * (speed_u - 0.5 * age * change_u)
         carried_v = seen[V, i] + age * (speed_v - 0.5 * age * change_v)
-        shift = dark * (settings.dark_shift_px + point[LIMB] * (settings.limb_dark_shift_px - settings.dark_shift_px))
+        shift = dark * (settings.dark_shift_px + table[found, LIMB] * (settings.limb_dark_shift_px - settings.dark_shift_px))
         target_u, target_v = carried_u - nu * shift, carried_v - nv * shift
         du, dv = u - target_u, v - target_v
         is_matched[i] = du * du + dv * dv < (gate_px * wider) ** 2
         offset = (du * nu + dv * nv) / wider
-        as_expected = _agreeing(dark * point[EXPECTED], settings)
-        dark = dark * point[ORIENTED]
+        as_expected = _agreeing(dark * table[found, EXPECTED], settings)
+        dark = dark * table[found, ORIENTED]
         matches[WEIGHT, i], matches[MATCH_AGE, i] = as_expected, age
-        matches[POINT_X, i], matches[POINT_Y, i], matches[POINT_Z, i] = point[X], point[Y], point[Z]
+        matches[POINT_X, i], matches[POINT_Y, i], matches[POINT_Z, i] = point_x, point_y, point_z
         matches[TARGET_U, i], matches[TARGET_V, i] = target_u, target_v
         matches[DIRECTION_U, i], matches[DIRECTION_V, i] = nu, nv
-        matches[OFFSET, i], matches[IS_LIMB, i], matches[ERROR, i] = offset, point[LIMB], point[MISTAKEN]
+        matches[OFFSET, i], matches[IS_LIMB, i], matches[ERROR, i] = offset, table[found, LIMB], table[found, MISTAKEN]
         matches[DARK, i], matches[AS_EXPECTED, i] = dark, as_expected
         if is_matched[i]:
             # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
-            place[i, 0], place[i, 1] = carried_u - (u - point[INDEXED_U]), carried_v - (v - point[INDEXED_V])
+            place[i, 0], place[i, 1] = carried_u - (u - table[found, INDEXED_U]), carried_v - (v - table[found, INDEXED_V])
         if abs(offset) < settings.smear_px:
             cell = _patch(target_u, target_v, settings)
             votes[cell, _NEAR] += as_expected

@@ -26,15 +26,18 @@ def fill(
     settings: TableSettings,
     table: Array,
 ) -> None:
-    """Fill ``table [b, m, COLUMNS]``.
+    """Fill ``table [b, m, COLUMNS]``, with zeros for points that do not count.
 
     Args:
         points_obj, pixels, normals, kind, mask: of contours; ``pixels`` and ``normals`` as ``[b, 2, m]``, ``points_obj`` as ``[b, 3, m]``.
         indexed: ``[b, 2, m]``, pixels when indexed.
         polarity: ``[b, 8]``, expected by octant; ``[b, 0]`` where nothing is.
     """
+    table[:] = 0.0
     for b in range(len(table)):
         for i in range(table.shape[1]):
+            if not mask[b, i]:
+                continue
             row = table[b, i]
             row[X], row[Y], row[Z] = points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i]
             row[NORMAL_U], row[NORMAL_V] = normals[b, 0, i], normals[b, 1, i]
@@ -45,8 +48,7 @@ def fill(
             row[EXPECTED] = settings.of_print and kind[b, i] == settings.texture
             if is_oriented and polarity.shape[1]:
                 row[EXPECTED] = polarity[b, _octant(normals[b, 0, i], normals[b, 1, i])]
-            row[MISTAKEN] = 0.0
-            if settings.close_px and mask[b, i] and is_oriented:
+            if settings.close_px and is_oriented:
                 row[MISTAKEN] = _mistaken_px2(i, pixels[b], normals[b], kind[b], mask[b], nearest_of_cell[b], first[b], cells, settings)
 
 
