@@ -7,6 +7,7 @@ objects show when they turn. Dense meshes, and objects in front of one another, 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -17,6 +18,9 @@ from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourModel
 from torchtrack.contours import Contours
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
+from torchtrack.kernels.settings import GridSettings
 from torchtrack.lie import transform_points
 
 # A point this far behind a face's plane is behind it, not on it (diameters).
@@ -82,6 +86,8 @@ def _hidden_by(tests: Float[Tensor, "b t 4"], points: Float[Tensor, "b 4 m"]) ->
 def _hidden_by_self(scene: Scene, contours: Contours) -> Tensor:
     """Points of objects with few faces that these hide."""
     hidden = torch.zeros_like(contours.mask)
+    if switch.apply_to(contours.pixels):
+        return _hidden_by_self_by_kernel(scene, contours, hidden)
     for model in scene.models:
         if len(model.triangles):
             # All objects, where all have the model: a list of them would be looked up.
@@ -93,6 +99,19 @@ def _hidden_by_self(scene: Scene, contours: Contours) -> Tensor:
             normals = model.triangle_normals @ T_cam_obj[:, :3, :3].transpose(1, 2)
             points_cam = contours.points_cam[members][:, :places]
             hidden[members, :places] = hidden_by_faces(points_cam, triangles, normals, _ON_FACE * scene.diameters_m[members])
+    return hidden
+
+
+def _hidden_by_self_by_kernel(scene: Scene, contours: Contours, hidden: Tensor) -> Tensor:
+    """:func:`_hidden_by_self`, object by object."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.visibility import hide_behind_faces
+
+    points = as_arrays(contours.points_cam.transpose(1, 2), contours.mask)
+    T_cam_obj, tolerance_m = as_arrays(scene.T_cam_obj, _ON_FACE * scene.diameters_m)
+    for model in scene.models:
+        if len(model.triangles):
+            hide_behind_faces(*as_arrays(model.members), T_cam_obj, *as_arrays(model.triangles, model.triangle_normals), tolerance_m, *points, hidden.numpy())
     return hidden
 
 
@@ -176,10 +195,7 @@ def _samples(model: ContourModel, drawn: Tensor | None, scene: Scene, cell_px: i
     how small they are, the others are carried along.
     """
     members, points = model.members if drawn is None else model.members[drawn[model.members]], model.surface_points
-    depth_m = scene.T_cam_obj[members, 2, 3].clamp(min=MIN_DEPTH_M)
-    size_cells = scene.diameters_m[members] * scene.intrinsics[members, 0] / depth_m / cell_px
-    spare = len(points) / (_SAMPLES_PER_CELL * size_cells.square()).clamp(min=1)
-    halvings = spare.log2().long().clamp(min=0)
+    halvings = _halvings(model, members, scene, cell_px)
     if not readback.read_at_once(halvings):
         number = torch.arange(len(points), device=points.device)
         yield members, points, number & ((1 << halvings) - 1)[:, None] == 0
@@ -187,6 +203,14 @@ def _samples(model: ContourModel, drawn: Tensor | None, scene: Scene, cell_px: i
     all_of_them = torch.ones(1, 1, dtype=torch.bool, device=points.device)
     for times in sorted(set(halvings.tolist())):
         yield members[halvings == times], points[:: 2**times], all_of_them
+
+
+def _halvings(model: ContourModel, members: Int[Tensor, "k"], scene: Scene, cell_px: int) -> Int[Tensor, "k"]:
+    """How many times the surface samples of some objects of a model are halved, as few will do where the objects are small in the image."""
+    depth_m = scene.T_cam_obj[members, 2, 3].clamp(min=MIN_DEPTH_M)
+    size_cells = scene.diameters_m[members] * scene.intrinsics[members, 0] / depth_m / cell_px
+    spare = len(model.surface_points) / (_SAMPLES_PER_CELL * size_cells.square()).clamp(min=1)
+    return spare.log2().long().clamp(min=0)
 
 
 def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -> Tensor:
@@ -203,6 +227,8 @@ def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -
     u, v = contours.pixels.unbind(-1)
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     grid = DepthGrid.around(scene, contours.pixels, contours.mask & inside, cell_px)
+    if switch.apply_to(contours.pixels):
+        return _hidden_in_buffer_by_kernel(scene, contours, drawn, exact[:, 0], grid, config)
     depth_m, owner = depth_buffer(scene, grid, drawn if readback.read_at_once(drawn) else None)
     sides = torch.stack([contours.pixels + side * contours.normals for side in (0, -cell_px, cell_px)], 1)
     cell = grid.cell(sides, scene.stream_index)
@@ -210,6 +236,28 @@ def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -
     farthest_m = contours.points_cam[..., 2] - config.depth_margin * scene.diameters_m[:, None]
     behind = (farthest_m[:, None] > depth_m.take(cell)) & (other | ~exact[:, None])
     return inside & behind.all(1)
+
+
+def _hidden_in_buffer_by_kernel(
+    scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"], exact: Bool[Tensor, "b"], grid: DepthGrid, config: ContourConfig
+) -> Tensor:
+    """:func:`_hidden_in_buffer`, sample by sample and point by point."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels import visibility as kernels
+
+    settings = GridSettings(*grid.size, float(grid.cell_px), *scene.image_shape[1:], _DEPTH_STEPS_PER_M, MIN_DEPTH_M)
+    cells = len(grid.first) * settings.rows * settings.columns
+    depth, owner = np.full(cells, _NOTHING), np.full(cells, len(drawn))
+    T_cam_obj, intrinsics, stream_index, first = as_arrays(scene.T_cam_obj, scene.intrinsics, scene.stream_index, grid.first)
+    every = np.ones(len(drawn), np.int64)
+    for model in scene.models:
+        members = model.members[drawn[model.members]]
+        every[members.numpy()] = (1 << _halvings(model, members, scene, grid.cell_px)).numpy()
+        kernels.draw(*as_arrays(members, model.surface_points), every, T_cam_obj, intrinsics, stream_index, first, settings, depth, owner)
+    hidden, margin_m = torch.zeros_like(contours.mask), config.depth_margin * scene.diameters_m
+    points = as_arrays(*(value.transpose(1, 2) for value in (contours.points_cam, contours.pixels, contours.normals)), contours.mask, exact, margin_m)
+    kernels.hide_in_buffer(*points, stream_index, first, settings, depth, owner, hidden.numpy())
+    return hidden
 
 
 def _beside_others(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tensor, "b"]:

@@ -91,3 +91,23 @@ class TableSettings(NamedTuple):
     aside_px: float
     parallel: float
     apart_px: float
+
+
+class GridSettings(NamedTuple):
+    """What :mod:`torchtrack.kernels.visibility` goes by: the layout of depth buffers.
+
+    Args:
+        rows, columns: of each stream's.
+        side_px: of a cell.
+        height, width: of the image (px).
+        steps_per_m: depths are compared in so many parts of a metre.
+        least_depth_m: what is nearer is not drawn.
+    """
+
+    rows: int
+    columns: int
+    side_px: float
+    height: int
+    width: int
+    steps_per_m: float
+    least_depth_m: float

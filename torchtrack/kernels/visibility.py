@@ -1,0 +1,159 @@
+"""Hidden contour points: :func:`torchtrack.visibility.hidden_by_faces` and the depth buffer there, object by object."""
+
+import numpy as np
+
+from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.motion import placed
+from torchtrack.kernels.settings import GridSettings
+
+# Dot products of a face with a point: within its three edges, and behind its plane.
+_TESTS = 4
+
+
+@kernel()
+def hide_behind_faces(
+    members: Array, T_cam_obj: Array, triangles: Array, normals: Array, tolerance_m: Array, points_cam: Array, mask: Array, hidden: Array
+) -> None:
+    """Mark the points of objects of one model that lie behind one of its faces, as the camera sees them.
+
+    Args:
+        members: numbers of the objects.
+        T_cam_obj: ``[b, 4, 4]``.
+        triangles, normals: ``[f, 3, 3]`` and ``[f, 3]``, in the object's frame.
+        tolerance_m: ``[b]``.
+        points_cam, mask: ``[b, 3, m]``, and which of them count: ``[b, m]``.
+        hidden: ``[b, m]``, changed.
+    """
+    count = points_cam.shape[2]
+    tests = np.empty((len(triangles), _TESTS, 4), points_cam.dtype)
+    points, place, deepest = np.empty((3, count), points_cam.dtype), np.empty(count, np.int64), np.empty(count, points_cam.dtype)
+    for b in members:
+        used = 0
+        for i in range(count):
+            if mask[b, i]:
+                points[0, used], points[1, used], points[2, used] = points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i]
+                place[used], deepest[used] = i, -np.inf
+                used += 1
+        for f in range(len(triangles)):
+            _set_up(triangles[f], normals[f], T_cam_obj[b], tolerance_m[b], tests[f])
+        for f in range(len(triangles)):
+            _deepen(tests[f], points[0, :used], points[1, :used], points[2, :used], deepest[:used])
+        for j in range(used):
+            hidden[b, place[j]] = hidden[b, place[j]] or deepest[j] > 0
+
+
+@kernel()
+def _set_up(triangle: Array, normal: Array, T_cam_obj: Array, tolerance_m: float, tests: Array) -> None:
+    """Lay out the tests of a face, each positive for points that pass it: a vector, and what is added to its product with the point."""
+    corners = np.empty((3, 3))
+    for k in range(3):
+        corners[k, 0], corners[k, 1], corners[k, 2] = placed(T_cam_obj, triangle[k, 0], triangle[k, 1], triangle[k, 2])
+    sides = np.empty((3, 3))
+    for k in range(3):
+        a, b = corners[k], corners[(k + 1) % 3]
+        sides[k, 0], sides[k, 1], sides[k, 2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    turn = np.sign(sides[0, 0] * corners[2, 0] + sides[0, 1] * corners[2, 1] + sides[0, 2] * corners[2, 2])
+    plane = 0.0
+    for k in range(3):
+        away = T_cam_obj[k, 0] * normal[0] + T_cam_obj[k, 1] * normal[1] + T_cam_obj[k, 2] * normal[2]
+        plane += away * corners[0, k]
+        tests[3, k] = away
+        for side in range(3):
+            tests[side, k] = sides[side, k] * turn
+    for k in range(3):
+        tests[3, k] *= np.sign(plane)
+        tests[k, 3] = 0.0
+    tests[3, 3] = -(abs(plane) + tolerance_m)
+
+
+@kernel(fastmath={"contract"})
+def _deepen(tests: Array, x: Array, y: Array, z: Array, deepest: Array) -> None:
+    """Raise, for each point, the least result of the four tests to that of a face."""
+    for i in range(len(x)):
+        first = tests[0, 0] * x[i] + tests[0, 1] * y[i] + tests[0, 2] * z[i]
+        second = tests[1, 0] * x[i] + tests[1, 1] * y[i] + tests[1, 2] * z[i]
+        third = tests[2, 0] * x[i] + tests[2, 1] * y[i] + tests[2, 2] * z[i]
+        behind = tests[3, 0] * x[i] + tests[3, 1] * y[i] + tests[3, 2] * z[i] + tests[3, 3]
+        least = first if first < second else second
+        other = third if third < behind else behind
+        least = least if least < other else other
+        deepest[i] = least if least > deepest[i] else deepest[i]
+
+
+@kernel()
+def _cell(u: float, v: float, first: Array, stream: int, grid: GridSettings) -> int:
+    """The cell of a depth buffer that a pixel falls into; what lies outside falls into the outermost, what is not a number into the first."""
+    column, row = np.rint(u / grid.side_px) - first[stream, 0], np.rint(v / grid.side_px) - first[stream, 1]
+    column = min(max(column, 0.0), grid.columns - 1.0) if column == column else 0.0
+    row = min(max(row, 0.0), grid.rows - 1.0) if row == row else 0.0
+    return (int(row) + stream * grid.rows) * grid.columns + int(column)
+
+
+@kernel()
+def draw(
+    members: Array,
+    samples: Array,
+    every: Array,
+    T_cam_obj: Array,
+    intrinsics: Array,
+    stream_index: Array,
+    first: Array,
+    grid: GridSettings,
+    depth: Array,
+    owner: Array,
+) -> None:
+    """Draw surface samples of objects of one model into depth buffers; of objects as near, the first stays.
+
+    Args:
+        members: numbers of the objects.
+        samples: ``[n, 3]``, in the object's frame; ``every [b]`` so manieth of them is taken.
+        first: ``[s, 2]``, first cell of each stream's buffer.
+        depth, owner: ``[p]``, depths in whole steps, and the object of each; changed.
+    """
+    for b in members:
+        stream = stream_index[b]
+        for i in range(0, len(samples), every[b]):
+            x, y, z = placed(T_cam_obj[b], samples[i, 0], samples[i, 1], samples[i, 2])
+            if not z > grid.least_depth_m:
+                continue
+            u = x / z * intrinsics[b, 0] + intrinsics[b, 2]
+            v = y / z * intrinsics[b, 1] + intrinsics[b, 3]
+            cell, steps = _cell(u, v, first, stream, grid), int(z * grid.steps_per_m)
+            if steps < depth[cell] or (steps == depth[cell] and b < owner[cell]):
+                depth[cell], owner[cell] = steps, b
+
+
+@kernel()
+def hide_in_buffer(
+    points_cam: Array,
+    pixels: Array,
+    normals: Array,
+    mask: Array,
+    exact: Array,
+    margin_m: Array,
+    stream_index: Array,
+    first: Array,
+    grid: GridSettings,
+    depth: Array,
+    owner: Array,
+    hidden: Array,
+) -> None:
+    """Mark points in the image behind a surface in the depth buffer, there and a cell to each side of their contour.
+
+    Args:
+        points_cam, pixels, normals: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``; ``mask [b, m]``.
+        exact: ``[b]``, objects that their own surface does not count for.
+        margin_m: ``[b]``, how far behind it is hidden.
+        hidden: ``[b, m]``, changed.
+    """
+    for b in range(len(mask)):
+        for i in range(mask.shape[1]):
+            u, v = pixels[b, 0, i], pixels[b, 1, i]
+            if not mask[b, i] or not (u >= 0 and v >= 0 and u <= grid.width - 1 and v <= grid.height - 1):
+                continue
+            behind, farthest_m = True, points_cam[b, 2, i] - margin_m[b]
+            for side in (0.0, -grid.side_px, grid.side_px):
+                cell = _cell(u + side * normals[b, 0, i], v + side * normals[b, 1, i], first, stream_index[b], grid)
+                counts = not exact[b] or owner[cell] != b
+                behind = behind and counts and farthest_m > depth[cell] / grid.steps_per_m
+            hidden[b, i] = hidden[b, i] or behind
