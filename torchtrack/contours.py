@@ -7,6 +7,7 @@ image. Objects that share a model are handled as one batch.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -15,6 +16,9 @@ from torchtrack import readback
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourKind, ContourModel
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
+from torchtrack.kernels.settings import SamplingSettings
 from torchtrack.lie import transform_points
 
 # Of a model with no more edges than this, all are looked at.
@@ -25,6 +29,11 @@ _MAX_ACTIVE_EDGES = 8192
 _MIN_PX_PER_M = 1e-3
 # Texture seen at a grazing angle (cosine below this) is foreshortened beyond use. What fires and is left out draws what is beside it.
 _MIN_TEXTURE_COSINE = 0.02
+# What of a model its contour points are sampled from.
+_SAMPLED_FROM = (
+    *("edge_ends", "face_normals", "face_offsets", "is_crease", "is_segment", "edges"),
+    *("texture_points", "texture_tangents", "texture_normals"),
+)
 # Points and tangents (object frame), kinds and mask; where it was said which elements are shown, the element of each as well.
 _Points = tuple[Tensor, ...]
 
@@ -233,6 +242,8 @@ def mesh_elements(
 
 def _mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
     """Contour points of all objects, in places of their own, before hidden parts are removed."""
+    if shown is None and switch.apply_to(T_cam_obj):
+        return _mesh_points_by_kernel(models, T_cam_obj, intrinsics, config)
     if len(models) == 1:
         return _model_contours(models[0], T_cam_obj, intrinsics, config, shown)
     parts = [
@@ -242,6 +253,40 @@ def _mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: 
     width = max(mask.shape[1] for _, _, _, mask, *_ in parts)
     order = torch.cat([model.members for model in models]).argsort()
     return tuple(torch.cat([_widened(value, width) for value in column])[order] for column in zip(*parts, strict=True))
+
+
+def _mesh_points_by_kernel(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> _Points:
+    """:func:`_mesh_points`, object by object."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels import contours as kernels
+
+    batch, room = len(T_cam_obj), config.max_edge_points + max(len(model.texture_points) for model in models)
+    sampled = T_cam_obj.new_empty(batch, kernels.SAMPLED, room).numpy()
+    kind, counts = np.empty((batch, room), np.int64), np.zeros(batch, np.int64)
+    seen = as_arrays(T_cam_obj, intrinsics)
+    for model in models:
+        of_model = as_arrays(model.members, *(getattr(model, name) for name in _SAMPLED_FROM))
+        kernels.sample(*of_model, model.texture_spacing_m, *seen, _sampling_settings(config), sampled, kind, counts)
+    # One place at least: what selects from contours needs one to point at.
+    width = max(int(counts.max()), 1)
+    points, tangents = T_cam_obj.new_empty(2, batch, 3, width)
+    kinds, mask = torch.empty(batch, width, dtype=torch.int64), torch.empty(batch, width, dtype=torch.bool)
+    kernels.gather(sampled, kind, counts, *as_arrays(points, tangents, kinds, mask))
+    return points.transpose(1, 2), tangents.transpose(1, 2), kinds, mask
+
+
+def _sampling_settings(config: ContourConfig) -> SamplingSettings:
+    """What a kernel goes by that samples as :func:`mesh_contours` does."""
+    return SamplingSettings(
+        occluding=config.occluding,
+        most_edges=_MAX_ACTIVE_EDGES,
+        max_edge_points=config.max_edge_points,
+        spacing_px=config.spacing_px,
+        texture=int(ContourKind.TEXTURE),
+        least_cosine=_MIN_TEXTURE_COSINE,
+        least_depth_m=MIN_DEPTH_M,
+        least_px_per_m=_MIN_PX_PER_M,
+    )
 
 
 def _widened(values: Tensor, count: int) -> Tensor:
@@ -259,8 +304,22 @@ def assemble(
     intrinsics: Float[Tensor, "b 4"],
 ) -> Contours:
     """Contours from points in the object's frame; those behind the camera or without a normal are masked."""
+    if switch.apply_to(points_obj):
+        return _assemble_by_kernel(points_obj, tangents_obj, kind, mask, T_cam_obj, intrinsics)
     points_cam = transform_points(T_cam_obj, points_obj)
     tangents_cam = torch.bmm(T_cam_obj[:, :3, :3], tangents_obj.transpose(1, 2)).transpose(1, 2)
     normals, has_normal = image_normals(points_cam, tangents_cam, intrinsics)
     mask = mask & has_normal & (points_cam[..., 2] > MIN_DEPTH_M)
     return Contours(points_obj, tangents_obj, kind, mask, points_cam, project(points_cam, intrinsics), normals)
+
+
+def _assemble_by_kernel(points_obj: Tensor, tangents_obj: Tensor, kind: Tensor, mask: Tensor, T_cam_obj: Tensor, intrinsics: Tensor) -> Contours:
+    """:func:`assemble`, point by point."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.contours import show
+
+    points, tangents = points_obj.transpose(1, 2), tangents_obj.transpose(1, 2)
+    points_cam, pixels, normals, shown = points.new_empty(points.shape), *points.new_empty(2, len(mask), 2, mask.shape[1]), torch.empty_like(mask)
+    given = as_arrays(points, tangents, mask, T_cam_obj, intrinsics)
+    show(*given, _sampling_settings(ContourConfig()), *as_arrays(points_cam, pixels, normals, shown))
+    return Contours(points_obj, tangents_obj, kind, shown, *(value.transpose(1, 2) for value in (points_cam, pixels, normals)))

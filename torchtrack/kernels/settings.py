@@ -111,3 +111,27 @@ class GridSettings(NamedTuple):
     width: int
     steps_per_m: float
     least_depth_m: float
+
+
+class SamplingSettings(NamedTuple):
+    """What :mod:`torchtrack.kernels.contours` goes by: settings, and constants of :mod:`torchtrack.contours`.
+
+    Args:
+        occluding: whether edges between a front and a back face are contours.
+        most_edges: of more active edges, as many are taken.
+        max_edge_points: points on edges, at most.
+        spacing_px: points are no closer than this in the image.
+        texture: number of that kind.
+        least_cosine: texture seen at a smaller one is left out.
+        least_depth_m: what is nearer is not seen.
+        least_px_per_m: tangents that the image shows shorter have no direction in it.
+    """
+
+    occluding: bool
+    most_edges: int
+    max_edge_points: int
+    spacing_px: float
+    texture: int
+    least_cosine: float
+    least_depth_m: float
+    least_px_per_m: float

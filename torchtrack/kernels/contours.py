@@ -1,0 +1,223 @@
+"""Contour points of a mesh, and where they show: :func:`torchtrack.contours.mesh_contours` and ``assemble``, object by object."""
+
+import numpy as np
+
+from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.motion import inverse_depth, placed
+from torchtrack.kernels.settings import SamplingSettings
+
+# Rows of a model's table of edges, and of the points sampled on them.
+_START, _VECTOR, _DIRECTION, _TURNING, _KIND = 0, 3, 6, 9, 12
+_POINT, _TANGENT = 0, 3
+SAMPLED = 6
+_LEAST_LENGTH2 = 1e-18
+
+
+@kernel()
+def sample(
+    members: Array,
+    edge_ends: Array,
+    face_normals: Array,
+    face_offsets: Array,
+    is_crease: Array,
+    is_segment: Array,
+    edges: Array,
+    texture_points: Array,
+    texture_tangents: Array,
+    texture_normals: Array,
+    texture_spacing_m: float,
+    T_cam_obj: Array,
+    intrinsics: Array,
+    settings: SamplingSettings,
+    sampled: Array,
+    kind: Array,
+    counts: Array,
+) -> None:
+    """Points of objects of one model: on its edges, spread evenly in the image, and of its texture.
+
+    Args:
+        members: numbers of the objects.
+        edge_ends, face_normals, face_offsets, is_crease, is_segment, edges: of the model's edges, as :class:`torchtrack.contour_model.ContourModel`
+            has them; so are those of texture.
+        sampled, kind: ``[b, SAMPLED, n]`` and ``[b, n]``, with room enough; filled as far as ``counts [b]`` says.
+    """
+    active, length, depths = np.empty(len(edge_ends), np.int64), np.empty(len(edge_ends)), np.empty((len(edge_ends), 2))
+    camera_obj = np.empty(3)
+    for b in members:
+        T = T_cam_obj[b]
+        for k in range(3):
+            camera_obj[k] = -(T[0, k] * T[0, 3] + T[1, k] * T[1, 3] + T[2, k] * T[2, 3])
+        used = _active_edges(camera_obj, face_normals, face_offsets, is_crease, is_segment, settings, active)
+        total = _measure(active, used, edge_ends, T, intrinsics[b], settings, length, depths)
+        count = _sample_edges(active, used, edges, camera_obj, length, depths, total, settings, sampled[b], kind[b])
+        counts[b] = count + _sample_texture(
+            count, texture_points, texture_tangents, texture_normals, texture_spacing_m, T, intrinsics[b], settings, sampled[b], kind[b]
+        )
+
+
+@kernel()
+def _active_edges(
+    camera_obj: Array, face_normals: Array, face_offsets: Array, is_crease: Array, is_segment: Array, settings: SamplingSettings, active: Array
+) -> int:
+    """Which edges are contours, first in ``active``: how many; of too many, some, spread evenly."""
+    used = 0
+    for e in range(len(active)):
+        front = _faces(face_normals[e, 0], face_offsets[e, 0], camera_obj)
+        back = _faces(face_normals[e, 1], face_offsets[e, 1], camera_obj)
+        if is_segment[e] or (is_crease[e] and (front or back)) or (settings.occluding and front != back):
+            active[used] = e
+            used += 1
+    if used <= settings.most_edges:
+        return used
+    for j in range(settings.most_edges):
+        active[j] = active[int(j * (used / settings.most_edges))]
+    return settings.most_edges
+
+
+@kernel()
+def _faces(normal: Array, offset: float, camera_obj: Array) -> bool:
+    """Whether a face looks at the camera."""
+    return normal[0] * camera_obj[0] + normal[1] * camera_obj[1] + normal[2] * camera_obj[2] > offset
+
+
+@kernel()
+def _measure(
+    active: Array, used: int, edge_ends: Array, T_cam_obj: Array, intrinsics: Array, settings: SamplingSettings, length: Array, depths: Array
+) -> float:
+    """Lengths of edges in the image, zero for those that reach behind the camera, and depths of their ends; the sum of lengths."""
+    total = 0.0
+    for j in range(used):
+        ends = edge_ends[active[j]]
+        x0, y0, z0 = placed(T_cam_obj, ends[0, 0], ends[0, 1], ends[0, 2])
+        x1, y1, z1 = placed(T_cam_obj, ends[1, 0], ends[1, 1], ends[1, 2])
+        depths[j, 0], depths[j, 1], length[j] = z0, z1, 0.0
+        if z0 > settings.least_depth_m and z1 > settings.least_depth_m:
+            du, dv = (x1 / z1 - x0 / z0) * intrinsics[0], (y1 / z1 - y0 / z0) * intrinsics[1]
+            length[j] = np.sqrt(du * du + dv * dv)
+        total += length[j]
+    return total
+
+
+@kernel()
+def _sample_edges(
+    active: Array,
+    used: int,
+    edges: Array,
+    camera_obj: Array,
+    length: Array,
+    depths: Array,
+    total: float,
+    settings: SamplingSettings,
+    sampled: Array,
+    kind: Array,
+) -> int:
+    """Points at even distances in the image along all edges, one after the other; how many."""
+    if not total > 0:
+        return 0
+    count = settings.max_edge_points
+    if settings.spacing_px * count > total:
+        count = int(np.ceil(total / settings.spacing_px))
+    j, until = 0, length[0]
+    for i in range(count):
+        target = (i + 0.5) / count * total
+        while until < target and j < used - 1:
+            j += 1
+            until += length[j]
+        along = 1.0 - (until - target) / max(length[j], 1e-9)
+        # Even steps in the image are not even along the edge: undo the perspective.
+        z0, z1 = depths[j, 0], depths[j, 1]
+        along = min(max(along * z0 / max(z1 + along * (z0 - z1), settings.least_depth_m), 0.0), 1.0)
+        e, side = active[j], 0.0
+        for k in range(3):
+            sampled[_POINT + k, i] = edges[_START + k, e] + along * edges[_VECTOR + k, e]
+            side += edges[_TURNING + k, e] * (sampled[_POINT + k, i] - camera_obj[k])
+        # The normal in the image is to point out of the object: tangents turn with it on their right.
+        sign = 1.0 if side > 0 else -1.0
+        for k in range(3):
+            sampled[_TANGENT + k, i] = sign * edges[_DIRECTION + k, e]
+        kind[i] = int(edges[_KIND, e])
+    return count
+
+
+@kernel()
+def _sample_texture(
+    first: int,
+    points: Array,
+    tangents: Array,
+    normals: Array,
+    spacing_m: float,
+    T_cam_obj: Array,
+    intrinsics: Array,
+    settings: SamplingSettings,
+    sampled: Array,
+    kind: Array,
+) -> int:
+    """Points of texture that looks at the camera, written from place ``first`` on; how many."""
+    if len(points) == 0:
+        return 0
+    spacing_px = spacing_m * intrinsics[0] * inverse_depth(T_cam_obj[2, 3])
+    # Every second, third and so on, where they lie closer than need be.
+    every = len(points)
+    if every * spacing_px > settings.spacing_px:
+        every = max(int(settings.spacing_px / spacing_px), 1)
+    at = first
+    for i in range(0, len(points), every):
+        x, y, z = placed(T_cam_obj, points[i, 0], points[i, 1], points[i, 2])
+        towards = 0.0
+        for k in range(3):
+            own = T_cam_obj[k, 0] * normals[i, 0] + T_cam_obj[k, 1] * normals[i, 1] + T_cam_obj[k, 2] * normals[i, 2]
+            towards += own * (x if k == 0 else y if k == 1 else z)
+        if towards < -settings.least_cosine * np.sqrt(x * x + y * y + z * z):
+            for k in range(3):
+                sampled[_POINT + k, at], sampled[_TANGENT + k, at] = points[i, k], tangents[i, k]
+            kind[at] = settings.texture
+            at += 1
+    return at - first
+
+
+@kernel()
+def gather(sampled: Array, kind: Array, counts: Array, points_obj: Array, tangents_obj: Array, kinds: Array, mask: Array) -> None:
+    """Lay out what was sampled in as many places as needed: ``[b, 3, m]`` and ``[b, m]``; zero where there is nothing."""
+    for b in range(len(counts)):
+        for i in range(mask.shape[1]):
+            exists = i < counts[b]
+            mask[b, i], kinds[b, i] = exists, kind[b, i] if exists else 0
+            for k in range(3):
+                points_obj[b, k, i] = sampled[b, _POINT + k, i] if exists else 0.0
+                tangents_obj[b, k, i] = sampled[b, _TANGENT + k, i] if exists else 0.0
+
+
+@kernel()
+def show(
+    points_obj: Array,
+    tangents_obj: Array,
+    mask: Array,
+    T_cam_obj: Array,
+    intrinsics: Array,
+    settings: SamplingSettings,
+    points_cam: Array,
+    pixels: Array,
+    normals: Array,
+    shown: Array,
+) -> None:
+    """Contour points at a pose, with their normals in the image; those behind the camera or without a normal are not ``shown [b, m]``.
+
+    Args:
+        points_obj, tangents_obj: ``[b, 3, m]``, of which ``mask [b, m]`` count.
+        points_cam, pixels, normals: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``; filled.
+    """
+    for b in range(len(mask)):
+        T, fx, fy, cx, cy = T_cam_obj[b], intrinsics[b, 0], intrinsics[b, 1], intrinsics[b, 2], intrinsics[b, 3]
+        for i in range(mask.shape[1]):
+            x, y, z = placed(T, points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i])
+            tx, ty, tz = tangents_obj[b, 0, i], tangents_obj[b, 1, i], tangents_obj[b, 2, i]
+            ax = T[0, 0] * tx + T[0, 1] * ty + T[0, 2] * tz
+            ay = T[1, 0] * tx + T[1, 1] * ty + T[1, 2] * tz
+            az = T[2, 0] * tx + T[2, 1] * ty + T[2, 2] * tz
+            inverse = inverse_depth(z)
+            points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i] = x, y, z
+            pixels[b, 0, i], pixels[b, 1, i] = x * inverse * fx + cx, y * inverse * fy + cy
+            u, v = (ax - x * inverse * az) * inverse * fx, (ay - y * inverse * az) * inverse * fy
+            length = np.sqrt(max(u * u + v * v, _LEAST_LENGTH2))
+            normals[b, 0, i], normals[b, 1, i] = -v / length, u / length
+            shown[b, i] = mask[b, i] and length > settings.least_px_per_m and z > settings.least_depth_m
