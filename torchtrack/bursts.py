@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchtrack.constants import constant
 from torchtrack.events import PaddedEvents
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 
 # Ages (µs) are kept in 16 bits; it does not matter by how much longer ago a burst began.
 LONG_AGO_US = 32_000
@@ -44,6 +46,8 @@ def update_bursts(
     """
     _, _, height, width = burst_age_us.shape
     ages = aged(burst_age_us, elapsed_us)
+    if switch.apply_to(ages):
+        return ages, _update_by_kernel(ages, elapsed_us, events, longest_us)
     # In place: out of place, the whole map is copied again.
     flat = ages.flatten(1)
     place = (events.polarity * height + events.y) * width + events.x
@@ -55,6 +59,16 @@ def update_bursts(
     flat.scatter_reduce_(1, place, torch.where(begins, age_us, -1), "amax")
     into_us = torch.where(begins, flat.gather(1, place), before_us) - age_us
     return ages, torch.where(into_us < longest_us, into_us, 0)
+
+
+def _update_by_kernel(ages: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int) -> Int[Tensor, "s e"]:
+    """Bring aged maps up by the events, one after the other, and tell how far into its burst each is."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.events import update_bursts as update
+
+    into_us = torch.empty(events.mask.shape, dtype=torch.int16)
+    update(*as_arrays(*vars(events).values(), elapsed_us), longest_us, LONG_AGO_US, ages.numpy(), into_us.numpy())
+    return into_us
 
 
 def without_tail(

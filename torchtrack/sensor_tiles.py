@@ -12,6 +12,9 @@ from torch import Tensor, nn
 
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.events import EventBatch
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
+from torchtrack.kernels.settings import TileSettings
 from torchtrack.prediction import Prediction
 
 # Side of a tile (px, as a power of two).
@@ -65,6 +68,8 @@ class SensorTiles(nn.Module):
 
     def near(self, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
         """Tiles that anything can be seen in, within a window before ``prediction``, that is no farther than a margin from each object."""
+        if switch.apply_to(prediction.velocity):
+            return self._near_by_kernel(prediction, window_s, margin_px)
         objects, (turning, speed_m_s) = prediction.objects, prediction.velocity.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
         turned, moved, *_ = prediction.covariance.diagonal(dim1=-2, dim2=-1).unflatten(1, (4, 3)).amax(-1).sqrt().to(turning.dtype).unbind(1)
         rim_m = 0.5 * objects.diameter_m
@@ -81,18 +86,50 @@ class SensorTiles(nn.Module):
         # Written so that what is not a number is near.
         return ~(away_px > radius_px[:, None] + (margin_px + _SLACK_PX))
 
+    def _near_by_kernel(self, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
+        """:meth:`near`, tile by tile."""
+        # Not at the top: Numba is an extra.
+        from torchtrack.kernels.events import near_tiles
+
+        objects = prediction.objects
+        near = torch.empty(len(window_s), len(self.middle), dtype=torch.bool)
+        variance = prediction.covariance.diagonal(dim1=-2, dim2=-1)[:, :6]
+        of_objects = as_arrays(prediction.velocity, variance, prediction.centre_cam, objects.diameter_m, objects.intrinsics, window_s)
+        near_tiles(*as_arrays(self.middle, self.reach_px), *of_objects, TileSettings(_SIGMAS, margin_px + _SLACK_PX), near.numpy())
+        return near
+
     def keep(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> NearbyEvents:
         """The events in tiles near any object, or all of them where these are most."""
-        tile, near_each = self._of(events.x, events.y).numpy(), near.numpy()
-        # NumPy finds them several times faster.
-        kept = np.flatnonzero(near.any(0).numpy()[tile])
+        if switch.apply_to(events.x):
+            kept, of_each = self._kept_by_kernel(events, near)
+        else:
+            tile, near_each = self._of(events.x, events.y).numpy(), near.numpy()
+            # NumPy finds them several times faster.
+            kept = np.flatnonzero(near.any(0).numpy()[tile])
+            of_each = _of_each(near_each, tile[kept])
         if len(kept) == 0:
             # Padding, which stands for no event at all, has no number and is near nothing.
             return NearbyEvents(EventBatch.empty())
-        if len(kept) > _MOST_KEPT * len(events):
-            return NearbyEvents(events, None, _of_each(near_each, tile))
         number = torch.from_numpy(kept)
-        return NearbyEvents(events[number], number, _of_each(near_each, tile[kept]))
+        if len(kept) > _MOST_KEPT * len(events):
+            return NearbyEvents(events, None, None if of_each is None else (number[of_each[0]], of_each[1]))
+        return NearbyEvents(events[number], number, of_each)
+
+    def _kept_by_kernel(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> tuple[np.ndarray, tuple[Tensor, Tensor] | None]:
+        """The numbers of the events that are kept, and which of these are near each object, event by event."""
+        # Not at the top: Numba is an extra.
+        from torchtrack.kernels.events import keep
+
+        objects = len(near) if len(near) > 1 else 0
+        kept, own, counts = np.empty(len(events), np.int64), np.empty((objects, len(events)), np.int64), np.empty(objects, np.int64)
+        count = keep(*as_arrays(events.x, events.y, near), _TILE_BITS, self.columns, kept, own, counts)
+        return kept[:count], _padded(own, counts) if objects else None
+
+
+def _padded(own: np.ndarray, counts: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
+    """Lists of the events near each object, as wide as the longest, and which of their entries exist."""
+    exists = torch.arange(max(int(counts.max()), 1)) < torch.from_numpy(counts)[:, None]
+    return torch.where(exists, torch.from_numpy(own[:, : exists.shape[1]]), 0), exists
 
 
 def _of_each(near: np.ndarray, tile: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]] | None:

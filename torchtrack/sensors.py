@@ -20,6 +20,8 @@ from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.events import PaddedEvents, pad_streams
 from torchtrack.evidence import AgeAt
 from torchtrack.flow import estimate_flow
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 from torchtrack.observations import WindowEvents
 from torchtrack.prediction import Prediction
 from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
@@ -86,6 +88,8 @@ class Sensors:
         into_burst_us = nearby.into_burst_us
         if into_burst_us is None:
             burst_age_us, into_burst_us = update_bursts(burst_age_us, elapsed_us, window, longest_us)
+        if switch.apply_to(self.ideal_pixels):
+            return self._seen_by_kernel(window, into_burst_us, nearby), burst_age_us
         seen = self.seen(window, into_burst_us, nearby.number)
         return seen if nearby.of_each is None else seen.only(*nearby.of_each), burst_age_us
 
@@ -100,6 +104,26 @@ class Sensors:
         # Of one stream without a copy for every object.
         each = [value.expand(len(self.stream_index), *value.shape[1:]) if streams == 1 else value[self.stream_index] for value in values]
         return WindowEvents(each[0], each[1], each[2], each[3], each[4], None if number is None else number.expand_as(each[1]))
+
+    def _seen_by_kernel(self, window: PaddedEvents, into_burst_us: Int[Tensor, "s e"], nearby: NearbyEvents) -> WindowEvents:
+        """A window's events as each object's camera saw them, event by event."""
+        # Not at the top: Numba is an extra.
+        from torchtrack.kernels import events as kernels
+
+        streams, batch = len(self.ideal_pixels), len(self.stream_index)
+        own, exists = nearby.of_each or (torch.empty(0, 0, dtype=torch.int64), torch.empty(0, 0, dtype=torch.bool))
+        # What all see alike is written once.
+        rows = 1 if streams == 1 and len(own) == 0 else batch
+        count = window.mask.shape[1] if len(own) == 0 else own.shape[1]
+        seen, is_there = self.ideal_pixels.new_empty(rows, kernels.SEEN, count), torch.empty(rows, count, dtype=torch.bool)
+        told = as_arrays(window.x, window.y, window.age_us, into_burst_us, window.polarity, window.mask, self.ideal_pixels, self.stream_index)
+        kernels.see(*told, *as_arrays(own, exists.sum(1)), seen.numpy(), is_there.numpy())
+        pixels, age_s, into_burst_s, polarity = (part.expand(batch, *part.shape[1:]) for part in seen.split((2, 1, 1, 1), 1))
+        number = own if len(own) else None
+        if nearby.number is not None:
+            number = nearby.number.expand(batch, -1) if number is None else nearby.number[own]
+        told_s = age_s[:, 0], into_burst_s[:, 0], polarity[:, 0]
+        return WindowEvents(pixels.transpose(1, 2), *told_s, is_there.expand(batch, -1), number)
 
     def corners(
         self, contours: Contours, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], window_s: Float[Tensor, "s"], config: TrackerConfig

@@ -9,6 +9,9 @@ import numpy as np
 
 Array = np.ndarray
 
+# Liberties of arithmetic that change roundings alone, and leave what is infinite or not a number as it is.
+FAST = {"arcp", "contract", "nsz"}
+
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator: compile with numba; the compiled code is kept on disk where there is a place for it."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.look_up import nearest, nearest_of_four
 from torchtrack.kernels.motion import across, inverse_depth, placed
 from torchtrack.kernels.settings import Cells, MatchingSettings
@@ -34,7 +34,7 @@ def _patch(u: float, v: float, settings: MatchingSettings) -> int:
     return row * settings.patches + column
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def match(
     seen: Array,
     exists: Array,
@@ -120,7 +120,7 @@ def match(
     _weigh(is_near, matches, votes, settings)
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _weigh(is_near: Array, matches: Array, votes: Array, settings: MatchingSettings) -> None:
     """How far each match is to be trusted by those around it, and how many of these are on the contour."""
     gain = 1.0 / (settings.gathered_share - settings.smeared_share)
@@ -139,7 +139,7 @@ def _weigh(is_near: Array, matches: Array, votes: Array, settings: MatchingSetti
         matches[WEIGHT, i] = weight
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def believe(seen: Array, is_matched: Array, matches: Array, settings: MatchingSettings) -> None:
     """Make weights what there is to be said of each match: none without one, or where an object has too few of them."""
     total = 0.0

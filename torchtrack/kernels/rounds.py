@@ -5,7 +5,7 @@ One Gauss-Newton step a round, as :func:`torchtrack.pose_solver.solve_pose` take
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.matching import (
     AGE,
     DIRECTION_U,
@@ -29,7 +29,7 @@ from torchtrack.kernels.settings import Cells, MatchingSettings, RoundSettings
 # Pose, velocity and swelling; and their residual, in the rows of a Jacobian.
 UNKNOWNS, _RESIDUAL = 13, 13
 # Sums of products run along as many observations at a time: what they need stays in the fastest memory.
-_FAST = {"reassoc", "contract", "arcp", "nsz"}
+_ALONG = FAST | {"reassoc"}
 
 
 @kernel()
@@ -104,7 +104,7 @@ def _first_place(seen: Array, moving: Array, centre: Array, intrinsics: Array, p
         place[i, 0], place[i, 1] = u + speed_u * age, v + speed_v * age
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _linearise(
     matches: Array,
     T_cam_obj: Array,
@@ -151,7 +151,7 @@ def _linearise(
     return used
 
 
-@kernel(fastmath=_FAST)
+@kernel(fastmath=_ALONG)
 def _normal_equations(rows: Array, weights: Array, used: int, information: Array, offset: Array, gradient: Array, hessian: Array) -> None:
     """Gradient of the cost, and its Gauss-Newton Hessian, prior included."""
     weighted = np.empty(used, rows.dtype)

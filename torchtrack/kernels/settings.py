@@ -135,3 +135,15 @@ class SamplingSettings(NamedTuple):
     least_cosine: float
     least_depth_m: float
     least_px_per_m: float
+
+
+class TileSettings(NamedTuple):
+    """What :func:`torchtrack.kernels.events.near_tiles` goes by.
+
+    Args:
+        sigmas: objects are expected within so many standard deviations of their prediction.
+        margin_px: how far from an object what is near it is.
+    """
+
+    sigmas: float
+    margin_px: float
