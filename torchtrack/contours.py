@@ -203,8 +203,23 @@ def image_normals(
 
 def reproject(contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
     """The same contour points seen from a pose nearby: normals are kept, which turn far less than points move."""
-    points_cam = transform_points(T_cam_obj, contours.points_obj)
-    return replace(contours, points_cam=points_cam, pixels=project(points_cam, intrinsics))
+    if switch.apply_to(T_cam_obj):
+        points_cam, pixels = _projected_by_kernel(contours.points_obj, T_cam_obj, intrinsics)
+    else:
+        points_cam = transform_points(T_cam_obj, contours.points_obj)
+        pixels = project(points_cam, intrinsics)
+    return replace(contours, points_cam=points_cam, pixels=pixels)
+
+
+def _projected_by_kernel(points_obj: Float[Tensor, "b m 3"], T_cam_obj: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Points in the camera's frame and their pixels, point by point."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.contours import project as by_kernel
+
+    points = points_obj.transpose(1, 2)
+    points_cam, pixels = points.new_empty(points.shape), points.new_empty(len(points), 2, points.shape[2])
+    by_kernel(*as_arrays(points, T_cam_obj, intrinsics, points_cam, pixels))
+    return points_cam.transpose(1, 2), pixels.transpose(1, 2)
 
 
 def joined(first: Contours, second: Contours) -> Contours:

@@ -30,7 +30,7 @@ _MIN_CROSSING = 0.3
 # Contours slower than this across themselves (px/s) have no clear leading side.
 _SLOW_PX_S = 10.0
 # Concentration: side of a patch (16 px, as a power of two), patches a side of the image, and offsets that are near and on a contour (px).
-_PATCH_BITS, _PATCHES, _SMEAR_PX, ON_CONTOUR_PX = 4, 64, 3.0, 0.8
+PATCH_BITS, PATCHES, SMEAR_PX, ON_CONTOUR_PX = 4, 64, 3.0, 0.8
 # Mutual agreement: side of a bit of contour (8 px, as a power of two), and how many others there make its mean count in full.
 _PIECE_BITS, _MANY_OTHERS = 3, 3
 
@@ -192,9 +192,9 @@ def matching_settings(config: TrackerConfig) -> MatchingSettings:
         polarity=matching.polarity,
         slow_px_s=_SLOW_PX_S,
         on_contour_px=ON_CONTOUR_PX,
-        smear_px=_SMEAR_PX,
-        patch_bits=_PATCH_BITS,
-        patches=_PATCHES,
+        smear_px=SMEAR_PX,
+        patch_bits=PATCH_BITS,
+        patches=PATCHES,
         min_observations=config.quality.min_observations,
         common_px2=config.solver.common_px**2,
         observation_px=config.solver.observation_px,
@@ -280,25 +280,25 @@ def _two(like: Tensor) -> Tensor:
     return constant((2.0,), like.dtype, like.device)
 
 
-def patch(pixels: Float[Tensor, "b n 2"], bits: int = _PATCH_BITS) -> Int[Tensor, "b n"]:
+def patch(pixels: Float[Tensor, "b n 2"], bits: int = PATCH_BITS) -> Int[Tensor, "b n"]:
     """The patch of the image that each pixel lies in, whose side is a power of two (px): that of ``bits``.
 
     Patches wrap around: no object is so large that two of its own would meet, and if two of few pixels do, little is lost.
     """
     # The whole part of a shift to the right is rounded down, below zero too, unlike that of a division.
-    u, v = ((pixels.floor().long() >> bits) & (_PATCHES - 1)).unbind(-1)
-    return torch.add(u, v, alpha=_PATCHES)
+    u, v = ((pixels.floor().long() >> bits) & (PATCHES - 1)).unbind(-1)
+    return torch.add(u, v, alpha=PATCHES)
 
 
 def on_and_around(offsets: Float[Tensor, "b n"], near: Bool[Tensor, "b n"]) -> Float[Tensor, "b 2 n"]:
     """Which observations are on a contour, and which are so near to one that their share tells: 1 or 0."""
-    limits = constant(((ON_CONTOUR_PX,), (_SMEAR_PX,)), offsets.dtype, offsets.device)
+    limits = constant(((ON_CONTOUR_PX,), (SMEAR_PX,)), offsets.dtype, offsets.device)
     return (near[:, None] & (offsets.abs()[:, None] < limits)).to(offsets.dtype)
 
 
 def patch_sums(cell: Int[Tensor, "b n"], values: Float[Tensor, "b k n"]) -> Float[Tensor, "b k p"]:
     """Sums of values over the observations of each patch."""
-    nothing = torch.zeros(*values.shape[:2], _PATCHES**2, dtype=values.dtype, device=values.device)
+    nothing = torch.zeros(*values.shape[:2], PATCHES**2, dtype=values.dtype, device=values.device)
     return nothing.scatter_add(2, cell[:, None].expand_as(values), values)
 
 

@@ -10,6 +10,8 @@ from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contours import Contours, assemble, select_ranked, take_points
 from torchtrack.image_motion import MovingObjects, pixel_velocity
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 from torchtrack.lie import cayley, move_about, retract_about, transform_points
 from torchtrack.motion import Acceleration, inverse
 from torchtrack.object_batch import ObjectBatch, repeat_row
@@ -136,6 +138,8 @@ class Prediction:
 
     def sigma_px(self, contours: Contours) -> Float[Tensor, "b"]:
         """Standard deviation of the contours across themselves in the image (px), in the mean over them."""
+        if switch.apply_to(contours.pixels):
+            return self._sigma_px_by_kernel(contours)
         # Of the visible points, not of all places: how many there are depends on the other objects.
         chosen, mask = select_ranked(contours.mask, _LOOKED_AT)
         points, normals = take_points(contours.points_cam, chosen), take_points(contours.normals, chosen)
@@ -145,6 +149,17 @@ class Prediction:
         jacobian = pose_jacobian((points - self.centre_cam[:, None]).transpose(1, 2), (*slope.unbind(-1), along))
         variance = (jacobian * (self.covariance[:, :6, :6].to(jacobian.dtype) @ jacobian)).sum(1)
         return ((variance * mask).sum(-1) / mask.sum(-1).clamp(min=1)).sqrt()
+
+    def _sigma_px_by_kernel(self, contours: Contours) -> Float[Tensor, "b"]:
+        """:meth:`sigma_px`, point by point."""
+        # Not at the top: Numba is an extra.
+        from torchtrack.kernels.quality import variance_across
+
+        variance = contours.pixels.new_empty(len(contours.mask))
+        seen = as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.mask)
+        own = as_arrays(self.covariance[:, :6, :6], self.centre_cam, self.objects.intrinsics)
+        variance_across(*seen, *own, _LOOKED_AT, variance.numpy())
+        return variance.sqrt()
 
 
 def far_pose(centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:

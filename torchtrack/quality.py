@@ -12,7 +12,11 @@ from torch import Tensor
 from torchtrack.config.tracker import QualityConfig
 from torchtrack.constants import constant
 from torchtrack.contours import Contours
-from torchtrack.matching import ON_CONTOUR_PX, Matches, on_and_around, patch, patch_sums
+from torchtrack.image_motion import MovingObjects, pixel_velocity
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
+from torchtrack.kernels.settings import QualitySettings
+from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SMEAR_PX, Matches, on_and_around, patch, patch_sums
 
 # A patch explains its contours when this share of the observations near them are on them.
 _LEAST_SHARE = 0.5
@@ -56,6 +60,41 @@ def measured_share(
     total = moving.sum(-1)
     share = (moving & explained).sum(-1) / total.clamp(min=1)
     return torch.where(total < _MIN_MOVING_POINTS, torch.nan, share).to(contours.pixels.dtype)
+
+
+def shares(
+    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: QualityConfig
+) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"]]:
+    """:func:`measured_share` of contours that move with their objects, and :func:`gathered_share`."""
+    if not switch.apply_to(contours.pixels):
+        velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
+        return measured_share(contours, matches, velocity, image_size, config), gathered_share(matches, config)
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.quality import shares as by_kernel
+
+    measured, gathered = contours.pixels.new_empty(2, len(contours.mask))
+    shown = as_arrays(*(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask)
+    moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
+    matched = as_arrays(matches.targets.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
+    by_kernel(*shown, *moving, *matched, _settings(image_size, config), measured.numpy(), gathered.numpy())
+    return measured, gathered
+
+
+def _settings(image_size: tuple[int, int], config: QualityConfig) -> QualitySettings:
+    """What a kernel goes by that tells shares as :func:`shares` does."""
+    return QualitySettings(
+        *image_size,
+        min_observations=config.min_observations,
+        min_on_contour=config.min_on_contour,
+        min_speed_px_s=config.min_speed_px_s,
+        least_share=_LEAST_SHARE,
+        min_moving_points=_MIN_MOVING_POINTS,
+        around_px=_AROUND_PX,
+        on_contour_px=ON_CONTOUR_PX,
+        smear_px=SMEAR_PX,
+        patch_bits=PATCH_BITS,
+        patches=PATCHES,
+    )
 
 
 def gathered_share(matches: Matches, config: QualityConfig) -> Float[Tensor, "b"]:

@@ -72,12 +72,10 @@ def judge_fit(
     Args:
         full_gathered: of when each object is seen well; zero, or none at all, where that is not known.
     """
-    velocity = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).contour_velocity(fit.contours)
-    measured = quality.measured_share(fit.contours, fit.matches, velocity, prediction.objects.image_size, config.quality)
-    gathered = torch.full_like(measured, torch.nan)
-    if config.search.by_gathering:
-        # Of what does not move, events are noise.
-        gathered = torch.where(measured.isnan(), gathered, quality.gathered_share(fit.matches, config.quality))
+    moving = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).moving(compensated=True)
+    measured, gathered = quality.shares(fit.contours, fit.matches, moving, prediction.objects.image_size, config.quality)
+    # Of what does not move, events are noise.
+    gathered = torch.where(measured.isnan(), torch.nan, gathered) if config.search.by_gathering else torch.full_like(measured, torch.nan)
     full_gathered = torch.zeros_like(measured) if full_gathered is None else full_gathered
     return Found(fit, measured, at_rest, fit.matches.mask.sum(-1), gathered, full_gathered, torch.zeros_like(measured, dtype=torch.bool))
 

@@ -221,3 +221,15 @@ def show(
             length = np.sqrt(max(u * u + v * v, _LEAST_LENGTH2))
             normals[b, 0, i], normals[b, 1, i] = -v / length, u / length
             shown[b, i] = mask[b, i] and length > settings.least_px_per_m and z > settings.least_depth_m
+
+
+@kernel()
+def project(points_obj: Array, T_cam_obj: Array, intrinsics: Array, points_cam: Array, pixels: Array) -> None:
+    """Points in the camera's frame, and their pixels: ``[b, 3, m]`` and ``[b, 2, m]``, filled."""
+    for b in range(len(points_obj)):
+        for i in range(points_obj.shape[2]):
+            x, y, z = placed(T_cam_obj[b], points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i])
+            inverse = inverse_depth(z)
+            points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i] = x, y, z
+            pixels[b, 0, i] = x * inverse * intrinsics[b, 0] + intrinsics[b, 2]
+            pixels[b, 1, i] = y * inverse * intrinsics[b, 1] + intrinsics[b, 3]

@@ -27,11 +27,9 @@ def _agreeing(agreement: float, settings: MatchingSettings) -> float:
 
 
 @kernel()
-def _patch(u: float, v: float, settings: MatchingSettings) -> int:
-    """The patch of the image that a place lies in."""
-    column = (int(np.floor(u)) >> settings.patch_bits) & (settings.patches - 1)
-    row = (int(np.floor(v)) >> settings.patch_bits) & (settings.patches - 1)
-    return row * settings.patches + column
+def patch(u: float, v: float, bits: int, patches: int) -> int:
+    """The patch of the image that a place lies in: :func:`torchtrack.matching.patch`."""
+    return ((int(np.floor(v)) >> bits) & (patches - 1)) * patches + ((int(np.floor(u)) >> bits) & (patches - 1))
 
 
 @kernel(fastmath=FAST)
@@ -112,7 +110,7 @@ def match(
             # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
             place[i, 0], place[i, 1] = carried_u - (u - table[found, INDEXED_U]), carried_v - (v - table[found, INDEXED_V])
         if abs(offset) < settings.smear_px:
-            cell = _patch(target_u, target_v, settings)
+            cell = patch(target_u, target_v, settings.patch_bits, settings.patches)
             votes[cell, _NEAR] += as_expected
             if abs(offset) < settings.on_contour_px:
                 votes[cell, _ON] += as_expected
@@ -127,7 +125,7 @@ def _weigh(is_near: Array, matches: Array, votes: Array, settings: MatchingSetti
     for i in range(matches.shape[1]):
         if not is_near[i]:
             continue
-        cell = _patch(matches[TARGET_U, i], matches[TARGET_V, i], settings)
+        cell = patch(matches[TARGET_U, i], matches[TARGET_V, i], settings.patch_bits, settings.patches)
         on = votes[cell, _ON]
         matches[BESIDE, i] = on
         weight = matches[AS_EXPECTED, i]

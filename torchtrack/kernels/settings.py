@@ -147,3 +147,20 @@ class TileSettings(NamedTuple):
 
     sigmas: float
     margin_px: float
+
+
+class QualitySettings(NamedTuple):
+    """What :mod:`torchtrack.kernels.quality` goes by: settings, the image, and constants of :mod:`torchtrack.quality` and ``matching``."""
+
+    height: int
+    width: int
+    min_observations: int
+    min_on_contour: int
+    min_speed_px_s: float
+    least_share: float
+    min_moving_points: int
+    around_px: float
+    on_contour_px: float
+    smear_px: float
+    patch_bits: int
+    patches: int

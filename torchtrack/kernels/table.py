@@ -5,6 +5,7 @@ import numpy as np
 from torchtrack.kernels.compiler import Array, kernel
 from torchtrack.kernels.look_up import nearest
 from torchtrack.kernels.matching import COLUMNS, EXPECTED, INDEXED_U, INDEXED_V, LIMB, MISTAKEN, NORMAL_U, NORMAL_V, ORIENTED, X, Y, Z
+from torchtrack.kernels.quality import octant
 from torchtrack.kernels.settings import Cells, TableSettings
 
 
@@ -47,15 +48,9 @@ def fill(
             row[LIMB], row[ORIENTED] = is_limb, is_oriented
             row[EXPECTED] = settings.of_print and kind[b, i] == settings.texture
             if is_oriented and polarity.shape[1]:
-                row[EXPECTED] = polarity[b, _octant(normals[b, 0, i], normals[b, 1, i])]
+                row[EXPECTED] = polarity[b, octant(normals[b, 0, i], normals[b, 1, i])]
             if settings.close_px and is_oriented:
                 row[MISTAKEN] = _mistaken_px2(i, pixels[b], normals[b], kind[b], mask[b], nearest_of_cell[b], first[b], cells, settings)
-
-
-@kernel()
-def _octant(u: float, v: float) -> int:
-    """The eighth of the plane that a direction points to: :func:`torchtrack.polarity_memory.octant`."""
-    return int(u > 0) + 2 * int(v > 0) + 4 * int(abs(u) > abs(v))
 
 
 @kernel()

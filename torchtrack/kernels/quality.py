@@ -1,0 +1,133 @@
+"""What events explain of an object's contours, and how they gather on them: shares of :mod:`torchtrack.quality`, object by object."""
+
+import numpy as np
+
+from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.matching import patch
+from torchtrack.kernels.motion import across, drift, inverse_depth
+from torchtrack.kernels.settings import QualitySettings
+
+
+@kernel()
+def shares(
+    points_cam: Array,
+    pixels: Array,
+    normals: Array,
+    mask: Array,
+    velocity: Array,
+    centre_cam: Array,
+    intrinsics: Array,
+    targets: Array,
+    offsets: Array,
+    is_near: Array,
+    as_expected: Array,
+    settings: QualitySettings,
+    measured: Array,
+    gathered: Array,
+) -> None:
+    """Of the contour that should fire, the share with observations on it, and of the observations near it, the share that is on it.
+
+    Args:
+        points_cam, pixels, normals, mask: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``, ``[b, m]``.
+        velocity: ``[b, 6]``, about ``centre_cam [b, 3]``.
+        targets, offsets, is_near, as_expected: of matches: ``[b, 2, n]`` and ``[b, n]``.
+        measured, gathered: ``[b]``, filled; not a number where too little is there to tell.
+    """
+    counts, motion = np.empty((settings.patches**2, 2)), np.empty(6)
+    for b in range(len(mask)):
+        gathered[b] = _count(targets[b], offsets[b], is_near[b], as_expected[b], settings, counts)
+        drift(velocity[b], centre_cam[b], motion)
+        total, explained = 0, 0
+        for i in range(mask.shape[1]):
+            u, v = pixels[b, 0, i], pixels[b, 1, i]
+            if not mask[b, i] or not (u >= 0 and v >= 0 and u < settings.width and v < settings.height):
+                continue
+            x, y, z = points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i]
+            speed_u, speed_v = across(motion, x, y, z, inverse_depth(z), intrinsics[b])
+            if abs(normals[b, 0, i] * speed_u + normals[b, 1, i] * speed_v) > settings.min_speed_px_s:
+                cell = patch(u, v, settings.patch_bits, settings.patches)
+                on, near = counts[cell, 0], counts[cell, 1]
+                total += 1
+                explained += on >= settings.min_on_contour and on + 1.0 > settings.least_share * (near + 2.0)
+        measured[b] = explained / total if total >= settings.min_moving_points else np.nan
+
+
+@kernel()
+def _count(targets: Array, offsets: Array, is_near: Array, as_expected: Array, settings: QualitySettings, counts: Array) -> float:
+    """Count observations on and near contours in each patch of the image; the share of all near ones that is on them."""
+    counts[:] = 0.0
+    near = on = 0
+    for i in range(len(offsets)):
+        if not is_near[i]:
+            continue
+        away = abs(offsets[i])
+        near += away < settings.around_px
+        on += away < settings.on_contour_px
+        if away < settings.smear_px:
+            cell = patch(targets[0, i], targets[1, i], settings.patch_bits, settings.patches)
+            counts[cell, 1] += as_expected[i]
+            if away < settings.on_contour_px:
+                counts[cell, 0] += as_expected[i]
+    return on / near if near >= settings.min_observations else np.nan
+
+
+@kernel()
+def sides(directions: Array, dark: Array, weights: Array, sums: Array) -> None:
+    """Sums of what events on contours say of their darker side, and of its evidence, by octant: of :func:`torchtrack.polarity_memory.remembered`.
+
+    Args:
+        directions: ``[b, 2, n]``; ``dark`` and ``weights [b, n]``.
+        sums: ``[b, 2, 8]``, filled.
+    """
+    sums[:] = 0.0
+    for b in range(len(dark)):
+        for i in range(dark.shape[1]):
+            if weights[b, i] != 0:
+                which = octant(directions[b, 0, i], directions[b, 1, i])
+                sums[b, 0, which] += weights[b, i] * dark[b, i]
+                sums[b, 1, which] += weights[b, i] * abs(dark[b, i])
+
+
+@kernel()
+def octant(u: float, v: float) -> int:
+    """The eighth of the plane that a direction points to: :func:`torchtrack.polarity_memory.octant`."""
+    return int(u > 0) + 2 * int(v > 0) + 4 * int(abs(u) > abs(v))
+
+
+@kernel()
+def variance_across(
+    points_cam: Array, normals: Array, mask: Array, covariance: Array, centre_cam: Array, intrinsics: Array, most: int, variance: Array
+) -> None:
+    """Mean variance of contours across themselves in the image (px²): of :meth:`torchtrack.prediction.Prediction.sigma_px`.
+
+    Args:
+        points_cam, normals, mask: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, m]``.
+        covariance: ``[b, 6, 6]`` of the pose.
+        most: points that are looked at, spread evenly over those that count.
+        variance: ``[b]``, filled.
+    """
+    place, row = np.empty(mask.shape[1], np.int64), np.empty(6)
+    for b in range(len(mask)):
+        total = 0
+        for i in range(mask.shape[1]):
+            if mask[b, i]:
+                place[total] = i
+                total += 1
+        looked_at, variance[b] = min(total, most), 0.0
+        for j in range(looked_at):
+            i = place[int(j * max(total / most, 1.0))]
+            _gradient(points_cam[b, :, i], normals[b, :, i], centre_cam[b], intrinsics[b], row)
+            for k in range(6):
+                for m in range(6):
+                    variance[b] += row[k] * covariance[b, k, m] * row[m] / looked_at
+
+
+@kernel()
+def _gradient(point_cam: Array, normal: Array, centre_cam: Array, intrinsics: Array, row: Array) -> None:
+    """How a point moves along its normal in the image with the pose: :func:`torchtrack.pose_solver.pose_jacobian`."""
+    inverse = inverse_depth(point_cam[2])
+    gx, gy = normal[0] * intrinsics[0] * inverse, normal[1] * intrinsics[1] * inverse
+    gz = -(gx * point_cam[0] + gy * point_cam[1]) * inverse
+    ax, ay, az = point_cam[0] - centre_cam[0], point_cam[1] - centre_cam[1], point_cam[2] - centre_cam[2]
+    row[0], row[1], row[2] = ay * gz - az * gy, az * gx - ax * gz, ax * gy - ay * gx
+    row[3], row[4], row[5] = gx, gy, gz
