@@ -111,6 +111,8 @@ class SensorTiles(nn.Module):
             # Padding, which stands for no event at all, has no number and is near nothing.
             return NearbyEvents(EventBatch.empty())
         number = torch.from_numpy(kept)
+        if len(kept) == len(events):
+            return NearbyEvents(events, None, of_each)
         if len(kept) > _MOST_KEPT * len(events):
             return NearbyEvents(events, None, None if of_each is None else (number[of_each[0]], of_each[1]))
         return NearbyEvents(events[number], number, of_each)

@@ -252,6 +252,8 @@ def _hidden_in_buffer_by_kernel(
     every = np.ones(len(drawn), np.int64)
     for model in scene.models:
         members = model.members[drawn[model.members]]
+        if len(members) == 0:
+            continue
         every[members.numpy()] = (1 << _halvings(model, members, scene, grid.cell_px)).numpy()
         kernels.draw(*as_arrays(members, model.surface_points), every, T_cam_obj, intrinsics, stream_index, first, settings, depth, owner)
     hidden, margin_m = torch.zeros_like(contours.mask), config.depth_margin * scene.diameters_m

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.motion import inverse_depth, placed
 from torchtrack.kernels.settings import SamplingSettings
 
@@ -13,7 +13,7 @@ SAMPLED = 6
 _LEAST_LENGTH2 = 1e-18
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def sample(
     members: Array,
     edge_ends: Array,
@@ -55,7 +55,7 @@ def sample(
         )
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _active_edges(
     camera_obj: Array, face_normals: Array, face_offsets: Array, is_crease: Array, is_segment: Array, settings: SamplingSettings, active: Array
 ) -> int:
@@ -74,13 +74,13 @@ def _active_edges(
     return settings.most_edges
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _faces(normal: Array, offset: float, camera_obj: Array) -> bool:
     """Whether a face looks at the camera."""
     return normal[0] * camera_obj[0] + normal[1] * camera_obj[1] + normal[2] * camera_obj[2] > offset
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _measure(
     active: Array, used: int, edge_ends: Array, T_cam_obj: Array, intrinsics: Array, settings: SamplingSettings, length: Array, depths: Array
 ) -> float:
@@ -98,7 +98,7 @@ def _measure(
     return total
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _sample_edges(
     active: Array,
     used: int,
@@ -139,7 +139,7 @@ def _sample_edges(
     return count
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _sample_texture(
     first: int,
     points: Array,
@@ -175,7 +175,7 @@ def _sample_texture(
     return at - first
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def gather(sampled: Array, kind: Array, counts: Array, points_obj: Array, tangents_obj: Array, kinds: Array, mask: Array) -> None:
     """Lay out what was sampled in as many places as needed: ``[b, 3, m]`` and ``[b, m]``; zero where there is nothing."""
     for b in range(len(counts)):
@@ -187,7 +187,7 @@ def gather(sampled: Array, kind: Array, counts: Array, points_obj: Array, tangen
                 tangents_obj[b, k, i] = sampled[b, _TANGENT + k, i] if exists else 0.0
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def show(
     points_obj: Array,
     tangents_obj: Array,
@@ -223,7 +223,7 @@ def show(
             shown[b, i] = mask[b, i] and length > settings.least_px_per_m and z > settings.least_depth_m
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def project(points_obj: Array, T_cam_obj: Array, intrinsics: Array, points_cam: Array, pixels: Array) -> None:
     """Points in the camera's frame, and their pixels: ``[b, 3, m]`` and ``[b, 2, m]``, filled."""
     for b in range(len(points_obj)):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.motion import inverse_depth
 from torchtrack.kernels.settings import TileSettings
 
@@ -11,7 +11,7 @@ PIXELS, AGE, INTO_BURST, POLARITY = 0, 2, 3, 4
 SEEN = 5
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def near_tiles(
     middle: Array,
     reach_px: Array,
@@ -103,7 +103,7 @@ def update_bursts(
                 ages[s, side, y[s, i], x[s, i]] = age
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def see(
     x: Array,
     y: Array,

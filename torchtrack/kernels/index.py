@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.settings import IndexSettings
 
 
@@ -61,7 +61,7 @@ def write(pixels: Array, is_inside: Array, radius_px: Array, first: Array, colum
             nearest[b, cell] = number[cell] if steps[cell] <= farthest else -1
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _write_point(
     own: int, u: float, v: float, reach: int, first: Array, columns: int, settings: IndexSettings, across: Array, steps: Array, number: Array
 ) -> None:

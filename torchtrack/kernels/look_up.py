@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.settings import Cells
 
 _NOWHERE = 1e30
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def nearest(nearest_of_cell: Array, first: Array, u: float, v: float, cells: Cells) -> int:
     """The contour point that the cell around a place knows, -1 for none.
 
@@ -25,7 +25,7 @@ def nearest(nearest_of_cell: Array, first: Array, u: float, v: float, cells: Cel
     return nearest_of_cell[int(row) * cells.columns + int(column)]
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def nearest_of_four(nearest_of_cell: Array, first: Array, pixels: Array, u: float, v: float, cells: Cells) -> int:
     """Of the contour points that the four cells around a place know, the one nearest to it; -1 for none.
 

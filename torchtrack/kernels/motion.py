@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.compiler import FAST, Array, kernel
 
 # As torchtrack.camera.MIN_DEPTH_M: with it, this would be no foundation.
 _MIN_DEPTH_M = 1e-3
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def placed(T_cam_obj: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     """A point of the object in the camera's frame."""
     return (
@@ -18,13 +18,13 @@ def placed(T_cam_obj: Array, x: float, y: float, z: float) -> tuple[float, float
     )
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def inverse_depth(z: float) -> float:
     """One over a depth, of which none is too small."""
     return 1.0 / max(z, _MIN_DEPTH_M)
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def drift(velocity: Array, centre_cam: Array, motion: Array) -> None:
     """Lay out how points of an object move: those at ``p`` with ``motion[:3] × p + motion[3:]``."""
     w0, w1, w2 = velocity[0], velocity[1], velocity[2]
@@ -34,7 +34,7 @@ def drift(velocity: Array, centre_cam: Array, motion: Array) -> None:
     motion[5] = velocity[5] - (w0 * centre_cam[1] - w1 * centre_cam[0])
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def across(motion: Array, x: float, y: float, z: float, inverse: float, intrinsics: Array) -> tuple[float, float]:
     """Image velocity (px/s) of a point in the camera's frame, by the inverse of its depth."""
     moving_z = (motion[0] * y - motion[1] * x + motion[5]) * inverse
@@ -43,7 +43,7 @@ def across(motion: Array, x: float, y: float, z: float, inverse: float, intrinsi
     return (moving_x - x * inverse * moving_z) * intrinsics[0], (moving_y - y * inverse * moving_z) * intrinsics[1]
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def at_depth(motion: Array, depth_m: float, u: float, v: float, intrinsics: Array) -> tuple[float, float]:
     """Image velocity (px/s) that a pixel would have at a depth: :func:`torchtrack.image_motion.object_plane_velocity`."""
     x, y, inverse = (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], inverse_depth(depth_m)
@@ -53,13 +53,13 @@ def at_depth(motion: Array, depth_m: float, u: float, v: float, intrinsics: Arra
     return (moving_x - x * moving_z) * intrinsics[0], (moving_y - y * moving_z) * intrinsics[1]
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def centre_of(T_cam_obj: Array, centre_obj: Array, centre_cam: Array) -> None:
     """Where the object's centre is in the camera's frame."""
     centre_cam[0], centre_cam[1], centre_cam[2] = placed(T_cam_obj, centre_obj[0], centre_obj[1], centre_obj[2])
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def turn(rotation: Array, phi: Array, turned: Array) -> None:
     """Turn a rotation by Cayley's map: :func:`torchtrack.lie.turned`."""
     a, b, c = 0.5 * phi[0], 0.5 * phi[1], 0.5 * phi[2]
@@ -73,7 +73,7 @@ def turn(rotation: Array, phi: Array, turned: Array) -> None:
         turned[2, k] = z + factor * (r + a * q - b * p)
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def is_finite(values: Array) -> bool:
     """Whether all values are finite."""
     return np.isfinite(values.sum())

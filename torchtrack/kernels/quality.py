@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.matching import patch
 from torchtrack.kernels.motion import across, drift, inverse_depth
 from torchtrack.kernels.settings import QualitySettings
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def shares(
     points_cam: Array,
     pixels: Array,
@@ -94,7 +94,7 @@ def octant(u: float, v: float) -> int:
     return int(u > 0) + 2 * int(v > 0) + 4 * int(abs(u) > abs(v))
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def variance_across(
     points_cam: Array, normals: Array, mask: Array, covariance: Array, centre_cam: Array, intrinsics: Array, most: int, variance: Array
 ) -> None:
@@ -122,7 +122,7 @@ def variance_across(
                     variance[b] += row[k] * covariance[b, k, m] * row[m] / looked_at
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _gradient(point_cam: Array, normal: Array, centre_cam: Array, intrinsics: Array, row: Array) -> None:
     """How a point moves along its normal in the image with the pose: :func:`torchtrack.pose_solver.pose_jacobian`."""
     inverse = inverse_depth(point_cam[2])

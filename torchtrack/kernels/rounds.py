@@ -95,7 +95,7 @@ def align(
             _move(T_cam_obj[b], centre_obj[b], centre, offset[b], _step(gradient[b], hessian[b], rounds))
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _first_place(seen: Array, moving: Array, centre: Array, intrinsics: Array, place: Array) -> None:
     """Where the first round looks for each observation: carried to the window's end at the depth of the object's centre."""
     for i in range(len(place)):

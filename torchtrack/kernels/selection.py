@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.look_up import nearest
 from torchtrack.kernels.motion import at_depth, drift
 from torchtrack.kernels.settings import Cells
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def select(
     pixels: Array,
     told: Array,
@@ -50,7 +50,7 @@ def select(
         _take(near, drawn, pixels[e], told[e], chosen[b], exists[b])
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _draw(near: Array, total: int, number: Array, fill: float, golden_ratio: float, places: int) -> int:
     """Draw a share of the events, by their own numbers, where there are more than places; how many were drawn, first in ``near``."""
     if total <= places:
@@ -63,7 +63,7 @@ def _draw(near: Array, total: int, number: Array, fill: float, golden_ratio: flo
     return drawn
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _take(near: Array, drawn: int, pixels: Array, told: Array, chosen: Array, exists: Array) -> None:
     """Take what was drawn, spread evenly over it should it be more than places."""
     places = chosen.shape[1]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.motion import placed
 from torchtrack.kernels.settings import GridSettings
 
@@ -80,7 +80,7 @@ def _deepen(tests: Array, x: Array, y: Array, z: Array, deepest: Array) -> None:
         deepest[i] = least if least > deepest[i] else deepest[i]
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _cell(u: float, v: float, first: Array, stream: int, grid: GridSettings) -> int:
     """The cell of a depth buffer that a pixel falls into; what lies outside falls into the outermost, what is not a number into the first."""
     column, row = np.rint(u / grid.side_px) - first[stream, 0], np.rint(v / grid.side_px) - first[stream, 1]
@@ -89,7 +89,7 @@ def _cell(u: float, v: float, first: Array, stream: int, grid: GridSettings) -> 
     return (int(row) + stream * grid.rows) * grid.columns + int(column)
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def draw(
     members: Array,
     samples: Array,
@@ -123,7 +123,7 @@ def draw(
                 depth[cell], owner[cell] = steps, b
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def hide_in_buffer(
     points_cam: Array,
     pixels: Array,
