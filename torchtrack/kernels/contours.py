@@ -3,7 +3,7 @@
 import numpy as np
 
 from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.motion import inverse_depth, placed
+from torchtrack.kernels.motion import Numbers, entries, inverse_depth, lens, placed, turned
 from torchtrack.kernels.settings import SamplingSettings
 
 # Rows of a model's table of edges, and of the points sampled on them.
@@ -44,14 +44,14 @@ def sample(
     active, length, depths = np.empty(len(edge_ends), np.int64), np.empty(len(edge_ends)), np.empty((len(edge_ends), 2))
     camera_obj = np.empty(3)
     for b in members:
-        T = T_cam_obj[b]
+        T, pose, of_lens = T_cam_obj[b], entries(T_cam_obj[b]), lens(intrinsics[b])
         for k in range(3):
             camera_obj[k] = -(T[0, k] * T[0, 3] + T[1, k] * T[1, 3] + T[2, k] * T[2, 3])
         used = _active_edges(camera_obj, face_normals, face_offsets, is_crease, is_segment, settings, active)
-        total = _measure(active, used, edge_ends, T, intrinsics[b], settings, length, depths)
+        total = _measure(active, used, edge_ends, pose, of_lens, settings, length, depths)
         count = _sample_edges(active, used, edges, camera_obj, length, depths, total, settings, sampled[b], kind[b])
         counts[b] = count + _sample_texture(
-            count, texture_points, texture_tangents, texture_normals, texture_spacing_m, T, intrinsics[b], settings, sampled[b], kind[b]
+            count, texture_points, texture_tangents, texture_normals, texture_spacing_m, pose, of_lens, settings, sampled[b], kind[b]
         )
 
 
@@ -82,14 +82,14 @@ def _faces(normal: Array, offset: float, camera_obj: Array) -> bool:
 
 @kernel(fastmath=FAST)
 def _measure(
-    active: Array, used: int, edge_ends: Array, T_cam_obj: Array, intrinsics: Array, settings: SamplingSettings, length: Array, depths: Array
+    active: Array, used: int, edge_ends: Array, pose: Numbers, intrinsics: Numbers, settings: SamplingSettings, length: Array, depths: Array
 ) -> float:
     """Lengths of edges in the image, zero for those that reach behind the camera, and depths of their ends; the sum of lengths."""
     total = 0.0
     for j in range(used):
         ends = edge_ends[active[j]]
-        x0, y0, z0 = placed(T_cam_obj, ends[0, 0], ends[0, 1], ends[0, 2])
-        x1, y1, z1 = placed(T_cam_obj, ends[1, 0], ends[1, 1], ends[1, 2])
+        x0, y0, z0 = placed(pose, ends[0, 0], ends[0, 1], ends[0, 2])
+        x1, y1, z1 = placed(pose, ends[1, 0], ends[1, 1], ends[1, 2])
         depths[j, 0], depths[j, 1], length[j] = z0, z1, 0.0
         if z0 > settings.least_depth_m and z1 > settings.least_depth_m:
             du, dv = (x1 / z1 - x0 / z0) * intrinsics[0], (y1 / z1 - y0 / z0) * intrinsics[1]
@@ -146,8 +146,8 @@ def _sample_texture(
     tangents: Array,
     normals: Array,
     spacing_m: float,
-    T_cam_obj: Array,
-    intrinsics: Array,
+    pose: Numbers,
+    intrinsics: Numbers,
     settings: SamplingSettings,
     sampled: Array,
     kind: Array,
@@ -155,19 +155,16 @@ def _sample_texture(
     """Points of texture that looks at the camera, written from place ``first`` on; how many."""
     if len(points) == 0:
         return 0
-    spacing_px = spacing_m * intrinsics[0] * inverse_depth(T_cam_obj[2, 3])
+    spacing_px = spacing_m * intrinsics[0] * inverse_depth(pose[11])
     # Every second, third and so on, where they lie closer than need be.
     every = len(points)
     if every * spacing_px > settings.spacing_px:
         every = max(int(settings.spacing_px / spacing_px), 1)
     at = first
     for i in range(0, len(points), every):
-        x, y, z = placed(T_cam_obj, points[i, 0], points[i, 1], points[i, 2])
-        towards = 0.0
-        for k in range(3):
-            own = T_cam_obj[k, 0] * normals[i, 0] + T_cam_obj[k, 1] * normals[i, 1] + T_cam_obj[k, 2] * normals[i, 2]
-            towards += own * (x if k == 0 else y if k == 1 else z)
-        if towards < -settings.least_cosine * np.sqrt(x * x + y * y + z * z):
+        x, y, z = placed(pose, points[i, 0], points[i, 1], points[i, 2])
+        nx, ny, nz = turned(pose, normals[i, 0], normals[i, 1], normals[i, 2])
+        if nx * x + ny * y + nz * z < -settings.least_cosine * np.sqrt(x * x + y * y + z * z):
             for k in range(3):
                 sampled[_POINT + k, at], sampled[_TANGENT + k, at] = points[i, k], tangents[i, k]
             kind[at] = settings.texture
@@ -207,13 +204,10 @@ def show(
         points_cam, pixels, normals: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``; filled.
     """
     for b in range(len(mask)):
-        T, fx, fy, cx, cy = T_cam_obj[b], intrinsics[b, 0], intrinsics[b, 1], intrinsics[b, 2], intrinsics[b, 3]
+        pose, (fx, fy, cx, cy) = entries(T_cam_obj[b]), lens(intrinsics[b])
         for i in range(mask.shape[1]):
-            x, y, z = placed(T, points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i])
-            tx, ty, tz = tangents_obj[b, 0, i], tangents_obj[b, 1, i], tangents_obj[b, 2, i]
-            ax = T[0, 0] * tx + T[0, 1] * ty + T[0, 2] * tz
-            ay = T[1, 0] * tx + T[1, 1] * ty + T[1, 2] * tz
-            az = T[2, 0] * tx + T[2, 1] * ty + T[2, 2] * tz
+            x, y, z = placed(pose, points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i])
+            ax, ay, az = turned(pose, tangents_obj[b, 0, i], tangents_obj[b, 1, i], tangents_obj[b, 2, i])
             inverse = inverse_depth(z)
             points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i] = x, y, z
             pixels[b, 0, i], pixels[b, 1, i] = x * inverse * fx + cx, y * inverse * fy + cy
@@ -227,9 +221,9 @@ def show(
 def project(points_obj: Array, T_cam_obj: Array, intrinsics: Array, points_cam: Array, pixels: Array) -> None:
     """Points in the camera's frame, and their pixels: ``[b, 3, m]`` and ``[b, 2, m]``, filled."""
     for b in range(len(points_obj)):
+        pose, (fx, fy, cx, cy) = entries(T_cam_obj[b]), lens(intrinsics[b])
         for i in range(points_obj.shape[2]):
-            x, y, z = placed(T_cam_obj[b], points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i])
+            x, y, z = placed(pose, points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i])
             inverse = inverse_depth(z)
             points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i] = x, y, z
-            pixels[b, 0, i] = x * inverse * intrinsics[b, 0] + intrinsics[b, 2]
-            pixels[b, 1, i] = y * inverse * intrinsics[b, 1] + intrinsics[b, 3]
+            pixels[b, 0, i], pixels[b, 1, i] = x * inverse * fx + cx, y * inverse * fy + cy

@@ -4,7 +4,7 @@ import numpy as np
 
 from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.look_up import nearest, nearest_of_four
-from torchtrack.kernels.motion import across, inverse_depth, placed
+from torchtrack.kernels.motion import Numbers, across, inverse_depth, placed
 from torchtrack.kernels.settings import Cells, MatchingSettings
 
 # Rows of what was observed.
@@ -41,10 +41,10 @@ def match(
     nearest_of_cell: Array,
     first: Array,
     cells: Cells,
-    T_cam_obj: Array,
-    motion: Array,
-    change: Array,
-    intrinsics: Array,
+    pose: Numbers,
+    motion: Numbers,
+    change: Numbers,
+    intrinsics: Numbers,
     gate_px: float,
     wider: float,
     finely: bool,
@@ -61,7 +61,7 @@ def match(
         seen: ``[OBSERVED, n]``, and which of them exist.
         place: ``[n, 2]``.
         table: ``[m, COLUMNS]``.
-        motion, change: of the object, and by its acceleration, from :func:`torchtrack.kernels.motion.drift`.
+        pose, intrinsics: of the object, from :mod:`torchtrack.kernels.motion`; so are its ``motion``, and its ``change`` by an acceleration.
         contour, is_near, is_matched, matches: filled; ``[n]``, and ``[ROWS, n]``. Weights are those of ``match_nearest``.
         votes: room for ``[patches², 3]``.
     """
@@ -82,7 +82,7 @@ def match(
             continue
         contour[i], is_near[i] = found, True
         point_x, point_y, point_z = table[found, X], table[found, Y], table[found, Z]
-        x, y, z = placed(T_cam_obj, point_x, point_y, point_z)
+        x, y, z = placed(pose, point_x, point_y, point_z)
         inverse = inverse_depth(z)
         u, v = intrinsics[2] + x * inverse * intrinsics[0], intrinsics[3] + y * inverse * intrinsics[1]
         speed_u, speed_v = across(motion, x, y, z, inverse, intrinsics)
@@ -106,15 +106,15 @@ def match(
         matches[DIRECTION_U, i], matches[DIRECTION_V, i] = nu, nv
         matches[OFFSET, i], matches[IS_LIMB, i], matches[ERROR, i] = offset, table[found, LIMB], table[found, MISTAKEN]
         matches[DARK, i], matches[AS_EXPECTED, i] = dark, as_expected
-        if is_matched[i]:
-            # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
-            place[i, 0], place[i, 1] = carried_u - (u - table[found, INDEXED_U]), carried_v - (v - table[found, INDEXED_V])
-        if abs(offset) < settings.smear_px:
-            cell = patch(target_u, target_v, settings.patch_bits, settings.patches)
-            votes[cell, _NEAR] += as_expected
-            if abs(offset) < settings.on_contour_px:
-                votes[cell, _ON] += as_expected
-                votes[cell, _VOTES] += as_expected * dark
+        # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
+        next_u, next_v = carried_u - (u - table[found, INDEXED_U]), carried_v - (v - table[found, INDEXED_V])
+        place[i, 0], place[i, 1] = next_u if is_matched[i] else place[i, 0], next_v if is_matched[i] else place[i, 1]
+        # Products in the place of branches, of which a processor would guess half wrong.
+        cell = patch(target_u, target_v, settings.patch_bits, settings.patches)
+        near, on = as_expected * (abs(offset) < settings.smear_px), as_expected * (abs(offset) < settings.on_contour_px)
+        votes[cell, _NEAR] += near
+        votes[cell, _ON] += on
+        votes[cell, _VOTES] += on * dark
     _weigh(is_near, matches, votes, settings)
 
 

@@ -4,17 +4,43 @@ import numpy as np
 
 from torchtrack.kernels.compiler import FAST, Array, kernel
 
+Numbers = tuple[float, ...]
+
 # As torchtrack.camera.MIN_DEPTH_M: with it, this would be no foundation.
 _MIN_DEPTH_M = 1e-3
 
 
-@kernel(fastmath=FAST)
-def placed(T_cam_obj: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A point of the object in the camera's frame."""
+@kernel()
+def entries(T_cam_obj: Array) -> Numbers:
+    """Rotation and translation of a pose, row by row, as numbers: what is read from an array is read again after every write to another."""
+    T = T_cam_obj
     return (
-        T_cam_obj[0, 0] * x + T_cam_obj[0, 1] * y + T_cam_obj[0, 2] * z + T_cam_obj[0, 3],
-        T_cam_obj[1, 0] * x + T_cam_obj[1, 1] * y + T_cam_obj[1, 2] * z + T_cam_obj[1, 3],
-        T_cam_obj[2, 0] * x + T_cam_obj[2, 1] * y + T_cam_obj[2, 2] * z + T_cam_obj[2, 3],
+        np.float64(T[0, 0]), np.float64(T[0, 1]), np.float64(T[0, 2]), np.float64(T[0, 3]),
+        np.float64(T[1, 0]), np.float64(T[1, 1]), np.float64(T[1, 2]), np.float64(T[1, 3]),
+        np.float64(T[2, 0]), np.float64(T[2, 1]), np.float64(T[2, 2]), np.float64(T[2, 3]),
+    )  # fmt: skip
+
+
+@kernel()
+def lens(intrinsics: Array) -> Numbers:
+    """Focal lengths and principal point as numbers."""
+    return np.float64(intrinsics[0]), np.float64(intrinsics[1]), np.float64(intrinsics[2]), np.float64(intrinsics[3])
+
+
+@kernel(fastmath=FAST)
+def placed(pose: Numbers, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A point of the object in the camera's frame, by the pose's :func:`entries`."""
+    u, v, w = turned(pose, x, y, z)
+    return u + pose[3], v + pose[7], w + pose[11]
+
+
+@kernel(fastmath=FAST)
+def turned(pose: Numbers, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A direction of the object in the camera's frame."""
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z,
+        pose[4] * x + pose[5] * y + pose[6] * z,
+        pose[8] * x + pose[9] * y + pose[10] * z,
     )
 
 
@@ -25,17 +51,15 @@ def inverse_depth(z: float) -> float:
 
 
 @kernel(fastmath=FAST)
-def drift(velocity: Array, centre_cam: Array, motion: Array) -> None:
-    """Lay out how points of an object move: those at ``p`` with ``motion[:3] × p + motion[3:]``."""
-    w0, w1, w2 = velocity[0], velocity[1], velocity[2]
-    motion[0], motion[1], motion[2] = w0, w1, w2
-    motion[3] = velocity[3] - (w1 * centre_cam[2] - w2 * centre_cam[1])
-    motion[4] = velocity[4] - (w2 * centre_cam[0] - w0 * centre_cam[2])
-    motion[5] = velocity[5] - (w0 * centre_cam[1] - w1 * centre_cam[0])
+def drift(velocity: Array, centre_cam: Array) -> Numbers:
+    """How points of an object move: those at ``p`` with ``motion[:3] × p + motion[3:]``, in the camera's frame."""
+    w0, w1, w2 = np.float64(velocity[0]), np.float64(velocity[1]), np.float64(velocity[2])
+    x, y, z = np.float64(centre_cam[0]), np.float64(centre_cam[1]), np.float64(centre_cam[2])
+    return w0, w1, w2, velocity[3] - (w1 * z - w2 * y), velocity[4] - (w2 * x - w0 * z), velocity[5] - (w0 * y - w1 * x)
 
 
 @kernel(fastmath=FAST)
-def across(motion: Array, x: float, y: float, z: float, inverse: float, intrinsics: Array) -> tuple[float, float]:
+def across(motion: Numbers, x: float, y: float, z: float, inverse: float, intrinsics: Numbers) -> tuple[float, float]:
     """Image velocity (px/s) of a point in the camera's frame, by the inverse of its depth."""
     moving_z = (motion[0] * y - motion[1] * x + motion[5]) * inverse
     moving_x = (motion[1] * z - motion[2] * y + motion[3]) * inverse
@@ -44,7 +68,7 @@ def across(motion: Array, x: float, y: float, z: float, inverse: float, intrinsi
 
 
 @kernel(fastmath=FAST)
-def at_depth(motion: Array, depth_m: float, u: float, v: float, intrinsics: Array) -> tuple[float, float]:
+def at_depth(motion: Numbers, depth_m: float, u: float, v: float, intrinsics: Numbers) -> tuple[float, float]:
     """Image velocity (px/s) that a pixel would have at a depth: :func:`torchtrack.image_motion.object_plane_velocity`."""
     x, y, inverse = (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], inverse_depth(depth_m)
     moving_z = motion[0] * y - motion[1] * x + motion[5] * inverse
@@ -56,11 +80,11 @@ def at_depth(motion: Array, depth_m: float, u: float, v: float, intrinsics: Arra
 @kernel(fastmath=FAST)
 def centre_of(T_cam_obj: Array, centre_obj: Array, centre_cam: Array) -> None:
     """Where the object's centre is in the camera's frame."""
-    centre_cam[0], centre_cam[1], centre_cam[2] = placed(T_cam_obj, centre_obj[0], centre_obj[1], centre_obj[2])
+    centre_cam[0], centre_cam[1], centre_cam[2] = placed(entries(T_cam_obj), centre_obj[0], centre_obj[1], centre_obj[2])
 
 
 @kernel(fastmath=FAST)
-def turn(rotation: Array, phi: Array, turned: Array) -> None:
+def turn(rotation: Array, phi: Array, into: Array) -> None:
     """Turn a rotation by Cayley's map: :func:`torchtrack.lie.turned`."""
     a, b, c = 0.5 * phi[0], 0.5 * phi[1], 0.5 * phi[2]
     factor = 8.0 / (4.0 + phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
@@ -68,9 +92,9 @@ def turn(rotation: Array, phi: Array, turned: Array) -> None:
         x, y, z = rotation[0, k], rotation[1, k], rotation[2, k]
         # skew @ column, and skew @ that.
         p, q, r = b * z - c * y, c * x - a * z, a * y - b * x
-        turned[0, k] = x + factor * (p + b * r - c * q)
-        turned[1, k] = y + factor * (q + c * p - a * r)
-        turned[2, k] = z + factor * (r + a * q - b * p)
+        into[0, k] = x + factor * (p + b * r - c * q)
+        into[1, k] = y + factor * (q + c * p - a * r)
+        into[2, k] = z + factor * (r + a * q - b * p)
 
 
 @kernel(fastmath=FAST)

@@ -4,7 +4,7 @@ import numpy as np
 
 from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.matching import patch
-from torchtrack.kernels.motion import across, drift, inverse_depth
+from torchtrack.kernels.motion import across, drift, inverse_depth, lens
 from torchtrack.kernels.settings import QualitySettings
 
 
@@ -33,17 +33,17 @@ def shares(
         targets, offsets, is_near, as_expected: of matches: ``[b, 2, n]`` and ``[b, n]``.
         measured, gathered: ``[b]``, filled; not a number where too little is there to tell.
     """
-    counts, motion = np.empty((settings.patches**2, 2)), np.empty(6)
+    counts = np.empty((settings.patches**2, 2))
     for b in range(len(mask)):
         gathered[b] = _count(targets[b], offsets[b], is_near[b], as_expected[b], settings, counts)
-        drift(velocity[b], centre_cam[b], motion)
+        motion, of_lens = drift(velocity[b], centre_cam[b]), lens(intrinsics[b])
         total, explained = 0, 0
         for i in range(mask.shape[1]):
             u, v = pixels[b, 0, i], pixels[b, 1, i]
             if not mask[b, i] or not (u >= 0 and v >= 0 and u < settings.width and v < settings.height):
                 continue
             x, y, z = points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i]
-            speed_u, speed_v = across(motion, x, y, z, inverse_depth(z), intrinsics[b])
+            speed_u, speed_v = across(motion, x, y, z, inverse_depth(z), of_lens)
             if abs(normals[b, 0, i] * speed_u + normals[b, 1, i] * speed_v) > settings.min_speed_px_s:
                 cell = patch(u, v, settings.patch_bits, settings.patches)
                 on, near = counts[cell, 0], counts[cell, 1]

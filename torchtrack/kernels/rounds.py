@@ -23,7 +23,7 @@ from torchtrack.kernels.matching import (
     believe,
     match,
 )
-from torchtrack.kernels.motion import at_depth, centre_of, drift, inverse_depth, is_finite, turn
+from torchtrack.kernels.motion import Numbers, at_depth, centre_of, drift, entries, inverse_depth, is_finite, lens, turn, turned
 from torchtrack.kernels.settings import Cells, MatchingSettings, RoundSettings
 
 # Pose, velocity and swelling; and their residual, in the rows of a Jacobian.
@@ -74,29 +74,29 @@ def align(
     """
     count = seen.shape[2]
     place, rows, weights = np.empty((count, 2)), np.empty((UNKNOWNS + 1, count), seen.dtype), np.empty(count, seen.dtype)
-    votes, moving, change, centre = np.empty((matching.patches**2, 3)), np.empty(6), np.zeros(6), np.empty(3)
+    votes, centre = np.empty((matching.patches**2, 3)), np.empty(3)
     for b in range(len(seen)):
         centre_of(T_cam_obj[b], centre_obj[b], centre)
-        drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre, moving)
-        _first_place(seen[b], moving, centre, intrinsics[b], place)
+        moving, of_lens = drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre), lens(intrinsics[b])
+        _first_place(seen[b], moving, centre, of_lens, place)
         for r in range(len(gates_px)):
             centre_of(T_cam_obj[b], centre_obj[b], centre)
-            drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre, moving)
-            drift(rounds.compensated * (acceleration[b] + rate_hz[b] * offset[b, 6:12]), centre, change)
+            moving = drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre)
+            change = drift(rounds.compensated * (acceleration[b] + rate_hz[b] * offset[b, 6:12]), centre)
             match(
-                seen[b], exists[b], place, table[b], nearest_of_cell[b], first[b], cells, T_cam_obj[b], moving, change, intrinsics[b],
+                seen[b], exists[b], place, table[b], nearest_of_cell[b], first[b], cells, entries(T_cam_obj[b]), moving, change, of_lens,
                 gates_px[r], wider[r, b], finely[b], matching, contour[b], is_near[b], is_matched[b], matches[b], votes,
             )  # fmt: skip
             believe(seen[b], is_matched[b], matches[b], matching)
             used = _linearise(
-                matches[b], T_cam_obj[b], centre_obj[b], centre, rate_hz[b], intrinsics[b], gates_px[r] * wider[r, b], offset[b], rounds, rows, weights
+                matches[b], entries(T_cam_obj[b]), centre_obj[b], centre, rate_hz[b], of_lens, gates_px[r] * wider[r, b], offset[b], rounds, rows, weights
             )  # fmt: skip
             _normal_equations(rows, weights, used, information[b], offset[b], gradient[b], hessian[b])
             _move(T_cam_obj[b], centre_obj[b], centre, offset[b], _step(gradient[b], hessian[b], rounds))
 
 
 @kernel(fastmath=FAST)
-def _first_place(seen: Array, moving: Array, centre: Array, intrinsics: Array, place: Array) -> None:
+def _first_place(seen: Array, moving: Numbers, centre: Array, intrinsics: Numbers, place: Array) -> None:
     """Where the first round looks for each observation: carried to the window's end at the depth of the object's centre."""
     for i in range(len(place)):
         u, v, age = seen[U, i], seen[V, i], seen[AGE, i]
@@ -107,11 +107,11 @@ def _first_place(seen: Array, moving: Array, centre: Array, intrinsics: Array, p
 @kernel(fastmath=FAST)
 def _linearise(
     matches: Array,
-    T_cam_obj: Array,
+    pose: Numbers,
     centre_obj: Array,
     centre: Array,
     rate_hz: Array,
-    intrinsics: Array,
+    intrinsics: Numbers,
     scale_px: float,
     offset: Array,
     rounds: RoundSettings,
@@ -119,22 +119,20 @@ def _linearise(
     weights: Array,
 ) -> int:
     """Fill rows of the Jacobian, with residuals, and weights of those that count; how many these are."""
-    used = 0
+    used, swelling, (cx, cy, cz) = 0, offset[UNKNOWNS - 1], (centre[0], centre[1], centre[2])
     for i in range(matches.shape[1]):
         weight = matches[WEIGHT, i]
         if not weight > 0:
             continue
         px, py, pz = matches[POINT_X, i] - centre_obj[0], matches[POINT_Y, i] - centre_obj[1], matches[POINT_Z, i] - centre_obj[2]
-        ax = T_cam_obj[0, 0] * px + T_cam_obj[0, 1] * py + T_cam_obj[0, 2] * pz
-        ay = T_cam_obj[1, 0] * px + T_cam_obj[1, 1] * py + T_cam_obj[1, 2] * pz
-        az = T_cam_obj[2, 0] * px + T_cam_obj[2, 1] * py + T_cam_obj[2, 2] * pz
-        inverse = inverse_depth(az + centre[2])
+        ax, ay, az = turned(pose, px, py, pz)
+        inverse = inverse_depth(az + cz)
         nu, nv, outward = matches[DIRECTION_U, i], matches[DIRECTION_V, i], matches[IS_LIMB, i]
         gx, gy = nu * intrinsics[0] * inverse, nv * intrinsics[1] * inverse
-        along = gx * (ax + centre[0]) + gy * (ay + centre[1])
+        along = gx * (ax + cx) + gy * (ay + cy)
         gz = -along * inverse
         there = (matches[TARGET_U, i] - intrinsics[2]) * nu + (matches[TARGET_V, i] - intrinsics[3]) * nv
-        residual = along - there + outward * offset[UNKNOWNS - 1]
+        residual = along - there + outward * swelling
         relative = residual / scale_px
         robust = max(1.0 - relative * relative, 0.0)
         if robust == 0.0:
@@ -212,12 +210,12 @@ def _step(gradient: Array, hessian: Array, rounds: RoundSettings) -> Array:
 def _move(T_cam_obj: Array, centre_obj: Array, centre: Array, offset: Array, step: Array) -> None:
     """Take a step: turn about the object's centre, and move the centre."""
     rotation = T_cam_obj[:3, :3].astype(np.float64)
-    turned = np.empty((3, 3))
-    turn(rotation, step, turned)
+    into = np.empty((3, 3))
+    turn(rotation, step, into)
     for j in range(3):
-        back = turned[j, 0] * centre_obj[0] + turned[j, 1] * centre_obj[1] + turned[j, 2] * centre_obj[2]
+        back = into[j, 0] * centre_obj[0] + into[j, 1] * centre_obj[1] + into[j, 2] * centre_obj[2]
         T_cam_obj[j, 3] = centre[j] + step[3 + j] - back
         for k in range(3):
-            T_cam_obj[j, k] = turned[j, k]
+            T_cam_obj[j, k] = into[j, k]
     for k in range(UNKNOWNS):
         offset[k] += step[k]

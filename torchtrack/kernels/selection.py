@@ -4,7 +4,7 @@ import numpy as np
 
 from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.look_up import nearest
-from torchtrack.kernels.motion import at_depth, drift
+from torchtrack.kernels.motion import at_depth, drift, lens
 from torchtrack.kernels.settings import Cells
 
 
@@ -33,16 +33,16 @@ def select(
         number: ``[e, n]`` of each among all of the window, by which lots are drawn.
         chosen: ``[b, 5, c]`` pixels and what is told; filled as far as there are any, as ``exists [b, c]`` says, and else zero.
     """
-    near, motion = np.empty(mask.shape[1], np.int64), np.empty(6)
+    near = np.empty(mask.shape[1], np.int64)
     chosen[:] = 0.0
     for b in range(len(chosen)):
         e = b if len(mask) > 1 else 0
-        drift(velocity[b], centre_cam[b], motion)
+        motion, depth_m, of_lens = drift(velocity[b], centre_cam[b]), centre_cam[b, 2], lens(intrinsics[b])
         total = 0
         for i in range(mask.shape[1]):
             if mask[e, i]:
                 u, v, age = pixels[e, 0, i], pixels[e, 1, i], told[e, 0, i]
-                speed_u, speed_v = at_depth(motion, centre_cam[b, 2], u, v, intrinsics[b])
+                speed_u, speed_v = at_depth(motion, depth_m, u, v, of_lens)
                 if nearest(nearest_of_cell[b], first[b], u + speed_u * age, v + speed_v * age, cells) >= 0:
                     near[total] = i
                     total += 1

@@ -3,7 +3,7 @@
 import numpy as np
 
 from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.motion import placed
+from torchtrack.kernels.motion import Numbers, entries, lens, placed, turned
 from torchtrack.kernels.settings import GridSettings
 
 # Dot products of a face with a point: within its three edges, and behind its plane.
@@ -34,8 +34,9 @@ def hide_behind_faces(
                 points[0, used], points[1, used], points[2, used] = points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i]
                 place[used], deepest[used] = i, -np.inf
                 used += 1
+        pose = entries(T_cam_obj[b])
         for f in range(len(triangles)):
-            _set_up(triangles[f], normals[f], T_cam_obj[b], tolerance_m[b], tests[f])
+            _set_up(triangles[f], normals[f], pose, tolerance_m[b], tests[f])
         for f in range(len(triangles)):
             _deepen(tests[f], points[0, :used], points[1, :used], points[2, :used], deepest[:used])
         for j in range(used):
@@ -43,25 +44,23 @@ def hide_behind_faces(
 
 
 @kernel()
-def _set_up(triangle: Array, normal: Array, T_cam_obj: Array, tolerance_m: float, tests: Array) -> None:
+def _set_up(triangle: Array, normal: Array, pose: Numbers, tolerance_m: float, tests: Array) -> None:
     """Lay out the tests of a face, each positive for points that pass it: a vector, and what is added to its product with the point."""
     corners = np.empty((3, 3))
     for k in range(3):
-        corners[k, 0], corners[k, 1], corners[k, 2] = placed(T_cam_obj, triangle[k, 0], triangle[k, 1], triangle[k, 2])
+        corners[k, 0], corners[k, 1], corners[k, 2] = placed(pose, triangle[k, 0], triangle[k, 1], triangle[k, 2])
     sides = np.empty((3, 3))
     for k in range(3):
         a, b = corners[k], corners[(k + 1) % 3]
         sides[k, 0], sides[k, 1], sides[k, 2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
     turn = np.sign(sides[0, 0] * corners[2, 0] + sides[0, 1] * corners[2, 1] + sides[0, 2] * corners[2, 2])
-    plane = 0.0
+    away = turned(pose, normal[0], normal[1], normal[2])
+    plane = away[0] * corners[0, 0] + away[1] * corners[0, 1] + away[2] * corners[0, 2]
     for k in range(3):
-        away = T_cam_obj[k, 0] * normal[0] + T_cam_obj[k, 1] * normal[1] + T_cam_obj[k, 2] * normal[2]
-        plane += away * corners[0, k]
-        tests[3, k] = away
+        tests[3, k] = away[k] * np.sign(plane)
         for side in range(3):
             tests[side, k] = sides[side, k] * turn
     for k in range(3):
-        tests[3, k] *= np.sign(plane)
         tests[k, 3] = 0.0
     tests[3, 3] = -(abs(plane) + tolerance_m)
 
@@ -111,13 +110,12 @@ def draw(
         depth, owner: ``[p]``, depths in whole steps, and the object of each; changed.
     """
     for b in members:
-        stream = stream_index[b]
+        stream, pose, (fx, fy, cx, cy) = stream_index[b], entries(T_cam_obj[b]), lens(intrinsics[b])
         for i in range(0, len(samples), every[b]):
-            x, y, z = placed(T_cam_obj[b], samples[i, 0], samples[i, 1], samples[i, 2])
+            x, y, z = placed(pose, samples[i, 0], samples[i, 1], samples[i, 2])
             if not z > grid.least_depth_m:
                 continue
-            u = x / z * intrinsics[b, 0] + intrinsics[b, 2]
-            v = y / z * intrinsics[b, 1] + intrinsics[b, 3]
+            u, v = x / z * fx + cx, y / z * fy + cy
             cell, steps = _cell(u, v, first, stream, grid), int(z * grid.steps_per_m)
             if steps < depth[cell] or (steps == depth[cell] and b < owner[cell]):
                 depth[cell], owner[cell] = steps, b
