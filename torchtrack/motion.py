@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import MotionConfig
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 from torchtrack.lie import hat
 
 # A prediction is not let grow less certain than this (rad, and diameters).
@@ -148,6 +150,8 @@ def predict_covariance(
     How much acceleration is to be expected grows with the speed: slow objects are held still, fast ones are free to turn.
     """
     dt_s, diameter_m, velocity = dt_s.double()[:, None], diameter_m.double()[:, None], velocity.double()
+    if switch.apply_to(covariance):
+        return _predicted_by_kernel(covariance, acceleration_sigma(velocity, diameter_m, config), dt_s, diameter_m)
     # [[1, dt], [0, 1]] P [[1, 0], [dt, 1]], by blocks.
     carried = torch.cat([torch.addcmul(covariance[:, :6], dt_s[..., None], covariance[:, 6:]), covariance[:, 6:]], 1)
     carried = torch.cat([torch.addcmul(carried[..., :6], dt_s[..., None], carried[..., 6:]), carried[..., 6:]], 2)
@@ -158,6 +162,16 @@ def predict_covariance(
     sigma = predicted.diagonal(dim1=-2, dim2=-1).sqrt()
     lost = (sigma[:, :3] > _MOST_UNCERTAIN).any(-1) | (sigma[:, 3:6] > _MOST_UNCERTAIN * diameter_m).any(-1)
     return torch.where(lost[:, None, None], covariance, predicted)
+
+
+def _predicted_by_kernel(covariance: Tensor, acceleration: Tensor, dt_s: Tensor, diameter_m: Tensor) -> Float[Tensor, "b 12 12"]:
+    """:func:`predict_covariance`, entry by entry."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.filtering import predict
+
+    predicted = torch.empty_like(covariance, memory_format=torch.contiguous_format)
+    predict(*as_arrays(covariance, acceleration, dt_s[:, 0], diameter_m[:, 0]), _MOST_UNCERTAIN, predicted.numpy())
+    return predicted
 
 
 def acceleration_sigma(velocity: Float[Tensor, "b 6"], diameter_m: Float[Tensor, "b 1"], config: MotionConfig) -> Float[Tensor, "b 6"]:
@@ -171,6 +185,13 @@ def inverse(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:
 
     Taken with a unit diagonal: rotations and translations, poses and velocities differ by many orders of magnitude.
     """
+    if switch.apply_to(matrices):
+        # Not at the top: Numba is an extra.
+        from torchtrack.kernels.filtering import invert
+
+        inverses = torch.empty_like(matrices, memory_format=torch.contiguous_format)
+        invert(*as_arrays(matrices, inverses))
+        return inverses
     scale = matrices.diagonal(dim1=-2, dim2=-1).clamp(min=1e-30).rsqrt()
     scales = scale[:, :, None] * scale[:, None]
     factor, info = torch.linalg.cholesky_ex(matrices * scales)

@@ -1,0 +1,92 @@
+"""Small matrices of the filter: functions of :mod:`torchtrack.motion`, object by object."""
+
+import numpy as np
+
+from torchtrack.kernels.compiler import Array, kernel
+
+# Variances are taken to be no less.
+_LEAST = 1e-30
+
+
+@kernel()
+def invert(matrices: Array, inverses: Array) -> None:
+    """Inverses of symmetric positive definite ``[b, k, k]``, taken with a unit diagonal; infinite on the diagonal where one is not."""
+    size = matrices.shape[1]
+    scale, factor, column = np.empty(size), np.empty((size, size)), np.empty(size)
+    for b in range(len(matrices)):
+        for j in range(size):
+            scale[j] = 1.0 / np.sqrt(max(matrices[b, j, j], _LEAST))
+        if not _factorise(matrices[b], scale, factor):
+            inverses[b] = 0.0
+            for j in range(size):
+                inverses[b, j, j] = np.inf
+            continue
+        for j in range(size):
+            _solve_unit(factor, j, column)
+            for k in range(size):
+                inverses[b, k, j] = column[k] * scale[k] * scale[j]
+
+
+@kernel()
+def _factorise(matrix: Array, scale: Array, factor: Array) -> bool:
+    """Cholesky's lower factor of a scaled matrix; whether there is one."""
+    for j in range(len(scale)):
+        for k in range(j + 1):
+            total = matrix[j, k] * scale[j] * scale[k]
+            for m in range(k):
+                total -= factor[j, m] * factor[k, m]
+            if j > k:
+                factor[j, k] = total / factor[k, k]
+            elif total > 0:
+                factor[j, j] = np.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@kernel()
+def _solve_unit(factor: Array, unit: int, column: Array) -> None:
+    """The column of the inverse that belongs to a unit vector."""
+    size = len(column)
+    for j in range(size):
+        total = 1.0 if j == unit else 0.0
+        for m in range(unit, j):
+            total -= factor[j, m] * column[m]
+        column[j] = total / factor[j, j] if j >= unit else 0.0
+    for j in range(size - 1, -1, -1):
+        total = column[j]
+        for m in range(j + 1, size):
+            total -= factor[m, j] * column[m]
+        column[j] = total / factor[j, j]
+
+
+@kernel()
+def predict(
+    covariance: Array, acceleration: Array, dt_s: Array, diameter_m: Array, most_uncertain: float, predicted: Array
+) -> None:
+    """Covariance of pose and velocity after a while: :func:`torchtrack.motion.predict_covariance`.
+
+    Args:
+        covariance: ``[b, 12, 12]``.
+        acceleration: ``[b, 6]``, standard deviation of it.
+        most_uncertain: what would be less certain than this (rad, and diameters) is left as it is.
+        predicted: filled.
+    """
+    for b in range(len(covariance)):
+        P, new, dt = covariance[b], predicted[b], dt_s[b]
+        for j in range(6):
+            for k in range(6):
+                both = P[j, 6 + k] + dt * P[6 + j, 6 + k]
+                new[j, k] = P[j, k] + dt * P[6 + j, k] + dt * both
+                new[j, 6 + k], new[6 + j, k] = both, P[6 + j, k] + dt * P[6 + j, 6 + k]
+                new[6 + j, 6 + k] = P[6 + j, 6 + k]
+            # An acceleration adds half its square of the time to the pose, and its time to the velocity.
+            way, gain = 0.5 * dt * dt * acceleration[b, j], dt * acceleration[b, j]
+            new[j, j] += way * way
+            new[j, 6 + j] += way * gain
+            new[6 + j, j] += way * gain
+            new[6 + j, 6 + j] += gain * gain
+        for j in range(6):
+            if np.sqrt(new[j, j]) > most_uncertain * (1.0 if j < 3 else diameter_m[b]):
+                new[:] = P
+                break
