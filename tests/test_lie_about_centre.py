@@ -114,3 +114,17 @@ def test_cayley_gives_rotations_that_agree_with_exp_to_second_order(batch, dtype
 def test_turning_a_rotation_is_the_product_with_cayleys(dtype):
     rotation, phi = random_pose(5).to(dtype)[:, :3, :3], random_twist(5, rotation_rad=1.0, translation_m=1.0).to(dtype)[:, :3]
     torch.testing.assert_close(lie.turned(rotation, phi), lie.cayley(phi) @ rotation)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.01, 1.0, 3.0])
+def test_small_steps_turn_by_cayley_and_move_the_centre(angle, dtype):
+    T, centre = random_pose(5).to(dtype), torch.randn((5, 3), generator=generator(2), dtype=torch.float64).to(dtype)
+    phi, move = rotation_vectors(angle, 5, seed=13, dtype=dtype), torch.randn((5, 3), generator=generator(14), dtype=torch.float64).to(dtype)
+    torch.testing.assert_close(lie.step_about(T, torch.cat([phi, move], 1), centre), lie.move_about(T, lie.cayley(phi), move, centre))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 3.1])
+def test_gradients_of_small_steps_are_right(angle):
+    T, centre = random_pose(2), torch.randn((2, 3), generator=generator(2), dtype=torch.float64)
+    step = torch.cat([rotation_vectors(angle, 2), torch.full((2, 3), 0.1, dtype=torch.float64)], 1)
+    assert gradcheck(lie.step_about, tuple(value.requires_grad_() for value in (T, step, centre)), atol=1e-7)

@@ -67,7 +67,7 @@ class ContourIndex:
         rows, columns = self.size
         # Whole cells first: rounded the same way wherever the region begins.
         column, row = pixels.add(0.5 * self.cell_px + _OFF_BORDER_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
-        nearest = self.nearest.gather(1, self._flat(column.clamp(0, columns - 1), row.clamp(0, rows - 1)))
+        nearest = self.nearest.gather(1, self._flat(column.clamp(0, columns - 1), row.clamp(0, rows - 1))).long()
         if finely is None or readback.none_of(finely):
             return nearest
         return torch.where(finely[:, None], self._nearest_of_four(pixels), nearest)
@@ -78,7 +78,7 @@ class ContourIndex:
         column, row = pixels.add(_OFF_BORDER_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
         first = self._flat(column.clamp(0, columns - 2), row.clamp(0, rows - 2))
         # A table of the places that cells know, where these are fewer than the places asked for.
-        table = self._places(self.nearest) if rows * columns <= 4 * pixels.shape[1] else None
+        table = self._places(self.nearest.long()) if rows * columns <= 4 * pixels.shape[1] else None
         best, least = first, self._squared_way(first, pixels, table)
         # One after the other: what is in memory at a time is then a quarter, and a search for the least of four takes longer still.
         for step in (1, columns, columns + 1):
@@ -86,11 +86,11 @@ class ContourIndex:
             away = self._squared_way(cell, pixels, table)
             nearer = away < least
             best, least = torch.where(nearer, cell, best), torch.minimum(away, least)
-        return self.nearest.gather(1, best)
+        return self.nearest.gather(1, best).long()
 
     def _squared_way(self, cell: Int[Tensor, "b n"], pixels: Float[Tensor, "b n 2"], table: Tensor | None) -> Float[Tensor, "b n"]:
         """From each pixel to what the cell knows, squared (px²)."""
-        known = self._places(self.nearest.gather(1, cell)) if table is None else take_points(table, cell)
+        known = self._places(self.nearest.gather(1, cell).long()) if table is None else take_points(table, cell)
         u, v = (known - pixels).unbind(-1)
         return torch.addcmul(u * u, v, v)
 
@@ -154,7 +154,8 @@ def _by_kernel(contours: Contours, image_size: tuple[int, int], answer: readback
     pixels, mask = contours.pixels.contiguous().numpy(), contours.mask.contiguous().numpy()
     first, is_inside = contours.pixels.new_empty(len(pixels), 2), np.empty_like(mask)
     rows, columns = kernels.extents(pixels, mask, radius, settings, is_inside, first.numpy())
-    nearest = torch.empty(len(pixels), rows * columns, dtype=torch.int64)
+    # Narrow numbers: half as much of the memory that a processor has near.
+    nearest = torch.empty(len(pixels), rows * columns, dtype=torch.int32)
     kernels.write(pixels, is_inside, radius, first.numpy(), columns, settings, nearest.numpy())
     return ContourIndex(first, (rows, columns), cell_px, nearest, contours.pixels, answer)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchtrack import readback
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.lie import cayley, move_about, small_difference_about
+from torchtrack.lie import small_difference_about, step_about
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
 from torchtrack.pose_solver import robust_cost, solve_positive
 
@@ -32,7 +32,7 @@ class _Place:
 
     def moved(self, step: Float[Tensor, "b k"], problem: PoseProblem) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b k"]]:
         """The pose after a step in the solver's chart, and the offset of all unknowns from the prior there."""
-        T_cam_obj = move_about(self.T_cam_obj, cayley(step[:, :3]), step[:, 3:6], problem.centre_obj)
+        T_cam_obj = step_about(self.T_cam_obj, step[:, :6], problem.centre_obj)
         from_prior = small_difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
         return T_cam_obj, torch.cat([from_prior, self.further + step[:, 6:]], -1)
 

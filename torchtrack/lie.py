@@ -242,6 +242,13 @@ def turned(rotation: Float[Tensor, "b 3 3"], phi: Float[Tensor, "b 3"]) -> Float
     return torch.addcmul(rotation, factor, torch.baddbmm(across, skew, across), value=8)
 
 
+def step_about(T: Float[Tensor, "b 4 4"], step: Float[Tensor, "b 6"], centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:
+    """:func:`retract_about` for small steps, with :func:`cayley` in the place of the exponential."""
+    rotation = turned(T[:, :3, :3], step[:, :3])
+    shift = torch.baddbmm(step[:, 3:, None], T[:, :3, :3] - rotation, centre_obj[..., None])
+    return torch.cat([torch.cat([rotation, T[:, :3, 3:] + shift], 2), T[:, 3:]], 1)
+
+
 def difference_about(T_from: Float[Tensor, "*b 4 4"], T_to: Float[Tensor, "*b 4 4"], centre_obj: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6"]:
     """The ``delta`` with ``retract_about(T_from, delta, centre_obj) == T_to``."""
     phi = so3_log(T_to[..., :3, :3] @ T_from[..., :3, :3].transpose(-1, -2))

@@ -12,7 +12,7 @@ from torchtrack.contours import Contours, assemble, select_ranked, take_points
 from torchtrack.image_motion import MovingObjects, pixel_velocity
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.lie import cayley, move_about, retract_about, transform_points
+from torchtrack.lie import retract_about, step_about, transform_points
 from torchtrack.motion import Acceleration, inverse
 from torchtrack.object_batch import ObjectBatch, repeat_row
 from torchtrack.once import once
@@ -95,7 +95,7 @@ class Prediction:
         if config.source == "splat" or not config.mid_window:
             return self.objects.contours(self.T_cam_obj, config)
         back = self.velocity * (-0.5 * dt_s)[:, None]
-        middle = move_about(self.T_cam_obj, cayley(back[:, :3]), back[:, 3:], self.objects.centre_obj)
+        middle = step_about(self.T_cam_obj, back, self.objects.centre_obj)
         middle, _ = before_camera(middle, self.objects.centre_obj, self.T_cam_obj)
         seen = self.objects.contours(middle, config)
         return assemble(seen.points_obj, seen.tangents_obj, seen.kind, seen.mask, self.T_cam_obj, self.objects.intrinsics)

@@ -123,15 +123,15 @@ class SensorTiles(nn.Module):
         from torchtrack.kernels.events import keep
 
         objects = len(near) if len(near) > 1 else 0
-        kept, own, counts = np.empty(len(events), np.int64), np.empty((objects, len(events)), np.int64), np.empty(objects, np.int64)
+        kept, own, counts = np.empty(len(events), np.int64), np.zeros((objects, len(events)), np.int64), np.empty(objects, np.int64)
         count = keep(*as_arrays(events.x, events.y, near), _TILE_BITS, self.columns, kept, own, counts)
         return kept[:count], _padded(own, counts) if objects else None
 
 
 def _padded(own: np.ndarray, counts: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
-    """Lists of the events near each object, as wide as the longest, and which of their entries exist."""
+    """Lists of the events near each object, zero after their end, made as wide as the longest, and which of their entries exist."""
     exists = torch.arange(max(int(counts.max()), 1)) < torch.from_numpy(counts)[:, None]
-    return torch.where(exists, torch.from_numpy(own[:, : exists.shape[1]]), 0), exists
+    return torch.from_numpy(own[:, : exists.shape[1]]), exists
 
 
 def _of_each(near: np.ndarray, tile: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]] | None:

@@ -267,7 +267,7 @@ class Tracker(TrackedObjects):
         acceleration = next_acceleration(state.acceleration, before, covariance, dt_s, self.diameter_m, px_per_m, motion)
         gained = acceleration.expected * dt_s[:, None]
         moved, velocity = torch.add(velocity, gained, alpha=0.5) * dt_s[:, None], velocity + gained
-        T_prior = lie.move_about(state.T_cam_obj.to(velocity.dtype), lie.cayley(moved[:, :3]), moved[:, 3:], self.centre_obj)
+        T_prior = lie.step_about(state.T_cam_obj.to(velocity.dtype), moved, self.centre_obj)
         objects = objects_as_known(self.objects, state, self.element_groups, self.on_surfaces is not None, self.config)
         T_prior, usable = before_camera(T_prior, self.centre_obj, self.far_pose)
         told = acceleration if self.config.solver.prior else None
