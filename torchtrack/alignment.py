@@ -103,9 +103,11 @@ def align(
     table = _table(contours, index, objects, matching)
     # One that may be far off would settle on the first edges that it is nearest to.
     small = (objects.size_px(begin.T_cam_obj).detach() < matching.fine_below_px) & (widening <= 1)
-    narrowing = _narrowing(widening, len(matching.gates_px))
+    narrowing = tuple(_narrowing(widening, len(matching.gates_px)))
     if fast_alignment.applies(config, offset):
-        solution, matches = fast_alignment.align_rounds(prediction, begin.T_cam_obj, offset, information, table, observations, narrowing, small, config)
+        solution, matches = fast_alignment.align_rounds(
+            prediction, begin.T_cam_obj, offset, information, table, observations, narrowing, small, config
+        )
         return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
     place = _first_place(begin, observations, config)
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, narrowing, strict=True)):

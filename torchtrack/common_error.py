@@ -13,9 +13,9 @@ from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import Contours, take_points
 
 # Where an edge is looked for beside another (px): found as far as twice that.
-_ASIDE_PX = 2.0
+ASIDE_PX = 2.0
 # Contours with normals this parallel (|n·m| above) and this far apart (px) are two edges.
-_PARALLEL, _APART_PX = 0.9, 0.5
+PARALLEL, APART_PX = 0.9, 0.5
 
 
 def told_by_each(beside: Float[Tensor, "b n"], common_px2: Float[Tensor, "b n"], observation_px: float) -> Float[Tensor, "b n"]:
@@ -32,11 +32,6 @@ def told_by_each(beside: Float[Tensor, "b n"], common_px2: Float[Tensor, "b n"],
     return torch.addcmul(one(beside), beside, common_px2, value=observation_px**-2).reciprocal()
 
 
-def mistaken_constants() -> dict[str, float]:
-    """What a kernel goes by that finds the edge beside as :func:`mistaken_px2` does."""
-    return {"aside_px": _ASIDE_PX, "parallel": _PARALLEL, "apart_px": _APART_PX}
-
-
 def mistaken_px2(contours: Contours, index: ContourIndex, of_edges: Bool[Tensor, "b m"], close_px: float) -> Float[Tensor, "b m"]:
     """Mean square of how far off what is seen on each contour point is, should it be of the edge beside (px²).
 
@@ -50,15 +45,15 @@ def mistaken_px2(contours: Contours, index: ContourIndex, of_edges: Bool[Tensor,
         close_px: distance from which edges are told apart.
     """
     pixels, normals = contours.pixels[:, None], contours.normals[:, None]
-    aside_px = constant((-_ASIDE_PX, _ASIDE_PX), pixels.dtype, pixels.device)[:, None]
+    aside_px = constant((-ASIDE_PX, ASIDE_PX), pixels.dtype, pixels.device)[:, None]
     found = index.look_up(torch.addcmul(pixels, normals, aside_px[..., None]).flatten(1, 2))
     counts = contours.mask & of_edges
     known = torch.cat([contours.pixels, contours.normals, counts[..., None].to(pixels.dtype)], -1)
     other_pixels, other_normals, is_edge = take_points(known, found.clamp(min=0)).unflatten(1, (2, -1)).split((2, 2, 1), -1)
     apart_px = vecdot(other_pixels - pixels, normals)
-    is_parallel = vecdot(other_normals, normals).abs() > _PARALLEL
+    is_parallel = vecdot(other_normals, normals).abs() > PARALLEL
     # To the side that was looked at, and not the same edge.
-    is_other = (apart_px * aside_px > _APART_PX * _ASIDE_PX) & is_parallel & counts[:, None] & (is_edge[..., 0] > 0)
+    is_other = (apart_px * aside_px > APART_PX * ASIDE_PX) & is_parallel & counts[:, None] & (is_edge[..., 0] > 0)
     is_other = is_other & (found >= 0).unflatten(1, (2, -1))
     squared = apart_px.square()
     return torch.where(is_other, 0.5 * squared * torch.exp(squared * -(close_px**-2)), 0).amax(1)

@@ -50,7 +50,7 @@ def align_rounds(
     from torchtrack.kernels import matching as rows
     from torchtrack.kernels import rounds
 
-    batch, count = observations.mask.shape
+    objects, (batch, count) = prediction.objects, observations.mask.shape
     T_cam_obj, offset = T_cam_obj.clone(memory_format=torch.contiguous_format), offset.clone()
     gradient, hessian = torch.empty_like(offset), torch.empty_like(information)
     contour = torch.empty(batch, count, dtype=torch.int64)
@@ -59,7 +59,7 @@ def align_rounds(
     rounds.align(
         *as_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
         table.index.cells,
-        *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, prediction.objects.intrinsics, prediction.objects.centre_obj),
+        *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, objects.intrinsics, objects.centre_obj),
         *as_arrays(torch.tensor(config.matching.gates_px, dtype=offset.dtype), torch.stack(list(wider)), finely),
         matching_settings(config),
         RoundSettings(config.matching.motion_compensation, config.solver.velocity_in_window, config.solver.damping, *rounding_floor()),

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.linalg import vecdot
 
 from torchtrack.bursts import without_tail
-from torchtrack.common_error import mistaken_constants, mistaken_px2
+from torchtrack.common_error import APART_PX, ASIDE_PX, PARALLEL, mistaken_px2
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
@@ -120,15 +120,13 @@ def _rows_by_kernel(contours: Contours, index: ContourIndex, polarity: Tensor | 
     # Not at the top: Numba is an extra.
     from torchtrack.kernels import table as kernels
 
-    kinds = {kind.name.lower(): int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE)}
-    settings = TableSettings(**kinds, of_print=of_print, close_px=close_px, **mistaken_constants())
+    limb, crease, texture = (int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
+    settings = TableSettings(limb, crease, texture, of_print, close_px, ASIDE_PX, PARALLEL, APART_PX)
     table = contours.points_obj.new_empty(*contours.mask.shape, kernels.COLUMNS)
-    points, pixels, normals, indexed = (
-        value.transpose(1, 2) for value in (contours.points_obj, contours.pixels, contours.normals, index.pixels)
-    )
+    points, pixels, normals, indexed = (value.transpose(1, 2) for value in (contours.points_obj, contours.pixels, contours.normals, index.pixels))
     expected = pixels.new_empty(len(table), 0) if polarity is None else polarity
-    of_index = as_arrays(indexed, index.nearest, index.first)
-    kernels.fill(*as_arrays(points, pixels, normals, contours.kind, contours.mask), *of_index, index.cells, *as_arrays(expected), settings, table.numpy())
+    given = as_arrays(points, pixels, normals, contours.kind, contours.mask, indexed, index.nearest, index.first)
+    kernels.fill(*given, index.cells, *as_arrays(expected), settings, table.numpy())
     return table.transpose(1, 2)
 
 

@@ -104,10 +104,10 @@ def build_tracker(sessions: Sequence[Session], config: TrackingConfig) -> Tracke
     stream_index = [stream for stream, session in enumerate(sessions) for _ in session.models]
     kind, dtype = tracker_class(config.preset), getattr(torch, config.dtype)
     if not config.compiled:
-        return kind(models, cameras, config.tracker, stream_index, dtype).to(config.device)
+        return kind(models, cameras, config.tracker, stream_index, dtype, kernels=config.kernels).to(config.device)
     if kind is not Tracker:
         raise ConfigError(f"compiled: the method '{config.preset}' cannot be compiled. Leave it out, or use the preset default, paper or nns.")
-    return Tracker(models, cameras, config.tracker, stream_index, dtype, compiled=True).to(config.device)
+    return Tracker(models, cameras, config.tracker, stream_index, dtype, compiled=config.compiled, kernels=config.kernels).to(config.device)
 
 
 @dataclass(frozen=True)

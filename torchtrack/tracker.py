@@ -20,6 +20,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.doubt import Doubt, gathered_when_known, is_adrift, is_due, is_wanted
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
+from torchtrack.kernels import switch
 from torchtrack.learned_contours import LearnedContours
 from torchtrack.model_trust import ModelTrust
 from torchtrack.motion import expected_velocity, initial_covariance, next_acceleration, predict_covariance, with_dropped, without_spin
@@ -56,6 +57,7 @@ class Tracker(TrackedObjects):
             comes with the package where ``matching.learned_trust`` is on, and none otherwise. Other poses that a search
             tries are aligned without it.
         compiled: whether steady windows are taken by compiled graphs, see :mod:`torchtrack.compiled`.
+        kernels: whether Numba's kernels are used where they apply, see :mod:`torchtrack.kernels`.
 
     Raises:
         ConfigError: if graphs are asked for, and this version of PyTorch cannot make them.
@@ -71,8 +73,10 @@ class Tracker(TrackedObjects):
         weigher: nn.Module | None = None,
         *,
         compiled: bool = False,
+        kernels: bool = True,
     ) -> None:
         super().__init__(objects, camera, config, stream_index, dtype, weigher)
+        self.kernels = kernels
         self.graphs = CompiledStep(self) if compiled else None
 
     def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
@@ -112,7 +116,7 @@ class Tracker(TrackedObjects):
             t_end_us: end of the window; the newest event of each stream when not given.
         """
         t_us = self._window_end(state, events, t_end_us)
-        with torch.autocast(t_us.device.type, enabled=False):
+        with torch.autocast(t_us.device.type, enabled=False), switch.kernels(wanted=self.kernels):
             steady = self._steady(state, events, t_us)
             if steady is not None:
                 return _counted(steady)

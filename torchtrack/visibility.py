@@ -111,7 +111,8 @@ def _hidden_by_self_by_kernel(scene: Scene, contours: Contours, hidden: Tensor) 
     T_cam_obj, tolerance_m = as_arrays(scene.T_cam_obj, _ON_FACE * scene.diameters_m)
     for model in scene.models:
         if len(model.triangles):
-            hide_behind_faces(*as_arrays(model.members), T_cam_obj, *as_arrays(model.triangles, model.triangle_normals), tolerance_m, *points, hidden.numpy())
+            members, triangles, normals = as_arrays(model.members, model.triangles, model.triangle_normals)
+            hide_behind_faces(members, T_cam_obj, triangles, normals, tolerance_m, *points, hidden.numpy())
     return hidden
 
 

@@ -61,9 +61,7 @@ def _solve_unit(factor: Array, unit: int, column: Array) -> None:
 
 
 @kernel()
-def predict(
-    covariance: Array, acceleration: Array, dt_s: Array, diameter_m: Array, most_uncertain: float, predicted: Array
-) -> None:
+def predict(covariance: Array, acceleration: Array, dt_s: Array, diameter_m: Array, most_uncertain: float, predicted: Array) -> None:
     """Covariance of pose and velocity after a while: :func:`torchtrack.motion.predict_covariance`.
 
     Args:

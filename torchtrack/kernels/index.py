@@ -6,7 +6,6 @@ from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.settings import IndexSettings
 
 
-
 @kernel()
 def extents(pixels: Array, mask: Array, radius_px: Array, settings: IndexSettings, is_inside: Array, first: Array) -> tuple[int, int]:
     """Rows and columns of regions that hold all objects' contour points, with a margin around them.

@@ -1,5 +1,7 @@
 """Matching one object's observations with its contours: :func:`torchtrack.matching.match_nearest`, and what its matches come to weigh."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from torchtrack.kernels.compiler import FAST, Array, kernel
@@ -9,15 +11,41 @@ from torchtrack.kernels.settings import Cells, MatchingSettings
 
 # Rows of what was observed.
 U, V, AGE, INTO_BURST, POLARITY, TRUST = range(6)
-OBSERVED = 6
 # Columns of a contour point: its place on the object, its normal, where it was indexed, and marks.
 X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, LIMB, ORIENTED, EXPECTED, MISTAKEN = range(11)
 COLUMNS = 11
 # Rows of a match.
-WEIGHT, MATCH_AGE, POINT_X, POINT_Y, POINT_Z, TARGET_U, TARGET_V, DIRECTION_U, DIRECTION_V, OFFSET, IS_LIMB, BESIDE, ERROR, DARK, AS_EXPECTED = range(15)
+WEIGHT, MATCH_AGE, POINT_X, POINT_Y, POINT_Z, TARGET_U, TARGET_V, DIRECTION_U, DIRECTION_V = range(9)
+OFFSET, IS_LIMB, BESIDE, ERROR, DARK, AS_EXPECTED = range(9, 15)
 ROWS = 15
 # Patches of the image: votes of the observations in each.
 _ON, _NEAR, _VOTES = range(3)
+
+
+class Index(NamedTuple):
+    """The index of one object's contour points: the nearest of every cell, the first cell (column, row), and the layout."""
+
+    nearest_of_cell: Array
+    first: Array
+    cells: Cells
+
+
+class Moving(NamedTuple):
+    """One object: its pose, camera, motion, and how that changes by an acceleration, as :mod:`torchtrack.kernels.motion` has them."""
+
+    pose: Numbers
+    lens: Numbers
+    motion: Numbers
+    change: Numbers
+
+
+class Matched(NamedTuple):
+    """The matches of one object: contour points, which are near one or matched with it, ``[n]``, and what else is told, ``[ROWS, n]``."""
+
+    contour: Array
+    is_near: Array
+    is_matched: Array
+    rows: Array
 
 
 @kernel()
@@ -38,84 +66,88 @@ def match(
     exists: Array,
     place: Array,
     table: Array,
-    nearest_of_cell: Array,
-    first: Array,
-    cells: Cells,
-    pose: Numbers,
-    motion: Numbers,
-    change: Numbers,
-    intrinsics: Numbers,
+    index: Index,
+    moving: Moving,
     gate_px: float,
     wider: float,
     finely: bool,
     settings: MatchingSettings,
-    contour: Array,
-    is_near: Array,
-    is_matched: Array,
-    matches: Array,
+    matched: Matched,
     votes: Array,
 ) -> None:
     """Match each observation with the contour point that is nearest to its place; ``place`` is moved on.
 
     Args:
-        seen: ``[OBSERVED, n]``, and which of them exist.
+        seen: ``[6, n]``, and which of them exist.
         place: ``[n, 2]``.
-        table: ``[m, COLUMNS]``.
-        pose, intrinsics: of the object, from :mod:`torchtrack.kernels.motion`; so are its ``motion``, and its ``change`` by an acceleration.
-        contour, is_near, is_matched, matches: filled; ``[n]``, and ``[ROWS, n]``. Weights are those of ``match_nearest``.
+        table: ``[m, COLUMNS]``, with the ``index`` of its points.
+        matched: filled; weights are those of ``match_nearest``.
         votes: room for ``[patches², 3]``.
     """
     votes[:] = 0.0
     indexed = table[:, INDEXED_U : INDEXED_V + 1]
     for i in range(seen.shape[1]):
-        is_near[i] = is_matched[i] = False
-        contour[i] = 0
         found = -1
         if exists[i]:
             if finely:
-                found = nearest_of_four(nearest_of_cell, first, indexed, place[i, 0], place[i, 1], cells)
+                found = nearest_of_four(index.nearest_of_cell, index.first, indexed, place[i, 0], place[i, 1], index.cells)
             else:
-                found = nearest(nearest_of_cell, first, place[i, 0], place[i, 1], cells)
+                found = nearest(index.nearest_of_cell, index.first, place[i, 0], place[i, 1], index.cells)
+        matched.contour[i], matched.is_near[i], matched.is_matched[i] = max(found, 0), found >= 0, False
         if found < 0:
             for k in range(ROWS):
-                matches[k, i] = 0.0
-            continue
-        contour[i], is_near[i] = found, True
-        point_x, point_y, point_z = table[found, X], table[found, Y], table[found, Z]
-        x, y, z = placed(pose, point_x, point_y, point_z)
-        inverse = inverse_depth(z)
-        u, v = intrinsics[2] + x * inverse * intrinsics[0], intrinsics[3] + y * inverse * intrinsics[1]
-        speed_u, speed_v = across(motion, x, y, z, inverse, intrinsics)
-        change_u, change_v = across(change, x, y, z, inverse, intrinsics)
-        nu, nv = table[found, NORMAL_U], table[found, NORMAL_V]
-        crossing = nu * speed_u + nv * speed_v
-        dark = seen[POLARITY, i] * crossing / (abs(crossing) + settings.slow_px_s)
-        age = seen[AGE, i] + max(seen[INTO_BURST, i] - settings.burst_px / max(abs(crossing), 1e-3), 0.0)
-        carried_u = seen[U, i] + age * (speed_u - 0.5 * age * change_u)
-        carried_v = seen[V, i] + age * (speed_v - 0.5 * age * change_v)
-        shift = dark * (settings.dark_shift_px + table[found, LIMB] * (settings.limb_dark_shift_px - settings.dark_shift_px))
-        target_u, target_v = carried_u - nu * shift, carried_v - nv * shift
-        du, dv = u - target_u, v - target_v
-        is_matched[i] = du * du + dv * dv < (gate_px * wider) ** 2
-        offset = (du * nu + dv * nv) / wider
-        as_expected = _agreeing(dark * table[found, EXPECTED], settings)
-        dark = dark * table[found, ORIENTED]
-        matches[WEIGHT, i], matches[MATCH_AGE, i] = as_expected, age
-        matches[POINT_X, i], matches[POINT_Y, i], matches[POINT_Z, i] = point_x, point_y, point_z
-        matches[TARGET_U, i], matches[TARGET_V, i] = target_u, target_v
-        matches[DIRECTION_U, i], matches[DIRECTION_V, i] = nu, nv
-        matches[OFFSET, i], matches[IS_LIMB, i], matches[ERROR, i] = offset, table[found, LIMB], table[found, MISTAKEN]
-        matches[DARK, i], matches[AS_EXPECTED, i] = dark, as_expected
-        # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
-        next_u, next_v = carried_u - (u - table[found, INDEXED_U]), carried_v - (v - table[found, INDEXED_V])
-        place[i, 0], place[i, 1] = next_u if is_matched[i] else place[i, 0], next_v if is_matched[i] else place[i, 1]
-        # Products in the place of branches, of which a processor would guess half wrong.
-        cell = patch(target_u, target_v, settings.patch_bits, settings.patches)
-        near, on = as_expected * (abs(offset) < settings.smear_px), as_expected * (abs(offset) < settings.on_contour_px)
-        votes[cell, _NEAR] += near
-        votes[cell, _ON] += on
-        votes[cell, _VOTES] += on * dark
-    _weigh(is_near, matches, votes, settings)
+                matched.rows[k, i] = 0.0
+        else:
+            _match_one(i, found, seen, place, table, moving, gate_px, wider, settings, matched, votes)
+    _weigh(matched.is_near, matched.rows, votes, settings)
+
+
+@kernel(fastmath=FAST)
+def _match_one(
+    i: int,
+    found: int,
+    seen: Array,
+    place: Array,
+    table: Array,
+    moving: Moving,
+    gate_px: float,
+    wider: float,
+    settings: MatchingSettings,
+    matched: Matched,
+    votes: Array,
+) -> None:
+    """Match one observation with the contour point that was found for it, and count it in its patch."""
+    rows, point_x, point_y, point_z = matched.rows, table[found, X], table[found, Y], table[found, Z]
+    x, y, z = placed(moving.pose, point_x, point_y, point_z)
+    inverse = inverse_depth(z)
+    u, v = moving.lens[2] + x * inverse * moving.lens[0], moving.lens[3] + y * inverse * moving.lens[1]
+    speed_u, speed_v = across(moving.motion, x, y, z, inverse, moving.lens)
+    change_u, change_v = across(moving.change, x, y, z, inverse, moving.lens)
+    nu, nv = table[found, NORMAL_U], table[found, NORMAL_V]
+    crossing = nu * speed_u + nv * speed_v
+    dark = seen[POLARITY, i] * crossing / (abs(crossing) + settings.slow_px_s)
+    age = seen[AGE, i] + max(seen[INTO_BURST, i] - settings.burst_px / max(abs(crossing), 1e-3), 0.0)
+    carried_u = seen[U, i] + age * (speed_u - 0.5 * age * change_u)
+    carried_v = seen[V, i] + age * (speed_v - 0.5 * age * change_v)
+    shift = dark * (settings.dark_shift_px + table[found, LIMB] * (settings.limb_dark_shift_px - settings.dark_shift_px))
+    target_u, target_v = carried_u - nu * shift, carried_v - nv * shift
+    du, dv = u - target_u, v - target_v
+    is_matched, offset = du * du + dv * dv < (gate_px * wider) ** 2, (du * nu + dv * nv) / wider
+    as_expected = _agreeing(dark * table[found, EXPECTED], settings)
+    dark = dark * table[found, ORIENTED]
+    rows[WEIGHT, i], rows[MATCH_AGE, i], rows[POINT_X, i], rows[POINT_Y, i], rows[POINT_Z, i] = as_expected, age, point_x, point_y, point_z
+    rows[TARGET_U, i], rows[TARGET_V, i], rows[DIRECTION_U, i], rows[DIRECTION_V, i] = target_u, target_v, nu, nv
+    rows[OFFSET, i], rows[IS_LIMB, i], rows[ERROR, i] = offset, table[found, LIMB], table[found, MISTAKEN]
+    rows[DARK, i], rows[AS_EXPECTED, i], matched.is_matched[i] = dark, as_expected, is_matched
+    # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
+    next_u, next_v = carried_u - (u - table[found, INDEXED_U]), carried_v - (v - table[found, INDEXED_V])
+    place[i, 0], place[i, 1] = next_u if is_matched else place[i, 0], next_v if is_matched else place[i, 1]
+    # Products in the place of branches, of which a processor would guess half wrong.
+    cell = patch(target_u, target_v, settings.patch_bits, settings.patches)
+    near, on = as_expected * (abs(offset) < settings.smear_px), as_expected * (abs(offset) < settings.on_contour_px)
+    votes[cell, _NEAR] += near
+    votes[cell, _ON] += on
+    votes[cell, _VOTES] += on * dark
 
 
 @kernel(fastmath=FAST)

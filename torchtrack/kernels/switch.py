@@ -9,14 +9,14 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from torchtrack import readback
+
 _WANTED: ContextVar[bool] = ContextVar("kernels are wanted", default=True)
 
 
 def apply_to(values: Tensor) -> bool:
     """Whether kernels may compute with tensors like this one: on the CPU, where no gradients are recorded, and Numba is installed."""
-    if torch.compiler.is_compiling() or values.device.type != "cpu" or torch.is_grad_enabled():
-        return False
-    return _WANTED.get() and numba_is_installed()
+    return readback.read_at_once(values) and not torch.is_grad_enabled() and _WANTED.get() and numba_is_installed()
 
 
 @cache

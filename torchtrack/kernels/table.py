@@ -8,7 +8,6 @@ from torchtrack.kernels.matching import COLUMNS, EXPECTED, INDEXED_U, INDEXED_V,
 from torchtrack.kernels.quality import octant
 from torchtrack.kernels.settings import Cells, TableSettings
 
-
 __all__ = ["COLUMNS", "fill"]
 
 
