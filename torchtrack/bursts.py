@@ -46,7 +46,8 @@ def update_bursts(
     """
     _, _, height, width = burst_age_us.shape
     ages = aged(burst_age_us, elapsed_us)
-    if switch.apply_to(ages):
+    # Of longer windows, ages do not tell what began in them.
+    if switch.apply_to(ages) and bool((elapsed_us < LONG_AGO_US).all()):
         return ages, _update_by_kernel(ages, elapsed_us, events, longest_us)
     # In place: out of place, the whole map is copied again.
     flat = ages.flatten(1)

@@ -48,6 +48,10 @@ def write(pixels: Array, is_inside: Array, radius_px: Array, first: Array, colum
     cells = nearest.shape[1]
     steps, number = np.empty(cells, np.float32), np.empty(cells, np.int32)
     for b in range(len(pixels)):
+        # Of an object that nothing is known of, this is no number to go by.
+        if radius_px[b] < 0:
+            nearest[b] = -1
+            continue
         steps[:] = np.inf
         farthest = np.floor(settings.distance_steps * radius_px[b] ** 2)
         # A square of cells that may lie within the radius: what is farther is no match.

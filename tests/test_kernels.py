@@ -1,0 +1,265 @@
+"""Kernels give what PyTorch's operations give, stage by stage; objects do not see one another in them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+import trimesh
+from both_ways import assert_as_close, both_ways
+from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_events, random_pose, random_twist
+from test_visibility import ball, l_prism
+
+from torchtrack.bursts import LONG_AGO_US, update_bursts
+from torchtrack.camera import undistortion_table
+from torchtrack.config.tracker import ContourConfig, MotionConfig, QualityConfig
+from torchtrack.contour_index import index_contours
+from torchtrack.contour_model import ContourKind, group_by_model
+from torchtrack.contours import assemble, mesh_contours, reproject
+from torchtrack.events import concatenate, pad_streams
+from torchtrack.image_motion import MovingObjects
+from torchtrack.matching import ContourTable, Matches
+from torchtrack.motion import inverse, predict_covariance
+from torchtrack.object_model import ObjectModel
+from torchtrack.observations import WindowEvents, select_events
+from torchtrack.polarity_memory import remembered
+from torchtrack.quality import shares
+from torchtrack.sensor_tiles import SensorTiles
+from torchtrack.visibility import Scene, remove_hidden
+
+pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
+TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
+
+
+def uniform(*shape, low=0.0, high=1.0, seed=0, dtype=torch.float64):
+    return (low + (high - low) * torch.rand(shape, generator=generator(seed), dtype=torch.float64)).to(dtype)
+
+
+def random_contours(batch=3, count=400, seed=0, dtype=torch.float64):
+    """Contour points all over an image and beside it, of all kinds, some of which do not count."""
+    pixels = uniform(batch, count, 2, low=-20, high=190, seed=seed, dtype=dtype)
+    angle = uniform(batch, count, high=6.28, seed=seed + 1, dtype=dtype)
+    kind = torch.randint(len(ContourKind), (batch, count), generator=generator(seed + 2))
+    mask = uniform(batch, count, seed=seed + 3) < 0.8
+    return replace(contours_at(pixels, torch.stack([angle.cos(), angle.sin()], -1), mask=mask, dtype=dtype), kind=kind)
+
+
+# ---- contours, hidden or not
+
+
+def textured_plate():
+    """A plate with points of print on one side."""
+    plate = ObjectModel.from_mesh(trimesh.creation.box((0.12, 0.10, 0.01)))
+    grid = torch.stack(torch.meshgrid(torch.linspace(-0.05, 0.05, 21), torch.linspace(-0.04, 0.04, 17), indexing="ij"), -1).flatten(0, 1)
+    points = torch.cat([grid, torch.full_like(grid[:, :1], -0.005)], 1)
+    tangents, normals = torch.tensor([1.0, 0.0, 0.0]).expand_as(points), torch.tensor([0.0, 0.0, -1.0]).expand_as(points)
+    return replace(plate, texture_points=points, texture_tangents=tangents.clone(), texture_normals=normals.clone())
+
+
+def all_kinds():
+    lines = ObjectModel.from_polylines([[[0, 0, 0], [0.08, 0, 0], [0.08, 0.05, 0.01], [0, 0, 0]]], unit="m")
+    box = box_model()
+    return [box, ObjectModel.from_mesh(l_prism()), ObjectModel.from_mesh(ball(0.05)), textured_plate(), lines, box]
+
+
+SETTINGS = {
+    "as it is": ContourConfig(),
+    "no occluding": ContourConfig(occluding=False),
+    "no creases": ContourConfig(creases=False),
+    "no texture": ContourConfig(texture=False),
+    "few points": ContourConfig(max_edge_points=40, spacing_px=2.0),
+    "as close as can be": ContourConfig(spacing_px=0.0),
+}
+
+
+@pytest.mark.parametrize("config", SETTINGS.values(), ids=SETTINGS)
+@pytest.mark.parametrize("seed", range(3))
+def test_contours_of_models_of_all_kinds(config, seed, dtype):
+    groups = [group.to(dtype) for group in group_by_model(all_kinds(), config)]
+    T, intrinsics = random_pose(6, seed=seed).to(dtype), SMALL_CAMERA.intrinsics(dtype).expand(6, 4)
+    by_kernels, plain = both_ways(lambda: mesh_contours(groups, T, intrinsics, config))
+    if dtype == torch.float32 and not torch.equal(by_kernels.mask.sum(1), plain.mask.sum(1)):
+        # A length that is nearly whole may be rounded up or down: then all points lie elsewhere.
+        pytest.skip("rounded to another number of points")
+    for number in range(6):
+        ours, theirs = ([value[number][contours.mask[number]] for value in vars(contours).values()] for contours in (by_kernels, plain))
+        assert_as_close(tuple(ours), tuple(theirs), tolerance=0.02 if dtype == torch.float32 else 1e-7)
+
+
+def test_what_is_behind_the_camera_has_no_contours():
+    groups = group_by_model([box_model(), box_model()], ContourConfig())
+    T = torch.stack([pose(), pose(translation=(0.0, 0.0, -0.5))]).float()
+    for contours in both_ways(lambda: mesh_contours(groups, T, SMALL_CAMERA.intrinsics().expand(2, 4), ContourConfig())):
+        assert contours.mask.any(1).tolist() == [True, False]
+        assert all(torch.isfinite(value).all() for value in vars(contours).values() if value.is_floating_point())
+
+
+def test_points_at_a_pose(dtype):
+    contours, T = random_contours(dtype=dtype), random_pose(3, depth_m=(-1.0, 3.0)).to(dtype)
+    intrinsics = SMALL_CAMERA.intrinsics(dtype).expand(3, 4)
+    given = contours.points_obj * 1e-3, contours.points_cam.roll(1, 1), contours.kind, contours.mask, T, intrinsics
+    assert_as_close(*both_ways(lambda: assemble(*given)), tolerance=TOLERANCE[dtype])
+    assert_as_close(*both_ways(lambda: reproject(replace(contours, points_obj=given[0]), T, intrinsics)), tolerance=TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("streams", [[0, 0, 0, 0, 0, 0], [0, 1, 2, 0, 1, 1]])
+@pytest.mark.parametrize("seed", range(3))
+def test_hidden_contours_of_objects_before_one_another(streams, seed):
+    models, streams = all_kinds(), torch.tensor(streams)
+    groups = [group.double() for group in group_by_model(models, ContourConfig())]
+    T, intrinsics = random_pose(6, seed=seed), SMALL_CAMERA.intrinsics(torch.float64).expand(6, 4)
+    diameters, shape = torch.tensor([model.diameter_m for model in models]).double(), (3, SMALL_CAMERA.height, SMALL_CAMERA.width)
+    contours = mesh_contours(groups, T, intrinsics, ContourConfig())
+    scene = Scene(groups, T, intrinsics, streams, diameters, shape, shared=True)
+    by_kernels, plain = both_ways(lambda: remove_hidden(contours, scene, ContourConfig()))
+    assert torch.equal(by_kernels.mask, plain.mask)
+    assert 0 < int(plain.mask.sum()) < int(contours.mask.sum())
+
+
+# ---- index, table and choice of events
+
+
+@pytest.mark.parametrize("cell_px", [1, 2, 3])
+@pytest.mark.parametrize("radius_px", [2, 7, torch.tensor([3, 7, 18])])
+def test_the_nearest_contour_of_every_cell(radius_px, cell_px):
+    contours, places = random_contours(), uniform(3, 5000, 2, low=-30, high=220, seed=9)
+    places[0, :3] = torch.tensor([torch.nan, torch.inf, 1e30])[:, None]
+    (ours, theirs) = both_ways(lambda: index_contours(contours, IMAGE_SIZE, radius_px, cell_px))
+    for finely in (None, torch.tensor([True, False, True])):
+        assert torch.equal(ours.look_up(places, finely), theirs.look_up(places, finely))
+
+
+def test_of_no_contours_nothing_is_found():
+    contours = random_contours()
+    contours = replace(contours, mask=contours.mask & torch.tensor([True, False, True])[:, None])
+    for index in both_ways(lambda: index_contours(contours, IMAGE_SIZE, 7, 2)):
+        assert (index.look_up(contours.pixels)[1] == -1).all()
+
+
+@pytest.mark.parametrize("close_px", [0.0, 1.7])
+@pytest.mark.parametrize("polarity", [None, uniform(3, 8, low=-1)])
+def test_the_table_of_contours(close_px, polarity, dtype):
+    contours, polarity = random_contours(dtype=dtype), None if polarity is None else polarity.to(dtype)
+    index = index_contours(contours, IMAGE_SIZE, 7, 2)
+    ours, theirs = both_ways(lambda: ContourTable.of(contours, index, polarity, close_px=close_px).rows)
+    counts = contours.mask[:, None].expand_as(ours)
+    torch.testing.assert_close(ours[counts], theirs[counts], rtol=1e-5, atol=1e-5)
+
+
+def window_events(batch=3, count=4000, dtype=torch.float64):
+    polarity = torch.where(uniform(batch, count, seed=3) < 0.5, -1.0, 1.0).to(dtype)
+    times = uniform(batch, count, high=5e-3, seed=1, dtype=dtype), uniform(batch, count, high=5e-3, seed=2, dtype=dtype)
+    return WindowEvents(uniform(batch, count, 2, high=180, dtype=dtype), *times, polarity, uniform(batch, count, seed=4) < 0.9)
+
+
+@pytest.mark.parametrize("count", [200, 10_000])
+@pytest.mark.parametrize("kind", ["of each", "numbered", "of all", "none"])
+def test_which_events_are_chosen(count, kind):
+    events, contours = window_events(), random_contours()
+    if kind == "numbered":
+        events = replace(events, number=torch.arange(4000).mul(3).expand(3, -1).contiguous())
+    if kind == "of all":
+        events = events.of(0).repeated(3)
+    if kind == "none":
+        events = replace(events, mask=torch.zeros_like(events.mask))
+    index, objects = index_contours(contours, IMAGE_SIZE, 7, 2), moving_objects((300.0, -200.0), 3)
+    ours, theirs = both_ways(lambda: select_events(events, index, objects, count))
+    assert torch.equal(ours.mask, theirs.mask)
+    for name in ("pixels", "age_s", "into_burst_s", "polarity"):
+        assert torch.equal(getattr(ours, name)[ours.mask], getattr(theirs, name)[ours.mask])
+
+
+# ---- events
+
+
+@pytest.mark.parametrize("elapsed_us", [5000, 40_000])
+@pytest.mark.parametrize("longest_us", [0, 1000, 10_000])
+@pytest.mark.parametrize("streams", [1, 3])
+def test_bursts_of_pixels_that_fire_again_and_again(elapsed_us, longest_us, streams):
+    batches = [random_events(800 + 50 * s, width=8, height=6, duration_us=elapsed_us - 1, seed=s, stream=s) for s in range(streams)]
+    events = pad_streams(concatenate(batches), streams, torch.full((streams,), elapsed_us))
+    before = torch.randint(LONG_AGO_US, (streams, 2, 6, 8), generator=generator(5), dtype=torch.int16)
+    ours, theirs = both_ways(lambda: update_bursts(before, torch.full((streams,), elapsed_us), events, longest_us))
+    assert torch.equal(ours[0], theirs[0])
+    assert torch.equal(ours[1][events.mask], theirs[1][events.mask])
+
+
+@pytest.mark.parametrize("objects", [1, 3])
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.6, 1.0])
+def test_events_near_objects(objects, share):
+    tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(2000, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
+    near = uniform(objects, len(tiles.middle)) < share
+    ours, theirs = both_ways(lambda: tiles.keep(events, near))
+    assert torch.equal(ours.events.t_us, theirs.events.t_us)
+    assert (ours.number is None) == (theirs.number is None)
+    assert (ours.of_each is None) == (theirs.of_each is None)
+    if ours.of_each is not None:
+        assert torch.equal(ours.of_each[0][ours.of_each[1]], theirs.of_each[0][theirs.of_each[1]])
+
+
+# ---- shares and matrices
+
+
+def random_matches(batch=3, count=900):
+    """Matches with numbers all over."""
+    offsets, near = uniform(batch, count, low=-6, high=6, seed=1), uniform(batch, count, seed=2) < 0.7
+    zeros, points = torch.zeros_like(offsets), torch.zeros(batch, count, 3).double()
+    targets, directions = uniform(batch, count, 2, high=180, seed=3), uniform(batch, count, 2, low=-1, seed=4)
+    told = zeros, zeros, zeros, torch.where(near, 1.0, -1.0).double(), uniform(batch, count, low=0.5, seed=5)
+    return Matches(zeros.long(), near, uniform(batch, count, seed=6), zeros, points, targets, directions, offsets, near, *told)
+
+
+@pytest.mark.parametrize("speed", [0.0, 40.0, 900.0])
+@pytest.mark.parametrize("settings", [{}, {"min_on_contour": 1, "min_speed_px_s": 100.0}, {"min_observations": 5000}])
+def test_what_events_explain(speed, settings):
+    contours, objects = random_contours(), moving_objects((speed, 0.5 * speed), 3)
+    by_kernels, plain = both_ways(lambda: shares(contours, random_matches(), objects, IMAGE_SIZE, QualityConfig(**settings)))
+    assert_as_close(by_kernels, plain, tolerance=1e-6)
+
+
+def test_what_is_remembered_of_sides():
+    matches, before = random_matches(), uniform(3, 8, low=-1, seed=8)
+    weights = torch.where(matches.near, matches.weights, 0)
+    window_s = torch.full((3,), 5e-3).double()
+    assert_as_close(*both_ways(lambda: remembered(before, matches.directions, matches.dark, weights, window_s, 0.05)))
+
+
+def random_covariances(batch=4):
+    root = torch.randn(batch, 12, 12, generator=generator(3), dtype=torch.float64) * torch.logspace(-4, 1, 12, dtype=torch.float64)[:, None]
+    return root @ root.mT + 1e-12 * torch.eye(12).double()
+
+
+def test_inverses_and_of_what_has_none_infinity():
+    covariance = random_covariances()
+    covariance[1, 3, 3] = -1.0
+    by_kernels, plain = both_ways(lambda: inverse(covariance))
+    scale = covariance.diagonal(dim1=1, dim2=2).abs().sqrt()
+    relative = by_kernels * scale[:, None] * scale[..., None], plain * scale[:, None] * scale[..., None]
+    assert torch.isinf(by_kernels[1].diagonal()).all()
+    for number in (0, 2, 3):
+        torch.testing.assert_close(relative[0][number], relative[1][number], rtol=1e-6, atol=1e-6)
+
+
+def test_predicted_covariances_and_those_that_are_lost():
+    covariance, dt_s = random_covariances(), torch.tensor([5e-3, 1e-2, 5e-3, 0.1])
+    covariance[2] *= 1e6
+    velocity, diameter_m = random_twist(4, rotation_rad=3.0, translation_m=1.0).float(), torch.tensor([0.1, 0.2, 0.3, 0.05])
+    by_kernels, plain = both_ways(lambda: predict_covariance(covariance, velocity, dt_s, diameter_m, MotionConfig()))
+    assert_as_close(by_kernels, plain, tolerance=1e-12)
+    assert torch.equal(by_kernels[2], covariance[2])
+
+
+# ---- every object for itself
+
+
+@pytest.mark.parametrize("what", ["points", "pixels"])
+def test_what_is_not_a_number_stays_with_its_object(what):
+    contours = random_contours()
+    spoilt = replace(contours, **{name: value.clone() for name, value in (("pixels", contours.pixels), ("points_cam", contours.points_cam))})
+    (spoilt.points_cam if what == "points" else spoilt.pixels)[1] = torch.nan
+    objects = MovingObjects(torch.eye(4).double().expand(3, 4, 4), random_twist(3), torch.ones(3, 3).double(), torch.ones(3, 4).double())
+    with torch.inference_mode():
+        alone, beside = (shares(of, random_matches(), objects, IMAGE_SIZE, QualityConfig()) for of in (contours, spoilt))
+        index, other = (index_contours(of, IMAGE_SIZE, 7, 2) for of in (contours, spoilt))
+    for first, second in zip(alone, beside, strict=True):
+        assert torch.equal(first[[0, 2]], second[[0, 2]])
+    assert torch.equal(index.look_up(contours.pixels)[[0, 2]], other.look_up(contours.pixels)[[0, 2]])

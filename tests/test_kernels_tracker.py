@@ -1,0 +1,161 @@
+"""Whole steps by kernels: equal to those without, under every setting; where kernels are used, and where not."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from both_ways import ROUNDINGS
+from helpers import SMALL_CAMERA, box_model, pose
+from tracked_boxes import SCENES, WIDE_CAMERA, assert_same, follow, merged, moving_box, poses_of, started, windows
+
+from torchtrack import Tracker, fast_alignment
+from torchtrack.config.presets import preset
+from torchtrack.config.run import RunConfig
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.kernels import switch
+from torchtrack.runner import run
+from torchtrack.stepping import track
+
+pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
+
+SETTINGS = {
+    "default": {},
+    "finely": {"matching": {"fine_below_px": 10_000.0}},
+    "no concentration": {"matching": {"concentration": False}},
+    "no polarity": {"matching": {"polarity": False, "polarity_memory_s": 0.0, "print_polarity": False}},
+    "no compensation": {"matching": {"motion_compensation": False}},
+    "one gate": {"matching": {"gates_px": (5.0,)}},
+    "no close edges": {"matching": {"close_edges_px": 0.0, "dark_shift_px": 0.0}},
+    "corners": {"corners": {"max_corners": 64}},
+    "learned trust": {"matching": {"learned_trust": True}},
+    "no velocity": {"solver": {"velocity_in_window": False}},
+    "no acceleration": {"solver": {"acceleration_in_window": False}, "motion": {"acceleration_s": 0.0}},
+    "no swelling": {"solver": {"swelling_px": 0.0, "common_px": 0.0}},
+    "damped": {"solver": {"damping": 0.1}},
+    "no hidden": {"contours": {"remove_hidden": False, "mid_window": False}},
+    "no gathering": {"search": {"by_gathering": False}},
+    "hold": {"motion": {"model": "hold", "without_events": "hold"}},
+    "model trust": {"model_trust": {"least_share": 0.5, "every": 1}},
+    "steps": {"solver": {"iterations": 3, "loss": "huber"}},
+    "mutual": {"matching": {"mutual_px": 0.7}},
+    "refreshed": {"contours": {"refresh_rounds": (0, 2)}},
+    "no prior": {"solver": {"prior": False}},
+}
+
+
+def both_steps(config, count=6, dtype=torch.float64):
+    """Results of every window, each from the same state, by kernels and without."""
+    _, events = moving_box(pose(), count)
+    plain = Tracker([box_model()], SMALL_CAMERA, config, dtype=dtype, kernels=False)
+    fast = Tracker([box_model()], SMALL_CAMERA, config, dtype=dtype)
+    state, pairs = plain.init(pose()[None], 0), []
+    with torch.inference_mode():
+        for of_window, end_us in windows(events, count):
+            pairs.append((fast.step(state, of_window, end_us)[1], plain.step(state, of_window, end_us)[1]))
+            state, _ = plain.step(state, of_window, end_us)
+    return pairs
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_a_step_is_the_same_by_kernels(settings):
+    for ours, theirs in both_steps(TrackerConfig.model_validate(settings)):
+        torch.testing.assert_close(ours.T_cam_obj, theirs.T_cam_obj, rtol=0, atol=ROUNDINGS[torch.float64])
+        torch.testing.assert_close(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-12)
+        torch.testing.assert_close(ours.quality, theirs.quality, rtol=0, atol=1e-6)
+        assert torch.equal(ours.status, theirs.status)
+        assert torch.equal(ours.observation_count, theirs.observation_count)
+
+
+def test_a_step_is_the_same_in_few_digits():
+    for ours, theirs in both_steps(TrackerConfig(), dtype=torch.float32):
+        torch.testing.assert_close(ours.T_cam_obj, theirs.T_cam_obj, rtol=0, atol=ROUNDINGS[torch.float32])
+
+
+@pytest.mark.parametrize("name", ["paper", "nns", "learned"])
+def test_a_step_of_other_presets_is_the_same(name):
+    for ours, theirs in both_steps(preset(name), count=3):
+        torch.testing.assert_close(ours.T_cam_obj, theirs.T_cam_obj, rtol=0, atol=ROUNDINGS[torch.float64])
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_scenes_of_several_objects_and_streams_are_the_same(scene):
+    starts, streams, cameras, of_windows = scene(6)
+    tracker = Tracker([box_model()] * len(starts), cameras, stream_index=streams, dtype=torch.float64)
+    state = tracker.init(torch.stack(starts), 0)
+    with torch.inference_mode():
+        _, ours = follow(tracker, state, of_windows)
+        tracker.kernels = False
+        _, theirs = follow(tracker, state, of_windows)
+    for mine, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(mine.T_cam_obj, other.T_cam_obj, rtol=0, atol=1e-7)
+
+
+# ---- where kernels are used
+
+
+@pytest.mark.parametrize("name", ["steps", "mutual", "refreshed", "no prior"])
+def test_settings_that_the_kernel_does_not_know_go_without_it(name):
+    with torch.inference_mode():
+        assert fast_alignment.applies(TrackerConfig(), torch.zeros(1))
+        assert not fast_alignment.applies(TrackerConfig.model_validate(SETTINGS[name]), torch.zeros(1))
+        assert not fast_alignment.applies(preset("paper"), torch.zeros(1))
+
+
+def test_where_gradients_are_recorded_there_are_no_kernels():
+    assert not switch.apply_to(torch.zeros(1))
+    with torch.no_grad():
+        assert switch.apply_to(torch.zeros(1))
+
+
+def test_within_what_does_without_kernels_nothing_asks_for_them():
+    with torch.inference_mode(), switch.kernels(wanted=False):
+        with switch.kernels(wanted=True):
+            assert not switch.apply_to(torch.zeros(1))
+    with torch.inference_mode():
+        assert switch.apply_to(torch.zeros(1))
+
+
+def test_without_numba_all_is_done_by_pytorch(monkeypatch):
+    tracker, state, _, (events, end_us), _ = started(torch.float64)
+    with torch.inference_mode():
+        tracker.kernels = False
+        _, expected = tracker.step(state, events, end_us)
+        tracker.kernels = True
+        monkeypatch.setattr(switch, "numba_is_installed", lambda: False)
+        _, found = tracker.step(state, events, end_us)
+    assert_same(found, expected)
+
+
+def test_a_run_without_kernels_gives_the_same_poses(folder, tmp_path):
+    poses = []
+    for kernels in (True, False):
+        output = tmp_path / str(kernels)
+        run(RunConfig(source=folder / "one.npz", output=output, kernels=kernels, dtype="float64", overlay={"enabled": False}))
+        poses.append([[float(number) for number in line.split()] for line in next(output.glob("*.tum")).read_text().splitlines() if line[0] != "#"])
+    torch.testing.assert_close(torch.tensor(poses[0]), torch.tensor(poses[1]), rtol=0, atol=1e-6)
+
+
+# ---- every object for itself
+
+
+def test_a_neighbour_that_fails_changes_nothing():
+    starts = torch.stack([pose((0.5, 0.6, 0.1), (-0.17, 0.0, 0.5)), pose((0.4, -0.7, 0.3), (0.17, 0.0, 0.5))])
+    events = merged(*(moving_box(T, 4, WIDE_CAMERA, seed=seed)[1] for seed, T in enumerate(starts)))
+    tracker, results = Tracker([box_model(), box_model()], WIDE_CAMERA, dtype=torch.float64), []
+    state = tracker.init(starts, 0)
+    spoilt = replace(state, T_cam_obj=state.T_cam_obj.clone(), velocity=state.velocity.clone())
+    spoilt.T_cam_obj[1], spoilt.velocity[1] = torch.nan, torch.nan
+    with torch.inference_mode():
+        for begin in (state, spoilt):
+            results.append(follow(tracker, begin, windows(events, 4))[1])
+    torch.testing.assert_close(poses_of(results[0]), poses_of(results[1]), rtol=0, atol=1e-9)
+
+
+def test_a_stream_is_tracked_by_kernels(monkeypatch):
+    """The loop over windows records no gradients."""
+    asked = []
+    monkeypatch.setattr(fast_alignment, "applies", lambda config, values: bool(asked.append(switch.apply_to(values))))
+    trajectory, events = moving_box(pose(), 2)
+    tracker = Tracker([box_model()], SMALL_CAMERA)
+    assert len(list(track([events], tracker, tracker.init(trajectory.T_cam_obj[:1], 0)))) == 2
+    assert asked and all(asked)
