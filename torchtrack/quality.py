@@ -58,8 +58,8 @@ def measured_share(
     speed = (contours.normals * contour_velocity).sum(-1).abs()
     moving = contours.mask & inside(contours.pixels, image_size) & (speed > config.min_speed_px_s)
     total = moving.sum(-1)
-    share = (moving & explained).sum(-1) / total.clamp(min=1)
-    return torch.where(total < _MIN_MOVING_POINTS, torch.nan, share).to(contours.pixels.dtype)
+    share = (moving & explained).sum(-1).to(contours.pixels.dtype) / total.clamp(min=1)
+    return torch.where(total < _MIN_MOVING_POINTS, torch.nan, share)
 
 
 def shares(
@@ -105,8 +105,8 @@ def gathered_share(matches: Matches, config: QualityConfig) -> Float[Tensor, "b"
     offsets = matches.offsets.abs()
     near = matches.near & (offsets < _AROUND_PX)
     count = near.sum(-1)
-    share = (near & (offsets < ON_CONTOUR_PX)).sum(-1) / count.clamp(min=1)
-    return torch.where(count < config.min_observations, torch.nan, share).to(offsets.dtype)
+    share = (near & (offsets < ON_CONTOUR_PX)).sum(-1).to(offsets.dtype) / count.clamp(min=1)
+    return torch.where(count < config.min_observations, torch.nan, share)
 
 
 def inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:

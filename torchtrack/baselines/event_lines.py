@@ -105,6 +105,8 @@ class EventLineTracker(Tracker):
         config: TrackerConfig | None = None,
         stream_index: Sequence[int] | None = None,
         dtype: torch.dtype = torch.float32,
+        *,
+        kernels: bool = True,
     ) -> None:
         distinct = {id(model): model for model in objects}
         for model in distinct.values():
@@ -112,7 +114,7 @@ class EventLineTracker(Tracker):
                 raise ModelError(f"{reason}. A method that tracks straight lines alone cannot follow it: use the preset default, paper or nns.")
         # Objects with one model go on having one: they are handled together.
         straight = {key: straight_edges_only(model) for key, model in distinct.items()}
-        super().__init__([straight[id(model)] for model in objects], camera, config, stream_index, dtype)
+        super().__init__([straight[id(model)] for model in objects], camera, config, stream_index, dtype, kernels=kernels)
 
     def _open(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None, velocity: Float[Tensor, "b 6"]) -> Window:
         """The window's times, and each object carried on with ``velocity``."""
