@@ -77,9 +77,12 @@ def test_pipeline(tiny, simulator, tmp_path, capsys):
     names = [entry["name"] for entry in content["results"]]
     assert names[:4] == ["1 object (lbracket), median", "1 object (lbracket), 95 %", "2 objects, median", "2 objects, 95 %"]
     assert names[4:6] == ["4 objects in 2 streams, median", "4 objects in 2 streams, 95 %"]
-    assert names[6:] == ["1 object with 1 Mev/s outside it over none", "1 object in 320x240 at 4 Mev/s, stream over work"]
+    alone = [f"{count}, without kernels, {what}" for count in ("1 object (lbracket)", "2 objects") for what in ("median", "95 %")]
+    assert names[6:10] == alone
+    assert names[10:] == ["1 object with 1 Mev/s outside it over none", "1 object in 320x240 at 4 Mev/s, stream over work"]
     assert all(entry["figures"][0] > 0 and len(entry["figures"]) == 1 for entry in content["results"])
     assert "100.0% of poses are TRACKING" in content["notes"][0]
+    assert content["machine"]["kernels"].startswith("numba")
     assert content["machine"]["threads"] == 1 and content["machine"]["device"] == "cpu"
     assert "1 object (lbracket), median" in capsys.readouterr().out
 

@@ -8,6 +8,7 @@ from torchtrack.bench.results import Report, Result, time_result
 from torchtrack.bench.scene import HD, SHAPES, Scene, read, shapes_of, simulated, started, with_events_outside
 from torchtrack.bench.setup import Setup
 from torchtrack.events import EventBatch
+from torchtrack.kernels.switch import numba_is_installed
 from torchtrack.stepping import cut_windows, steps
 from torchtrack.window_length import WindowLength
 
@@ -51,6 +52,10 @@ def _of_scenes(setup: Setup) -> Iterator[_Part]:
     for count, columns, streams, target_ms in MANY[kind]:
         name = f"{count * streams} objects" + (f" in {streams} streams" if streams > 1 else "")
         yield _latency(setup, name, simulated(shapes_of(count), columns), target_ms, streams=streams)
+    if kind == "cpu" and numba_is_installed():
+        yield _latency(setup, f"1 object ({SHAPES[0]})", simulated(SHAPES[:1]), kernels=False)
+        count, columns, _, _ = MANY[kind][0]
+        yield _latency(setup, f"{count} objects", simulated(shapes_of(count), columns), kernels=False)
     yield _outside(setup)
     for compiled in setup.ways:
         yield _real_time(setup, compiled)
@@ -65,11 +70,12 @@ def _latency(
     *,
     streams: int = 1,
     compiled: bool = False,
+    kernels: bool = True,
 ) -> _Part:
     """Median and 95 % of the time of a step, each once per repeat, and how well it tracked."""
-    name = _named(name, compiled)
+    name = _named(name, compiled) if kernels else f"{name}, without kernels"
     setup.show(name)
-    run = started(scene, setup.device, streams, compiled=compiled)
+    run = started(scene, setup.device, streams, compiled=compiled, kernels=kernels)
     quality = run.quality(setup.clock)
     repeats = [run.latencies(setup.clock) for _ in range(setup.repeats)]
     median, p95 = ([float(value) for value in np.quantile(repeats, share, axis=1)] for share in (0.5, 0.95))

@@ -6,6 +6,7 @@ import platform
 import statistics
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import torch
 from torchtrack.bench.plots import Plot, draw
 from torchtrack.errors import ConfigError, MissingFileError
 from torchtrack.io.atomic import atomic_path
+from torchtrack.kernels.switch import numba_is_installed
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,7 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
         "python": platform.python_version(),
         "numpy": np.__version__,
         "torch": torch.__version__,
+        "kernels": f"numba {version('numba')}" if numba_is_installed() else "none, as Numba is not installed",
     }
 
 

@@ -239,7 +239,9 @@ class Run:
         return torch.stack([rotation_angle_deg(found[:, :3, :3], expected[:, :3, :3]), 1e3 * (found - expected)[:, :3, 3].norm(dim=-1)], -1)
 
 
-def started(scene: Scene, device: torch.device, streams: int = 1, config: TrackerConfig | None = None, *, compiled: bool = False) -> Run:
+def started(
+    scene: Scene, device: torch.device, streams: int = 1, config: TrackerConfig | None = None, *, compiled: bool = False, kernels: bool = True
+) -> Run:
     """A tracker that follows the scene, after its first windows.
 
     Args:
@@ -248,13 +250,14 @@ def started(scene: Scene, device: torch.device, streams: int = 1, config: Tracke
         streams: how many cameras see the same scene, each in a stream of its own.
         config: settings; those of the preset ``default`` when not given.
         compiled: whether steady windows are taken by compiled graphs.
+        kernels: whether Numba's kernels are used where they apply.
 
     Raises:
         ConfigError: if the scene ends with its first windows.
     """
     count = len(scene.models)
     index = [stream for stream in range(streams) for _ in range(count)]
-    tracker = Tracker(scene.models * streams, [scene.camera] * streams, config, index, compiled=compiled).to(device)
+    tracker = Tracker(scene.models * streams, [scene.camera] * streams, config, index, compiled=compiled, kernels=kernels).to(device)
     state = tracker.init(scene.T_cam_obj.repeat(streams, 1, 1), scene.start_us)
     tracker.prepare(state)
     windows = []

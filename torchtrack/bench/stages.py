@@ -31,6 +31,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "matching": ("alignment:match_nearest", "alignment:match_along_flow"),
     "problem": ("alignment:_believed", "alignment:_problem", "alignment:_information"),
     "solver": ("alignment:solve_pose",),
+    "matching to solver, by kernel": ("fast_alignment:align_rounds",),
     "reprojection": ("alignment:reproject", "conclusion:reproject"),
     "alignment, rest": ("tracker:align",),
     "quality": ("tracker:judge_fit",),
