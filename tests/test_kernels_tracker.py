@@ -56,6 +56,7 @@ def both_steps(config, count=6, dtype=torch.float64):
     return pairs
 
 
+@pytest.mark.many_windows
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
 def test_a_step_is_the_same_by_kernels(settings):
     for ours, theirs in both_steps(TrackerConfig.model_validate(settings)):
@@ -108,9 +109,8 @@ def test_where_gradients_are_recorded_there_are_no_kernels():
 
 
 def test_within_what_does_without_kernels_nothing_asks_for_them():
-    with torch.inference_mode(), switch.kernels(wanted=False):
-        with switch.kernels(wanted=True):
-            assert not switch.apply_to(torch.zeros(1))
+    with torch.inference_mode(), switch.kernels(wanted=False), switch.kernels(wanted=True):
+        assert not switch.apply_to(torch.zeros(1))
     with torch.inference_mode():
         assert switch.apply_to(torch.zeros(1))
 
@@ -141,13 +141,12 @@ def test_a_run_without_kernels_gives_the_same_poses(folder, tmp_path):
 def test_a_neighbour_that_fails_changes_nothing():
     starts = torch.stack([pose((0.5, 0.6, 0.1), (-0.17, 0.0, 0.5)), pose((0.4, -0.7, 0.3), (0.17, 0.0, 0.5))])
     events = merged(*(moving_box(T, 4, WIDE_CAMERA, seed=seed)[1] for seed, T in enumerate(starts)))
-    tracker, results = Tracker([box_model(), box_model()], WIDE_CAMERA, dtype=torch.float64), []
+    tracker = Tracker([box_model(), box_model()], WIDE_CAMERA, dtype=torch.float64)
     state = tracker.init(starts, 0)
     spoilt = replace(state, T_cam_obj=state.T_cam_obj.clone(), velocity=state.velocity.clone())
     spoilt.T_cam_obj[1], spoilt.velocity[1] = torch.nan, torch.nan
     with torch.inference_mode():
-        for begin in (state, spoilt):
-            results.append(follow(tracker, begin, windows(events, 4))[1])
+        results = [follow(tracker, begin, windows(events, 4))[1] for begin in (state, spoilt)]
     torch.testing.assert_close(poses_of(results[0]), poses_of(results[1]), rtol=0, atol=1e-9)
 
 

@@ -44,11 +44,11 @@ def update_bursts(
 
     Of padding, the second result says nothing.
     """
+    # Of longer windows, ages do not tell what began in them.
+    if switch.apply_to(burst_age_us) and bool((elapsed_us < LONG_AGO_US).all()):
+        return _update_by_kernel(burst_age_us, elapsed_us, events, longest_us)
     _, _, height, width = burst_age_us.shape
     ages = aged(burst_age_us, elapsed_us)
-    # Of longer windows, ages do not tell what began in them.
-    if switch.apply_to(ages) and bool((elapsed_us < LONG_AGO_US).all()):
-        return ages, _update_by_kernel(ages, elapsed_us, events, longest_us)
     # In place: out of place, the whole map is copied again.
     flat = ages.flatten(1)
     place = (events.polarity * height + events.y) * width + events.x
@@ -62,14 +62,16 @@ def update_bursts(
     return ages, torch.where(into_us < longest_us, into_us, 0)
 
 
-def _update_by_kernel(ages: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int) -> Int[Tensor, "s e"]:
-    """Bring aged maps up by the events, one after the other, and tell how far into its burst each is."""
+def _update_by_kernel(
+    burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int
+) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
+    """:func:`update_bursts`, one event after the other."""
     # Not at the top: Numba is an extra.
     from torchtrack.kernels.events import update_bursts as update
 
-    into_us = torch.empty(events.mask.shape, dtype=torch.int16)
-    update(*as_arrays(*vars(events).values(), elapsed_us), longest_us, LONG_AGO_US, ages.numpy(), into_us.numpy())
-    return into_us
+    ages, into_us = torch.empty(burst_age_us.shape, dtype=torch.int16), torch.empty(events.mask.shape, dtype=torch.int16)
+    update(*as_arrays(*vars(events).values(), elapsed_us), longest_us, LONG_AGO_US, *as_arrays(burst_age_us, ages, into_us))
+    return ages, into_us
 
 
 def without_tail(

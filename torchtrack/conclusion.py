@@ -69,10 +69,23 @@ def conclude(
     certain = (share >= _CERTAIN * state.full_share) & (status == int(quality.Status.TRACKING))
     T_last_seen = torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen)
     unseen_s = torch.where(certain, 0, state.unseen_s + dt_s)
-    state = replace(state, T_cam_obj=T_cam_obj, velocity=velocity, acceleration=acceleration, covariance=covariance)
-    darker_outside = _darker_outside(state, found, status, dt_s, config)
-    state = replace(state, doubted_s=doubted_s, T_last_seen=T_last_seen, unseen_s=unseen_s, darker_outside=darker_outside)
-    return _with_scores(state, found, failed), result
+    usual_score, full_share, full_gathered = _usual(state, found, failed)
+    next_state = replace(
+        state,
+        T_cam_obj=T_cam_obj,
+        velocity=velocity,
+        acceleration=acceleration,
+        covariance=covariance,
+        score=found.score,
+        usual_score=usual_score,
+        full_share=full_share,
+        full_gathered=full_gathered,
+        doubted_s=doubted_s,
+        T_last_seen=T_last_seen,
+        unseen_s=unseen_s,
+        darker_outside=_darker_outside(state, found, status, dt_s, config),
+    )
+    return next_state, result
 
 
 def _darker_outside(
@@ -89,12 +102,12 @@ def _darker_outside(
     return remembered(state.darker_outside, matches.directions, matches.dark, weights, dt_s, config.matching.polarity_memory_s)
 
 
-def _with_scores(state: TrackerState, found: Found, failed: Bool[Tensor, "b"]) -> TrackerState:
-    """The state with what a window's find explains, as a rule and when seen well; of objects that failed, the last alone."""
+def _usual(state: TrackerState, found: Found, failed: Bool[Tensor, "b"]) -> tuple[Float[Tensor, "b"], ...]:
+    """Score as a rule, and share and gathering when seen well, with a window more; of objects that failed, as before."""
     usual = torch.where(failed, state.usual_score, torch.lerp(state.usual_score, found.score, _USUAL_GAIN))
     full_share = torch.where(failed, state.full_share, _seen_well(state.full_share, found.share))
     full_gathered = torch.where(failed | found.gathered.isnan(), state.full_gathered, _seen_well(state.full_gathered, found.gathered))
-    return replace(state, score=found.score, usual_score=usual, full_share=full_share, full_gathered=full_gathered)
+    return usual, full_share, full_gathered
 
 
 def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:

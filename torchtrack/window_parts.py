@@ -4,11 +4,13 @@ Its velocity is learned in short steps first, where there are events enough for 
 """
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.events import EventBatch, stream_bounds
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.speed_limit import unknown_speed
 from torchtrack.state import TrackerState
@@ -46,9 +48,22 @@ def of_unknown_motion(state: TrackerState, t_us: Int[Tensor, "s"], objects: Obje
     window = config.window
     if window.parts == 1 or not config.solver.prior:
         return torch.zeros_like(objects.stream_index, dtype=torch.bool)
+    unknown_px, sigma_px = _uncertain_px(state, ((t_us - state.t_us) * 1e-6)[objects.stream_index], objects)
+    # What is not known to be anywhere is looked for by all events of a window, and with the motion that leads to each place.
+    return (unknown_px > window.max_unknown_px) & (sigma_px <= config.search.wide_sigma_px)
+
+
+def _uncertain_px(state: TrackerState, window_s: Float[Tensor, "b"], objects: ObjectBatch) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"]]:
+    """How far objects may move in a window beside what is known, and standard deviations of where they are (px)."""
+    if switch.apply_to(window_s):
+        # Not at the top: Numba is an extra.
+        from torchtrack.kernels.filtering import unknown_motion
+
+        unknown_px, sigma_px = objects.diameter_m.new_empty(2, len(window_s))
+        own = as_arrays(objects.centre_obj, objects.intrinsics[:, 0], objects.diameter_m, window_s)
+        unknown_motion(*as_arrays(state.covariance, state.T_cam_obj), *own, unknown_px.numpy(), sigma_px.numpy())
+        return unknown_px, sigma_px
     unknown_m_s = unknown_speed(state.covariance, objects.diameter_m).to(objects.intrinsics.dtype)
     px_per_m = objects.px_per_m(state.T_cam_obj.to(unknown_m_s.dtype))
-    window_s = ((t_us - state.t_us) * 1e-6)[objects.stream_index]
-    # What is not known to be anywhere is looked for by all events of a window, and with the motion that leads to each place.
-    sigma_px = px_per_m * state.covariance.diagonal(dim1=1, dim2=2)[:, 3:5].mean(1).sqrt().to(px_per_m.dtype)
-    return (unknown_m_s * window_s * px_per_m > window.max_unknown_px) & (sigma_px <= config.search.wide_sigma_px)
+    sigma_m = state.covariance.diagonal(dim1=1, dim2=2)[:, 3:5].mean(1).sqrt().to(px_per_m.dtype)
+    return unknown_m_s * window_s * px_per_m, px_per_m * sigma_m

@@ -76,7 +76,17 @@ def keep(x: Array, y: Array, near: Array, tile_bits: int, columns: int, kept: Ar
 
 @kernel()
 def update_bursts(
-    x: Array, y: Array, age_us: Array, polarity: Array, mask: Array, elapsed_us: Array, longest_us: int, long_ago_us: int, ages: Array, into_us: Array
+    x: Array,
+    y: Array,
+    age_us: Array,
+    polarity: Array,
+    mask: Array,
+    elapsed_us: Array,
+    longest_us: int,
+    long_ago_us: int,
+    before: Array,
+    ages: Array,
+    into_us: Array,
 ) -> None:
     """Bring a map of bursts up to a window's end, and tell how far into its burst each event is (µs).
 
@@ -86,11 +96,12 @@ def update_bursts(
     Args:
         x, y, age_us, polarity, mask: ``[s, e]``.
         elapsed_us: ``[s]``; what is younger than that began in the window.
-        ages: ``[s, 2, h, w]``, aged already; changed.
-        into_us: ``[s, e]``, filled.
+        before: ``[s, 2, h, w]``, where the window began.
+        ages, into_us: at its end, and ``[s, e]``; filled.
     """
     for s in range(len(mask)):
-        since = min(elapsed_us[s], long_ago_us)
+        elapsed = elapsed_us[s]
+        _age(before[s].ravel(), np.int16(elapsed), np.int16(long_ago_us - elapsed), ages[s].ravel())
         for i in range(mask.shape[1]):
             into_us[s, i] = 0
             if not mask[s, i]:
@@ -99,8 +110,15 @@ def update_bursts(
             into = np.int64(ages[s, side, y[s, i], x[s, i]]) - age
             if into < longest_us:
                 into_us[s, i] = into
-            elif ages[s, side, y[s, i], x[s, i]] >= since:
+            elif ages[s, side, y[s, i], x[s, i]] >= elapsed:
                 ages[s, side, y[s, i], x[s, i]] = age
+
+
+@kernel()
+def _age(before: Array, elapsed: int, most: int, ages: Array) -> None:
+    """All ages some time later: :func:`torchtrack.bursts.aged`."""
+    for i in range(len(before)):
+        ages[i] = min(before[i], most) + elapsed
 
 
 @kernel(fastmath=FAST)

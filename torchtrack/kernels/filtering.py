@@ -3,6 +3,7 @@
 import numpy as np
 
 from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.motion import inverse_depth
 
 # Variances are taken to be no less.
 _LEAST = 1e-30
@@ -88,3 +89,26 @@ def predict(covariance: Array, acceleration: Array, dt_s: Array, diameter_m: Arr
             if np.sqrt(new[j, j]) > most_uncertain * (1.0 if j < 3 else diameter_m[b]):
                 new[:] = P
                 break
+
+
+@kernel()
+def unknown_motion(
+    covariance: Array, T_cam_obj: Array, centre_obj: Array, focal_px: Array, diameter_m: Array, window_s: Array, unknown_px: Array, sigma_px: Array
+) -> None:
+    """How far objects may move in a window beside what is known, and where they may be: of :mod:`torchtrack.window_parts` and ``speed_limit``.
+
+    Args:
+        covariance: ``[b, 12, 12]``.
+        focal_px, diameter_m, window_s: ``[b]``.
+        unknown_px, sigma_px: ``[b]``, filled.
+    """
+    for b in range(len(covariance)):
+        depth_m, turning, moving = np.float64(T_cam_obj[b, 2, 3]), 0.0, 0.0
+        for k in range(3):
+            depth_m += T_cam_obj[b, 2, k] * centre_obj[b, k]
+            turning += covariance[b, 6 + k, 6 + k] / 3.0
+            moving += covariance[b, 9 + k, 9 + k] / 3.0
+        place = 0.5 * (covariance[b, 3, 3] + covariance[b, 4, 4])
+        px_per_m = focal_px[b] * inverse_depth(depth_m)
+        unknown_px[b] = np.sqrt(moving + turning * (0.5 * diameter_m[b]) ** 2) * window_s[b] * px_per_m
+        sigma_px[b] = np.sqrt(place) * px_per_m
