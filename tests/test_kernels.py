@@ -16,12 +16,15 @@ from torchtrack.contour_index import index_contours
 from torchtrack.contour_model import ContourKind, group_by_model
 from torchtrack.contours import assemble, mesh_contours, reproject
 from torchtrack.events import concatenate, pad_streams
+from torchtrack.hypotheses import mark
 from torchtrack.image_motion import MovingObjects
 from torchtrack.matching import ContourTable, Matches
 from torchtrack.motion import inverse, predict_covariance
+from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.polarity_memory import remembered
+from torchtrack.prediction import Prediction
 from torchtrack.quality import shares
 from torchtrack.sensor_tiles import SensorTiles
 from torchtrack.visibility import Scene, remove_hidden
@@ -263,3 +266,23 @@ def test_what_is_not_a_number_stays_with_its_object(what):
     for first, second in zip(alone, beside, strict=True):
         assert torch.equal(first[[0, 2]], second[[0, 2]])
     assert torch.equal(index.look_up(contours.pixels)[[0, 2]], other.look_up(contours.pixels)[[0, 2]])
+
+
+# ---- marks of poses
+
+
+@pytest.mark.parametrize("each", [True, False])
+def test_marks_of_poses(each, dtype):
+    camera = torch.tensor([[1.0, 1.0, 0.0, 0.0]], dtype=dtype)
+    group = group_by_model([box_model()], ContourConfig())[0].to(dtype)
+    objects = ObjectBatch([group], camera, torch.zeros(1, 3, dtype=dtype), torch.ones(1, dtype=dtype), torch.zeros(1).long(), (1, *IMAGE_SIZE), False)
+    T_cam_obj = torch.eye(4, dtype=dtype)[None]
+    prediction = Prediction(objects, T_cam_obj, torch.ones(1).bool(), torch.zeros(1, 6, dtype=dtype), torch.eye(12).double()[None])
+    outlines = random_contours(40 if each else 1, 200, dtype=dtype)
+    outlines = replace(outlines, tangents_obj=uniform(*outlines.points_obj.shape, low=-1, seed=5, dtype=dtype))
+    offsets = torch.nn.functional.pad(random_twist(40, rotation_rad=0.01, translation_m=3.0).to(dtype), (0, 7))
+    offsets[3, :6] = torch.nan
+    image = uniform(IMAGE_SIZE[0] + 4, IMAGE_SIZE[1] + 4, high=3, seed=7, dtype=dtype)
+    by_kernels, plain = both_ways(lambda: mark(prediction, outlines, offsets, image))
+    known = torch.arange(40) != 3
+    torch.testing.assert_close(by_kernels[known], plain[known], rtol=1e-4, atol=1e-9 if dtype == torch.float64 else 0.03)

@@ -281,7 +281,7 @@ def _mesh_points_by_kernel(models: Sequence[ContourModel], T_cam_obj: Tensor, in
     seen = as_arrays(T_cam_obj, intrinsics)
     for model in models:
         of_model = as_arrays(model.members, *(getattr(model, name) for name in _SAMPLED_FROM))
-        kernels.sample(*of_model, model.texture_spacing_m, *seen, _sampling_settings(config), sampled, kind, counts)
+        kernels.sample(*of_model, model.texture_spacing_m, *seen, sampling_settings(config), sampled, kind, counts)
     # One place at least: what selects from contours needs one to point at.
     width = max(int(counts.max()), 1)
     points, tangents = T_cam_obj.new_empty(2, batch, 3, width)
@@ -290,8 +290,9 @@ def _mesh_points_by_kernel(models: Sequence[ContourModel], T_cam_obj: Tensor, in
     return points.transpose(1, 2), tangents.transpose(1, 2), kinds, mask
 
 
-def _sampling_settings(config: ContourConfig) -> SamplingSettings:
-    """What a kernel goes by that samples as :func:`mesh_contours` does."""
+def sampling_settings(config: ContourConfig | None = None) -> SamplingSettings:
+    """What a kernel goes by that samples as :func:`mesh_contours` does, or only shows what was sampled."""
+    config = config or ContourConfig()
     return SamplingSettings(
         occluding=config.occluding,
         most_edges=_MAX_ACTIVE_EDGES,
@@ -336,5 +337,5 @@ def _assemble_by_kernel(points_obj: Tensor, tangents_obj: Tensor, kind: Tensor, 
     points, tangents = points_obj.transpose(1, 2), tangents_obj.transpose(1, 2)
     points_cam, pixels, normals, shown = points.new_empty(points.shape), *points.new_empty(2, len(mask), 2, mask.shape[1]), torch.empty_like(mask)
     given = as_arrays(points, tangents, mask, T_cam_obj, intrinsics)
-    show(*given, _sampling_settings(ContourConfig()), *as_arrays(points_cam, pixels, normals, shown))
+    show(*given, sampling_settings(), *as_arrays(points_cam, pixels, normals, shown))
     return Contours(points_obj, tangents_obj, kind, shown, *(value.transpose(1, 2) for value in (points_cam, pixels, normals)))

@@ -13,10 +13,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contours import Contours, assemble
-from torchtrack.event_image import event_density, look_up
+from torchtrack.contours import Contours, assemble, sampling_settings
+from torchtrack.event_image import BORDER_PX, event_density, look_up
 from torchtrack.event_pull import pulled
 from torchtrack.image_shifts import shifted
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 from torchtrack.lie import difference_about
 from torchtrack.prediction import Prediction
 from torchtrack.views import outlines_at, thinned
@@ -103,6 +105,8 @@ def mark(prediction: Prediction, outlines: Contours, offsets: Float[Tensor, "n 1
         image: how many events there are at every pixel, as :mod:`torchtrack.event_image` has it.
     """
     count, objects = len(offsets), prediction.objects
+    if switch.apply_to(image):
+        return _marked_by_kernel(outlines, prediction.poses_at(offsets[:, :6]), objects.intrinsics, image)
     points, tangents, kind, mask = (
         values.expand(count, *values.shape[1:]) for values in (outlines.points_obj, outlines.tangents_obj, outlines.kind, outlines.mask)
     )
@@ -111,3 +115,16 @@ def mark(prediction: Prediction, outlines: Contours, offsets: Float[Tensor, "n 1
     for side_px, weight in ((0.0, 1.0), (_BESIDE_PX, -0.5), (-_BESIDE_PX, -0.5)):
         total = total + weight * (look_up(image, moved.pixels + side_px * moved.normals) * moved.mask).sum(-1)
     return total / moved.mask.sum(-1).clamp(min=1)
+
+
+def _marked_by_kernel(
+    outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"], image: Float[Tensor, "h w"]
+) -> Float[Tensor, "n"]:
+    """:func:`mark`, point by point."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.contours import mark as by_kernel
+
+    marks = image.new_empty(len(T_cam_obj))
+    points = as_arrays(outlines.points_obj.transpose(1, 2), outlines.tangents_obj.transpose(1, 2), outlines.mask)
+    by_kernel(*points, *as_arrays(T_cam_obj, intrinsics[0]), sampling_settings(), *as_arrays(image), BORDER_PX, _BESIDE_PX, marks.numpy())
+    return marks

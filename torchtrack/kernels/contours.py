@@ -204,17 +204,78 @@ def show(
         points_cam, pixels, normals: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``; filled.
     """
     for b in range(len(mask)):
-        pose, (fx, fy, cx, cy) = entries(T_cam_obj[b]), lens(intrinsics[b])
+        pose, of_lens = entries(T_cam_obj[b]), lens(intrinsics[b])
+        fx, fy, cx, cy = of_lens
         for i in range(mask.shape[1]):
             x, y, z = placed(pose, points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i])
-            ax, ay, az = turned(pose, tangents_obj[b, 0, i], tangents_obj[b, 1, i], tangents_obj[b, 2, i])
-            inverse = inverse_depth(z)
             points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i] = x, y, z
+            inverse = inverse_depth(z)
             pixels[b, 0, i], pixels[b, 1, i] = x * inverse * fx + cx, y * inverse * fy + cy
-            u, v = (ax - x * inverse * az) * inverse * fx, (ay - y * inverse * az) * inverse * fy
-            length = np.sqrt(max(u * u + v * v, _LEAST_LENGTH2))
-            normals[b, 0, i], normals[b, 1, i] = -v / length, u / length
+            ax, ay, az = turned(pose, tangents_obj[b, 0, i], tangents_obj[b, 1, i], tangents_obj[b, 2, i])
+            u, v, length = normal_of(ax - x * inverse * az, ay - y * inverse * az, inverse, of_lens)
+            normals[b, 0, i], normals[b, 1, i] = u, v
             shown[b, i] = mask[b, i] and length > settings.least_px_per_m and z > settings.least_depth_m
+
+
+@kernel(fastmath=FAST)
+def normal_of(across_x: float, across_y: float, inverse: float, of_lens: Numbers) -> tuple[float, float, float]:
+    """Unit normal of a projected tangent, and how long the tangent is there (px/m): :func:`torchtrack.contours.image_normals`.
+
+    Args:
+        across_x, across_y: the tangent across the line of sight.
+        inverse: one over the depth.
+    """
+    u, v = across_x * inverse * of_lens[0], across_y * inverse * of_lens[1]
+    length = np.sqrt(max(u * u + v * v, _LEAST_LENGTH2))
+    return -v / length, u / length, length
+
+
+@kernel(fastmath=FAST)
+def mark(
+    points_obj: Array,
+    tangents_obj: Array,
+    mask: Array,
+    T_cam_obj: Array,
+    intrinsics: Array,
+    settings: SamplingSettings,
+    image: Array,
+    border_px: int,
+    beside_px: float,
+    marks: Array,
+) -> None:
+    """How much denser events are on contours at some poses than beside them: :func:`torchtrack.hypotheses.mark`.
+
+    Args:
+        points_obj, tangents_obj, mask: ``[n, 3, m]`` and ``[n, m]`` of each pose; or one row for all.
+        T_cam_obj: ``[n, 4, 4]``.
+        intrinsics: ``[4]``.
+        image: ``[h, w]``, with a border.
+        marks: ``[n]``, filled.
+    """
+    of_lens = lens(intrinsics)
+    for n in range(len(marks)):
+        row, pose, total, count = n if len(mask) > 1 else 0, entries(T_cam_obj[n]), 0.0, 0
+        for i in range(mask.shape[1]):
+            x, y, z = placed(pose, points_obj[row, 0, i], points_obj[row, 1, i], points_obj[row, 2, i])
+            inverse = inverse_depth(z)
+            ax, ay, az = turned(pose, tangents_obj[row, 0, i], tangents_obj[row, 1, i], tangents_obj[row, 2, i])
+            nu, nv, length = normal_of(ax - x * inverse * az, ay - y * inverse * az, inverse, of_lens)
+            if mask[row, i] and length > settings.least_px_per_m and z > settings.least_depth_m:
+                u, v = x * inverse * of_lens[0] + of_lens[2], y * inverse * of_lens[1] + of_lens[3]
+                beside = _at(image, u + beside_px * nu, v + beside_px * nv, border_px) + _at(image, u - beside_px * nu, v - beside_px * nv, border_px)
+                total += _at(image, u, v, border_px) - 0.5 * beside
+                count += 1
+        marks[n] = total / max(count, 1)
+
+
+@kernel()
+def _at(image: Array, u: float, v: float, border_px: int) -> float:
+    """What an image with its border has at a pixel: :func:`torchtrack.event_image.look_up`."""
+    column, row = np.rint(u) + border_px, np.rint(v) + border_px
+    # What is not a number is looked up at the first pixel.
+    column = min(max(column, 0.0), image.shape[1] - 1.0) if column == column else 0.0
+    row = min(max(row, 0.0), image.shape[0] - 1.0) if row == row else 0.0
+    return image[int(row), int(column)]
 
 
 @kernel(fastmath=FAST)
