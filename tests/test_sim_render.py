@@ -269,25 +269,7 @@ def test_without_numba_the_error_names_the_extra(monkeypatch):
     for name in ("rasterizer", "shading", "raster_drawer"):
         monkeypatch.delitem(sys.modules, f"torchtrack.sim.{name}", raising=False)
         monkeypatch.delattr(torchtrack.sim, name, raising=False)
+    monkeypatch.delitem(sys.modules, "torchtrack.kernels.compiler", raising=False)
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'torchtrack\[sim\]'"):
         Renderer([square()], CAMERA, plain_background(64, 48, 0.1))
-
-
-def test_kernels_compile_where_nothing_can_be_cached(monkeypatch):
-    from torchtrack.sim import rasterizer
-
-    compile_function = rasterizer.numba.njit
-
-    def njit(function, cache=False, **options):
-        if cache:
-            raise RuntimeError("cannot cache function: no locator available")
-        return compile_function(function, **options)
-
-    monkeypatch.setattr(rasterizer.numba, "njit", njit)
-
-    @rasterizer.kernel()
-    def double(value):
-        return 2 * value
-
-    assert double(21) == 42

@@ -1,7 +1,5 @@
 """Matching one object's observations with its contours: :func:`torchtrack.matching.match_nearest`, and what its matches come to weigh."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from torchtrack.kernels.compiler import FAST, Array, kernel
@@ -22,32 +20,6 @@ ROWS = 15
 _ON, _NEAR, _VOTES = range(3)
 
 
-class Index(NamedTuple):
-    """The index of one object's contour points: the nearest of every cell, the first cell (column, row), and the layout."""
-
-    nearest_of_cell: Array
-    first: Array
-    cells: Cells
-
-
-class Moving(NamedTuple):
-    """One object: its pose, camera, motion, and how that changes by an acceleration, as :mod:`torchtrack.kernels.motion` has them."""
-
-    pose: Numbers
-    lens: Numbers
-    motion: Numbers
-    change: Numbers
-
-
-class Matched(NamedTuple):
-    """The matches of one object: contour points, which are near one or matched with it, ``[n]``, and what else is told, ``[ROWS, n]``."""
-
-    contour: Array
-    is_near: Array
-    is_matched: Array
-    rows: Array
-
-
 @kernel()
 def _agreeing(agreement: float, settings: MatchingSettings) -> float:
     """Trust by how far a polarity is what it should be."""
@@ -66,13 +38,21 @@ def match(
     exists: Array,
     place: Array,
     table: Array,
-    index: Index,
-    moving: Moving,
+    nearest_of_cell: Array,
+    first: Array,
+    cells: Cells,
+    pose: Numbers,
+    motion: Numbers,
+    change: Numbers,
+    intrinsics: Numbers,
     gate_px: float,
     wider: float,
     finely: bool,
     settings: MatchingSettings,
-    matched: Matched,
+    contour: Array,
+    is_near: Array,
+    is_matched: Array,
+    matches: Array,
     votes: Array,
 ) -> None:
     """Match each observation with the contour point that is nearest to its place; ``place`` is moved on.
@@ -80,8 +60,9 @@ def match(
     Args:
         seen: ``[6, n]``, and which of them exist.
         place: ``[n, 2]``.
-        table: ``[m, COLUMNS]``, with the ``index`` of its points.
-        matched: filled; weights are those of ``match_nearest``.
+        table: ``[m, COLUMNS]``.
+        pose, intrinsics: of the object, from :mod:`torchtrack.kernels.motion`; so are its ``motion``, and its ``change`` by an acceleration.
+        contour, is_near, is_matched, matches: filled; ``[n]``, and ``[ROWS, n]``. Weights are those of ``match_nearest``.
         votes: room for ``[patches², 3]``.
     """
     votes[:] = 0.0
@@ -90,16 +71,16 @@ def match(
         found = -1
         if exists[i]:
             if finely:
-                found = nearest_of_four(index.nearest_of_cell, index.first, indexed, place[i, 0], place[i, 1], index.cells)
+                found = nearest_of_four(nearest_of_cell, first, indexed, place[i, 0], place[i, 1], cells)
             else:
-                found = nearest(index.nearest_of_cell, index.first, place[i, 0], place[i, 1], index.cells)
-        matched.contour[i], matched.is_near[i], matched.is_matched[i] = max(found, 0), found >= 0, False
+                found = nearest(nearest_of_cell, first, place[i, 0], place[i, 1], cells)
+        contour[i], is_near[i], is_matched[i] = max(found, 0), found >= 0, False
         if found < 0:
             for k in range(ROWS):
-                matched.rows[k, i] = 0.0
+                matches[k, i] = 0.0
         else:
-            _match_one(i, found, seen, place, table, moving, gate_px, wider, settings, matched, votes)
-    _weigh(matched.is_near, matched.rows, votes, settings)
+            is_matched[i] = _match_one(i, found, seen, place, table, pose, motion, change, intrinsics, gate_px, wider, settings, matches, votes)
+    _weigh(is_near, matches, votes, settings)
 
 
 @kernel(fastmath=FAST)
@@ -109,20 +90,23 @@ def _match_one(
     seen: Array,
     place: Array,
     table: Array,
-    moving: Moving,
+    pose: Numbers,
+    motion: Numbers,
+    change: Numbers,
+    intrinsics: Numbers,
     gate_px: float,
     wider: float,
     settings: MatchingSettings,
-    matched: Matched,
+    rows: Array,
     votes: Array,
-) -> None:
-    """Match one observation with the contour point that was found for it, and count it in its patch."""
-    rows, point_x, point_y, point_z = matched.rows, table[found, X], table[found, Y], table[found, Z]
-    x, y, z = placed(moving.pose, point_x, point_y, point_z)
+) -> bool:
+    """Match one observation with the contour point that was found for it, and count it in its patch; whether they match."""
+    point_x, point_y, point_z = table[found, X], table[found, Y], table[found, Z]
+    x, y, z = placed(pose, point_x, point_y, point_z)
     inverse = inverse_depth(z)
-    u, v = moving.lens[2] + x * inverse * moving.lens[0], moving.lens[3] + y * inverse * moving.lens[1]
-    speed_u, speed_v = across(moving.motion, x, y, z, inverse, moving.lens)
-    change_u, change_v = across(moving.change, x, y, z, inverse, moving.lens)
+    u, v = intrinsics[2] + x * inverse * intrinsics[0], intrinsics[3] + y * inverse * intrinsics[1]
+    speed_u, speed_v = across(motion, x, y, z, inverse, intrinsics)
+    change_u, change_v = across(change, x, y, z, inverse, intrinsics)
     nu, nv = table[found, NORMAL_U], table[found, NORMAL_V]
     crossing = nu * speed_u + nv * speed_v
     dark = seen[POLARITY, i] * crossing / (abs(crossing) + settings.slow_px_s)
@@ -138,7 +122,7 @@ def _match_one(
     rows[WEIGHT, i], rows[MATCH_AGE, i], rows[POINT_X, i], rows[POINT_Y, i], rows[POINT_Z, i] = as_expected, age, point_x, point_y, point_z
     rows[TARGET_U, i], rows[TARGET_V, i], rows[DIRECTION_U, i], rows[DIRECTION_V, i] = target_u, target_v, nu, nv
     rows[OFFSET, i], rows[IS_LIMB, i], rows[ERROR, i] = offset, table[found, LIMB], table[found, MISTAKEN]
-    rows[DARK, i], rows[AS_EXPECTED, i], matched.is_matched[i] = dark, as_expected, is_matched
+    rows[DARK, i], rows[AS_EXPECTED, i] = dark, as_expected
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     next_u, next_v = carried_u - (u - table[found, INDEXED_U]), carried_v - (v - table[found, INDEXED_V])
     place[i, 0], place[i, 1] = next_u if is_matched else place[i, 0], next_v if is_matched else place[i, 1]
@@ -148,6 +132,7 @@ def _match_one(
     votes[cell, _NEAR] += near
     votes[cell, _ON] += on
     votes[cell, _VOTES] += on * dark
+    return is_matched
 
 
 @kernel(fastmath=FAST)

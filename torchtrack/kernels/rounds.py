@@ -18,9 +18,6 @@ from torchtrack.kernels.matching import (
     TARGET_U,
     TARGET_V,
     WEIGHT,
-    Index,
-    Matched,
-    Moving,
     U,
     V,
     believe,
@@ -80,38 +77,40 @@ def align(
     votes, centre = np.empty((matching.patches**2, 3)), np.empty(3)
     for b in range(len(seen)):
         centre_of(T_cam_obj[b], centre_obj[b], centre)
-        motion, of_lens = drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre), lens(intrinsics[b])
-        index, matched = Index(nearest_of_cell[b], first[b], cells), Matched(contour[b], is_near[b], is_matched[b], matches[b])
-        _first_place(seen[b], motion, centre, of_lens, place)
+        moving, of_lens = drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre), lens(intrinsics[b])
+        _first_place(seen[b], moving, centre, of_lens, place)
         for r in range(len(gates_px)):
             centre_of(T_cam_obj[b], centre_obj[b], centre)
-            pose, motion = entries(T_cam_obj[b]), drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre)
+            moving = drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre)
             change = drift(rounds.compensated * (acceleration[b] + rate_hz[b] * offset[b, 6:12]), centre)
-            moving, wide = Moving(pose, of_lens, motion, change), wider[r, b]
-            match(seen[b], exists[b], place, table[b], index, moving, gates_px[r], wide, finely[b], matching, matched, votes)
-            believe(seen[b], matched.is_matched, matched.rows, matching)
-            scale_px = gates_px[r] * wide
-            used = _linearise(matches[b], moving, centre_obj[b], centre, rate_hz[b], scale_px, offset[b], rounds, rows, weights)
+            match(
+                seen[b], exists[b], place, table[b], nearest_of_cell[b], first[b], cells, entries(T_cam_obj[b]), moving, change, of_lens,
+                gates_px[r], wider[r, b], finely[b], matching, contour[b], is_near[b], is_matched[b], matches[b], votes,
+            )  # fmt: skip
+            believe(seen[b], is_matched[b], matches[b], matching)
+            pose, scale_px = entries(T_cam_obj[b]), gates_px[r] * wider[r, b]
+            used = _linearise(matches[b], pose, centre_obj[b], centre, rate_hz[b], of_lens, scale_px, offset[b], rounds, rows, weights)
             _normal_equations(rows, weights, used, information[b], offset[b], gradient[b], hessian[b])
             _move(T_cam_obj[b], centre_obj[b], centre, offset[b], _step(gradient[b], hessian[b], rounds))
 
 
 @kernel(fastmath=FAST)
-def _first_place(seen: Array, motion: Numbers, centre: Array, of_lens: Numbers, place: Array) -> None:
+def _first_place(seen: Array, moving: Numbers, centre: Array, intrinsics: Numbers, place: Array) -> None:
     """Where the first round looks for each observation: carried to the window's end at the depth of the object's centre."""
     for i in range(len(place)):
         u, v, age = seen[U, i], seen[V, i], seen[AGE, i]
-        speed_u, speed_v = at_depth(motion, centre[2], u, v, of_lens)
+        speed_u, speed_v = at_depth(moving, centre[2], u, v, intrinsics)
         place[i, 0], place[i, 1] = u + speed_u * age, v + speed_v * age
 
 
 @kernel(fastmath=FAST)
 def _linearise(
     matches: Array,
-    moving: Moving,
+    pose: Numbers,
     centre_obj: Array,
     centre: Array,
     rate_hz: Array,
+    intrinsics: Numbers,
     scale_px: float,
     offset: Array,
     rounds: RoundSettings,
@@ -119,19 +118,19 @@ def _linearise(
     weights: Array,
 ) -> int:
     """Fill rows of the Jacobian, with residuals, and weights of those that count; how many these are."""
-    used, swelling, (cx, cy, cz), (fx, fy, u0, v0) = 0, offset[UNKNOWNS - 1], (centre[0], centre[1], centre[2]), moving.lens
+    used, swelling, (cx, cy, cz) = 0, offset[UNKNOWNS - 1], (centre[0], centre[1], centre[2])
     for i in range(matches.shape[1]):
         weight = matches[WEIGHT, i]
         if not weight > 0:
             continue
         px, py, pz = matches[POINT_X, i] - centre_obj[0], matches[POINT_Y, i] - centre_obj[1], matches[POINT_Z, i] - centre_obj[2]
-        ax, ay, az = turned(moving.pose, px, py, pz)
+        ax, ay, az = turned(pose, px, py, pz)
         inverse = inverse_depth(az + cz)
         nu, nv, outward = matches[DIRECTION_U, i], matches[DIRECTION_V, i], matches[IS_LIMB, i]
-        gx, gy = nu * fx * inverse, nv * fy * inverse
+        gx, gy = nu * intrinsics[0] * inverse, nv * intrinsics[1] * inverse
         along = gx * (ax + cx) + gy * (ay + cy)
         gz = -along * inverse
-        there = (matches[TARGET_U, i] - u0) * nu + (matches[TARGET_V, i] - v0) * nv
+        there = (matches[TARGET_U, i] - intrinsics[2]) * nu + (matches[TARGET_V, i] - intrinsics[3]) * nv
         residual = along - there + outward * swelling
         relative = residual / scale_px
         robust = max(1.0 - relative * relative, 0.0)

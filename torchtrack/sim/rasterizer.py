@@ -9,30 +9,12 @@ Samples of a pixel lie beside one another in memory, sample ``s`` at ``offsets[s
 few cache lines, and a pixel's samples are tested in one go. Coordinates are float64 up to the pixel's centre, float32 from there.
 """
 
-import inspect
-from collections.abc import Callable
-from typing import Any
-
-import numba
 import numpy as np
 
-Array = np.ndarray
+from torchtrack.kernels.compiler import Array, kernel
 
 # A triangle is seen edge-on, or is a sliver, when its volume with the camera is below this share of its corners' distances.
 _SLIVER = 1e-13
-
-
-def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: compile with numba; the compiled code is kept on disk where there is a place for it."""
-
-    def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-        function = inspect.unwrap(function)  # a type checker's wrapper cannot be compiled
-        try:
-            return numba.njit(function, cache=True, error_model="numpy", **options)
-        except RuntimeError:  # numba found no folder that it may write to (a read-only installation)
-            return numba.njit(function, error_model="numpy", **options)
-
-    return compiled
 
 
 @kernel()

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchtrack.sim.rasterizer import Array, kernel
+from torchtrack.kernels.compiler import Array, kernel
 
 Triple = tuple[float, float, float]
 
