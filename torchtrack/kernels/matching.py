@@ -83,7 +83,8 @@ def match(
     _weigh(is_near, matches, votes, settings)
 
 
-@kernel(fastmath=FAST)
+# Called for each observation, with so many numbers, it takes a quarter longer.
+@kernel(fastmath=FAST, forceinline=True)
 def _match_one(
     i: int,
     found: int,
