@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from torchtrack.kernels.cholesky import factorise, solve
 from torchtrack.kernels.compiler import Array, kernel
 from torchtrack.kernels.motion import inverse_depth
 
@@ -13,52 +14,21 @@ _LEAST = 1e-30
 def invert(matrices: Array, inverses: Array) -> None:
     """Inverses of symmetric positive definite ``[b, k, k]``, taken with a unit diagonal; infinite on the diagonal where one is not."""
     size = matrices.shape[1]
-    scale, factor, column = np.empty(size), np.empty((size, size)), np.empty(size)
+    scale, scaled, factor, column = np.empty(size), np.empty((size, size)), np.empty((size, size)), np.empty(size)
     for b in range(len(matrices)):
         for j in range(size):
             scale[j] = 1.0 / np.sqrt(max(matrices[b, j, j], _LEAST))
-        if not _factorise(matrices[b], scale, factor):
-            inverses[b] = 0.0
-            for j in range(size):
-                inverses[b, j, j] = np.inf
-            continue
         for j in range(size):
-            _solve_unit(factor, j, column)
             for k in range(size):
-                inverses[b, k, j] = column[k] * scale[k] * scale[j]
-
-
-@kernel()
-def _factorise(matrix: Array, scale: Array, factor: Array) -> bool:
-    """Cholesky's lower factor of a scaled matrix; whether there is one."""
-    for j in range(len(scale)):
-        for k in range(j + 1):
-            total = matrix[j, k] * scale[j] * scale[k]
-            for m in range(k):
-                total -= factor[j, m] * factor[k, m]
-            if j > k:
-                factor[j, k] = total / factor[k, k]
-            elif total > 0:
-                factor[j, j] = np.sqrt(total)
-            else:
-                return False
-    return True
-
-
-@kernel()
-def _solve_unit(factor: Array, unit: int, column: Array) -> None:
-    """The column of the inverse that belongs to a unit vector."""
-    size = len(column)
-    for j in range(size):
-        total = 1.0 if j == unit else 0.0
-        for m in range(unit, j):
-            total -= factor[j, m] * column[m]
-        column[j] = total / factor[j, j] if j >= unit else 0.0
-    for j in range(size - 1, -1, -1):
-        total = column[j]
-        for m in range(j + 1, size):
-            total -= factor[m, j] * column[m]
-        column[j] = total / factor[j, j]
+                scaled[j, k] = matrices[b, j, k] * scale[j] * scale[k]
+        good = factorise(scaled, factor)
+        for j in range(size):
+            column[:] = 0.0
+            column[j] = 1.0
+            if good:
+                solve(factor, column)
+            for k in range(size):
+                inverses[b, k, j] = column[k] * scale[k] * scale[j] if good else (np.inf if k == j else 0.0)
 
 
 @kernel()

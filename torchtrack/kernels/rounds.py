@@ -5,6 +5,7 @@ One Gauss-Newton step a round, as :func:`torchtrack.pose_solver.solve_pose` take
 
 import numpy as np
 
+from torchtrack.kernels.cholesky import factorise, solve
 from torchtrack.kernels.compiler import FAST, Array, kernel
 from torchtrack.kernels.matching import (
     AGE,
@@ -175,33 +176,15 @@ def _normal_equations(rows: Array, weights: Array, used: int, information: Array
 @kernel()
 def _step(gradient: Array, hessian: Array, rounds: RoundSettings) -> Array:
     """The damped step to the optimum; none where the Hessian is not positive definite."""
-    factor, step = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
+    damped, factor, step = hessian.astype(np.float64), np.zeros((UNKNOWNS, UNKNOWNS)), -gradient.astype(np.float64)
     largest = 0.0
     for k in range(6):
-        largest = max(largest, hessian[k, k])
-    for j in range(UNKNOWNS):
-        for k in range(j + 1):
-            total = np.float64(hessian[j, k])
-            if j == k:
-                total += rounds.least_diagonal + rounds.least_share * largest + rounds.damping * hessian[j, j]
-            for m in range(k):
-                total -= factor[j, m] * factor[k, m]
-            if j > k:
-                factor[j, k] = total / factor[k, k]
-            elif total > 0:
-                factor[j, j] = np.sqrt(total)
-            else:
-                return np.zeros(UNKNOWNS)
-    for j in range(UNKNOWNS):
-        total = -np.float64(gradient[j])
-        for m in range(j):
-            total -= factor[j, m] * step[m]
-        step[j] = total / factor[j, j]
-    for j in range(UNKNOWNS - 1, -1, -1):
-        total = step[j]
-        for m in range(j + 1, UNKNOWNS):
-            total -= factor[m, j] * step[m]
-        step[j] = total / factor[j, j]
+        largest = max(largest, damped[k, k])
+    for k in range(UNKNOWNS):
+        damped[k, k] += rounds.least_diagonal + rounds.least_share * largest + rounds.damping * damped[k, k]
+    if not factorise(damped, factor):
+        return np.zeros(UNKNOWNS)
+    solve(factor, step)
     return step if is_finite(step) else np.zeros(UNKNOWNS)
 
 
