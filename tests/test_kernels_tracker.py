@@ -6,9 +6,10 @@ import pytest
 import torch
 from both_ways import ROUNDINGS
 from helpers import SMALL_CAMERA, box_model, pose
-from tracked_boxes import SCENES, WIDE_CAMERA, assert_same, follow, merged, moving_box, poses_of, started, windows
+from tracked_boxes import SCENES, WIDE_CAMERA, assert_same, follow, merged, moving_box, poses_of, started, tensors_of, windows
 
 from torchtrack import Tracker, fast_alignment
+from torchtrack.baselines import tracker_class
 from torchtrack.config.presets import preset
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import TrackerConfig
@@ -158,3 +159,16 @@ def test_a_stream_is_tracked_by_kernels(monkeypatch):
     tracker = Tracker([box_model()], SMALL_CAMERA)
     assert len(list(track([events], tracker, tracker.init(trajectory.T_cam_obj[:1], 0)))) == 2
     assert asked and all(asked)
+
+
+@pytest.mark.parametrize("name", ["default", "paper", "line"])
+def test_what_is_compiled_is_compiled_before_the_first_window(name, monkeypatch):
+    asked = []
+    monkeypatch.setattr(switch, "numba_is_installed", lambda: not asked.append(name))
+    tracker = tracker_class(name)([box_model(), box_model()], [SMALL_CAMERA] * 2, preset(name), [0, 1])
+    state = tracker.init(torch.stack([pose(), pose()]), 0)
+    before = [tensor.clone() for tensor in tensors_of(state)]
+    tracker.prepare(state)
+    assert bool(asked) == (name != "line")
+    for now, then in zip(tensors_of(state), before, strict=True):
+        assert torch.equal(now, then)

@@ -145,13 +145,17 @@ class Tracker(TrackedObjects):
         return *done, assumptions.wrong()
 
     def prepare(self, state: TrackerState) -> None:
-        """Compile what is compiled, before the first window: it takes a minute or more, and a live camera does not wait.
+        """Compile what is compiled, before the first window: graphs take a minute or more, kernels half of that, and a live camera does not wait.
 
         Args:
             state: from :meth:`init`.
         """
         if self.graphs is not None:
             self.graphs.prepare(state)
+        with torch.inference_mode(), switch.kernels(wanted=self.kernels):
+            if switch.apply_to(self.intrinsics):
+                # Kernels are compiled, or read from the disk, when they are first called: for a window without events.
+                self._advance(state, EventBatch.empty(), state.t_us + 1)
 
     def _steady(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult] | None:
         """A window by a compiled graph, where there is one and it holds."""

@@ -116,6 +116,9 @@ class EventLineTracker(Tracker):
         straight = {key: straight_edges_only(model) for key, model in distinct.items()}
         super().__init__([straight[id(model)] for model in objects], camera, config, stream_index, dtype, kernels=kernels)
 
+    def prepare(self, state: TrackerState) -> None:
+        """Nothing is to be compiled."""
+
     def _open(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None, velocity: Float[Tensor, "b 6"]) -> Window:
         """The window's times, and each object carried on with ``velocity``."""
         t_us = self._window_end(state, events, t_end_us)
