@@ -7,17 +7,15 @@ image. Objects that share a model are handled as one batch.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import readback
+from torchtrack import fast_contours, readback
 from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourKind, ContourModel
 from torchtrack.kernels import switch
-from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import SamplingSettings
 from torchtrack.lie import transform_points
 
@@ -29,11 +27,6 @@ _MAX_ACTIVE_EDGES = 8192
 _MIN_PX_PER_M = 1e-3
 # Texture seen at a grazing angle (cosine below this) is foreshortened beyond use. What fires and is left out draws what is beside it.
 _MIN_TEXTURE_COSINE = 0.02
-# What of a model its contour points are sampled from.
-_SAMPLED_FROM = (
-    *("edge_ends", "face_normals", "face_offsets", "is_crease", "is_segment", "edges"),
-    *("texture_points", "texture_tangents", "texture_normals"),
-)
 # Points and tangents (object frame), kinds and mask; where it was said which elements are shown, the element of each as well.
 _Points = tuple[Tensor, ...]
 
@@ -204,22 +197,11 @@ def image_normals(
 def reproject(contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
     """The same contour points seen from a pose nearby: normals are kept, which turn far less than points move."""
     if switch.apply_to(T_cam_obj):
-        points_cam, pixels = _projected_by_kernel(contours.points_obj, T_cam_obj, intrinsics)
+        points_cam, pixels = fast_contours.projected(contours.points_obj, T_cam_obj, intrinsics)
     else:
         points_cam = transform_points(T_cam_obj, contours.points_obj)
         pixels = project(points_cam, intrinsics)
     return replace(contours, points_cam=points_cam, pixels=pixels)
-
-
-def _projected_by_kernel(points_obj: Float[Tensor, "b m 3"], T_cam_obj: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Points in the camera's frame and their pixels, point by point."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.kernels.contours import project as by_kernel
-
-    points = points_obj.transpose(1, 2)
-    points_cam, pixels = points.new_empty(points.shape), points.new_empty(len(points), 2, points.shape[2])
-    by_kernel(*as_arrays(points, T_cam_obj, intrinsics, points_cam, pixels))
-    return points_cam.transpose(1, 2), pixels.transpose(1, 2)
 
 
 def joined(first: Contours, second: Contours) -> Contours:
@@ -258,7 +240,7 @@ def mesh_elements(
 def _mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
     """Contour points of all objects, in places of their own, before hidden parts are removed."""
     if shown is None and switch.apply_to(T_cam_obj):
-        return _mesh_points_by_kernel(models, T_cam_obj, intrinsics, config)
+        return fast_contours.mesh_points(models, T_cam_obj, intrinsics, sampling_settings(config))
     if len(models) == 1:
         return _model_contours(models[0], T_cam_obj, intrinsics, config, shown)
     parts = [
@@ -268,26 +250,6 @@ def _mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: 
     width = max(mask.shape[1] for _, _, _, mask, *_ in parts)
     order = torch.cat([model.members for model in models]).argsort()
     return tuple(torch.cat([_widened(value, width) for value in column])[order] for column in zip(*parts, strict=True))
-
-
-def _mesh_points_by_kernel(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> _Points:
-    """:func:`_mesh_points`, object by object."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.kernels import contours as kernels
-
-    batch, room = len(T_cam_obj), config.max_edge_points + max(len(model.texture_points) for model in models)
-    sampled = T_cam_obj.new_empty(batch, kernels.SAMPLED, room).numpy()
-    kind, counts = np.empty((batch, room), np.int64), np.zeros(batch, np.int64)
-    seen = as_arrays(T_cam_obj, intrinsics)
-    for model in models:
-        of_model = as_arrays(model.members, *(getattr(model, name) for name in _SAMPLED_FROM))
-        kernels.sample(*of_model, model.texture_spacing_m, *seen, sampling_settings(config), sampled, kind, counts)
-    # One place at least: what selects from contours needs one to point at.
-    width = max(int(counts.max()), 1)
-    points, tangents = T_cam_obj.new_empty(2, batch, 3, width)
-    kinds, mask = torch.empty(batch, width, dtype=torch.int64), torch.empty(batch, width, dtype=torch.bool)
-    kernels.gather(sampled, kind, counts, *as_arrays(points, tangents, kinds, mask))
-    return points.transpose(1, 2), tangents.transpose(1, 2), kinds, mask
 
 
 def sampling_settings(config: ContourConfig | None = None) -> SamplingSettings:
@@ -321,21 +283,10 @@ def assemble(
 ) -> Contours:
     """Contours from points in the object's frame; those behind the camera or without a normal are masked."""
     if switch.apply_to(points_obj):
-        return _assemble_by_kernel(points_obj, tangents_obj, kind, mask, T_cam_obj, intrinsics)
+        shown, *seen = fast_contours.shown(points_obj, tangents_obj, mask, T_cam_obj, intrinsics, sampling_settings())
+        return Contours(points_obj, tangents_obj, kind, shown, *seen)
     points_cam = transform_points(T_cam_obj, points_obj)
     tangents_cam = torch.bmm(T_cam_obj[:, :3, :3], tangents_obj.transpose(1, 2)).transpose(1, 2)
     normals, has_normal = image_normals(points_cam, tangents_cam, intrinsics)
     mask = mask & has_normal & (points_cam[..., 2] > MIN_DEPTH_M)
     return Contours(points_obj, tangents_obj, kind, mask, points_cam, project(points_cam, intrinsics), normals)
-
-
-def _assemble_by_kernel(points_obj: Tensor, tangents_obj: Tensor, kind: Tensor, mask: Tensor, T_cam_obj: Tensor, intrinsics: Tensor) -> Contours:
-    """:func:`assemble`, point by point."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.kernels.contours import show
-
-    points, tangents = points_obj.transpose(1, 2), tangents_obj.transpose(1, 2)
-    points_cam, pixels, normals, shown = points.new_empty(points.shape), *points.new_empty(2, len(mask), 2, mask.shape[1]), torch.empty_like(mask)
-    given = as_arrays(points, tangents, mask, T_cam_obj, intrinsics)
-    show(*given, sampling_settings(), *as_arrays(points_cam, pixels, normals, shown))
-    return Contours(points_obj, tangents_obj, kind, shown, *(value.transpose(1, 2) for value in (points_cam, pixels, normals)))

@@ -9,8 +9,8 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import RoundSettings
-from torchtrack.matching import ContourTable, Matches, matching_settings
+from torchtrack.kernels.settings import MatchingSettings, RoundSettings
+from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SLOW_PX_S, SMEAR_PX, ContourTable, Matches
 from torchtrack.observations import Observations
 from torchtrack.pose_problem import Linearisation
 from torchtrack.pose_solver import rounding_floor
@@ -61,11 +61,36 @@ def align_rounds(
         table.index.cells,
         *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, objects.intrinsics, objects.centre_obj),
         *as_arrays(torch.tensor(config.matching.gates_px, dtype=offset.dtype), torch.stack(list(wider)), finely),
-        matching_settings(config),
+        _matching_settings(config),
         RoundSettings(config.matching.motion_compensation, config.solver.velocity_in_window, config.solver.damping, *rounding_floor()),
         *as_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
     )
     return Linearisation(T_cam_obj, gradient, hessian, offset), _matches(contour, is_near, is_matched, matches)
+
+
+def _matching_settings(config: TrackerConfig) -> MatchingSettings:
+    """What a kernel goes by that matches as :func:`torchtrack.matching.match_nearest` does."""
+    matching = config.matching
+    return MatchingSettings(
+        burst_px=matching.burst_px,
+        dark_shift_px=matching.dark_shift_px,
+        limb_dark_shift_px=matching.limb_dark_shift_px,
+        polarity_gain=matching.polarity_gain,
+        least_agreement=matching.least_agreement,
+        smeared_share=matching.smeared_share,
+        gathered_share=matching.gathered_share,
+        least_trust=matching.least_trust,
+        concentration=matching.concentration,
+        polarity=matching.polarity,
+        slow_px_s=SLOW_PX_S,
+        on_contour_px=ON_CONTOUR_PX,
+        smear_px=SMEAR_PX,
+        patch_bits=PATCH_BITS,
+        patches=PATCHES,
+        min_observations=config.quality.min_observations,
+        common_px2=config.solver.common_px**2,
+        observation_px=config.solver.observation_px,
+    )
 
 
 def _seen(observations: Observations) -> Float[Tensor, "b 6 n"]:

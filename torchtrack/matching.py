@@ -13,7 +13,7 @@ from torch.linalg import vecdot
 
 from torchtrack.bursts import without_tail
 from torchtrack.common_error import APART_PX, ASIDE_PX, PARALLEL, mistaken_px2
-from torchtrack.config.tracker import MatchingConfig, TrackerConfig
+from torchtrack.config.tracker import MatchingConfig
 from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contour_model import ContourKind
@@ -21,14 +21,14 @@ from torchtrack.contours import Contours, take_points
 from torchtrack.image_motion import MovingObjects
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import MatchingSettings, TableSettings
+from torchtrack.kernels.settings import TableSettings
 from torchtrack.observations import Observations
 from torchtrack.polarity_memory import octant
 
 # An edge this parallel to the flow (|n·f| below) is not crossed by it.
 _MIN_CROSSING = 0.3
 # Contours slower than this across themselves (px/s) have no clear leading side.
-_SLOW_PX_S = 10.0
+SLOW_PX_S = 10.0
 # Concentration: side of a patch (16 px, as a power of two), patches a side of the image, and offsets that are near and on a contour (px).
 PATCH_BITS, PATCHES, SMEAR_PX, ON_CONTOUR_PX = 4, 64, 3.0, 0.8
 # Mutual agreement: side of a bit of contour (8 px, as a power of two), and how many others there make its mean count in full.
@@ -174,34 +174,9 @@ def match_nearest(
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)
 
 
-def matching_settings(config: TrackerConfig) -> MatchingSettings:
-    """What a kernel goes by that matches as :func:`match_nearest` does."""
-    matching = config.matching
-    return MatchingSettings(
-        burst_px=matching.burst_px,
-        dark_shift_px=matching.dark_shift_px,
-        limb_dark_shift_px=matching.limb_dark_shift_px,
-        polarity_gain=matching.polarity_gain,
-        least_agreement=matching.least_agreement,
-        smeared_share=matching.smeared_share,
-        gathered_share=matching.gathered_share,
-        least_trust=matching.least_trust,
-        concentration=matching.concentration,
-        polarity=matching.polarity,
-        slow_px_s=_SLOW_PX_S,
-        on_contour_px=ON_CONTOUR_PX,
-        smear_px=SMEAR_PX,
-        patch_bits=PATCH_BITS,
-        patches=PATCHES,
-        min_observations=config.quality.min_observations,
-        common_px2=config.solver.common_px**2,
-        observation_px=config.solver.observation_px,
-    )
-
-
 def _leading(speed_px_s: Tensor) -> Tensor:
     """Whether a contour moves along its normal or against it: 1 or -1, and less where it is slow."""
-    return speed_px_s / (speed_px_s.abs() + constant((_SLOW_PX_S,), speed_px_s.dtype, speed_px_s.device))
+    return speed_px_s / (speed_px_s.abs() + constant((SLOW_PX_S,), speed_px_s.dtype, speed_px_s.device))
 
 
 def _dark_shift_px(limb: Tensor, config: MatchingConfig) -> Tensor:
