@@ -13,6 +13,7 @@ from torchtrack.baselines import tracker_class
 from torchtrack.config.presets import preset
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.errors import EventDataError
 from torchtrack.kernels import switch
 from torchtrack.runner import run
 from torchtrack.stepping import track
@@ -172,3 +173,14 @@ def test_what_is_compiled_is_compiled_before_the_first_window(name, monkeypatch)
     assert bool(asked) == (name != "line")
     for now, then in zip(tensors_of(state), before, strict=True):
         assert torch.equal(now, then)
+
+
+@pytest.mark.parametrize(("x", "y"), [(SMALL_CAMERA.width, 3), (-1, 3), (3, SMALL_CAMERA.height), (3, -2)])
+def test_events_outside_the_sensor_are_told_before_anything_is_written(x, y):
+    tracker, state, _, (events, end_us), _ = started(torch.float64)
+    spoilt = replace(events, x=events.x.clone(), y=events.y.clone())
+    spoilt.x[7], spoilt.y[7] = x, y
+    before = [tensor.clone() for tensor in tensors_of(state)]
+    with torch.inference_mode(), pytest.raises(EventDataError, match=rf"event 7 is at \({x}, {y}\), outside the sensor of 200x150 pixels"):
+        tracker.step(state, spoilt, end_us)
+    assert all(torch.equal(now, then) for now, then in zip(tensors_of(state), before, strict=True))

@@ -134,13 +134,22 @@ def check_events(events: EventBatch, width: int, height: int, source: str = "eve
         at = int(torch.nonzero(steps < 0)[0])
         before, after = events.t_us[at : at + 2].tolist()
         raise EventDataError(f"{source}: time goes back from {before} to {after} µs at event {first_index + at + 1}. Sort the events by time.")
+    check_on_sensor(events, width, height, source, first_index)
+
+
+def check_on_sensor(events: EventBatch, width: int, height: int, source: str = "events", first_index: int = 0) -> None:
+    """Raise :class:`EventDataError` unless the events are inside the sensor; of several, inside the largest."""
+    if len(events) == 0:
+        return
+    (least_x, most_x), (least_y, most_y) = (torch.aminmax(values) for values in (events.x, events.y))
+    if int(least_x) >= 0 and int(most_x) < width and int(least_y) >= 0 and int(most_y) < height:
+        return
     outside = (events.x < 0) | (events.x >= width) | (events.y < 0) | (events.y >= height)
-    if bool(outside.any()):
-        at = int(torch.nonzero(outside)[0])
-        raise EventDataError(
-            f"{source}: event {first_index + at} is at ({int(events.x[at])}, {int(events.y[at])}), outside the sensor of {width}x{height} pixels "
-            f"({int(outside.sum())} such events). Check the sensor size, or whether x and y are swapped."
-        )
+    at = int(torch.nonzero(outside)[0])
+    raise EventDataError(
+        f"{source}: event {first_index + at} is at ({int(events.x[at])}, {int(events.y[at])}), outside the sensor of {width}x{height} pixels "
+        f"({int(outside.sum())} such events). Check the sensor size, or whether x and y are swapped."
+    )
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.doubt import Doubt, gathered_when_known, is_adrift, is_due, is_wanted
-from torchtrack.events import EventBatch, pad_streams
+from torchtrack.events import EventBatch, check_on_sensor, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.kernels import switch
 from torchtrack.learned_contours import LearnedContours
@@ -114,6 +114,9 @@ class Tracker(TrackedObjects):
             state: from :meth:`init` or the last step.
             events: of all streams, after ``state.t_us`` and up to ``t_end_us``.
             t_end_us: end of the window; the newest event of each stream when not given.
+
+        Raises:
+            EventDataError: if an event is outside the sensor, where kernels are used.
         """
         t_us = self._window_end(state, events, t_end_us)
         with torch.autocast(t_us.device.type, enabled=False), switch.kernels(wanted=self.kernels):
@@ -218,6 +221,9 @@ class Tracker(TrackedObjects):
             learns: whether anything may be learned from the window.
         """
         config, sensors, last_event_us = self.config, self.sensors, state.last_event_us
+        if switch.apply_to(t_us):
+            # Unlike PyTorch's operations, kernels do not look where they read and write.
+            check_on_sensor(events.events, self.image_size[1], self.image_size[0])
         window_s = self._window_s(state, t_us)
         dt_s = window_s[self.stream_index]
         recorded = self._predict(self._held_back(state, events.events, t_us, dt_s, questions), dt_s)
