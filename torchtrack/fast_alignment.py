@@ -51,8 +51,9 @@ def align_rounds(
     from torchtrack.kernels import rounds
 
     objects, (batch, count) = prediction.objects, observations.mask.shape
-    T_cam_obj, offset = T_cam_obj.clone(memory_format=torch.contiguous_format), offset.clone()
-    gradient, hessian = torch.empty_like(offset), torch.empty_like(information)
+    # What the kernel writes to lies row by row in memory: of anything else it would be given a copy.
+    T_cam_obj, offset = (value.clone(memory_format=torch.contiguous_format) for value in (T_cam_obj, offset))
+    gradient, hessian = offset.new_empty(offset.shape), offset.new_empty(information.shape)
     contour = torch.empty(batch, count, dtype=torch.int64)
     is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool)
     matches = torch.empty(batch, rows.ROWS, count, dtype=offset.dtype)
