@@ -15,7 +15,7 @@ from torchtrack.config.tracker import ContourConfig, MotionConfig, QualityConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contour_model import ContourKind, group_by_model
 from torchtrack.contours import assemble, mesh_contours, reproject
-from torchtrack.events import concatenate, pad_streams
+from torchtrack.events import EventBatch, concatenate, pad_streams
 from torchtrack.hypotheses import mark
 from torchtrack.image_motion import MovingObjects
 from torchtrack.matching import ContourTable, Matches
@@ -286,3 +286,11 @@ def test_marks_of_poses(each, dtype):
     by_kernels, plain = both_ways(lambda: mark(prediction, outlines, offsets, image))
     known = torch.arange(40) != 3
     torch.testing.assert_close(by_kernels[known], plain[known], rtol=1e-4, atol=1e-9 if dtype == torch.float64 else 0.03)
+
+
+@pytest.mark.parametrize("objects", [1, 3])
+def test_of_no_events_none_are_near(objects):
+    tiles = SensorTiles(undistortion_table(SMALL_CAMERA))
+    near = torch.ones(objects, len(tiles.middle), dtype=torch.bool)
+    for found in both_ways(lambda: tiles.keep(EventBatch.empty(), near)):
+        assert len(found.events) == 0 and found.of_each is None

@@ -162,12 +162,13 @@ def test_a_stream_is_tracked_by_kernels(monkeypatch):
     assert asked and all(asked)
 
 
+@pytest.mark.parametrize("streams", [[0, 1], [0, 0], [0]])
 @pytest.mark.parametrize("name", ["default", "paper", "line"])
-def test_what_is_compiled_is_compiled_before_the_first_window(name, monkeypatch):
+def test_what_is_compiled_is_compiled_before_the_first_window(name, streams, monkeypatch):
     asked = []
     monkeypatch.setattr(switch, "numba_is_installed", lambda: not asked.append(name))
-    tracker = tracker_class(name)([box_model(), box_model()], [SMALL_CAMERA] * 2, preset(name), [0, 1])
-    state = tracker.init(torch.stack([pose(), pose()]), 0)
+    tracker = tracker_class(name)([box_model()] * len(streams), [SMALL_CAMERA] * (max(streams) + 1), preset(name), streams)
+    state = tracker.init(torch.stack([pose()] * len(streams)), 0)
     before = [tensor.clone() for tensor in tensors_of(state)]
     tracker.prepare(state)
     assert bool(asked) == (name != "line")

@@ -123,7 +123,8 @@ class SensorTiles(nn.Module):
         from torchtrack.kernels.events import keep
 
         objects = len(near) if len(near) > 1 else 0
-        kept, own, counts = np.empty(len(events), np.int64), np.zeros((objects, len(events)), np.int64), np.empty(objects, np.int64)
+        kept, counts = np.empty(len(events), np.int64), np.empty(objects, np.int64)
+        own = np.zeros((objects, max(len(events), 1)), np.int64)
         count = keep(*as_arrays(events.x, events.y, near), _TILE_BITS, self.columns, kept, own, counts)
         return kept[:count], _padded(own, counts) if objects else None
 
