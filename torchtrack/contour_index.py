@@ -18,6 +18,7 @@ from torchtrack import readback
 from torchtrack.constants import constant, disc
 from torchtrack.contours import Contours, take_points
 from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import Cells, IndexSettings
 
 # Squared distances are compared in these fractions of a pixel².
@@ -148,10 +149,10 @@ def _by_kernel(contours: Contours, image_size: tuple[int, int], answer: readback
     # Not at the top: Numba is an extra.
     from torchtrack.kernels import index as kernels
 
-    radius, margin = answer.on_device.numpy(), _reach(max([0, *answer.numbers()]), cell_px) + 2
+    margin = _reach(max([0, *answer.numbers()]), cell_px) + 2
     middle = 0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)
     settings = IndexSettings(*middle, float(cell_px), margin, _DISTANCE_STEPS, _HALF_DIAGONAL, _FAR_CELLS)
-    pixels, mask = contours.pixels.contiguous().numpy(), contours.mask.contiguous().numpy()
+    pixels, mask, radius = as_arrays(contours.pixels, contours.mask, answer.on_device)
     first, is_inside = contours.pixels.new_empty(len(pixels), 2), np.empty_like(mask)
     rows, columns = kernels.extents(pixels, mask, radius, settings, is_inside, first.numpy())
     # Narrow numbers: half as much of the memory that a processor has near.

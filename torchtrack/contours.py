@@ -27,6 +27,8 @@ _MAX_ACTIVE_EDGES = 8192
 _MIN_PX_PER_M = 1e-3
 # Texture seen at a grazing angle (cosine below this) is foreshortened beyond use. What fires and is left out draws what is beside it.
 _MIN_TEXTURE_COSINE = 0.02
+# To show what was sampled takes no setting: made once, as making them takes longer than a kernel does.
+_TO_SHOW = ContourConfig()
 # Points and tangents (object frame), kinds and mask; where it was said which elements are shown, the element of each as well.
 _Points = tuple[Tensor, ...]
 
@@ -252,9 +254,8 @@ def _mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: 
     return tuple(torch.cat([_widened(value, width) for value in column])[order] for column in zip(*parts, strict=True))
 
 
-def sampling_settings(config: ContourConfig | None = None) -> SamplingSettings:
+def sampling_settings(config: ContourConfig = _TO_SHOW) -> SamplingSettings:
     """What a kernel goes by that samples as :func:`mesh_contours` does, or only shows what was sampled."""
-    config = config or ContourConfig()
     return SamplingSettings(
         occluding=config.occluding,
         most_edges=_MAX_ACTIVE_EDGES,
