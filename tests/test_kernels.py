@@ -11,7 +11,7 @@ from test_visibility import ball, l_prism
 
 from torchtrack.bursts import LONG_AGO_US, update_bursts
 from torchtrack.camera import undistortion_table
-from torchtrack.config.tracker import ContourConfig, MotionConfig, QualityConfig
+from torchtrack.config.tracker import ContourConfig, QualityConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contour_model import ContourKind, group_by_model
 from torchtrack.contours import assemble, mesh_contours, reproject
@@ -19,7 +19,6 @@ from torchtrack.events import EventBatch, concatenate, pad_streams
 from torchtrack.hypotheses import mark
 from torchtrack.image_motion import MovingObjects
 from torchtrack.matching import ContourTable, Matches
-from torchtrack.motion import inverse, predict_covariance
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import WindowEvents, select_events
@@ -224,31 +223,6 @@ def test_what_is_remembered_of_sides():
     weights = torch.where(matches.near, matches.weights, 0)
     window_s = torch.full((3,), 5e-3).double()
     assert_as_close(*both_ways(lambda: remembered(before, matches.directions, matches.dark, weights, window_s, 0.05)))
-
-
-def random_covariances(batch=4):
-    root = torch.randn(batch, 12, 12, generator=generator(3), dtype=torch.float64) * torch.logspace(-4, 1, 12, dtype=torch.float64)[:, None]
-    return root @ root.mT + 1e-12 * torch.eye(12).double()
-
-
-def test_inverses_and_of_what_has_none_infinity():
-    covariance = random_covariances()
-    covariance[1, 3, 3] = -1.0
-    by_kernels, plain = both_ways(lambda: inverse(covariance))
-    scale = covariance.diagonal(dim1=1, dim2=2).abs().sqrt()
-    relative = by_kernels * scale[:, None] * scale[..., None], plain * scale[:, None] * scale[..., None]
-    assert torch.isinf(by_kernels[1].diagonal()).all()
-    for number in (0, 2, 3):
-        torch.testing.assert_close(relative[0][number], relative[1][number], rtol=1e-6, atol=1e-6)
-
-
-def test_predicted_covariances_and_those_that_are_lost():
-    covariance, dt_s = random_covariances(), torch.tensor([5e-3, 1e-2, 5e-3, 0.1])
-    covariance[2] *= 1e6
-    velocity, diameter_m = random_twist(4, rotation_rad=3.0, translation_m=1.0).float(), torch.tensor([0.1, 0.2, 0.3, 0.05])
-    by_kernels, plain = both_ways(lambda: predict_covariance(covariance, velocity, dt_s, diameter_m, MotionConfig()))
-    assert_as_close(by_kernels, plain, tolerance=1e-12)
-    assert torch.equal(by_kernels[2], covariance[2])
 
 
 # ---- every object for itself

@@ -24,7 +24,7 @@ from torchtrack.readback import Answer
 # The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).
 _INDEX_MARGIN_PX = 2
 # What has to be looked for with a gate this many times wider may be anywhere.
-_ANYWHERE = 2.0
+ANYWHERE = 2.0
 # Standard deviation of a swelling that is switched off (px).
 _NO_SWELLING_PX = 1e-3
 
@@ -53,7 +53,7 @@ def gate_widening(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[
 
 def may_be_anywhere(widening: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
     """Objects of whose place hardly anything was known, by the widening of their first gates."""
-    return widening >= _ANYWHERE
+    return widening >= ANYWHERE
 
 
 def index_radius(widening: Float[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:

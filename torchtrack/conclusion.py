@@ -7,13 +7,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import lie, quality
-from torchtrack.alignment import may_be_anywhere
+from torchtrack.alignment import ANYWHERE, may_be_anywhere
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import reproject
 from torchtrack.corners import Corners
-from torchtrack.doubt import in_doubt
+from torchtrack.doubt import SMEARED, in_doubt
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
+from torchtrack.kernels.settings import ConclusionSettings
 from torchtrack.matching import ON_CONTOUR_PX
-from torchtrack.motion import fade, found_acceleration, inverse, left_covariance, with_dropped
+from torchtrack.motion import Acceleration, fade, found_acceleration, inverse, left_covariance, with_dropped
 from torchtrack.polarity_memory import is_seen_well, remembered
 from torchtrack.prediction import Prediction
 from torchtrack.search import Found
@@ -43,6 +46,8 @@ def conclude(
         widening: of each object's first gate.
         dt_s: length of the window.
     """
+    if config.solver.prior and prediction.acceleration is not None and switch.apply_to(dt_s):
+        return _by_kernel(state, prediction, prediction.acceleration, widening, found, corners, dt_s, config)
     objects, contours, share = prediction.objects, found.fit.contours, found.share
     solution = found.fit.solution
     in_view = quality.visible_share(contours, objects.image_size)
@@ -86,6 +91,78 @@ def conclude(
         darker_outside=_darker_outside(state, found, status, dt_s, config),
     )
     return next_state, result
+
+
+def _by_kernel(
+    state: TrackerState,
+    prediction: Prediction,
+    expected: Acceleration,
+    widening: Float[Tensor, "b"],
+    found: Found,
+    corners: Corners,
+    dt_s: Float[Tensor, "b"],
+    config: TrackerConfig,
+) -> tuple[TrackerState, StepResult]:
+    """:func:`conclude`, object by object; ``expected`` is the prediction's acceleration."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels import conclusion as kernels
+
+    objects, fit, solution = prediction.objects, found.fit, found.fit.solution
+    in_view = quality.visible_share(fit.contours, objects.image_size)
+    told = torch.stack([found.share, found.score, found.gathered, found.full_gathered, in_view, widening])
+    remembers = torch.stack([state.usual_score, state.full_share, state.full_gathered, state.doubted_s, state.unseen_s])
+    T_last_seen, batch = state.T_last_seen.clone(memory_format=torch.contiguous_format), len(dt_s)
+    T_cam_obj, covariance, left = (T_last_seen.new_empty(batch, size, size) for size in (4, 12, 6))
+    velocity, acceleration = dt_s.new_empty(2, batch, 6)
+    status = found.count.new_empty(batch)
+    kernels.conclude(
+        *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance, prediction.information),
+        *as_arrays(expected.expected, expected.variance, solution.T_cam_obj, solution.from_prior, solution.hessian),
+        *as_arrays(found.elsewhere, found.count, told, dt_s, objects.centre_obj, objects.diameter_m),
+        _settings(config),
+        *as_arrays(remembers, T_last_seen, T_cam_obj, velocity, acceleration, covariance, left, status),
+    )
+    contours = reproject(fit.contours, T_cam_obj.to(velocity.dtype), objects.intrinsics)
+    usual_score, full_share, full_gathered, doubted_s, unseen_s = remembers.unbind()
+    next_state = replace(
+        state,
+        T_cam_obj=T_cam_obj,
+        velocity=velocity,
+        acceleration=acceleration,
+        covariance=covariance,
+        score=found.score,
+        usual_score=usual_score,
+        full_share=full_share,
+        full_gathered=full_gathered,
+        doubted_s=doubted_s,
+        T_last_seen=T_last_seen,
+        unseen_s=unseen_s,
+        darker_outside=_darker_outside(state, found, status, dt_s, config),
+    )
+    return next_state, StepResult(state.t_us, T_cam_obj, left, status, found.share, contours, corners, found.count)
+
+
+def _settings(config: TrackerConfig) -> ConclusionSettings:
+    """What a kernel goes by that concludes as :func:`conclude` does."""
+    return ConclusionSettings(
+        holds=config.motion.without_events == "hold",
+        anywhere=ANYWHERE,
+        uncertain_below=config.quality.uncertain_below,
+        lost_below=config.quality.lost_below,
+        caught_above=config.quality.caught_above,
+        certain_at=config.quality.certain_at,
+        min_observations=config.quality.min_observations,
+        min_visible_share=config.quality.min_visible_share,
+        max_step_rotation_rad=config.quality.max_step_rotation_rad,
+        max_step_translation=config.quality.max_step_translation,
+        observation_px=config.solver.observation_px,
+        coast_s=config.motion.coast_s,
+        doubted_below=config.search.doubted_below,
+        smeared=SMEARED,
+        usual_gain=_USUAL_GAIN,
+        fall_gain=_FALL_GAIN,
+        certain_share=_CERTAIN,
+    )
 
 
 def _darker_outside(

@@ -20,7 +20,7 @@ _LONGEST_S, _LONGEST_TURN_S = 0.4, 1.0
 # An object is new while what it explains when seen well, which rises with every window, is below this share of what it explains.
 _NEW = 0.9
 # Events that gather less than this share of how far they do when an object is seen well are smeared.
-_SMEARED = 0.8
+SMEARED = 0.8
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def in_doubt(
 
     Where less is explained but events gather as ever, an object is right, and partly hidden.
     """
-    return (gathered < _SMEARED * full_gathered) & (score < config.doubted_below * full_share)
+    return (gathered < SMEARED * full_gathered) & (score < config.doubted_below * full_share)
 
 
 def gathered_when_known(doubt: Doubt, full_gathered: Float[Tensor, "b"], config: SearchConfig) -> Float[Tensor, "b"]:

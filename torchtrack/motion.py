@@ -19,9 +19,9 @@ from torchtrack.kernels.arrays import as_arrays
 from torchtrack.lie import hat
 
 # A prediction is not let grow less certain than this (rad, and diameters).
-_MOST_UNCERTAIN = 0.5
+MOST_UNCERTAIN = 0.5
 # How sharply accelerations that count are told from those that do not.
-_STEEPNESS = 4
+STEEPNESS = 4
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def acceleration_counts(
         px_per_m: how far objects move in the image when they move by a metre across it.
     """
     way_px = 0.5 * sigma[:, 3:4] * (dt_s.square() * px_per_m)[:, None]
-    return (1 + (config.acceleration_px / way_px.clamp(min=1e-6)) ** _STEEPNESS).reciprocal()
+    return (1 + (config.acceleration_px / way_px.clamp(min=1e-6)) ** STEEPNESS).reciprocal()
 
 
 def carried_on(acceleration: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 6"]:
@@ -150,8 +150,6 @@ def predict_covariance(
     How much acceleration is to be expected grows with the speed: slow objects are held still, fast ones are free to turn.
     """
     dt_s, diameter_m, velocity = dt_s.double()[:, None], diameter_m.double()[:, None], velocity.double()
-    if switch.apply_to(covariance):
-        return _predicted_by_kernel(covariance, acceleration_sigma(velocity, diameter_m, config), dt_s, diameter_m)
     # [[1, dt], [0, 1]] P [[1, 0], [dt, 1]], by blocks.
     carried = torch.cat([torch.addcmul(covariance[:, :6], dt_s[..., None], covariance[:, 6:]), covariance[:, 6:]], 1)
     carried = torch.cat([torch.addcmul(carried[..., :6], dt_s[..., None], carried[..., 6:]), carried[..., 6:]], 2)
@@ -160,18 +158,8 @@ def predict_covariance(
     push = torch.cat([0.5 * dt_s.square() * acceleration, dt_s * acceleration], -1).view(-1, 2, 6)
     predicted = carried + torch.diag_embed(push[:, :, None] * push[:, None]).permute(0, 1, 3, 2, 4).reshape(-1, 12, 12)
     sigma = predicted.diagonal(dim1=-2, dim2=-1).sqrt()
-    lost = (sigma[:, :3] > _MOST_UNCERTAIN).any(-1) | (sigma[:, 3:6] > _MOST_UNCERTAIN * diameter_m).any(-1)
+    lost = (sigma[:, :3] > MOST_UNCERTAIN).any(-1) | (sigma[:, 3:6] > MOST_UNCERTAIN * diameter_m).any(-1)
     return torch.where(lost[:, None, None], covariance, predicted)
-
-
-def _predicted_by_kernel(covariance: Tensor, acceleration: Tensor, dt_s: Tensor, diameter_m: Tensor) -> Float[Tensor, "b 12 12"]:
-    """:func:`predict_covariance`, entry by entry."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.kernels.filtering import predict
-
-    predicted = torch.empty_like(covariance, memory_format=torch.contiguous_format)
-    predict(*as_arrays(covariance, acceleration, dt_s[:, 0], diameter_m[:, 0]), _MOST_UNCERTAIN, predicted.numpy())
-    return predicted
 
 
 def acceleration_sigma(velocity: Float[Tensor, "b 6"], diameter_m: Float[Tensor, "b 1"], config: MotionConfig) -> Float[Tensor, "b 6"]:

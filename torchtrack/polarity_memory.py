@@ -68,6 +68,13 @@ def remembered(
         dark: 1 where an event says that the outer side is the darker one, -1 the inner one, 0 unknown.
         weights: of the events; zero where nothing is to be learned.
     """
+    if switch.apply_to(dark):
+        # Not at the top: Numba is an extra.
+        from torchtrack.kernels.quality import remember
+
+        after = darker_outside.clone(memory_format=torch.contiguous_format)
+        remember(*as_arrays(after, directions.transpose(1, 2), dark, weights, window_s), memory_s, _LITTLE_EVIDENCE)
+        return after
     total, evidence = _sums(directions, dark, weights).unbind(1)
     gain = (1 - torch.exp(-window_s / memory_s))[:, None] * evidence / (evidence + _LITTLE_EVIDENCE)
     return torch.lerp(darker_outside, total / evidence.clamp(min=1e-3), gain)
@@ -75,13 +82,6 @@ def remembered(
 
 def _sums(directions: Float[Tensor, "b n 2"], dark: Float[Tensor, "b n"], weights: Float[Tensor, "b n"]) -> Float[Tensor, "b 2 8"]:
     """What events said of each octant, and how much they said."""
-    if switch.apply_to(dark):
-        # Not at the top: Numba is an extra.
-        from torchtrack.kernels.quality import sides
-
-        sums = dark.new_empty(len(dark), 2, _OCTANTS)
-        sides(*as_arrays(directions.transpose(1, 2), dark, weights), sums.numpy())
-        return sums
     values = weights[:, None] * torch.stack([dark, dark.abs()], 1)
     sums = values.new_zeros(len(values), 2, _OCTANTS).scatter_add_(2, octant(directions)[:, None].expand_as(values), values)
     return sums.detach()

@@ -19,7 +19,7 @@ from torchtrack.once import once
 from torchtrack.pose_solver import pose_jacobian
 
 # Nothing that is tracked is farther away (m).
-_MAX_DEPTH_M = 1e4
+MAX_DEPTH_M = 1e4
 # Contour points that the uncertainty is looked at, at most.
 _LOOKED_AT = 64
 
@@ -165,7 +165,7 @@ class Prediction:
 def far_pose(centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:
     """A pose of each object with its centre far before the camera."""
     poses = torch.eye(4, dtype=centre_obj.dtype).repeat(len(centre_obj), 1, 1)
-    poses[:, :3, 3] = torch.tensor([0, 0, _MAX_DEPTH_M], dtype=centre_obj.dtype) - centre_obj
+    poses[:, :3, 3] = torch.tensor([0, 0, MAX_DEPTH_M], dtype=centre_obj.dtype) - centre_obj
     return poses
 
 
@@ -175,5 +175,5 @@ def before_camera(
     """The poses with a harmless one in the place of those that are not finite or not before the camera, and which are."""
     depth = transform_points(T_cam_obj, centre_obj[:, None])[:, 0, 2]
     # A sum is finite only where every entry is.
-    usable = (T_cam_obj.sum((1, 2)).abs() < torch.inf) & (depth > MIN_DEPTH_M) & (depth < _MAX_DEPTH_M)
+    usable = (T_cam_obj.sum((1, 2)).abs() < torch.inf) & (depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M)
     return torch.where(usable[:, None, None], T_cam_obj, harmless), usable

@@ -117,6 +117,13 @@ def inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
 
 def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
     """Share of an object's contour points that lie in the image; zero without any."""
+    if switch.apply_to(contours.pixels):
+        # Not at the top: Numba is an extra.
+        from torchtrack.kernels.quality import visible
+
+        share = contours.pixels.new_empty(len(contours.mask))
+        visible(*as_arrays(contours.pixels.transpose(1, 2), contours.mask), *image_size, share.numpy())
+        return share
     seen = contours.mask & inside(contours.pixels, image_size)
     return seen.sum(-1) / contours.mask.sum(-1).clamp(min=1)
 

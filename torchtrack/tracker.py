@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor, nn
 
-from torchtrack import lie, readback
+from torchtrack import readback
 from torchtrack.alignment import align, gate_widening, index_for, index_radius, usual_index_radius
 from torchtrack.bursts import no_bursts
 from torchtrack.camera import Camera
@@ -20,15 +20,16 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.doubt import Doubt, gathered_when_known, is_adrift, is_due, is_wanted
 from torchtrack.events import EventBatch, check_on_sensor, pad_streams
 from torchtrack.evidence import Evidence, judged
+from torchtrack.forecast import forecast
 from torchtrack.kernels import switch
 from torchtrack.learned_contours import LearnedContours
 from torchtrack.model_trust import ModelTrust
-from torchtrack.motion import expected_velocity, initial_covariance, next_acceleration, predict_covariance, with_dropped, without_spin
+from torchtrack.motion import initial_covariance
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.polarity_memory import nothing_remembered
-from torchtrack.prediction import Prediction, before_camera
+from torchtrack.prediction import Prediction
 from torchtrack.probation import after_probation
 from torchtrack.search import explained_at_rest, judge_fit, search_wanted
 from torchtrack.sensor_tiles import NearbyEvents
@@ -269,23 +270,8 @@ class Tracker(TrackedObjects):
 
     def _predict(self, state: TrackerState, dt_s: Tensor) -> Prediction:
         """Predicted pose and motion, and how certain they are."""
-        motion, covariance = self.config.motion, state.covariance
-        velocity = expected_velocity(state.velocity, dt_s, motion)
-        if motion.model == "hold":
-            velocity, covariance = torch.zeros_like(velocity), with_dropped(covariance, velocity)
-        if self.revolves and motion.spin_fades:
-            axes_cam = (state.T_cam_obj[:, :3, :3].to(velocity.dtype) @ self.revolution_axes[..., None])[..., 0]
-            velocity, covariance = without_spin(velocity, covariance, axes_cam, dt_s, motion)
-        before, px_per_m = velocity.detach(), self.objects.px_per_m(state.T_cam_obj.detach().to(velocity.dtype)).detach()
-        covariance = predict_covariance(covariance.detach(), before, dt_s, self.diameter_m, motion)
-        acceleration = next_acceleration(state.acceleration, before, covariance, dt_s, self.diameter_m, px_per_m, motion)
-        gained = acceleration.expected * dt_s[:, None]
-        moved, velocity = torch.add(velocity, gained, alpha=0.5) * dt_s[:, None], velocity + gained
-        T_prior = lie.step_about(state.T_cam_obj.to(velocity.dtype), moved, self.centre_obj)
         objects = objects_as_known(self.objects, state, self.element_groups, self.on_surfaces is not None, self.config)
-        T_prior, usable = before_camera(T_prior, self.centre_obj, self.far_pose)
-        told = acceleration if self.config.solver.prior else None
-        return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance, told)
+        return forecast(state, dt_s, objects, self.revolution_axes if self.revolves else None, self.far_pose, self.config)
 
     def _doubt(self, state: TrackerState, t_us: Tensor, sigma_px: Tensor, starting: Tensor) -> Doubt:
         """What speaks for trying other poses in the window that ends at ``t_us``."""

@@ -71,21 +71,45 @@ def _count(targets: Array, offsets: Array, is_near: Array, as_expected: Array, s
     return on / near if near >= settings.min_observations else np.nan
 
 
+@kernel(fastmath=FAST)
+def visible(pixels: Array, mask: Array, height: int, width: int, share: Array) -> None:
+    """Share of contour points in the image: :func:`torchtrack.quality.visible_share`, of ``pixels [b, 2, m]`` and ``mask [b, m]``."""
+    for b in range(len(mask)):
+        total = seen = 0
+        for i in range(mask.shape[1]):
+            u, v = pixels[b, 0, i], pixels[b, 1, i]
+            total += mask[b, i]
+            seen += mask[b, i] and u >= 0 and v >= 0 and u < width and v < height
+        share[b] = seen / max(total, 1)
+
+
 @kernel()
-def sides(directions: Array, dark: Array, weights: Array, sums: Array) -> None:
-    """Sums of what events on contours say of their darker side, and of its evidence, by octant: of :func:`torchtrack.polarity_memory.remembered`.
+def remember(darker_outside: Array, directions: Array, dark: Array, weights: Array, window_s: Array, memory_s: float, little: float) -> None:
+    """What is remembered of sides with a window more: :func:`torchtrack.polarity_memory.remembered`, in place.
 
     Args:
-        directions: ``[b, 2, n]``; ``dark`` and ``weights [b, n]``.
-        sums: ``[b, 2, 8]``, filled.
+        darker_outside: ``[b, 8]``.
+        directions: ``[b, 2, n]``; ``dark`` and ``weights [b, n]``; ``window_s [b]``.
+        little: evidence that counts for half.
     """
-    sums[:] = 0.0
+    sums = np.empty((2, 8))
     for b in range(len(dark)):
-        for i in range(dark.shape[1]):
-            if weights[b, i] != 0:
-                which = octant(directions[b, 0, i], directions[b, 1, i])
-                sums[b, 0, which] += weights[b, i] * dark[b, i]
-                sums[b, 1, which] += weights[b, i] * abs(dark[b, i])
+        _sides(directions[b], dark[b], weights[b], sums)
+        fresh = 1.0 - np.exp(-window_s[b] / memory_s)
+        for k in range(8):
+            gain = fresh * sums[1, k] / (sums[1, k] + little)
+            darker_outside[b, k] += gain * (sums[0, k] / max(sums[1, k], 1e-3) - darker_outside[b, k])
+
+
+@kernel()
+def _sides(directions: Array, dark: Array, weights: Array, sums: Array) -> None:
+    """Sums of what events on one object's contours say of their darker side, and of its evidence, by octant."""
+    sums[:] = 0.0
+    for i in range(len(dark)):
+        if weights[i] != 0:
+            which = octant(directions[0, i], directions[1, i])
+            sums[0, which] += weights[i] * dark[i]
+            sums[1, which] += weights[i] * abs(dark[i])
 
 
 @kernel()

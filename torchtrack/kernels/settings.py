@@ -164,3 +164,56 @@ class QualitySettings(NamedTuple):
     smear_px: float
     patch_bits: int
     patches: int
+
+
+class ForecastSettings(NamedTuple):
+    """What :mod:`torchtrack.kernels.forecast` goes by: settings, and constants of :mod:`torchtrack.motion` and ``prediction``.
+
+    Args:
+        holds: whether objects are expected to stay where they are.
+        turn_s, acceleration_s: time constants; 0 for what does not die away, and for accelerations that do not go on.
+        most_uncertain: what would be less certain (rad, and diameters) is left as it is.
+        least_depth_m, most_depth_m: between these a pose is usable.
+    """
+
+    holds: bool
+    turn_s: float
+    coast_s: float
+    acceleration_rate_hz: float
+    acceleration_floor_m_s2: float
+    acceleration_px: float
+    acceleration_s: float
+    most_uncertain: float
+    steepness: int
+    least_depth_m: float
+    most_depth_m: float
+
+
+class ConclusionSettings(NamedTuple):
+    """What :mod:`torchtrack.kernels.conclusion` goes by: settings, and constants of :mod:`torchtrack.conclusion`, ``alignment`` and ``doubt``.
+
+    Args:
+        holds: whether what failed stays where it was.
+        anywhere: widening of the first gate from which an object may be anywhere.
+        smeared: events that gather less than this share of how far they usually do are smeared.
+        usual_gain, fall_gain: share of a new window in what is usual, and in what is seen well where it is less.
+        certain_share: of what it explains when it is seen well, from which a pose is remembered as one.
+    """
+
+    holds: bool
+    anywhere: float
+    uncertain_below: float
+    lost_below: float
+    caught_above: float
+    certain_at: float
+    min_observations: int
+    min_visible_share: float
+    max_step_rotation_rad: float
+    max_step_translation: float
+    observation_px: float
+    coast_s: float
+    doubted_below: float
+    smeared: float
+    usual_gain: float
+    fall_gain: float
+    certain_share: float

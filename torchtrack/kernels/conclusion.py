@@ -1,0 +1,235 @@
+"""What each object's pose is worth, and where it goes on from there: :mod:`torchtrack.conclusion`, object by object."""
+
+import numpy as np
+
+from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.filtering import inverse
+from torchtrack.kernels.motion import centre_of, is_finite
+from torchtrack.kernels.settings import ConclusionSettings
+
+# As torchtrack.quality.Status.
+TRACKING, UNCERTAIN, LOST, TOO_FEW_EVENTS, OUT_OF_VIEW, DIVERGED = range(6)
+# What is remembered of each object as a number, before a window and after it.
+USUAL_SCORE, FULL_SHARE, FULL_GATHERED, DOUBTED_S, UNSEEN_S = range(5)
+REMEMBERED = 5
+# What was found of it.
+SHARE, SCORE, GATHERED, USUALLY_GATHERED, IN_VIEW, WIDENING = range(6)
+FOUND = 6
+_UNKNOWNS = 13
+# As torchtrack.quality.trust has it.
+_LEAST_RANGE = 1e-6
+
+
+@kernel()
+def conclude(
+    T_before: Array,
+    T_prior: Array,
+    usable: Array,
+    velocity: Array,
+    covariance: Array,
+    information: Array,
+    expected: Array,
+    variance: Array,
+    T_found: Array,
+    offset: Array,
+    hessian: Array,
+    elsewhere: Array,
+    matched: Array,
+    found: Array,
+    dt_s: Array,
+    centre_obj: Array,
+    diameter_m: Array,
+    settings: ConclusionSettings,
+    remembered: Array,
+    T_last_seen: Array,
+    T_cam_obj: Array,
+    new_velocity: Array,
+    acceleration: Array,
+    posterior: Array,
+    left: Array,
+    status: Array,
+) -> None:
+    """Judge every object, and go on as predicted where it failed.
+
+    Args:
+        T_before: poses before the window, ``[b, 4, 4]``.
+        T_prior, usable, velocity, covariance, information, expected, variance: of the prediction, and its acceleration.
+        T_found, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 13]``, ``[b, 13, 13]``.
+        elsewhere: ``[b]``, of finds; ``matched [b]``, how many observations they have.
+        found: ``[FOUND, b]``, what else is told of them.
+        remembered, T_last_seen: ``[REMEMBERED, b]`` and ``[b, 4, 4]`` before the window; changed to those after it.
+        T_cam_obj, new_velocity, acceleration, posterior, left, status: after the window, ``left`` being the covariance of poses; filled.
+    """
+    inverses, centre = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(3)
+    for b in range(len(usable)):
+        full_share, share, dt = remembered[FULL_SHARE, b], found[SHARE, b], dt_s[b]
+        status[b] = _judge(b, usable, offset, elsewhere, matched, found, diameter_m[b], settings)
+        failed = status[b] >= LOST
+        _orthonormalise(T_prior[b] if failed else T_found[b], T_cam_obj[b])
+        if failed and (settings.holds or not usable[b]):
+            T_cam_obj[b] = T_before[b]
+        trusted = 0.0 if failed else _trust(share, full_share, found[WIDENING, b], settings)
+        doubted = not failed and _in_doubt(b, found, full_share, settings)
+        if doubted:
+            status[b] = max(status[b], UNCERTAIN)
+        inverse(hessian[b], inverses)
+        _update(trusted, failed, dt, velocity[b], covariance[b], offset[b], inverses, settings, new_velocity[b], posterior[b])
+        seen_well = not failed and share >= settings.certain_at * full_share
+        _accelerate(trusted if seen_well else 0.0, dt, information[b], offset[b], expected[b], variance[b], acceleration[b])
+        centre_of(T_cam_obj[b], centre_obj[b], centre)
+        _to_left(posterior[b], centre, left[b])
+        certain = share >= settings.certain_share * full_share and status[b] == TRACKING
+        _remember(b, failed, doubted, certain, dt, found, settings, remembered)
+        if certain:
+            T_last_seen[b] = T_cam_obj[b]
+
+
+@kernel()
+def _clamped(value: float, least: float, most: float) -> float:
+    """A value between bounds; what is not a number stays that."""
+    return least if value < least else (most if value > most else value)
+
+
+@kernel()
+def _judge(
+    b: int, usable: Array, offset: Array, elsewhere: Array, matched: Array, found: Array, diameter_m: float, settings: ConclusionSettings
+) -> int:
+    """The status of an object: :func:`torchtrack.quality.judge`."""
+    widening, share, status = found[WIDENING, b], found[SHARE, b], TRACKING
+    wider, turned, moved = _clamped(widening - 1.0, 0.0, 1.0), 0.0, 0.0
+    # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
+    counts = 0.0 if elsewhere[b] and widening >= settings.anywhere else 1.0
+    for k in range(3):
+        turned += (counts * offset[b, k]) ** 2
+        moved += (counts * offset[b, 3 + k]) ** 2
+    if share < settings.uncertain_below:
+        status = UNCERTAIN
+    if share < settings.lost_below + (max(settings.caught_above, settings.lost_below) - settings.lost_below) * wider:
+        status = LOST
+    if matched[b] < settings.min_observations:
+        status = TOO_FEW_EVENTS
+    if found[IN_VIEW, b] < settings.min_visible_share:
+        status = OUT_OF_VIEW
+    turned_ok = np.sqrt(turned) / widening < settings.max_step_rotation_rad
+    if not (turned_ok and np.sqrt(moved) / widening < settings.max_step_translation * diameter_m) or not usable[b]:
+        status = DIVERGED
+    return status
+
+
+@kernel()
+def _trust(share: float, full_share: float, widening: float, settings: ConclusionSettings) -> float:
+    """How far a pose counts against the prediction: :func:`torchtrack.quality.trust`."""
+    full = max(settings.uncertain_below, settings.certain_at * full_share * _clamped(widening - 1.0, 0.0, 1.0))
+    return _clamped((share - settings.lost_below) / max(full - settings.lost_below, _LEAST_RANGE), 0.0, 1.0)
+
+
+@kernel()
+def _in_doubt(b: int, found: Array, full_share: float, settings: ConclusionSettings) -> bool:
+    """Whether an object may be elsewhere: :func:`torchtrack.doubt.in_doubt`."""
+    smeared = found[GATHERED, b] < settings.smeared * found[USUALLY_GATHERED, b]
+    return smeared and found[SCORE, b] < settings.doubted_below * full_share
+
+
+@kernel()
+def _orthonormalise(T: Array, exact: Array) -> None:
+    """A pose whose rotation is exact again: :func:`torchtrack.lie.orthonormalise`."""
+    square = np.zeros((3, 3))
+    for j in range(3):
+        for k in range(3):
+            for m in range(3):
+                square[j, k] += np.float64(T[m, j]) * np.float64(T[m, k])
+    exact[:] = T
+    for j in range(3):
+        for k in range(3):
+            exact[j, k] = 1.5 * T[j, k] - 0.5 * (T[j, 0] * square[0, k] + T[j, 1] * square[1, k] + T[j, 2] * square[2, k])
+
+
+@kernel()
+def _update(
+    trusted: float,
+    failed: bool,
+    dt: float,
+    velocity: Array,
+    predicted: Array,
+    offset: Array,
+    inverses: Array,
+    settings: ConclusionSettings,
+    new_velocity: Array,
+    posterior: Array,
+) -> None:
+    """Velocity and covariance after a window: as found, as far as the find is to be trusted; and they fade where nothing confirmed them."""
+    variance, total = settings.observation_px**2, 0.0
+    for j in range(12):
+        for k in range(12):
+            total += variance * inverses[j, k]
+    trusted *= np.isfinite(total)
+    for j in range(12):
+        for k in range(12):
+            found = variance * inverses[j, k]
+            posterior[j, k] = found + (1.0 - trusted) * (predicted[j, k] - found) if trusted > 0 else predicted[j, k]
+    kept = (0.0 if settings.holds else np.exp(-dt / settings.coast_s)) if failed else 1.0
+    dropped = np.empty(6)
+    for k in range(6):
+        moving = velocity[k] + trusted * offset[6 + k]
+        new_velocity[k] = 0.0 if failed and settings.holds else kept * moving
+        dropped[k] = moving - new_velocity[k]
+    if settings.holds:
+        for j in range(6):
+            for k in range(6):
+                posterior[6 + j, 6 + k] += dropped[j] * dropped[k]
+
+
+@kernel()
+def _accelerate(trusted: float, dt: float, information: Array, offset: Array, expected: Array, variance: Array, acceleration: Array) -> None:
+    """The likeliest acceleration, as far as it is to be trusted: :func:`torchtrack.motion.found_acceleration`."""
+    total = 0.0
+    for j in range(6):
+        of_pose, of_velocity = 0.0, 0.0
+        for k in range(12):
+            of_pose += information[j, k] * offset[k]
+            of_velocity += information[6 + j, k] * offset[k]
+        acceleration[j] = expected[j] + variance[j] * dt * (of_velocity + 0.5 * dt * of_pose)
+        total += acceleration[j]
+    for j in range(6):
+        acceleration[j] = trusted * acceleration[j] if trusted > 0 and np.isfinite(total) else 0.0
+
+
+@kernel()
+def _to_left(covariance: Array, centre_cam: Array, left: Array) -> None:
+    """Covariance of the left perturbation of a pose: :func:`torchtrack.motion.left_covariance`."""
+    left[:] = covariance[:6, :6]
+    if not is_finite(left):
+        return
+    x, y, z = centre_cam
+    # Rows and columns of translations take on the centre × those of rotations.
+    for k in range(6):
+        a, b, c = left[0, k], left[1, k], left[2, k]
+        left[3, k] += y * c - z * b
+        left[4, k] += z * a - x * c
+        left[5, k] += x * b - y * a
+    for k in range(6):
+        a, b, c = left[k, 0], left[k, 1], left[k, 2]
+        left[k, 3] += y * c - z * b
+        left[k, 4] += z * a - x * c
+        left[k, 5] += x * b - y * a
+
+
+@kernel()
+def _remember(b: int, failed: bool, doubted: bool, certain: bool, dt: float, found: Array, settings: ConclusionSettings, remembered: Array) -> None:
+    """What is remembered of an object with a window more: running means, and for how long it is in doubt, or was not seen well."""
+    known = remembered[:, b]
+    if not failed:
+        known[USUAL_SCORE] += settings.usual_gain * (found[SCORE, b] - known[USUAL_SCORE])
+        known[FULL_SHARE] = _seen_well(known[FULL_SHARE], found[SHARE, b], settings)
+        if not np.isnan(found[GATHERED, b]):
+            known[FULL_GATHERED] = _seen_well(known[FULL_GATHERED], found[GATHERED, b], settings)
+        # One good window among bad ones does not end a doubt.
+        known[DOUBTED_S] += dt if doubted else -dt
+    known[DOUBTED_S] = _clamped(known[DOUBTED_S], 0.0, np.inf)
+    known[UNSEEN_S] = 0.0 if certain else known[UNSEEN_S] + dt
+
+
+@kernel()
+def _seen_well(before: float, now: float, settings: ConclusionSettings) -> float:
+    """A running mean of when objects are seen well: it rises fast, and falls slowly."""
+    return before + (settings.usual_gain if now > before else settings.fall_gain) * (now - before)

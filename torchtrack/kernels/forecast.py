@@ -1,0 +1,160 @@
+"""Where objects are expected at a window's end: :mod:`torchtrack.forecast`, object by object."""
+
+import numpy as np
+
+from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.kernels.motion import inverse_depth, is_finite, turn
+from torchtrack.kernels.settings import ForecastSettings
+
+# What is told of each motion: its velocity, and of its acceleration what is expected, its variance, and its rate.
+VELOCITY, EXPECTED, VARIANCE, RATE = range(4)
+TOLD = 4
+# Ways in the image, and variances of velocities, are taken to be no less.
+_LEAST_WAY_PX, _LEAST_VARIANCE = 1e-6, 1e-12
+
+
+@kernel()
+def forecast(
+    T_cam_obj: Array,
+    velocity: Array,
+    acceleration: Array,
+    covariance: Array,
+    dt_s: Array,
+    centre_obj: Array,
+    diameter_m: Array,
+    intrinsics: Array,
+    axes_obj: Array,
+    far_pose: Array,
+    settings: ForecastSettings,
+    T_prior: Array,
+    usable: Array,
+    told: Array,
+    predicted: Array,
+) -> None:
+    """Predict each object's pose, velocity, acceleration and covariance.
+
+    Args:
+        T_cam_obj, velocity, acceleration, covariance: of the state: ``[b, 4, 4]``, ``[b, 6]``, ``[b, 6]``, ``[b, 12, 12]``.
+        axes_obj: ``[b, 3]`` of surfaces of revolution, zero of other objects; or none at all, ``[0, 3]``.
+        far_pose: ``[b, 4, 4]``, in the place of what is not ``usable [b]``.
+        T_prior, told, predicted: ``[b, 4, 4]``, ``[TOLD, b, 6]`` and ``[b, 12, 12]``; filled.
+    """
+    before, start = np.empty(6), np.empty((12, 12))
+    for b in range(len(T_cam_obj)):
+        dt = np.float64(dt_s[b])
+        start[:] = covariance[b]
+        _expected_velocity(velocity[b], dt, settings, before, start)
+        if len(axes_obj):
+            _without_spin(T_cam_obj[b], axes_obj[b], dt, settings, before, start)
+        rotation_sigma, move_sigma = _acceleration_sigma(before, diameter_m[b], settings)
+        predict(start, rotation_sigma, move_sigma, dt, diameter_m[b], settings.most_uncertain, predicted[b])
+        depth_m = T_cam_obj[b, 2, 3]
+        for k in range(3):
+            depth_m += T_cam_obj[b, 2, k] * centre_obj[b, k]
+        way_px = 0.5 * move_sigma * dt * dt * intrinsics[b, 0] * inverse_depth(depth_m)
+        counts = 1.0 / (1.0 + (settings.acceleration_px / max(way_px, _LEAST_WAY_PX)) ** settings.steepness)
+        goes_on = counts * np.exp(-dt / settings.acceleration_s) if settings.acceleration_s > 0 and not settings.holds else 0.0
+        for k in range(6):
+            variance = (rotation_sigma if k < 3 else move_sigma) ** 2
+            told[EXPECTED, b, k], told[VARIANCE, b, k] = goes_on * acceleration[b, k], variance
+            told[RATE, b, k] = counts * variance * dt / max(predicted[b, 6 + k, 6 + k], _LEAST_VARIANCE)
+        usable[b] = _move(T_cam_obj[b], centre_obj[b], before, told[EXPECTED, b], dt, settings, T_prior[b], told[VELOCITY, b])
+        if not usable[b]:
+            T_prior[b], told[VELOCITY, b] = far_pose[b], 0.0
+
+
+@kernel()
+def _expected_velocity(velocity: Array, dt: float, settings: ForecastSettings, before: Array, covariance: Array) -> None:
+    """Velocity before any acceleration: turns die away; none at all where an object is expected to stay, which makes it uncertain."""
+    kept = np.exp(-dt / settings.turn_s) if settings.turn_s > 0 else 1.0
+    for k in range(6):
+        before[k] = velocity[k] * (kept if k < 3 else 1.0)
+    if settings.holds:
+        for j in range(6):
+            for k in range(6):
+                covariance[6 + j, 6 + k] += before[j] * before[k]
+        before[:] = 0.0
+
+
+@kernel()
+def _without_spin(T_cam_obj: Array, axis_obj: Array, dt: float, settings: ForecastSettings, velocity: Array, covariance: Array) -> None:
+    """The spin about an axis of revolution dies away: :func:`torchtrack.motion.without_spin`, in place."""
+    lost, axis = 1.0 - np.exp(-dt / settings.coast_s), np.zeros(3)
+    for j in range(3):
+        for k in range(3):
+            axis[j] += T_cam_obj[j, k] * axis_obj[k]
+    _drop(axis, lost, velocity[:3])
+    for first in (0, 6):
+        for k in range(12):
+            _drop(axis, lost, covariance[first : first + 3, k])
+        for k in range(12):
+            _drop(axis, lost, covariance[k, first : first + 3])
+
+
+@kernel()
+def _drop(axis: Array, share: float, values: Array) -> None:
+    """Take a share of what lies along an axis off a vector, in place."""
+    along = share * (axis[0] * values[0] + axis[1] * values[1] + axis[2] * values[2])
+    for k in range(3):
+        values[k] -= along * axis[k]
+
+
+@kernel()
+def _acceleration_sigma(velocity: Array, diameter_m: float, settings: ForecastSettings) -> tuple[float, float]:
+    """Standard deviations of angular acceleration and of that of the centre: :func:`torchtrack.motion.acceleration_sigma`."""
+    turning = np.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
+    moving = np.sqrt(velocity[3] ** 2 + velocity[4] ** 2 + velocity[5] ** 2)
+    of_rim = settings.acceleration_rate_hz * (moving + 0.5 * diameter_m * turning) + settings.acceleration_floor_m_s2
+    return 2.0 * of_rim / diameter_m, of_rim
+
+
+@kernel()
+def predict(
+    covariance: Array, rotation_sigma: float, move_sigma: float, dt: float, diameter_m: float, most_uncertain: float, predicted: Array
+) -> None:
+    """Covariance of pose and velocity after a while: :func:`torchtrack.motion.predict_covariance`.
+
+    Args:
+        covariance: ``[12, 12]``.
+        rotation_sigma, move_sigma: standard deviations of the acceleration.
+        most_uncertain: what would be less certain than this (rad, and diameters) is left as it is.
+        predicted: filled.
+    """
+    P, new = covariance, predicted
+    for j in range(6):
+        for k in range(6):
+            both = P[j, 6 + k] + dt * P[6 + j, 6 + k]
+            new[j, k] = P[j, k] + dt * P[6 + j, k] + dt * both
+            new[j, 6 + k], new[6 + j, k] = both, P[6 + j, k] + dt * P[6 + j, 6 + k]
+            new[6 + j, 6 + k] = P[6 + j, 6 + k]
+        # An acceleration adds half its square of the time to the pose, and its time to the velocity.
+        sigma = rotation_sigma if j < 3 else move_sigma
+        way, gain = 0.5 * dt * dt * sigma, dt * sigma
+        new[j, j] += way * way
+        new[j, 6 + j] += way * gain
+        new[6 + j, j] += way * gain
+        new[6 + j, 6 + j] += gain * gain
+    for j in range(6):
+        if np.sqrt(new[j, j]) > most_uncertain * (1.0 if j < 3 else diameter_m):
+            new[:] = P
+            break
+
+
+@kernel()
+def _move(
+    T_cam_obj: Array, centre_obj: Array, before: Array, acceleration: Array, dt: float, settings: ForecastSettings, T_prior: Array, velocity: Array
+) -> bool:
+    """Move a pose by its velocity and acceleration, which change the velocity, too; whether it is one before the camera."""
+    moved, rotation = np.empty(6), np.empty((3, 3))
+    for k in range(6):
+        gained = acceleration[k] * dt
+        moved[k], velocity[k] = (before[k] + 0.5 * gained) * dt, before[k] + gained
+    turn(T_cam_obj[:3, :3], moved, rotation)
+    for j in range(3):
+        T_prior[j, 3] = T_cam_obj[j, 3] + moved[3 + j]
+        for k in range(3):
+            T_prior[j, 3] += (T_cam_obj[j, k] - rotation[j, k]) * centre_obj[k]
+            T_prior[j, k] = rotation[j, k]
+    T_prior[3] = T_cam_obj[3]
+    depth_m = T_prior[2, 0] * centre_obj[0] + T_prior[2, 1] * centre_obj[1] + T_prior[2, 2] * centre_obj[2] + T_prior[2, 3]
+    return is_finite(T_prior) and settings.least_depth_m < depth_m < settings.most_depth_m
