@@ -268,6 +268,13 @@ def _check_streams_in_order(stream_index: Int[Tensor, "e"]) -> None:
         )
 
 
+def of_streams(events: EventBatch, streams: int) -> EventBatch:
+    """The events without those of no stream, after them."""
+    if len(events) == 0 or int(events.stream_index[-1]) < streams:
+        return events
+    return events[: int(torch.searchsorted(events.stream_index, streams))]
+
+
 def stream_bounds(events: EventBatch, streams: int) -> Int[Tensor, "_"]:
     """Where each of the ``streams`` begins among the events, and where the last one ends."""
     return torch.searchsorted(events.stream_index, torch.arange(streams + 1, device=events.stream_index.device))

@@ -64,6 +64,14 @@ class WindowEvents:
     mask: Bool[Tensor, "b e"]
     number: Int[Tensor, "b e"] | None = None
 
+    def rows(self) -> "WindowEvents":
+        """The events, a row for each object."""
+        return self
+
+    def counts(self) -> Int[Tensor, "b"]:
+        """How many each object has."""
+        return self.mask.sum(-1)
+
     def of(self, number: int) -> "WindowEvents":
         """The events of one object."""
         return self._with(lambda value: value[number : number + 1])
@@ -91,21 +99,52 @@ class WindowEvents:
         return select_ranked(candidates & ((number.double() * _GOLDEN_RATIO).frac() < share), count)
 
 
+@dataclass(frozen=True)
+class SharedEvents:
+    """The events of a window that several objects' camera saw, and which of them can have to do with each: no copies of them.
+
+    Args:
+        shared: all of them, one row.
+        own: places in it of those of each object; as many as ``count`` says.
+    """
+
+    shared: WindowEvents
+    own: Int[Tensor, "b e"]
+    count: Int[Tensor, "b"]
+
+    def rows(self) -> WindowEvents:
+        """The events, a row for each object."""
+        exists = torch.arange(max(int(self.count.max()), 1)) < self.count[:, None]
+        own = torch.where(exists, self.own[:, : exists.shape[1]], 0).long()
+        return self.shared.repeated(len(own)).only(own, exists)
+
+    def counts(self) -> Int[Tensor, "b"]:
+        """How many each object has."""
+        return self.count
+
+    def of(self, number: int) -> WindowEvents:
+        """The events of one object."""
+        count = max(int(self.count[number]), 1)
+        exists = torch.arange(count)[None] < self.count[number]
+        return self.shared.only(torch.where(exists, self.own[number : number + 1, :count], 0).long(), exists)
+
+
 def corner_observations(corners: Corners) -> Observations:
     """The corners as observations; their polarity is not known."""
     unknown = torch.zeros_like(corners.age_s)
     return Observations(corners.pixels, corners.age_s, unknown, unknown, corners.mask, corners.flow, corners.has_flow)
 
 
-def select_events(events: WindowEvents, index: ContourIndex, objects: MovingObjects, count: int) -> Observations:
+def select_events(events: WindowEvents | SharedEvents, index: ContourIndex, objects: MovingObjects, count: int) -> Observations:
     """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time.
 
     Which of them are taken hangs on each event's own number, not on how many come before it: a pose that is a little
     different takes almost the same events.
     """
-    if switch.apply_to(events.pixels):
+    if switch.apply_to(objects.velocity):
         values, exists = _selected_by_kernel(events, index, objects, count)
     else:
+        events = events.rows()
         pixels, mask = events.pixels, events.mask
         near = mask & (index.look_up(torch.addcmul(pixels, objects.plane_velocity(pixels), events.age_s[..., None])) >= 0)
         total = near.sum(-1, keepdim=True)
@@ -118,26 +157,31 @@ def select_events(events: WindowEvents, index: ContourIndex, objects: MovingObje
 
 
 def _selected_by_kernel(
-    events: WindowEvents, index: ContourIndex, objects: MovingObjects, count: int
+    events: WindowEvents | SharedEvents, index: ContourIndex, objects: MovingObjects, count: int
 ) -> tuple[Float[Tensor, "b c 5"], Bool[Tensor, "b c"]]:
     """What is told of the events that :func:`select_events` takes, and which there are, event by event."""
     # Not at the top: Numba is an extra.
     from torchtrack.kernels.selection import select
 
-    # Of what many have in common, one row is enough.
-    rows = events.of(0) if events.pixels.stride(0) == 0 else events
-    told = torch.stack([rows.age_s, rows.into_burst_s, rows.polarity], 1)
-    number = torch.arange(told.shape[2]).expand(len(told), -1) if rows.number is None else rows.number
-    batch = len(events.pixels)
-    chosen, exists = told.new_empty(batch, 5, count), torch.empty(batch, count, dtype=torch.bool)
+    own, counts = torch.empty(0, 0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)
+    if isinstance(events, SharedEvents):
+        rows, own, counts = events.shared, events.own, events.count
+    else:
+        # Of what many have in common, one row is enough.
+        rows = events.of(0) if events.pixels.stride(0) == 0 else events
+    number = torch.arange(rows.mask.shape[1]).expand(len(rows.mask), -1) if rows.number is None else rows.number
+    batch = len(objects.velocity)
+    chosen, exists = rows.pixels.new_empty(batch, 5, count), torch.empty(batch, count, dtype=torch.bool)
+    seen = as_arrays(*rows.pixels.unbind(-1), rows.age_s, rows.into_burst_s, rows.polarity, rows.mask, number, own, counts)
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics, index.nearest, index.first)
-    seen = as_arrays(rows.pixels.transpose(1, 2), told, rows.mask, number)
     select(*seen, *moving, index.cells, _FILL, _GOLDEN_RATIO, chosen.numpy(), exists.numpy())
     return chosen.transpose(1, 2), exists
 
 
 def join(first: Observations, second: Observations) -> Observations:
     """Observations of both, for each object; none has been judged yet."""
+    if first.mask.shape[1] == 0:
+        return second
     names = [name for name in vars(first) if name != "trust"]
     return Observations(*(_one_after_the_other(getattr(first, name), getattr(second, name)) for name in names))
 

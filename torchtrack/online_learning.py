@@ -9,7 +9,7 @@ from torchtrack import readback
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.model_trust import judge_elements
 from torchtrack.object_batch import ObjectBatch
-from torchtrack.observations import WindowEvents
+from torchtrack.observations import SharedEvents, WindowEvents
 from torchtrack.polarity_memory import expected_polarity
 from torchtrack.prediction import Prediction
 from torchtrack.quality import Status
@@ -57,7 +57,7 @@ class Lesson:
         learns: whether anything is learned, and not only looked whether there is need to.
     """
 
-    events: WindowEvents
+    events: WindowEvents | SharedEvents
     window_s: Float[Tensor, "b"]
     sigma_px: Float[Tensor, "b"]
     on_surfaces: Bool[Tensor, "b"] | None
@@ -80,7 +80,7 @@ def learned_after(
     trusted = (result.status <= int(Status.UNCERTAIN)) & (lesson.sigma_px < config.learning.max_sigma_px)
     fitted = replace(prediction, T_cam_obj=state.T_cam_obj.to(lesson.sigma_px.dtype), velocity=state.velocity)
     if trust is not None and is_judged:
-        trust = judge_elements(trust, fitted, lesson.window_s, lesson.events, trusted, config)
+        trust = judge_elements(trust, fitted, lesson.window_s, lesson.events.rows(), trusted, config)
     if learned is not None and lesson.on_surfaces is not None:
         taken_share = None if trust is None else trust.taken_share
         around = Surroundings(fitted.objects, fitted.T_cam_obj, fitted.velocity, lesson.window_s, result.contours, trusted, taken_share)

@@ -15,7 +15,7 @@ from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.contours import Contours
 from torchtrack.doubt import Doubt, drifted, less_certain
 from torchtrack.hypotheses import promising
-from torchtrack.observations import WindowEvents, select_events
+from torchtrack.observations import SharedEvents, WindowEvents, select_events
 from torchtrack.once import once
 from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
 from torchtrack.pose_problem import Linearisation
@@ -92,7 +92,7 @@ def explained_at_rest(widening: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
 def search_wanted(
     prediction: Prediction,
     doubt: Doubt,
-    events: WindowEvents,
+    events: WindowEvents | SharedEvents,
     found: Found,
     widening: Float[Tensor, "b"],
     config: TrackerConfig,
@@ -110,7 +110,7 @@ def search_wanted(
         drifted off, those of one as uncertain as it turned out to be.
     """
     # Without events no pose is better than another.
-    enough = events.mask.sum(-1) >= config.quality.min_observations
+    enough = events.counts() >= config.quality.min_observations
     reasons = (*doubt.reasons(found.score, config.search), doubt.has_run_off(config.search))
     least_near, least_far = _least(doubt, found, config.search)
     uncertain = drifted(prediction, doubt, config.search)
@@ -150,7 +150,13 @@ def _least(doubt: Doubt, found: Found, config: SearchConfig) -> Float[Tensor, "2
 
 
 def _search_slipped(
-    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "3"], events: WindowEvents, found: Found, config: TrackerConfig
+    number: int,
+    prediction: Prediction,
+    sigma_px: float,
+    least: Float[Tensor, "3"],
+    events: WindowEvents | SharedEvents,
+    found: Found,
+    config: TrackerConfig,
 ) -> Found:
     """:func:`search` for an object that is sure of where it is, and may be farther off than that.
 
@@ -184,7 +190,7 @@ def _search_from(
     other: Prediction,
     sigma_px: float,
     least: Float[Tensor, "3"],
-    events: WindowEvents,
+    events: WindowEvents | SharedEvents,
     found: Found,
     prediction: Prediction,
     config: TrackerConfig,
@@ -196,7 +202,13 @@ def _search_from(
 
 
 def search(
-    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "3"], events: WindowEvents, found: Found, config: TrackerConfig
+    number: int,
+    prediction: Prediction,
+    sigma_px: float,
+    least: Float[Tensor, "3"],
+    events: WindowEvents | SharedEvents,
+    found: Found,
+    config: TrackerConfig,
 ) -> Found:
     """Try other poses for the object ``number``; ``found`` with the best of them in its place, if that is better.
 
@@ -214,7 +226,7 @@ def _search_around(
     outline: Contours,
     sigma_px: float,
     least: Float[Tensor, "3"],
-    events: WindowEvents,
+    events: WindowEvents | SharedEvents,
     found: Found,
     config: TrackerConfig,
 ) -> Found:

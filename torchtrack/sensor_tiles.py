@@ -11,20 +11,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchtrack.camera import MIN_DEPTH_M, project
-from torchtrack.events import EventBatch
+from torchtrack.events import EventBatch, check_on_sensor
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import TileSettings
 from torchtrack.prediction import Prediction
 
 # Side of a tile (px, as a power of two).
-_TILE_BITS = 4
+TILE_BITS = 4
 # Objects are expected within this many standard deviations of their prediction.
 _SIGMAS = 4.0
 # What is looked up near contours is so much coarser than a pixel (px).
 _SLACK_PX = 4.0
-# Where more than this share of the events is near objects, leaving the others out is not worth the copy.
-_MOST_KEPT = 0.8
 
 
 @dataclass(frozen=True)
@@ -36,12 +34,14 @@ class NearbyEvents:
         number: of each among all of the window, where some were left out.
         of_each: indices of those that can have to do with each object, padded, and which of these exist; all where not given.
         into_burst_us: how far each is into its burst (µs), a padded row per stream, where the map of bursts has been brought up already.
+        near_tiles: tiles near each object, where the events in them are still to be chosen.
     """
 
     events: EventBatch
     number: Int[Tensor, "e"] | None = None
     of_each: tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]] | None = None
     into_burst_us: Int[Tensor, "s e"] | None = None
+    near_tiles: Bool[Tensor, "b t"] | None = None
 
 
 class SensorTiles(nn.Module):
@@ -53,8 +53,8 @@ class SensorTiles(nn.Module):
     def __init__(self, ideal_pixels: Float[Tensor, "h w 2"]) -> None:
         """Take the tiles from the undistortion table of the sensor."""
         super().__init__()
-        height, width = ideal_pixels.shape[:2]
-        side = 1 << _TILE_BITS
+        self.height, self.width = height, width = ideal_pixels.shape[:2]
+        side = 1 << TILE_BITS
         self.columns = -(-width // side)
         rows, columns = (torch.arange(side // 2, side // 2 + extent, side).clamp(max=extent - 1) for extent in (height, width))
         self.register_buffer("middle", ideal_pixels[rows[:, None], columns].flatten(0, 1))
@@ -64,7 +64,7 @@ class SensorTiles(nn.Module):
 
     def _of(self, x: Int[Tensor, "*n"], y: Int[Tensor, "*n"]) -> Int[Tensor, "*n"]:
         """The tile of each pixel."""
-        return torch.add(x >> _TILE_BITS, y >> _TILE_BITS, alpha=self.columns).long()
+        return torch.add(x >> TILE_BITS, y >> TILE_BITS, alpha=self.columns).long()
 
     def near(self, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
         """Tiles that anything can be seen in, within a window before ``prediction``, that is no farther than a margin from each object."""
@@ -99,40 +99,34 @@ class SensorTiles(nn.Module):
         return near
 
     def keep(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> NearbyEvents:
-        """The events in tiles near any object, or all of them where these are most."""
+        """The events in tiles near any object."""
         if switch.apply_to(events.x):
-            kept, of_each = self._kept_by_kernel(events, near)
+            kept, count = self.numbers_near(events, near)
+            kept = kept[:count]
         else:
-            tile, near_each = self._of(events.x, events.y).numpy(), near.numpy()
             # NumPy finds them several times faster.
-            kept = np.flatnonzero(near.any(0).numpy()[tile])
-            of_each = _of_each(near_each, tile[kept])
+            kept = np.flatnonzero(near.any(0).numpy()[self._of(events.x, events.y).numpy()])
         if len(kept) == 0:
             # Padding, which stands for no event at all, has no number and is near nothing.
             return NearbyEvents(EventBatch.empty())
-        number = torch.from_numpy(kept)
-        if len(kept) == len(events):
-            return NearbyEvents(events, None, of_each)
-        if len(kept) > _MOST_KEPT * len(events):
-            return NearbyEvents(events, None, None if of_each is None else (number[of_each[0]], of_each[1]))
-        return NearbyEvents(events[number], number, of_each)
+        number = torch.from_numpy(kept) if len(kept) < len(events) else None
+        events = events if number is None else events[number]
+        return NearbyEvents(events, number, _of_each(near.numpy(), self._of(events.x, events.y).numpy()))
 
-    def _kept_by_kernel(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> tuple[np.ndarray, tuple[Tensor, Tensor] | None]:
-        """The numbers of the events that are kept, and which of these are near each object, event by event."""
+    def numbers_near(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> tuple[np.ndarray, int]:
+        """The numbers of the events in tiles near any object, event by event, and how many these are; after them there are no numbers.
+
+        Raises:
+            EventDataError: if an event is outside the sensor.
+        """
         # Not at the top: Numba is an extra.
         from torchtrack.kernels.events import keep
 
-        objects = len(near) if len(near) > 1 else 0
-        kept, counts = np.empty(len(events), np.int64), np.empty(objects, np.int64)
-        own = np.zeros((objects, max(len(events), 1)), np.int64)
-        count = keep(*as_arrays(events.x, events.y, near), _TILE_BITS, self.columns, kept, own, counts)
-        return kept[:count], _padded(own, counts) if objects else None
-
-
-def _padded(own: np.ndarray, counts: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
-    """Lists of the events near each object, zero after their end, made as wide as the longest, and which of their entries exist."""
-    exists = torch.arange(max(int(counts.max()), 1)) < torch.from_numpy(counts)[:, None]
-    return torch.from_numpy(own[:, : exists.shape[1]]), exists
+        kept = np.empty(len(events) + 1, np.int64)
+        count = int(keep(*as_arrays(events.x, events.y, near.any(0)), TILE_BITS, self.width, self.height, kept))
+        if count < 0:
+            check_on_sensor(events, self.width, self.height)
+        return kept, count
 
 
 def _of_each(near: np.ndarray, tile: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]] | None:

@@ -23,7 +23,7 @@ from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.learned_contours import LearnedContours, judge_model
 from torchtrack.lie import transform_points
 from torchtrack.object_batch import ObjectBatch
-from torchtrack.observations import WindowEvents
+from torchtrack.observations import SharedEvents, WindowEvents
 from torchtrack.search import Found
 from torchtrack.surface_rays import surface_points
 
@@ -96,7 +96,12 @@ class _Sample:
 
 @torch.no_grad()
 def learn_after(
-    learned: LearnedContours, around: Surroundings, found: Found, events: WindowEvents, wanted: Bool[Tensor, "b"] | None, config: TrackerConfig
+    learned: LearnedContours,
+    around: Surroundings,
+    found: Found,
+    events: WindowEvents | SharedEvents,
+    wanted: Bool[Tensor, "b"] | None,
+    config: TrackerConfig,
 ) -> LearnedContours:
     """What is known after a window of contours that the models lack.
 
@@ -107,7 +112,7 @@ def learn_after(
     learned = judge_model(learned, found, velocity, image_size, config, any_count=any_count, taken_share=around.taken_share)
     if wanted is None or readback.none_of(wanted):
         return learned
-    return learned.but_of(wanted, learn(learned, around, events, config))
+    return learned.but_of(wanted, learn(learned, around, events.rows(), config))
 
 
 def learn(learned: LearnedContours, around: Surroundings, events: WindowEvents, config: TrackerConfig) -> LearnedContours:

@@ -18,7 +18,7 @@ from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.doubt import Doubt, gathered_when_known, is_adrift, is_due, is_wanted
-from torchtrack.events import EventBatch, check_on_sensor, pad_streams
+from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.forecast import forecast
 from torchtrack.kernels import switch
@@ -222,9 +222,6 @@ class Tracker(TrackedObjects):
             learns: whether anything may be learned from the window.
         """
         config, sensors, last_event_us = self.config, self.sensors, state.last_event_us
-        if switch.apply_to(t_us):
-            # Unlike PyTorch's operations, kernels do not look where they read and write.
-            check_on_sensor(events.events, self.image_size[1], self.image_size[0])
         window_s = self._window_s(state, t_us)
         dt_s = window_s[self.stream_index]
         recorded = self._predict(self._held_back(state, events.events, t_us, dt_s, questions), dt_s)
@@ -245,7 +242,7 @@ class Tracker(TrackedObjects):
             near = select_events(seen, index, prediction.moving(compensated=True), config.matching.max_events)
             observations = join(observations, near)
         if self.weigher is not None:
-            evidence = Evidence(observations, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
+            evidence = Evidence(observations, seen.rows(), prediction, contours, index, sensors.history(last_event_us, t_us))
             observations = judged(evidence, self.weigher)
         fit = align(recorded, contours, index, widening, observations, config)
         found = judge_fit(prediction, fit, config, explained_at_rest(widening), gathered_when_known(doubt, state.full_gathered, config.search))

@@ -50,28 +50,102 @@ def near_tiles(
 
 
 @kernel()
-def keep(x: Array, y: Array, near: Array, tile_bits: int, columns: int, kept: Array, own: Array, counts: Array) -> int:
-    """Events in tiles near any object: how many, with their numbers in ``kept [e]``.
+def keep(x: Array, y: Array, is_near: Array, tile_bits: int, width: int, height: int, kept: Array) -> np.int64:
+    """Numbers of the events in tiles near any object: how many; -1 where any event is outside the sensor.
 
     Args:
-        near: ``[b, t]``.
-        own: ``[b, e]``, which of those that are kept each object is near, by their place among them; ``counts [b]`` of each. Of one
-            object, ``[0, e]``: it is near all.
+        kept: ``[e + 1]``, filled as far as there are any, and a zero after them.
+        is_near: ``[t]``, tiles near any object.
     """
-    count = 0
-    counts[:] = 0
+    count, outside, columns = np.uint64(0), False, np.uint64((width - 1 >> tile_bits) + 1)
     for i in range(len(x)):
-        tile, is_near = (x[i] >> tile_bits) + (y[i] >> tile_bits) * columns, False
-        for b in range(len(near)):
-            if near[b, tile]:
-                is_near = True
-                if len(own):
-                    own[b, counts[b]] = count
-                    counts[b] += 1
-        if is_near:
-            kept[count] = i
-            count += 1
-    return count
+        # Unsigned, a negative number is a large one.
+        u, v = np.uint32(x[i]), np.uint32(y[i])
+        if u >= width or v >= height:
+            outside = True
+            continue
+        # Products in the place of branches, of which a processor would guess many wrong.
+        kept[count] = i
+        count += np.uint64(is_near[np.uint64(u >> tile_bits) + np.uint64(v >> tile_bits) * columns])
+    kept[count] = 0
+    return np.int64(-1) if outside else np.int64(count)
+
+
+@kernel(fastmath=FAST)
+def see_kept(
+    kept: Array,
+    x: Array,
+    y: Array,
+    t_us: Array,
+    polarity: Array,
+    end_us: int,
+    elapsed_us: int,
+    longest_us: int,
+    long_ago_us: int,
+    ideal_pixels: Array,
+    before: Array,
+    ages: Array,
+    seen: Array,
+    exists: Array,
+) -> None:
+    """Some events of one stream as its camera saw them, and the map of bursts brought up to the window's end.
+
+    As :func:`update_bursts` and :func:`see` one after the other, without anything written in between.
+
+    Args:
+        kept: numbers of the events, ``[n]``.
+        ideal_pixels: ``[h, w, 2]``; ``before`` and ``ages [2, h, w]``.
+        seen, exists: ``[SEEN, n]`` and ``[n]``, filled; where there are more places, with zeros.
+    """
+    width, brighter = np.uint64(ideal_pixels.shape[1]), np.uint64(ideal_pixels.shape[0] * ideal_pixels.shape[1])
+    aged, ideal = ages.ravel(), ideal_pixels.reshape(-1, 2)
+    u, v, age_s, into_s, sign = seen[PIXELS], seen[PIXELS + 1], seen[AGE], seen[INTO_BURST], seen[POLARITY]
+    _age(before.ravel(), np.int16(elapsed_us), np.int16(long_ago_us - elapsed_us), aged)
+    for j in range(len(kept)):
+        i = np.uint64(kept[j])
+        pixel, age = np.uint64(y[i]) * width + np.uint64(x[i]), end_us - t_us[i]
+        place = pixel + np.uint64(polarity[i]) * brighter
+        into = _into_burst(aged, place, min(age, long_ago_us), True, elapsed_us, longest_us)
+        u[j], v[j], age_s[j], into_s[j] = ideal[pixel, 0], ideal[pixel, 1], age * 1e-6, into * 1e-6
+        sign[j], exists[j] = 2.0 * polarity[i] - 1.0, True
+    for j in range(len(kept), len(exists)):
+        exists[j] = False
+        seen[:, j] = 0.0
+
+
+@kernel()
+def divide(kept: Array, x: Array, y: Array, near: Array, tile_bits: int, width: int, own: Array, counts: Array) -> None:
+    """Which of the events that are kept are near each object.
+
+    Args:
+        kept: numbers of the events, ``[n]``.
+        near: ``[b, t]``, tiles near each object.
+        own, counts: ``[b, n + 1]`` places among those that are kept, and how many of them there are: ``[b]``; filled.
+    """
+    tile, columns = np.empty(len(kept), np.uint32), np.uint64((width - 1 >> tile_bits) + 1)
+    for j in range(len(kept)):
+        i = np.uint64(kept[j])
+        tile[j] = np.uint64(x[i] >> tile_bits) + np.uint64(y[i] >> tile_bits) * columns
+    for b in range(len(near)):
+        of_object, places, count = near[b], own[b], np.uint64(0)
+        for j in range(len(tile)):
+            places[count] = j
+            count += np.uint64(of_object[np.uint64(tile[j])])
+        counts[b] = count
+
+
+@kernel()
+def _into_burst(ages: Array, place: int, age: int, exists: bool, elapsed_us: int, longest_us: int) -> int:
+    """How far into its burst an event is (µs), which may begin one; ``ages`` are those of the map, all at the window's end.
+
+    Events come in the order of their times: the first of a pixel that begins a burst in the window is the oldest, and those after
+    it begin none. What is younger than the window began in it.
+    """
+    began = np.int64(ages[place])
+    goes_on = began - age < longest_us
+    # Written always, in the place of a branch of which a processor would guess many wrong: twice as fast.
+    ages[place] = np.int16(age if exists and not goes_on and began >= elapsed_us else began)
+    return int(began - age) if goes_on else 0
 
 
 @kernel()
@@ -90,28 +164,19 @@ def update_bursts(
 ) -> None:
     """Bring a map of bursts up to a window's end, and tell how far into its burst each event is (µs).
 
-    Events come in the order of their times: the first of a pixel that begins a burst in the window is the oldest, and those after
-    it begin none.
-
     Args:
         x, y, age_us, polarity, mask: ``[s, e]``.
-        elapsed_us: ``[s]``; what is younger than that began in the window.
+        elapsed_us: ``[s]``.
         before: ``[s, 2, h, w]``, where the window began.
         ages, into_us: at its end, and ``[s, e]``; filled.
     """
+    height, width = np.uint64(before.shape[2]), np.uint64(before.shape[3])
     for s in range(len(mask)):
-        elapsed = elapsed_us[s]
-        _age(before[s].ravel(), np.int16(elapsed), np.int16(long_ago_us - elapsed), ages[s].ravel())
+        elapsed, aged = elapsed_us[s], ages[s].ravel()
+        _age(before[s].ravel(), np.int16(elapsed), np.int16(long_ago_us - elapsed), aged)
         for i in range(mask.shape[1]):
-            into_us[s, i] = 0
-            if not mask[s, i]:
-                continue
-            side, age = int(polarity[s, i]), min(age_us[s, i], long_ago_us)
-            into = np.int64(ages[s, side, y[s, i], x[s, i]]) - age
-            if into < longest_us:
-                into_us[s, i] = into
-            elif ages[s, side, y[s, i], x[s, i]] >= elapsed:
-                ages[s, side, y[s, i], x[s, i]] = age
+            place = (np.uint64(polarity[s, i]) * height + np.uint64(y[s, i])) * width + np.uint64(x[s, i])
+            into_us[s, i] = _into_burst(aged, place, min(age_us[s, i], long_ago_us), mask[s, i], elapsed, longest_us)
 
 
 @kernel()
@@ -123,40 +188,26 @@ def _age(before: Array, elapsed: int, most: int, ages: Array) -> None:
 
 @kernel(fastmath=FAST)
 def see(
-    x: Array,
-    y: Array,
-    age_us: Array,
-    into_us: Array,
-    polarity: Array,
-    mask: Array,
-    ideal_pixels: Array,
-    stream_index: Array,
-    own: Array,
-    counts: Array,
-    seen: Array,
-    exists: Array,
+    x: Array, y: Array, age_us: Array, into_us: Array, polarity: Array, mask: Array, ideal_pixels: Array, stream_index: Array, seen: Array
 ) -> None:
-    """Events as each object's camera saw them.
+    """Events of several streams as each object's camera saw them.
 
     Args:
         x, y, age_us, into_us, polarity, mask: ``[s, e]`` of a window.
         ideal_pixels: ``[s, h, w, 2]``.
-        stream_index: ``[b]``.
-        own, counts: ``[b, c]`` events of each object, and how many they are; ``[0, 0]`` for all of its stream.
-        seen, exists: ``[b, SEEN, c]`` and ``[b, c]``, filled; zero where there is nothing.
+        stream_index: ``[b]``; of one stream, ``[1]`` is enough for all that see it.
+        seen: ``[SEEN, b, e]``, filled; zero where there is nothing.
     """
-    for b in range(len(seen)):
+    width = np.uint64(ideal_pixels.shape[2])
+    for b in range(len(stream_index)):
         s = stream_index[b]
-        for j in range(seen.shape[2]):
-            i = j
-            if len(own):
-                i = own[b, j] if j < counts[b] else 0
-            exists[b, j] = mask[s, i] and (len(own) == 0 or j < counts[b])
-            if not exists[b, j]:
+        ideal = ideal_pixels[s].reshape(-1, 2)
+        for i in range(seen.shape[2]):
+            if not mask[s, i]:
                 for k in range(SEEN):
-                    seen[b, k, j] = 0.0
+                    seen[k, b, i] = 0.0
                 continue
-            for k in range(2):
-                seen[b, PIXELS + k, j] = ideal_pixels[s, y[s, i], x[s, i], k]
-            seen[b, AGE, j], seen[b, INTO_BURST, j] = age_us[s, i] * 1e-6, into_us[s, i] * 1e-6
-            seen[b, POLARITY, j] = 1.0 if polarity[s, i] else -1.0
+            pixel = np.uint64(y[s, i]) * width + np.uint64(x[s, i])
+            seen[PIXELS, b, i], seen[PIXELS + 1, b, i] = ideal[pixel, 0], ideal[pixel, 1]
+            seen[AGE, b, i], seen[INTO_BURST, b, i] = age_us[s, i] * 1e-6, into_us[s, i] * 1e-6
+            seen[POLARITY, b, i] = 1.0 if polarity[s, i] else -1.0

@@ -10,10 +10,15 @@ from torchtrack.kernels.settings import Cells
 
 @kernel(fastmath=FAST)
 def select(
-    pixels: Array,
-    told: Array,
+    u: Array,
+    v: Array,
+    age_s: Array,
+    into_burst_s: Array,
+    polarity: Array,
     mask: Array,
     number: Array,
+    own: Array,
+    counts: Array,
     velocity: Array,
     centre_cam: Array,
     intrinsics: Array,
@@ -28,51 +33,68 @@ def select(
     """Take events near each object's contours once moved to the window's end, spread evenly in time.
 
     Args:
-        pixels: ``[e, 2, n]``, with ``told [e, 3, n]`` (age, time into the burst, polarity) and ``mask [e, n]``: events of each object,
-            or one row for all.
+        u, v, age_s, into_burst_s, polarity, mask: ``[e, n]``: events of each object, or one row for all.
         number: ``[e, n]`` of each among all of the window, by which lots are drawn.
-        chosen: ``[b, 5, c]`` pixels and what is told; filled as far as there are any, as ``exists [b, c]`` says, and else zero.
+        own, counts: ``[b, n]`` of the one row, those of each object, and how many these are: ``[b]``; ``[0, 0]`` for all.
+        chosen: ``[b, 5, c]`` pixels, ages, times into the burst, and polarities; filled as far as there are any, as ``exists [b, c]``
+            says, and else zero.
     """
-    near = np.empty(mask.shape[1], np.int64)
+    near = np.empty(mask.shape[1] + 1, np.int64)
     chosen[:] = 0.0
     for b in range(len(chosen)):
         e = b if len(mask) > 1 else 0
-        motion, depth_m, of_lens = drift(velocity[b], centre_cam[b]), centre_cam[b, 2], lens(intrinsics[b])
-        total = 0
-        for i in range(mask.shape[1]):
-            if mask[e, i]:
-                u, v, age = pixels[e, 0, i], pixels[e, 1, i], told[e, 0, i]
-                speed_u, speed_v = at_depth(motion, depth_m, u, v, of_lens)
-                if nearest(nearest_of_cell[b], first[b], u + speed_u * age, v + speed_v * age, cells) >= 0:
-                    near[total] = i
-                    total += 1
+        looked_at = counts[b] if len(own) else mask.shape[1]
+        total = _find(
+            u[e], v[e], age_s[e], mask[e], own[b] if len(own) else own.ravel(), looked_at, velocity[b], centre_cam[b], intrinsics[b],
+            nearest_of_cell[b], first[b], cells, near,
+        )  # fmt: skip
         drawn = _draw(near, total, number[e], fill, golden_ratio, chosen.shape[2])
-        _take(near, drawn, pixels[e], told[e], chosen[b], exists[b])
+        apart = max(drawn / chosen.shape[2], 1.0)
+        for j in range(chosen.shape[2]):
+            # Spread evenly over what was drawn, should it be more than places.
+            rank = int(j * apart)
+            exists[b, j] = rank < drawn
+            if exists[b, j]:
+                i = near[rank]
+                chosen[b, 0, j], chosen[b, 1, j], chosen[b, 2, j] = u[e, i], v[e, i], age_s[e, i]
+                chosen[b, 3, j], chosen[b, 4, j] = into_burst_s[e, i], polarity[e, i]
 
 
 @kernel(fastmath=FAST)
-def _draw(near: Array, total: int, number: Array, fill: float, golden_ratio: float, places: int) -> int:
+def _find(
+    u: Array,
+    v: Array,
+    age_s: Array,
+    mask: Array,
+    own: Array,
+    looked_at: int,
+    velocity: Array,
+    centre_cam: Array,
+    intrinsics: Array,
+    nearest_of_cell: Array,
+    first: Array,
+    cells: Cells,
+    near: Array,
+) -> np.int64:
+    """Events near the contours of one object, of the first that are its ``own`` or, without a list of them, of all: how many, first in ``near``."""
+    motion, depth_m, of_lens, total = drift(velocity, centre_cam), centre_cam[2], lens(intrinsics), np.uint64(0)
+    for j in range(looked_at):
+        i = np.uint64(own[j]) if len(own) else np.uint64(j)
+        speed_u, speed_v = at_depth(motion, depth_m, u[i], v[i], of_lens)
+        found = nearest(nearest_of_cell, first, u[i] + speed_u * age_s[i], v[i] + speed_v * age_s[i], cells)
+        near[total] = i
+        total += np.uint64(mask[i] and found >= 0)
+    return np.int64(total)
+
+
+@kernel(fastmath=FAST)
+def _draw(near: Array, total: np.int64, number: Array, fill: float, golden_ratio: float, places: int) -> np.int64:
     """Draw a share of the events, by their own numbers, where there are more than places; how many were drawn, first in ``near``."""
     if total <= places:
         return total
-    share, drawn = fill * places / total, 0
+    share, drawn = fill * places / total, np.int64(0)
     for j in range(total):
-        if (number[near[j]] * golden_ratio) % 1.0 < share:
-            near[drawn] = near[j]
-            drawn += 1
+        lot = number[near[j]] * golden_ratio
+        near[drawn] = near[j]
+        drawn += lot - np.floor(lot) < share
     return drawn
-
-
-@kernel(fastmath=FAST)
-def _take(near: Array, drawn: int, pixels: Array, told: Array, chosen: Array, exists: Array) -> None:
-    """Take what was drawn, spread evenly over it should it be more than places."""
-    places = chosen.shape[1]
-    apart = max(drawn / places, 1.0)
-    for j in range(places):
-        rank = int(j * apart)
-        exists[j] = rank < drawn
-        if exists[j]:
-            i = near[rank]
-            chosen[0, j], chosen[1, j] = pixels[0, i], pixels[1, i]
-            for k in range(3):
-                chosen[2 + k, j] = told[k, i]

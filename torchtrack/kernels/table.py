@@ -35,37 +35,54 @@ def fill(
     """
     table[:] = 0.0
     for b in range(len(table)):
-        for i in range(table.shape[1]):
-            if not mask[b, i]:
-                continue
-            row = table[b, i]
-            row[X], row[Y], row[Z] = points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i]
-            row[NORMAL_U], row[NORMAL_V] = normals[b, 0, i], normals[b, 1, i]
-            row[INDEXED_U], row[INDEXED_V] = indexed[b, 0, i], indexed[b, 1, i]
-            is_limb = kind[b, i] == settings.limb
-            is_oriented = is_limb or kind[b, i] == settings.crease
-            row[LIMB], row[ORIENTED] = is_limb, is_oriented
-            row[EXPECTED] = settings.of_print and kind[b, i] == settings.texture
-            if is_oriented and polarity.shape[1]:
-                row[EXPECTED] = polarity[b, octant(normals[b, 0, i], normals[b, 1, i])]
-            if settings.close_px and is_oriented:
-                row[MISTAKEN] = _mistaken_px2(i, pixels[b], normals[b], kind[b], mask[b], nearest_of_cell[b], first[b], cells, settings)
+        expected = polarity[b] if polarity.shape[1] else polarity.ravel()
+        _fill_one(points_obj[b], pixels[b], normals[b], kind[b], mask[b], indexed[b], expected, settings, table[b])
+        if settings.close_px:
+            _add_mistaken(pixels[b], normals[b], mask[b], nearest_of_cell[b], first[b], cells, settings, table[b])
 
 
 @kernel()
-def _mistaken_px2(
-    i: int, pixels: Array, normals: Array, kind: Array, mask: Array, nearest_of_cell: Array, first: Array, cells: Cells, settings: TableSettings
-) -> float:
-    """How far off what is seen on a point is, should it be of the edge beside: :func:`torchtrack.common_error.mistaken_px2`."""
-    most = 0.0
-    u, v, nu, nv = pixels[0, i], pixels[1, i], normals[0, i], normals[1, i]
-    for side_px in (-settings.aside_px, settings.aside_px):
-        other = nearest(nearest_of_cell, first, u + side_px * nu, v + side_px * nv, cells)
-        if other < 0 or not mask[other] or not (kind[other] == settings.limb or kind[other] == settings.crease):
+def _fill_one(
+    points_obj: Array,
+    pixels: Array,
+    normals: Array,
+    kind: Array,
+    mask: Array,
+    indexed: Array,
+    polarity: Array,
+    settings: TableSettings,
+    table: Array,
+) -> None:
+    """Fill the table of one object, but for how far off what is seen may be."""
+    for i in range(len(mask)):
+        if not mask[i]:
             continue
-        apart_px = (pixels[0, other] - u) * nu + (pixels[1, other] - v) * nv
-        is_parallel = abs(normals[0, other] * nu + normals[1, other] * nv) > settings.parallel
-        if is_parallel and apart_px * side_px > settings.apart_px * settings.aside_px:
-            squared = apart_px * apart_px
-            most = max(most, 0.5 * squared * np.exp(-squared / settings.close_px**2))
-    return most
+        table[i, X], table[i, Y], table[i, Z] = points_obj[0, i], points_obj[1, i], points_obj[2, i]
+        table[i, NORMAL_U], table[i, NORMAL_V] = normals[0, i], normals[1, i]
+        table[i, INDEXED_U], table[i, INDEXED_V] = indexed[0, i], indexed[1, i]
+        is_limb = kind[i] == settings.limb
+        is_oriented = is_limb or kind[i] == settings.crease
+        table[i, LIMB], table[i, ORIENTED] = is_limb, is_oriented
+        table[i, EXPECTED] = settings.of_print and kind[i] == settings.texture
+        if is_oriented and len(polarity):
+            table[i, EXPECTED] = polarity[octant(normals[0, i], normals[1, i])]
+
+
+@kernel()
+def _add_mistaken(
+    pixels: Array, normals: Array, mask: Array, nearest_of_cell: Array, first: Array, cells: Cells, settings: TableSettings, table: Array
+) -> None:
+    """How far off what is seen on points of edges is, should it be of the edge beside: :func:`torchtrack.common_error.mistaken_px2`."""
+    for i in range(len(mask)):
+        if not mask[i] or not table[i, ORIENTED]:
+            continue
+        u, v, nu, nv = pixels[0, i], pixels[1, i], normals[0, i], normals[1, i]
+        for side_px in (-settings.aside_px, settings.aside_px):
+            other = nearest(nearest_of_cell, first, u + side_px * nu, v + side_px * nv, cells)
+            if other < 0 or not mask[other] or not table[other, ORIENTED]:
+                continue
+            apart_px = (pixels[0, other] - u) * nu + (pixels[1, other] - v) * nv
+            is_parallel = abs(normals[0, other] * nu + normals[1, other] * nv) > settings.parallel
+            if is_parallel and apart_px * side_px > settings.apart_px * settings.aside_px:
+                squared = apart_px * apart_px
+                table[i, MISTAKEN] = max(table[i, MISTAKEN], 0.5 * squared * np.exp(-squared / settings.close_px**2))
