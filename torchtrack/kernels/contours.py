@@ -252,7 +252,7 @@ def mark(
         image: ``[h, w]``, with a border.
         marks: ``[n]``, filled.
     """
-    of_lens = lens(intrinsics)
+    of_lens, flat, height, width = lens(intrinsics), image.ravel(), float(image.shape[0]), float(image.shape[1])
     for n in range(len(marks)):
         row, pose, total, count = n if len(mask) > 1 else 0, entries(T_cam_obj[n]), 0.0, 0
         for i in range(mask.shape[1]):
@@ -262,20 +262,20 @@ def mark(
             nu, nv, length = normal_of(ax - x * inverse * az, ay - y * inverse * az, inverse, of_lens)
             if mask[row, i] and length > settings.least_px_per_m and z > settings.least_depth_m:
                 u, v = x * inverse * of_lens[0] + of_lens[2], y * inverse * of_lens[1] + of_lens[3]
-                beside = _at(image, u + beside_px * nu, v + beside_px * nv, border_px) + _at(image, u - beside_px * nu, v - beside_px * nv, border_px)
-                total += _at(image, u, v, border_px) - 0.5 * beside
+                outer = _at(flat, width, height, u + beside_px * nu, v + beside_px * nv, border_px)
+                inner = _at(flat, width, height, u - beside_px * nu, v - beside_px * nv, border_px)
+                total += _at(flat, width, height, u, v, border_px) - 0.5 * (outer + inner)
                 count += 1
         marks[n] = total / max(count, 1)
 
 
-@kernel()
-def _at(image: Array, u: float, v: float, border_px: int) -> float:
-    """What an image with its border has at a pixel: :func:`torchtrack.event_image.look_up`."""
+@kernel(fastmath=FAST)
+def _at(image: Array, width: float, height: float, u: float, v: float, border_px: int) -> float:
+    """What an image with its border, row by row, has at a pixel: :func:`torchtrack.event_image.look_up`."""
     column, row = np.rint(u) + border_px, np.rint(v) + border_px
-    # What is not a number is looked up at the first pixel.
-    column = min(max(column, 0.0), image.shape[1] - 1.0) if column == column else 0.0
-    row = min(max(row, 0.0), image.shape[0] - 1.0) if row == row else 0.0
-    return image[int(row), int(column)]
+    # What is not a number is looked up at the first pixel. No branch, of which a processor would guess many wrong.
+    column, row = min(column if column >= 0 else 0.0, width - 1.0), min(row if row >= 0 else 0.0, height - 1.0)
+    return image[np.uint64(row * width + column)]
 
 
 @kernel(fastmath=FAST)
