@@ -1,0 +1,101 @@
+"""What each object sees of a window's events is the same by kernels, which choose, date and divide them in two passes."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from both_ways import both_ways
+from helpers import SMALL_CAMERA, box_model, generator, pose, random_events
+
+from torchtrack import Tracker
+from torchtrack.bursts import LONG_AGO_US
+from torchtrack.camera import Camera
+from torchtrack.contour_index import index_contours
+from torchtrack.events import EventBatch, concatenate
+from torchtrack.observations import SharedEvents, WindowEvents, select_events
+from torchtrack.sensor_tiles import NearbyEvents
+
+pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
+BENT_CAMERA = replace(SMALL_CAMERA, distortion_model="plumb_bob", distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))
+# Places of boxes (m), of which the last is far from the others.
+PLACES_M = ((0.0, 0.0, 0.5), (0.02, -0.03, 0.6), (-0.06, 0.03, 0.9), (5.0, 0.0, 0.5))
+
+
+def window_of(objects: int, count: int, window_us: int, camera: Camera = SMALL_CAMERA):
+    """How a window's events come to be what each of some boxes sees: a function for both ways."""
+    tracker = Tracker([box_model()] * objects, camera, dtype=torch.float64)
+    T_cam_obj = pose().repeat(objects, 1, 1)
+    T_cam_obj[:, :3, 3] = torch.tensor(PLACES_M[:objects]).double()
+    state = tracker.init(T_cam_obj, 0)
+    ages = torch.randint(LONG_AGO_US, state.burst_age_us.shape, generator=generator(1), dtype=torch.int16)
+    events = random_events(count, width=camera.width, height=camera.height, duration_us=window_us - 1) if count else EventBatch.empty()
+    t_us, dt_s = torch.tensor([window_us]), torch.full((objects,), 1e-6 * window_us).double()
+    prediction, sensors = tracker._predict(state, dt_s), tracker.sensors
+
+    def seen():
+        nearby = sensors.near_objects(NearbyEvents(events), prediction, dt_s, tracker.config)
+        return sensors.window_events(nearby, ages, t_us, t_us, tracker.config.matching.burst_us)
+
+    return tracker, events, prediction, seen
+
+
+def entries_of(events: WindowEvents, number: int) -> dict[str, torch.Tensor]:
+    """What there is of the events of one object, by the name of what is told."""
+    own = {name: value[number, events.mask[number]] for name, value in vars(events).items() if value is not None}
+    return own if "number" in own else own | {"number": torch.arange(events.mask.shape[1])[events.mask[number]]}
+
+
+@pytest.mark.parametrize("objects", [1, 2, 4])
+@pytest.mark.parametrize(("count", "window_us"), [(6000, 5000), (60, 5000), (6000, 2 * LONG_AGO_US), (0, 5000)])
+@pytest.mark.parametrize("camera", [SMALL_CAMERA, BENT_CAMERA], ids=["straight", "bent"])
+def test_what_each_object_sees_of_a_window(objects, count, window_us, camera):
+    _, _, _, seen = window_of(objects, count, window_us, camera)
+    (ours, ages), (theirs, plain_ages) = both_ways(seen)
+    assert torch.equal(ages, plain_ages)
+    for number in range(objects):
+        by_kernel, plain = (entries_of(events.rows(), number) for events in (ours, theirs))
+        assert by_kernel.keys() == plain.keys()
+        for name, value in plain.items():
+            torch.testing.assert_close(by_kernel[name], value, rtol=0, atol=1e-15)
+        assert int(ours.counts()[number]) == len(plain["age_s"])
+
+
+def test_events_of_several_objects_are_not_copied_for_each():
+    _, _, _, seen = window_of(4, 6000, 5000)
+    with torch.inference_mode():
+        events, _ = seen()
+    assert isinstance(events, SharedEvents)
+    assert events.shared.mask.shape[0] == 1
+    for number in range(4):
+        one, row = entries_of(events.of(number), 0), entries_of(events.rows(), number)
+        assert all(torch.equal(one[name], row[name]) for name in row)
+    assert int(events.counts()[3]) == 0
+    assert not events.of(3).mask.any()
+
+
+@pytest.mark.parametrize("count", [100, 5000])
+def test_of_shared_events_those_are_chosen_that_would_be_of_rows(count):
+    tracker, _, prediction, seen = window_of(3, 6000, 5000)
+    with torch.inference_mode():
+        events, _ = seen()
+        contours = prediction.contours(torch.full((3,), 5e-3).double(), tracker.config.contours)
+        index, moving = index_contours(contours, tracker.image_size, 7, 2), prediction.moving(compensated=True)
+        shared, rows = (select_events(each, index, moving, count) for each in (events, events.rows()))
+    assert int(shared.mask.sum()) > 0
+    assert torch.equal(shared.mask, rows.mask)
+    for name in ("pixels", "age_s", "into_burst_s", "polarity"):
+        assert torch.equal(getattr(shared, name)[shared.mask], getattr(rows, name)[rows.mask])
+
+
+def test_events_of_no_stream_are_not_seen():
+    tracker, events, prediction, _ = window_of(2, 500, 5000)
+    beyond = replace(events, stream_index=torch.full_like(events.stream_index, 3))
+    dt_s, t_us = torch.full((2,), 5e-3).double(), torch.tensor([5000])
+    ages = tracker.init(pose().expand(2, 4, 4), 0).burst_age_us
+    with torch.inference_mode():
+        counts = []
+        for batch in (events, concatenate([events, beyond])):
+            nearby = tracker.sensors.near_objects(NearbyEvents(batch), prediction, dt_s, tracker.config)
+            seen, _ = tracker.sensors.window_events(nearby, ages, t_us, t_us, 1000)
+            counts.append(seen.counts())
+    assert torch.equal(*counts)
