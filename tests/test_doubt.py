@@ -9,7 +9,7 @@ from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, 
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig, SearchConfig, TrackerConfig
-from torchtrack.doubt import Doubt, drifted, gathered_when_known, in_doubt, is_adrift, is_due, is_wanted, less_certain
+from torchtrack.doubt import Doubt, drifted, gathered_when_known, has_strayed, in_doubt, is_adrift, is_due, is_wanted, less_certain
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
@@ -24,15 +24,31 @@ SEARCHED = TrackerConfig(
     corners=CornerConfig(max_corners=32), matching=FORGETFUL, motion=TURNING, search=SearchConfig(doubt_us=10_000, drift_diameters_s=4)
 )
 NEVER_ADRIFT = TrackerConfig(corners=CornerConfig(max_corners=32), matching=FORGETFUL, motion=TURNING, search=SearchConfig(doubt_us=0, slipped_to=0))
+# Nothing is ever in doubt, and looks farther away are for what was not seen well for long, or for nothing.
+STRAYING, NEVER_STRAYED = (
+    SEARCHED.model_copy(update={"search": SearchConfig(doubt_us=10_000, drift_diameters_s=4, doubted_below=0, slipped_to=0, strayed_to=share)})
+    for share in (0.85, 0.0)
+)
 # Twenty degrees, onto other edges: farther than a pose that is sure of itself is looked for.
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
 
 def doubt(
-    sigma_px, score=0.9, usual=0.9, starting=False, due=True, adrift=False, doubted_s=0.0, full=0.9, far_due=False, symmetric=False, unseen_s=1.0
+    sigma_px,
+    score=0.9,
+    usual=0.9,
+    starting=False,
+    due=True,
+    adrift=False,
+    doubted_s=0.0,
+    full=0.9,
+    far_due=False,
+    symmetric=False,
+    unseen_s=1.0,
+    strayed=False,
 ):
     sigma_px = torch.as_tensor(sigma_px)
-    values = score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric, unseen_s
+    values = score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric, unseen_s, strayed
     return Doubt(sigma_px, *(torch.as_tensor(value).expand_as(sigma_px) for value in values))
 
 
@@ -121,6 +137,16 @@ def test_it_is_time_once_in_every_interval_whatever_the_windows():
 def test_an_object_is_adrift_once_it_was_in_doubt_for_long_and_it_is_time(doubt_us, expected):
     doubted_s, due = torch.tensor([0.045, 0.051, 0.051]), torch.tensor([True, True, False])
     assert is_adrift(doubted_s, due, SearchConfig(doubt_us=doubt_us)).tolist() == expected
+
+
+def test_what_is_sure_of_its_place_and_was_not_seen_well_for_long_may_have_strayed_when_it_is_time():
+    score, full = torch.tensor([0.7, 0.8, 0.7, 0.7, 0.7, 0.3]), torch.tensor([0.9] * 5 + [0.3])
+    unseen_s, sigma_px = torch.tensor([0.051, 0.051, 0.049, 0.051, 0.051, 0.051]), torch.tensor([1.0, 1.0, 1.0, 6.1, 1.0, 1.0])
+    due = torch.tensor([True] * 4 + [False, True])
+    settings = {"strayed_to": 0.85, "doubt_us": 50_000, "slip_sigma_px": 6.0}
+    assert has_strayed(score, full, unseen_s, sigma_px, due, SearchConfig(**settings)).tolist() == [True] + [False] * 5
+    for never in ({"strayed_to": 0}, {"doubt_us": 0}):
+        assert not has_strayed(score, full, unseen_s, sigma_px, due, SearchConfig(**{**settings, **never})).any()
 
 
 def test_what_explains_much_less_than_when_seen_well_by_smeared_events_is_in_doubt():
@@ -224,9 +250,23 @@ def test_a_pose_that_slipped_is_in_doubt_and_found_again():
 
 
 @pytest.mark.many_windows
-def test_finding_one_that_slipped_changes_nothing_for_its_neighbour():
-    _, alone, _ = slipped(SEARCHED, streams=2, displaced=-1)
-    _, beside, _ = slipped(SEARCHED, streams=2, displaced=0)
+def test_a_pose_that_strayed_is_found_again_though_it_was_never_in_doubt():
+    after, results, T_true = slipped(STRAYING, count=30)
+    lost, without, _ = slipped(NEVER_STRAYED, count=30)
+    degrees, millimetres = pose_errors(results[-1].T_cam_obj, T_true)
+    assert float(degrees) < 0.5
+    assert float(millimetres) < 1.0
+    assert float(after.unseen_s) == 0
+    assert float(pose_errors(without[-1].T_cam_obj, T_true)[0]) > 5
+    assert float(lost.unseen_s) > 0.1
+    assert float(after.doubted_s) == float(lost.doubted_s) == 0
+
+
+@pytest.mark.many_windows
+@pytest.mark.parametrize(("config", "count"), [(SEARCHED, 10), (STRAYING, 20)])
+def test_finding_one_that_slipped_changes_nothing_for_its_neighbour(config, count):
+    _, alone, _ = slipped(config, count, streams=2, displaced=-1)
+    _, beside, _ = slipped(config, count, streams=2, displaced=0)
     # Sums over as many columns as the fullest of the two has are rounded otherwise.
     torch.testing.assert_close(poses_of(alone, 1), poses_of(beside, 1), rtol=0, atol=1e-7)
     assert float((poses_of(alone) - poses_of(beside)).abs().max()) > 1e-3

@@ -21,8 +21,8 @@ IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
 DISPLACED = torch.tensor([[0.09, -0.06, 0.12, 0.008, -0.006, 0.0]], dtype=torch.float64)
 
 
-# By how much another pose must explain more, how much it must explain, and how much of the events around it it must gather.
-LEAST = torch.tensor([0.1, 0.0, 0.0])
+# By how much another pose must explain more, how much it must explain, how much of the events around it it must gather, and how many explain.
+LEAST = torch.tensor([0.1, 0.0, 0.0, 0.0])
 
 
 def test_rest_explains_nothing_of_what_was_looked_for_in_many_places():
@@ -89,7 +89,7 @@ def test_what_is_no_better_by_the_margin_is_left():
 def test_what_explains_too_little_for_being_far_away_is_left():
     tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
     prediction = replace(prediction, covariance=1e2 * prediction.covariance)
-    assert search(0, prediction, 8.0, torch.tensor([0.1, 1.1, 0.0]), seen, found, tracker.config) is found
+    assert search(0, prediction, 8.0, torch.tensor([0.1, 1.1, 0.0, 0.0]), seen, found, tracker.config) is found
     better = search(0, prediction, 8.0, LEAST, seen, found, tracker.config)
     assert better.elsewhere.tolist() == [True] and found.elsewhere.tolist() == [False]
 
@@ -99,10 +99,33 @@ def test_what_smears_events_more_than_it_may_is_left(gathered):
     """Where it cannot be told how far events gather, nothing speaks against a pose."""
     tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
     prediction = replace(prediction, covariance=1e2 * prediction.covariance)
-    assert search(0, prediction, 8.0, torch.tensor([0.1, 0.0, 1.01]), seen, found, tracker.config) is found
-    better = search(0, prediction, 8.0, torch.tensor([0.1, 0.0, gathered]), seen, found, tracker.config)
+    assert search(0, prediction, 8.0, torch.tensor([0.1, 0.0, 1.01, 0.0]), seen, found, tracker.config) is found
+    better = search(0, prediction, 8.0, torch.tensor([0.1, 0.0, gathered, 0.0]), seen, found, tracker.config)
     assert better.elsewhere.tolist() == [True]
     assert float(better.gathered) > 0.3
+
+
+def test_what_explains_too_few_events_is_left():
+    tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
+    prediction = replace(prediction, covariance=1e2 * prediction.covariance)
+    better = search(0, prediction, 8.0, LEAST, seen, found, tracker.config)
+    many = float(better.count)
+    assert search(0, prediction, 8.0, torch.tensor([0.1, 0.0, 0.0, many]), seen, found, tracker.config).elsewhere.tolist() == [True]
+    assert search(0, prediction, 8.0, torch.tensor([0.1, 0.0, 0.0, 2 * many]), seen, found, tracker.config) is found
+
+
+def test_what_was_merely_not_seen_well_has_to_explain_nearly_all_elsewhere_and_no_fewer_events():
+    tracker, state, _, _, _ = started()
+    _, _, _, found, _ = in_motion()
+    state = replace(state, score=torch.full((1,), 0.5), full_share=torch.full((1,), 0.8), unseen_s=torch.full((1,), 0.2))
+    strayed, in_place = (tracker._doubt(state, state.t_us + later_us, torch.ones(1), torch.tensor([False])) for later_us in (50_000, 0))
+    assert strayed.strayed.tolist() == strayed.adrift.tolist() == [True]
+    torch.testing.assert_close(strayed.doubted_s, state.unseen_s)
+    assert in_place.adrift.tolist() == [False]
+    near, elsewhere = _least(strayed, found, tracker.config.search)[..., 0]
+    torch.testing.assert_close(near, torch.tensor([0.15, 0.72, 0.0, 0.8 * float(found.count)]))
+    torch.testing.assert_close(elsewhere, torch.tensor([0.15, 0.72, 0.0, 0.0]))
+    torch.testing.assert_close(_least(in_place, found, tracker.config.search)[0, :, 0], torch.tensor([0.1, 0.0, 0.0, 0.0]))
 
 
 def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
@@ -172,7 +195,7 @@ def test_what_slipped_goes_on_as_certain_as_if_it_had_been_predicted():
     beside = better.fit.solution.hessian[0, :12, :12].double() - told
     scale = told.diagonal().rsqrt()
     assert float(torch.linalg.eigvalsh(beside * scale[:, None] * scale).min()) > -1e-3
-    assert _search_slipped(0, prediction, 1.0, torch.tensor([0.1, 1.1, 0.0]), seen, found, tracker.config) is found
+    assert _search_slipped(0, prediction, 1.0, torch.tensor([0.1, 1.1, 0.0, 0.0]), seen, found, tracker.config) is found
 
 
 @pytest.mark.parametrize("config", [UNSEARCHED, SEARCHED.model_copy(update={"solver": SEARCHED.solver.model_copy(update={"prior": False})})])

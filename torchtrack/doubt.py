@@ -2,7 +2,8 @@
 
 A pose that slipped onto other edges is sure of itself, and they explain its contours. What tells is that events around its
 contours no longer gather on them as they did. An object of which that is so for a while may have drifted off unnoticed, and
-the farther, the longer it lasts.
+the farther, the longer it lasts. So may one that merely explains less than when it is seen well: as a rule it is partly hidden
+instead, so that a pose elsewhere has to explain nearly all, and no fewer events, to be taken for it.
 """
 
 from dataclasses import dataclass, replace
@@ -34,11 +35,12 @@ class Doubt:
         starting: objects whose motion is not known yet.
         due: objects that it is time for, should they be very uncertain: what is hidden is not found by looking more often.
         adrift: objects that have been in doubt for long, and which it is time for.
-        doubted_s: for how long each has been in doubt (s).
+        doubted_s: for how long each has been in doubt, or not been seen well (s).
         full_share: explained when the object is seen well.
         far_due: objects that it is time to look for farther away, should there be reason to.
         has_symmetry: objects with a plane of symmetry.
         unseen_s: how long ago each was last seen well (s).
+        strayed: which of those adrift merely explain less than when seen well.
     """
 
     sigma_px: Float[Tensor, "b"]
@@ -52,6 +54,7 @@ class Doubt:
     far_due: Bool[Tensor, "b"]
     has_symmetry: Bool[Tensor, "b"]
     unseen_s: Float[Tensor, "b"]
+    strayed: Bool[Tensor, "b"]
 
     def reasons(self, score: Float[Tensor, "b"], config: SearchConfig) -> tuple[Bool[Tensor, "b"], ...]:
         """Which objects a search is wanted for: beside the prediction, where they may have slipped to, and mirrored."""
@@ -142,6 +145,24 @@ def gathered_when_known(doubt: Doubt, full_gathered: Float[Tensor, "b"], config:
 def is_adrift(doubted_s: Float[Tensor, "b"], due: Bool[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
     """Which objects have been in doubt for so long that they are looked for farther away, where that is ``due``."""
     return due & (doubted_s >= 1e-6 * config.doubt_us) if config.doubt_us else torch.zeros_like(due)
+
+
+def has_strayed(
+    last_score: Float[Tensor, "b"],
+    full_share: Float[Tensor, "b"],
+    unseen_s: Float[Tensor, "b"],
+    sigma_px: Float[Tensor, "b"],
+    due: Bool[Tensor, "b"],
+    config: SearchConfig,
+) -> Bool[Tensor, "b"]:
+    """Which objects, sure of their place, have not been seen well for so long that they are looked for farther away, where that is ``due``.
+
+    What is usual follows a slip that grows slowly, and the covariance forgets the direction that it went in.
+    """
+    if not (config.doubt_us and config.strayed_to):
+        return torch.zeros_like(due)
+    low = last_score < config.strayed_to * full_share
+    return due & low & (unseen_s >= 1e-6 * config.doubt_us) & (sigma_px < config.slip_sigma_px)
 
 
 def drifted(prediction: Prediction, doubt: Doubt, config: SearchConfig) -> Prediction:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -129,13 +130,17 @@ class SharedEvents:
         return self.shared.only(torch.where(exists, self.own[number : number + 1, :count], 0).long(), exists)
 
 
+# A window's events for each object, laid out one way or the other.
+ObjectEvents: TypeAlias = WindowEvents | SharedEvents
+
+
 def corner_observations(corners: Corners) -> Observations:
     """The corners as observations; their polarity is not known."""
     unknown = torch.zeros_like(corners.age_s)
     return Observations(corners.pixels, corners.age_s, unknown, unknown, corners.mask, corners.flow, corners.has_flow)
 
 
-def select_events(events: WindowEvents | SharedEvents, index: ContourIndex, objects: MovingObjects, count: int) -> Observations:
+def select_events(events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int) -> Observations:
     """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time.
 
     Which of them are taken hangs on each event's own number, not on how many come before it: a pose that is a little
@@ -157,7 +162,7 @@ def select_events(events: WindowEvents | SharedEvents, index: ContourIndex, obje
 
 
 def _selected_by_kernel(
-    events: WindowEvents | SharedEvents, index: ContourIndex, objects: MovingObjects, count: int
+    events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int
 ) -> tuple[Float[Tensor, "b c 5"], Bool[Tensor, "b c"]]:
     """What is told of the events that :func:`select_events` takes, and which there are, event by event."""
     # Not at the top: Numba is an extra.

@@ -9,7 +9,7 @@ from torchtrack import readback
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.model_trust import judge_elements
 from torchtrack.object_batch import ObjectBatch
-from torchtrack.observations import SharedEvents, WindowEvents
+from torchtrack.observations import ObjectEvents
 from torchtrack.polarity_memory import expected_polarity
 from torchtrack.prediction import Prediction
 from torchtrack.quality import Status
@@ -57,7 +57,7 @@ class Lesson:
         learns: whether anything is learned, and not only looked whether there is need to.
     """
 
-    events: WindowEvents | SharedEvents
+    events: ObjectEvents
     window_s: Float[Tensor, "b"]
     sigma_px: Float[Tensor, "b"]
     on_surfaces: Bool[Tensor, "b"] | None

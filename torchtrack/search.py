@@ -15,7 +15,7 @@ from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.contours import Contours
 from torchtrack.doubt import Doubt, drifted, less_certain
 from torchtrack.hypotheses import promising
-from torchtrack.observations import SharedEvents, WindowEvents, select_events
+from torchtrack.observations import ObjectEvents, WindowEvents, select_events
 from torchtrack.once import once
 from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
 from torchtrack.pose_problem import Linearisation
@@ -26,6 +26,8 @@ from torchtrack.readback import Answer
 _AS_MUCH = 0.02
 # The 99th percentile of the squared distance of a pose, of six dimensions, in standard deviations (chi-square).
 _LIKELY = 16.8
+# A pose explains no fewer events than another where it explains this share of theirs.
+_AS_MANY = 0.8
 # From this share of how far they do when an object is seen well, events gather in full.
 _AS_GATHERED = 0.9
 
@@ -92,7 +94,7 @@ def explained_at_rest(widening: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
 def search_wanted(
     prediction: Prediction,
     doubt: Doubt,
-    events: WindowEvents | SharedEvents,
+    events: ObjectEvents,
     found: Found,
     widening: Float[Tensor, "b"],
     config: TrackerConfig,
@@ -132,8 +134,10 @@ def search_wanted(
     return found, prediction, torch.where(was_adrift, gate_widening(sigma_px, config), widening)
 
 
-def _least(doubt: Doubt, found: Found, config: SearchConfig) -> Float[Tensor, "2 3 b"]:
-    """By how much other poses must explain more, how much they must explain and gather; and the same of where an object is not predicted at all.
+def _least(doubt: Doubt, found: Found, config: SearchConfig) -> Float[Tensor, "2 4 b"]:
+    """By how much other poses must explain more, how much they must explain and gather, and by how many events at least.
+
+    And the same of where an object is not predicted at all.
 
     While a motion is not known nothing says how far events gather when all is well, and dense print explains as much of many poses:
     one that smears the events more than the prediction's own is not better.
@@ -141,22 +145,20 @@ def _least(doubt: Doubt, found: Found, config: SearchConfig) -> Float[Tensor, "2
     margin = torch.where(doubt.starting, config.start_margin, config.margin)
     # What is far away has to explain about as much as usual; so has what is found step by step, while a motion is lost, ever farther away.
     needed = torch.where(doubt.adrift | doubt.starting, config.adrift_share * doubt.full_share, 0)
+    # What is partly hidden explains less, too: nothing but the whole object, seen elsewhere, speaks against that. A part of its edges does not.
+    margin = torch.where(doubt.strayed, config.slip_margin, margin)
+    needed = torch.where(doubt.strayed, config.slip_share * doubt.full_share, needed)
+    count = torch.where(doubt.strayed, _AS_MANY * found.count.to(margin.dtype), 0)
     # Of a new object, only what explains nearly all is surely better: edges of what hides it explain half.
     new = doubt.is_new(found.score, config)
     needed = torch.where(new, config.new_share, needed)
     gathered = torch.where(doubt.starting | new, found.gathered.nan_to_num(0.0) - _AS_MUCH, 0)
-    elsewhere = torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share, torch.zeros_like(margin)
-    return torch.stack([margin, needed, gathered, *elsewhere]).unflatten(0, (2, 3))
+    elsewhere = torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share, torch.zeros_like(margin), torch.zeros_like(count)
+    return torch.stack([margin, needed, gathered, count, *elsewhere]).unflatten(0, (2, 4))
 
 
 def _search_slipped(
-    number: int,
-    prediction: Prediction,
-    sigma_px: float,
-    least: Float[Tensor, "3"],
-    events: WindowEvents | SharedEvents,
-    found: Found,
-    config: TrackerConfig,
+    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "4"], events: ObjectEvents, found: Found, config: TrackerConfig
 ) -> Found:
     """:func:`search` for an object that is sure of where it is, and may be farther off than that.
 
@@ -189,8 +191,8 @@ def _search_from(
     number: int,
     other: Prediction,
     sigma_px: float,
-    least: Float[Tensor, "3"],
-    events: WindowEvents | SharedEvents,
+    least: Float[Tensor, "4"],
+    events: ObjectEvents,
     found: Found,
     prediction: Prediction,
     config: TrackerConfig,
@@ -202,19 +204,14 @@ def _search_from(
 
 
 def search(
-    number: int,
-    prediction: Prediction,
-    sigma_px: float,
-    least: Float[Tensor, "3"],
-    events: WindowEvents | SharedEvents,
-    found: Found,
-    config: TrackerConfig,
+    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "4"], events: ObjectEvents, found: Found, config: TrackerConfig
 ) -> Found:
     """Try other poses for the object ``number``; ``found`` with the best of them in its place, if that is better.
 
     Args:
         sigma_px: standard deviation of the object's prediction in the image.
-        least: by how much another pose must explain more, how much it must explain, and how much of the events around it it must gather.
+        least: by how much another pose must explain more, how much it must explain, how much of the events around it it must gather, and
+            how many events it must explain.
         events: of all objects.
     """
     return _search_around(number, prediction.copies(number, 1), found.fit.contours.of(number), sigma_px, least, events, found, config)
@@ -225,8 +222,8 @@ def _search_around(
     one: Prediction,
     outline: Contours,
     sigma_px: float,
-    least: Float[Tensor, "3"],
-    events: WindowEvents | SharedEvents,
+    least: Float[Tensor, "4"],
+    events: ObjectEvents,
     found: Found,
     config: TrackerConfig,
 ) -> Found:
@@ -237,9 +234,9 @@ def _search_around(
     offsets = promising(one, outline, covariance, widened_px, places, config)
     tried = _align_all(one.copies(0, len(offsets)), offsets, seen, config, found.full_gathered[number])
     offset = tried.fit.solution.from_prior
-    margin, needed, gathered = least.unbind()
+    margin, needed, gathered, count = least.unbind()
     # Written so that what does not tell how far it gathers counts.
-    counts = (tried.count >= config.quality.min_observations) & _is_likely(offset, covariance) & ~(tried.gathered < gathered)
+    counts = (tried.count >= count.clamp(min=config.quality.min_observations)) & _is_likely(offset, covariance) & ~(tried.gathered < gathered)
     score = torch.where(counts, tried.score, 0)
     best = _likeliest(score, offset, one.covariance[0])
     mine = torch.where(found.count[number] >= config.quality.min_observations, found.score[number], 0.0)

@@ -22,7 +22,7 @@ from torchtrack.evidence import AgeAt
 from torchtrack.flow import estimate_flow
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.observations import SharedEvents, WindowEvents
+from torchtrack.observations import ObjectEvents, SharedEvents, WindowEvents
 from torchtrack.prediction import Prediction
 from torchtrack.sensor_tiles import TILE_BITS, NearbyEvents, SensorTiles
 from torchtrack.time_surface import at_pixels, object_regions, time_surface
@@ -76,7 +76,7 @@ class Sensors:
 
     def window_events(
         self, nearby: NearbyEvents, burst_age_us: Int[Tensor, "s 2 h w"], t_us: Int[Tensor, "s"], elapsed_us: Int[Tensor, "s"], longest_us: int
-    ) -> tuple[WindowEvents | SharedEvents, Int[Tensor, "s 2 h w"]]:
+    ) -> tuple[ObjectEvents, Int[Tensor, "s 2 h w"]]:
         """The events of a window as each object's camera saw them, and the bursts' ages with them (µs).
 
         Args:
@@ -129,7 +129,7 @@ class Sensors:
 
     def _chosen_by_kernel(
         self, events: EventBatch, near: Tensor, tiles: SensorTiles, burst_age_us: Tensor, t_us: Tensor, elapsed_us: Tensor, longest_us: int
-    ) -> tuple[WindowEvents | SharedEvents, Int[Tensor, "s 2 h w"]]:
+    ) -> tuple[ObjectEvents, Int[Tensor, "s 2 h w"]]:
         """The events in tiles near each object, as it saw them, and the bursts' ages with them, event by event."""
         # Not at the top: Numba is an extra.
         from torchtrack.kernels import events as kernels

@@ -23,7 +23,7 @@ from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.learned_contours import LearnedContours, judge_model
 from torchtrack.lie import transform_points
 from torchtrack.object_batch import ObjectBatch
-from torchtrack.observations import SharedEvents, WindowEvents
+from torchtrack.observations import ObjectEvents
 from torchtrack.search import Found
 from torchtrack.surface_rays import surface_points
 
@@ -99,7 +99,7 @@ def learn_after(
     learned: LearnedContours,
     around: Surroundings,
     found: Found,
-    events: WindowEvents | SharedEvents,
+    events: ObjectEvents,
     wanted: Bool[Tensor, "b"] | None,
     config: TrackerConfig,
 ) -> LearnedContours:

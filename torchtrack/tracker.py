@@ -17,7 +17,7 @@ from torchtrack.camera import Camera
 from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.doubt import Doubt, gathered_when_known, is_adrift, is_due, is_wanted
+from torchtrack.doubt import Doubt, gathered_when_known, has_strayed, is_adrift, is_due, is_wanted
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.forecast import forecast
@@ -275,8 +275,10 @@ class Tracker(TrackedObjects):
         config = self.config.search
         due, far_due = (is_due(state.t_us, t_us, interval_us)[self.stream_index] for interval_us in (config.interval_us, config.doubt_us))
         adrift = is_adrift(state.doubted_s, far_due, config)
-        scores = state.score, state.usual_score
-        return Doubt(sigma_px, *scores, starting, due, adrift, state.doubted_s, state.full_share, far_due, self.has_symmetry, state.unseen_s)
+        strayed = ~(adrift | starting) & has_strayed(state.score, state.full_share, state.unseen_s, sigma_px, far_due, config)
+        since_s = torch.where(strayed, state.unseen_s, state.doubted_s)
+        told = sigma_px, state.score, state.usual_score, starting, due, adrift | strayed, since_s, state.full_share, far_due
+        return Doubt(*told, self.has_symmetry, state.unseen_s, strayed)
 
     @torch.no_grad()
     def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:

@@ -252,6 +252,9 @@ class SearchConfig(Settings):
     by_gathering: bool = Field(True, description="Poses are also compared by how far the events around contours gather on them: slips smear them.")
     doubted_below: float = Field(0.6, ge=0, le=1, description="Share of what an object explains when it is seen well below which it is in doubt.")
     doubt_us: int = Field(50_000, ge=0, description="What is in doubt for so long is looked for farther away, once in this time (µs); 0 for never.")
+    strayed_to: float = Field(
+        0.85, ge=0, le=1, description="Share of what an object explains when seen well below which, as long, it is looked for as well; 0 for never."
+    )
     drift_px_s: float = Field(200.0, gt=0, description="How fast it may have drifted off since the doubt began (px/s).")
     drift_diameters_s: float = Field(1.5, gt=0, description="The same for objects that are small in the image (diameters/s); the slower counts.")
     adrift_share: float = Field(0.65, ge=0, le=1, description="Share of what an object explains when seen well that is asked of a find farther away.")
