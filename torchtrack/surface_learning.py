@@ -23,7 +23,7 @@ from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.learned_contours import LearnedContours, judge_model
 from torchtrack.lie import transform_points
 from torchtrack.object_batch import ObjectBatch
-from torchtrack.observations import ObjectEvents
+from torchtrack.observations import ObjectEvents, WindowEvents
 from torchtrack.search import Found
 from torchtrack.surface_rays import surface_points
 
