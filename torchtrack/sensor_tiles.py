@@ -111,7 +111,9 @@ class SensorTiles(nn.Module):
             return NearbyEvents(EventBatch.empty())
         number = torch.from_numpy(kept) if len(kept) < len(events) else None
         events = events if number is None else events[number]
-        return NearbyEvents(events, number, _of_each(near.numpy(), self._of(events.x, events.y).numpy()))
+        # What is kept is near the one object; of several, it is told which.
+        of_each = _of_each(near.numpy(), self._of(events.x, events.y).numpy()) if len(near) > 1 else None
+        return NearbyEvents(events, number, of_each)
 
     def numbers_near(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> tuple[np.ndarray, int]:
         """The numbers of the events in tiles near any object, event by event, and how many these are; after them there are no numbers.
@@ -129,10 +131,8 @@ class SensorTiles(nn.Module):
         return kept, count
 
 
-def _of_each(near: np.ndarray, tile: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]] | None:
-    """The events near each object, where there are several, by the tiles near it and those of the events."""
-    if len(near) == 1:
-        return None
+def _of_each(near: np.ndarray, tile: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
+    """The events near each object, by the tiles near it and those of the events."""
     own = [np.flatnonzero(row[tile]) for row in near]
     count = torch.tensor([len(events) for events in own])
     exists = torch.arange(max(int(count.max()), 1)) < count[:, None]
