@@ -46,11 +46,26 @@ def conclude(
         widening: of each object's first gate.
         dt_s: length of the window.
     """
-    if config.solver.prior and prediction.acceleration is not None and switch.apply_to(dt_s):
-        return _by_kernel(state, prediction, prediction.acceleration, widening, found, corners, dt_s, config)
-    objects, contours, share = prediction.objects, found.fit.contours, found.share
-    solution = found.fit.solution
-    in_view = quality.visible_share(contours, objects.image_size)
+    expected = prediction.acceleration
+    if config.solver.prior and expected is not None and switch.apply_to(dt_s):
+        after, covariance, status = _judged_by_kernel(state, prediction, expected, widening, found, dt_s, config)
+    else:
+        after, covariance, status = _judged(state, prediction, widening, found, dt_s, config)
+    contours = reproject(found.fit.contours, after.T_cam_obj.to(dt_s.dtype), prediction.objects.intrinsics)
+    result = StepResult(state.t_us, after.T_cam_obj, covariance, status, found.share, contours, corners, found.count)
+    return replace(after, score=found.score, darker_outside=_darker_outside(state, found, status, dt_s, config)), result
+
+
+# The state with what is known of poses and motions after a window, covariances of the poses' left perturbation, and statuses.
+_Judgement = tuple[TrackerState, Float[Tensor, "b 6 6"], Int[Tensor, "b"]]
+
+
+def _judged(
+    state: TrackerState, prediction: Prediction, widening: Float[Tensor, "b"], found: Found, dt_s: Float[Tensor, "b"], config: TrackerConfig
+) -> _Judgement:
+    """What every object's pose is worth, and where it goes on from there: arguments as those of :func:`conclude`."""
+    objects, share, solution = prediction.objects, found.share, found.fit.solution
+    in_view = quality.visible_share(found.fit.contours, objects.image_size)
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     step = solution.from_prior[:, :6] * ~(found.elsewhere & may_be_anywhere(widening))[:, None]
     status = quality.judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening)
@@ -66,80 +81,68 @@ def conclude(
     # Of an object that is partly hidden too little is seen to tell.
     seen_well = ~failed & (share >= config.quality.certain_at * state.full_share)
     acceleration = _acceleration(prediction, found, torch.where(seen_well, trusted, 0), dt_s)
-    contours = reproject(contours, T_cam_obj.to(velocity.dtype), objects.intrinsics)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
-    result = StepResult(state.t_us, T_cam_obj, left_covariance(covariance[:, :6, :6], centre_cam), status, share, contours, corners, found.count)
-    # One good window among bad ones does not end a doubt.
-    doubted_s = (state.doubted_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0)
     certain = (share >= _CERTAIN * state.full_share) & (status == int(quality.Status.TRACKING))
-    T_last_seen = torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen)
-    unseen_s = torch.where(certain, 0, state.unseen_s + dt_s)
     usual_score, full_share, full_gathered = _usual(state, found, failed)
-    next_state = replace(
+    after = replace(
         state,
         T_cam_obj=T_cam_obj,
         velocity=velocity,
         acceleration=acceleration,
         covariance=covariance,
-        score=found.score,
         usual_score=usual_score,
         full_share=full_share,
         full_gathered=full_gathered,
-        doubted_s=doubted_s,
-        T_last_seen=T_last_seen,
-        unseen_s=unseen_s,
-        darker_outside=_darker_outside(state, found, status, dt_s, config),
+        # One good window among bad ones does not end a doubt.
+        doubted_s=(state.doubted_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0),
+        T_last_seen=torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen),
+        unseen_s=torch.where(certain, 0, state.unseen_s + dt_s),
     )
-    return next_state, result
+    return after, left_covariance(covariance[:, :6, :6], centre_cam), status
 
 
-def _by_kernel(
+def _judged_by_kernel(
     state: TrackerState,
     prediction: Prediction,
     expected: Acceleration,
     widening: Float[Tensor, "b"],
     found: Found,
-    corners: Corners,
     dt_s: Float[Tensor, "b"],
     config: TrackerConfig,
-) -> tuple[TrackerState, StepResult]:
-    """:func:`conclude`, object by object; ``expected`` is the prediction's acceleration."""
+) -> _Judgement:
+    """:func:`_judged`, object by object; ``expected`` is the prediction's acceleration."""
     # Not at the top: Numba is an extra.
     from torchtrack.kernels import conclusion as kernels
 
-    objects, fit, solution = prediction.objects, found.fit, found.fit.solution
-    in_view = quality.visible_share(fit.contours, objects.image_size)
+    objects, solution, batch = prediction.objects, found.fit.solution, len(dt_s)
+    in_view = quality.visible_share(found.fit.contours, objects.image_size)
     told = torch.stack([found.share, found.score, found.gathered, found.full_gathered, in_view, widening])
-    remembers = torch.stack([state.usual_score, state.full_share, state.full_gathered, state.doubted_s, state.unseen_s])
-    T_last_seen, batch = state.T_last_seen.clone(memory_format=torch.contiguous_format), len(dt_s)
+    remembered = torch.stack([state.usual_score, state.full_share, state.full_gathered, state.doubted_s, state.unseen_s])
+    T_last_seen = state.T_last_seen.clone(memory_format=torch.contiguous_format)
     T_cam_obj, covariance, left = (T_last_seen.new_empty(batch, size, size) for size in (4, 12, 6))
-    velocity, acceleration = dt_s.new_empty(2, batch, 6)
-    status = found.count.new_empty(batch)
+    (velocity, acceleration), status = dt_s.new_empty(2, batch, 6), found.count.new_empty(batch)
     kernels.conclude(
         *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance, prediction.information),
         *as_arrays(expected.expected, expected.variance, solution.T_cam_obj, solution.from_prior, solution.hessian),
         *as_arrays(found.elsewhere, found.count, told, dt_s, objects.centre_obj, objects.diameter_m),
         _settings(config),
-        *as_arrays(remembers, T_last_seen, T_cam_obj, velocity, acceleration, covariance, left, status),
+        *as_arrays(remembered, T_last_seen, T_cam_obj, velocity, acceleration, covariance, left, status),
     )
-    contours = reproject(fit.contours, T_cam_obj.to(velocity.dtype), objects.intrinsics)
-    usual_score, full_share, full_gathered, doubted_s, unseen_s = remembers.unbind()
-    next_state = replace(
+    usual_score, full_share, full_gathered, doubted_s, unseen_s = remembered.unbind()
+    after = replace(
         state,
         T_cam_obj=T_cam_obj,
         velocity=velocity,
         acceleration=acceleration,
         covariance=covariance,
-        score=found.score,
         usual_score=usual_score,
         full_share=full_share,
         full_gathered=full_gathered,
         doubted_s=doubted_s,
         T_last_seen=T_last_seen,
         unseen_s=unseen_s,
-        darker_outside=_darker_outside(state, found, status, dt_s, config),
     )
-    return next_state, StepResult(state.t_us, T_cam_obj, left, status, found.share, contours, corners, found.count)
+    return after, left, status
 
 
 def _settings(config: TrackerConfig) -> ConclusionSettings:
