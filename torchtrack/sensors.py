@@ -148,7 +148,7 @@ class Sensors:
             return shared, ages_us
         # Only what is written of this is ever looked at.
         own, counts = torch.empty(batch, places + 1, dtype=torch.int32), torch.empty(batch, dtype=torch.int64)
-        kernels.divide(kept, *of_events[:2], *as_arrays(near), TILE_BITS, tiles.width, *as_arrays(own, counts))
+        kernels.divide(kept, *of_events[:2], *as_arrays(near), TILE_BITS, tiles.columns, *as_arrays(own, counts))
         return SharedEvents(shared, own, counts), ages_us
 
     def corners(

@@ -50,14 +50,20 @@ def near_tiles(
 
 
 @kernel()
-def keep(x: Array, y: Array, is_near: Array, tile_bits: int, width: int, height: int, kept: Array) -> np.int64:
+def _tile(x: int, y: int, tile_bits: int, columns: int) -> np.uint64:
+    """The tile that a pixel lies in; unsigned, as an index needs no look then whether it is negative."""
+    return np.uint64(x >> tile_bits) + np.uint64(y >> tile_bits) * np.uint64(columns)
+
+
+@kernel()
+def keep(x: Array, y: Array, is_near: Array, tile_bits: int, columns: int, width: int, height: int, kept: Array) -> np.int64:
     """Numbers of the events in tiles near any object: how many; -1 where any event is outside the sensor.
 
     Args:
         kept: ``[e + 1]``, filled as far as there are any, and a zero after them.
         is_near: ``[t]``, tiles near any object.
     """
-    count, outside, columns = np.uint64(0), False, np.uint64((width - 1 >> tile_bits) + 1)
+    count, outside = np.uint64(0), False
     for i in range(len(x)):
         # Unsigned, a negative number is a large one.
         u, v = np.uint32(x[i]), np.uint32(y[i])
@@ -66,7 +72,7 @@ def keep(x: Array, y: Array, is_near: Array, tile_bits: int, width: int, height:
             continue
         # Products in the place of branches, of which a processor would guess many wrong.
         kept[count] = i
-        count += np.uint64(is_near[np.uint64(u >> tile_bits) + np.uint64(v >> tile_bits) * columns])
+        count += np.uint64(is_near[_tile(u, v, tile_bits, columns)])
     kept[count] = 0
     return np.int64(-1) if outside else np.int64(count)
 
@@ -114,7 +120,7 @@ def see_kept(
 
 
 @kernel()
-def divide(kept: Array, x: Array, y: Array, near: Array, tile_bits: int, width: int, own: Array, counts: Array) -> None:
+def divide(kept: Array, x: Array, y: Array, near: Array, tile_bits: int, columns: int, own: Array, counts: Array) -> None:
     """Which of the events that are kept are near each object.
 
     Args:
@@ -122,10 +128,10 @@ def divide(kept: Array, x: Array, y: Array, near: Array, tile_bits: int, width: 
         near: ``[b, t]``, tiles near each object.
         own, counts: ``[b, n + 1]`` places among those that are kept, and how many of them there are: ``[b]``; filled.
     """
-    tile, columns = np.empty(len(kept), np.uint32), np.uint64((width - 1 >> tile_bits) + 1)
+    tile = np.empty(len(kept), np.uint32)
     for j in range(len(kept)):
         i = np.uint64(kept[j])
-        tile[j] = np.uint64(x[i] >> tile_bits) + np.uint64(y[i] >> tile_bits) * columns
+        tile[j] = _tile(x[i], y[i], tile_bits, columns)
     for b in range(len(near)):
         of_object, places, count = near[b], own[b], np.uint64(0)
         for j in range(len(tile)):

@@ -4,7 +4,7 @@ import numpy as np
 
 from torchtrack.kernels.cholesky import factorise, solve
 from torchtrack.kernels.compiler import Array, kernel
-from torchtrack.kernels.motion import inverse_depth
+from torchtrack.kernels.motion import depth_of, inverse_depth
 
 # Variances are taken to be no less.
 _LEAST = 1e-30
@@ -49,12 +49,11 @@ def unknown_motion(
         unknown_px, sigma_px: ``[b]``, filled.
     """
     for b in range(len(covariance)):
-        depth_m, turning, moving = np.float64(T_cam_obj[b, 2, 3]), 0.0, 0.0
+        turning = moving = 0.0
         for k in range(3):
-            depth_m += T_cam_obj[b, 2, k] * centre_obj[b, k]
             turning += covariance[b, 6 + k, 6 + k] / 3.0
             moving += covariance[b, 9 + k, 9 + k] / 3.0
         place = 0.5 * (covariance[b, 3, 3] + covariance[b, 4, 4])
-        px_per_m = focal_px[b] * inverse_depth(depth_m)
+        px_per_m = focal_px[b] * inverse_depth(depth_of(T_cam_obj[b], centre_obj[b]))
         unknown_px[b] = np.sqrt(moving + turning * (0.5 * diameter_m[b]) ** 2) * window_s[b] * px_per_m
         sigma_px[b] = np.sqrt(place) * px_per_m

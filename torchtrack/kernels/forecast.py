@@ -3,7 +3,7 @@
 import numpy as np
 
 from torchtrack.kernels.compiler import Array, kernel
-from torchtrack.kernels.motion import inverse_depth, is_finite, turn
+from torchtrack.kernels.motion import depth_of, inverse_depth, is_finite, turn
 from torchtrack.kernels.settings import ForecastSettings
 
 # What is told of each motion: its velocity, and of its acceleration what is expected, its variance, and its rate.
@@ -47,11 +47,8 @@ def forecast(
         if len(axes_obj):
             _without_spin(T_cam_obj[b], axes_obj[b], dt, settings, before, start)
         rotation_sigma, move_sigma = _acceleration_sigma(before, diameter_m[b], settings)
-        predict(start, rotation_sigma, move_sigma, dt, diameter_m[b], settings.most_uncertain, predicted[b])
-        depth_m = T_cam_obj[b, 2, 3]
-        for k in range(3):
-            depth_m += T_cam_obj[b, 2, k] * centre_obj[b, k]
-        way_px = 0.5 * move_sigma * dt * dt * intrinsics[b, 0] * inverse_depth(depth_m)
+        _predict(start, rotation_sigma, move_sigma, dt, diameter_m[b], settings.most_uncertain, predicted[b])
+        way_px = 0.5 * move_sigma * dt * dt * intrinsics[b, 0] * inverse_depth(depth_of(T_cam_obj[b], centre_obj[b]))
         counts = 1.0 / (1.0 + (settings.acceleration_px / max(way_px, _LEAST_WAY_PX)) ** settings.steepness)
         goes_on = counts * np.exp(-dt / settings.acceleration_s) if settings.acceleration_s > 0 and not settings.holds else 0.0
         for k in range(6):
@@ -109,7 +106,7 @@ def _acceleration_sigma(velocity: Array, diameter_m: float, settings: ForecastSe
 
 
 @kernel()
-def predict(
+def _predict(
     covariance: Array, rotation_sigma: float, move_sigma: float, dt: float, diameter_m: float, most_uncertain: float, predicted: Array
 ) -> None:
     """Covariance of pose and velocity after a while: :func:`torchtrack.motion.predict_covariance`.
@@ -156,5 +153,4 @@ def _move(
             T_prior[j, 3] += (T_cam_obj[j, k] - rotation[j, k]) * centre_obj[k]
             T_prior[j, k] = rotation[j, k]
     T_prior[3] = T_cam_obj[3]
-    depth_m = T_prior[2, 0] * centre_obj[0] + T_prior[2, 1] * centre_obj[1] + T_prior[2, 2] * centre_obj[2] + T_prior[2, 3]
-    return is_finite(T_prior) and settings.least_depth_m < depth_m < settings.most_depth_m
+    return is_finite(T_prior) and settings.least_depth_m < depth_of(T_prior, centre_obj) < settings.most_depth_m

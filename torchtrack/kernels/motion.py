@@ -83,6 +83,13 @@ def centre_of(T_cam_obj: Array, centre_obj: Array, centre_cam: Array) -> None:
     centre_cam[0], centre_cam[1], centre_cam[2] = placed(entries(T_cam_obj), centre_obj[0], centre_obj[1], centre_obj[2])
 
 
+@kernel()
+def depth_of(T_cam_obj: Array, centre_obj: Array) -> float:
+    """Depth of the object's centre (m)."""
+    T, c = T_cam_obj, centre_obj
+    return np.float64(T[2, 3]) + T[2, 0] * c[0] + T[2, 1] * c[1] + T[2, 2] * c[2]
+
+
 @kernel(fastmath=FAST)
 def turn(rotation: Array, phi: Array, into: Array) -> None:
     """Turn a rotation by Cayley's map: :func:`torchtrack.lie.turned`."""
