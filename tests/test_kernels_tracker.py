@@ -8,7 +8,7 @@ from both_ways import ROUNDINGS
 from helpers import SMALL_CAMERA, box_model, pose
 from tracked_boxes import SCENES, WIDE_CAMERA, assert_same, follow, merged, moving_box, poses_of, started, tensors_of, windows
 
-from torchtrack import Tracker, fast_alignment
+from torchtrack import Tracker, compiled, fast_alignment
 from torchtrack.baselines import tracker_class
 from torchtrack.config.presets import preset
 from torchtrack.config.run import RunConfig
@@ -16,6 +16,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.errors import EventDataError
 from torchtrack.kernels import switch
 from torchtrack.runner import run
+from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.stepping import track
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
@@ -185,3 +186,13 @@ def test_events_outside_the_sensor_are_told_before_anything_is_written(x, y):
     with torch.inference_mode(), pytest.raises(EventDataError, match=rf"event 7 is at \({x}, {y}\), outside the sensor of 200x150 pixels"):
         tracker.step(state, spoilt, end_us)
     assert all(torch.equal(now, then) for now, then in zip(tensors_of(state), before, strict=True))
+
+
+def test_events_outside_the_sensor_are_told_before_a_compiled_graph_is_given_them():
+    _, state, _, (events, end_us), _ = started(torch.float64)
+    spoilt = replace(events, x=events.x.clone())
+    spoilt.x[7] = SMALL_CAMERA.width
+    before = state.burst_age_us.clone()
+    with torch.inference_mode(), pytest.raises(EventDataError, match="event 7 is at .*, outside the sensor of 200x150 pixels"):
+        compiled._in_bursts(state, compiled._filled(NearbyEvents(spoilt), 1), torch.tensor([end_us]), 1000)
+    assert torch.equal(state.burst_age_us, before)

@@ -24,7 +24,8 @@ from torch.nn.functional import pad
 from torchtrack.bursts import update_bursts
 from torchtrack.constants import cells_within
 from torchtrack.errors import ConfigError
-from torchtrack.events import EventBatch, pad_streams
+from torchtrack.events import EventBatch, check_on_sensor, pad_streams
+from torchtrack.kernels import switch
 from torchtrack.online_learning import learning_is_due
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.state import S, StepResult, TrackerState, each_tensor
@@ -187,6 +188,10 @@ def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest
     Not in the graph: where 16 bits are enough, a CPU's compiler takes one pixel at a time.
     """
     streams, most = len(t_us), filled.events.most_of_one
+    if switch.apply_to(t_us):
+        # Unlike PyTorch's operations, kernels do not look where they read and write.
+        height, width = opened.burst_age_us.shape[-2:]
+        check_on_sensor(filled.events, width, height)
     window = pad_streams(filled.events, streams, t_us)
     burst_age_us, into_burst_us = update_bursts(opened.burst_age_us, t_us - opened.t_us, window, longest_us)
     if most is not None:
