@@ -9,7 +9,7 @@ from helpers import IMAGE_SIZE, contours_at, generator, moving_objects, seen, up
 from tracked_boxes import in_motion
 
 from torchtrack.alignment import align, gate_widening, index_for
-from torchtrack.common_error import mistaken_px2, told_by_each
+from torchtrack.common_error import SORTED_PX2, mistaken_px2, told_by_each
 from torchtrack.config.tracker import MatchingConfig, SolverConfig, TrackerConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contour_model import ContourKind
@@ -108,7 +108,7 @@ def two_lines(apart_px, dtype=torch.float64, kind=ContourKind.CREASE):
 
 def mistaken(contours, index, close_px=2.0):
     edges = (contours.kind == int(ContourKind.CREASE)) | (contours.kind == int(ContourKind.LIMB))
-    return mistaken_px2(contours, index, edges, close_px)[0]
+    return mistaken_px2(contours, index, edges, contours.kind == int(ContourKind.CREASE), close_px)[0]
 
 
 @pytest.mark.parametrize("apart_px", [1.0, 2.0, 3.0])
@@ -122,6 +122,28 @@ def test_close_edges_are_taken_for_each_other_half_of_the_time_at_most(apart_px,
 @pytest.mark.parametrize("apart_px", [0.2, 5.0, 12.0])
 def test_what_is_one_edge_or_far_from_the_next_is_not_mistaken(apart_px):
     assert (mistaken(*two_lines(apart_px)) == 0).all()
+
+
+def two_depths(apart_px, kind=ContourKind.CREASE, depth_m=1.05):
+    """Two upright lines, the second at another depth than the first, and a point whose depth makes the object 0.1 m deep."""
+    far = upright_line(80.0 + apart_px, kind=kind)
+    far.points_cam[..., 2] = depth_m
+    corner = contours_at([[[20.0, 20.0]]], kind=kind)
+    corner.points_cam[..., 2] = 1.1
+    contours = joined(joined(upright_line(80.0, kind=kind), far), corner)
+    return contours, index_contours(contours, IMAGE_SIZE, 8, 1)
+
+
+@pytest.mark.parametrize("apart_px", [0.2, 0.45, 1.0])
+def test_sharp_edges_at_different_depths_share_what_is_seen_even_where_they_cover_each_other(apart_px):
+    found = mistaken(*two_depths(apart_px))[:-1]
+    torch.testing.assert_close(found, torch.full_like(found, 0.5 * math.exp(-((apart_px / 2.0) ** 2)) * (apart_px**2 + SORTED_PX2)))
+
+
+def test_only_sharp_edges_and_only_where_they_are_far_apart_in_depth_cover_each_other():
+    assert (mistaken(*two_depths(0.2, ContourKind.LIMB)) == 0).all()
+    assert (mistaken(*two_depths(0.2, depth_m=1.01)) == 0).all()
+    assert (mistaken(*two_depths(0.02)) == 0).all()
 
 
 def test_print_and_edges_that_cross_are_not_mistaken():

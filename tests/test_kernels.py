@@ -141,6 +141,7 @@ def test_of_no_contours_nothing_is_found():
 @pytest.mark.parametrize("polarity", [None, uniform(3, 8, low=-1)])
 def test_the_table_of_contours(close_px, polarity, dtype):
     contours, polarity = random_contours(dtype=dtype), None if polarity is None else polarity.to(dtype)
+    contours = replace(contours, points_cam=contours.points_cam + uniform(*contours.mask.shape, 1, seed=5, dtype=dtype))
     index = index_contours(contours, IMAGE_SIZE, 7, 2)
     ours, theirs = both_ways(lambda: ContourTable.of(contours, index, polarity, close_px=close_px).rows)
     counts = contours.mask[:, None].expand_as(ours)

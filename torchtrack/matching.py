@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.linalg import vecdot
 
 from torchtrack.bursts import without_tail
-from torchtrack.common_error import APART_PX, ASIDE_PX, PARALLEL, mistaken_px2
+from torchtrack.common_error import APART_PX, ASIDE_PX, DEPTH_SHARE, PARALLEL, SORTED_PX2, TOUCHING_PX, mistaken_px2
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
@@ -103,7 +103,7 @@ class ContourTable:
         oriented, expected = limb | crease, (texture & of_print).to(contours.pixels.dtype)
         if polarity is not None:
             expected = torch.where(oriented, polarity.gather(1, octant(contours.normals)), expected)
-        mistaken = mistaken_px2(contours, index, oriented, close_px) if close_px else torch.zeros_like(expected)
+        mistaken = mistaken_px2(contours, index, oriented, crease, close_px) if close_px else torch.zeros_like(expected)
         marks = torch.stack([limb.to(expected.dtype), oriented.to(expected.dtype), expected, mistaken], -1)
         values = (contours.points_obj, contours.normals, index.pixels, marks)
         return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index)
@@ -121,11 +121,12 @@ def _rows_by_kernel(contours: Contours, index: ContourIndex, polarity: Tensor | 
     from torchtrack.kernels import table as kernels
 
     limb, crease, texture = (int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
-    settings = TableSettings(limb, crease, texture, of_print, close_px, ASIDE_PX, PARALLEL, APART_PX)
+    close = ASIDE_PX, PARALLEL, APART_PX, TOUCHING_PX, DEPTH_SHARE, SORTED_PX2
+    settings = TableSettings(limb, crease, texture, of_print, close_px, *close)
     table = contours.points_obj.new_empty(*contours.mask.shape, kernels.COLUMNS)
     points, pixels, normals, indexed = (value.transpose(1, 2) for value in (contours.points_obj, contours.pixels, contours.normals, index.pixels))
     expected = pixels.new_empty(len(table), 0) if polarity is None else polarity
-    given = as_arrays(points, pixels, normals, contours.kind, contours.mask, indexed, index.nearest, index.first)
+    given = as_arrays(points, contours.points_cam[..., 2], pixels, normals, contours.kind, contours.mask, indexed, index.nearest, index.first)
     kernels.fill(*given, index.cells, *as_arrays(expected), settings, table.numpy())
     return table.transpose(1, 2)
 

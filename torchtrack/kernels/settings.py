@@ -81,6 +81,7 @@ class TableSettings(NamedTuple):
         close_px: distance from which parallel edges are told apart; 0 for always.
         aside_px: where an edge is looked for beside another.
         parallel, apart_px: contours this parallel and this far apart are two edges.
+        touching_px, depth_share, sorted_px2: how little apart edges at different depths are, and by how much more they seem so.
     """
 
     limb: int
@@ -91,6 +92,9 @@ class TableSettings(NamedTuple):
     aside_px: float
     parallel: float
     apart_px: float
+    touching_px: float
+    depth_share: float
+    sorted_px2: float
 
 
 class GridSettings(NamedTuple):

@@ -14,6 +14,7 @@ __all__ = ["COLUMNS", "fill"]
 @kernel()
 def fill(
     points_obj: Array,
+    depth_m: Array,
     pixels: Array,
     normals: Array,
     kind: Array,
@@ -29,7 +30,7 @@ def fill(
     """Fill ``table [b, m, COLUMNS]``, with zeros for points that do not count.
 
     Args:
-        points_obj, pixels, normals, kind, mask: of contours; ``pixels`` and ``normals`` as ``[b, 2, m]``, ``points_obj`` as ``[b, 3, m]``.
+        points_obj, depth_m, pixels, normals, kind, mask: of contours; ``pixels`` and ``normals`` as ``[b, 2, m]``, ``points_obj`` as ``[b, 3, m]``.
         indexed: ``[b, 2, m]``, pixels when indexed.
         polarity: ``[b, 8]``, expected by octant; ``[b, 0]`` where nothing is.
     """
@@ -38,7 +39,7 @@ def fill(
         expected = polarity[b] if polarity.shape[1] else polarity.ravel()
         _fill_one(points_obj[b], pixels[b], normals[b], kind[b], mask[b], indexed[b], expected, settings, table[b])
         if settings.close_px:
-            _add_mistaken(pixels[b], normals[b], mask[b], nearest_of_cell[b], first[b], cells, settings, table[b])
+            _add_mistaken(depth_m[b], pixels[b], normals[b], kind[b], mask[b], nearest_of_cell[b], first[b], cells, settings, table[b])
 
 
 @kernel()
@@ -70,9 +71,19 @@ def _fill_one(
 
 @kernel()
 def _add_mistaken(
-    pixels: Array, normals: Array, mask: Array, nearest_of_cell: Array, first: Array, cells: Cells, settings: TableSettings, table: Array
+    depth_m: Array,
+    pixels: Array,
+    normals: Array,
+    kind: Array,
+    mask: Array,
+    nearest_of_cell: Array,
+    first: Array,
+    cells: Cells,
+    settings: TableSettings,
+    table: Array,
 ) -> None:
     """How far off what is seen on points of edges is, should it be of the edge beside: :func:`torchtrack.common_error.mistaken_px2`."""
+    least_m = settings.depth_share * _range(depth_m, mask)
     for i in range(len(mask)):
         if not mask[i] or not table[i, ORIENTED]:
             continue
@@ -83,6 +94,19 @@ def _add_mistaken(
                 continue
             apart_px = (pixels[0, other] - u) * nu + (pixels[1, other] - v) * nv
             is_parallel = abs(normals[0, other] * nu + normals[1, other] * nv) > settings.parallel
-            if is_parallel and apart_px * side_px > settings.apart_px * settings.aside_px:
+            is_deep = abs(depth_m[other] - depth_m[i]) > least_m and kind[i] == settings.crease and kind[other] == settings.crease
+            least_px = settings.touching_px if is_deep else settings.apart_px
+            if is_parallel and apart_px * side_px > least_px * settings.aside_px:
                 squared = apart_px * apart_px
-                table[i, MISTAKEN] = max(table[i, MISTAKEN], 0.5 * squared * np.exp(-squared / settings.close_px**2))
+                mistaken = 0.5 * (squared + settings.sorted_px2 * is_deep) * np.exp(-squared / settings.close_px**2)
+                table[i, MISTAKEN] = max(table[i, MISTAKEN], mistaken)
+
+
+@kernel()
+def _range(values: Array, mask: Array) -> float:
+    """How far apart the least and the largest of those values are that count; 0 of none."""
+    least, largest = np.inf, -np.inf
+    for i in range(len(mask)):
+        if mask[i]:
+            least, largest = min(least, values[i]), max(largest, values[i])
+    return max(largest - least, 0.0)
