@@ -100,6 +100,8 @@ def test_new_objects_that_leave_much_unexplained_are_searched_for_when_it_is_tim
     assert state.is_new(score, settings).tolist() == state.asks(score, settings).tolist() == [True, False, False]
     # Of one that explained about as much when it was seen well, nothing is new.
     assert not replace(state, full_share=torch.full((3,), 0.75)).is_new(score, settings).any()
+    # One window that is a little worse is no reason.
+    assert not replace(state, last_score=torch.full((3,), 0.95)).is_new(score, settings).any()
     assert not state.is_new(score, SearchConfig(new_share=0)).any()
 
 

@@ -72,8 +72,8 @@ class Doubt:
 
         Once in a while only: one that begins half hidden is new for long.
         """
-        new = self.full_share < _NEW * torch.maximum(score, self.last_score)
-        return ~self.starting & self.due & new & (score < config.new_share)
+        best = torch.maximum(score, self.last_score)
+        return ~self.starting & self.due & (self.full_share < _NEW * best) & (best < config.new_share)
 
     def slips(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects may have slipped: those that are sure of their place, and explain far less all at once."""
