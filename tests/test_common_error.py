@@ -137,7 +137,8 @@ def two_depths(apart_px, kind=ContourKind.CREASE, depth_m=1.05):
 @pytest.mark.parametrize("apart_px", [0.2, 0.45, 1.0])
 def test_sharp_edges_at_different_depths_share_what_is_seen_even_where_they_cover_each_other(apart_px):
     found = mistaken(*two_depths(apart_px))[:-1]
-    torch.testing.assert_close(found, torch.full_like(found, 0.5 * math.exp(-((apart_px / 2.0) ** 2)) * (apart_px**2 + SORTED_PX2)))
+    expected = 0.5 * math.exp(-((apart_px / 2.0) ** 2)) * (apart_px**2 + SORTED_PX2)
+    torch.testing.assert_close(found, torch.full_like(found, expected), rtol=1e-12, atol=0)
 
 
 def test_only_sharp_edges_and_only_where_they_are_far_apart_in_depth_cover_each_other():

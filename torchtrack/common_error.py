@@ -68,10 +68,12 @@ def mistaken_px2(
     least_m = DEPTH_SHARE * _range_m(depth_m, contours.mask)[:, None, None]
     is_deep = ((other_depth_m - depth_m[:, None]).abs() > least_m) & sharp[:, None] & (is_sharp > 0)
     # To the side that was looked at, and not the same edge.
-    is_apart = apart_px * aside_px > torch.where(is_deep, TOUCHING_PX, APART_PX) * ASIDE_PX
+    beyond_px = apart_px * aside_px / ASIDE_PX
+    is_apart = (beyond_px > APART_PX) | (is_deep & (beyond_px > TOUCHING_PX))
     is_other = is_apart & is_parallel & counts[:, None] & (is_edge > 0) & (found >= 0).unflatten(1, (2, -1))
     squared = apart_px.square()
-    return torch.where(is_other, 0.5 * (squared + SORTED_PX2 * is_deep) * torch.exp(squared * -(close_px**-2)), 0).amax(1)
+    seeming = torch.where(is_deep, squared + SORTED_PX2, squared)
+    return torch.where(is_other, 0.5 * seeming * torch.exp(squared * -(close_px**-2)), 0).amax(1)
 
 
 def _range_m(depth_m: Float[Tensor, "b m"], mask: Bool[Tensor, "b m"]) -> Float[Tensor, "b"]:
