@@ -7,6 +7,7 @@ import torch
 import trimesh
 from both_ways import assert_as_close, both_ways
 from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_events, random_pose, random_twist
+from test_common_error import two_depths
 from test_visibility import ball, l_prism
 
 from torchtrack.bursts import LONG_AGO_US, update_bursts
@@ -146,6 +147,13 @@ def test_the_table_of_contours(close_px, polarity, dtype):
     ours, theirs = both_ways(lambda: ContourTable.of(contours, index, polarity, close_px=close_px).rows)
     counts = contours.mask[:, None].expand_as(ours)
     torch.testing.assert_close(ours[counts], theirs[counts], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("apart_px", [0.05, 0.3, 1.0])
+def test_the_table_of_sharp_edges_that_nearly_cover_each_other(apart_px):
+    contours, index = two_depths(apart_px)
+    ours, theirs = both_ways(lambda: ContourTable.of(contours, index, close_px=1.7).rows)
+    torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-12)
 
 
 def window_events(batch=3, count=4000, dtype=torch.float64):
