@@ -258,7 +258,8 @@ def test_what_is_not_a_number_stays_with_its_object(what):
 def test_marks_of_poses(each, dtype):
     camera = torch.tensor([[1.0, 1.0, 0.0, 0.0]], dtype=dtype)
     group = group_by_model([box_model()], ContourConfig())[0].to(dtype)
-    objects = ObjectBatch([group], camera, torch.zeros(1, 3, dtype=dtype), torch.ones(1, dtype=dtype), torch.zeros(1).long(), (1, *IMAGE_SIZE), False)
+    own = torch.zeros(1, 3, dtype=dtype), torch.ones(1, 3, dtype=dtype), torch.ones(1, dtype=dtype), torch.zeros(1).long()
+    objects = ObjectBatch([group], camera, *own, (1, *IMAGE_SIZE), False)
     T_cam_obj = torch.eye(4, dtype=dtype)[None]
     prediction = Prediction(objects, T_cam_obj, torch.ones(1).bool(), torch.zeros(1, 6, dtype=dtype), torch.eye(12).double()[None])
     outlines = random_contours(40 if each else 1, 200, dtype=dtype)

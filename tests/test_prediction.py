@@ -28,6 +28,7 @@ def boxes(poses, covariance=None, velocity=None, dtype=torch.float64):
         models=[group.to(dtype) for group in group_by_model([box_model()] * count, CONTOURS)],
         intrinsics=SMALL_CAMERA.intrinsics(dtype).expand(count, 4),
         centre_obj=CENTRE_OBJ.to(dtype).expand(count, 3),
+        half_extent=torch.full((count, 3), 0.05, dtype=dtype),
         diameter_m=torch.full((count,), 0.17, dtype=dtype),
         stream_index=torch.arange(count),
         image_shape=(count, SMALL_CAMERA.height, SMALL_CAMERA.width),

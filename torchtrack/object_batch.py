@@ -46,6 +46,7 @@ class ObjectBatch:
         models: the distinct models, with the objects that have each.
         intrinsics: ``[fx, fy, cx, cy]`` of each object's camera.
         centre_obj: centre of each object (m).
+        half_extent: from there to the sides of each object's bounding box, along the axes of its frame (m).
         diameter_m: diameter of each object.
         stream_index: the stream that each object is seen in.
         image_shape: streams, height and width of the image.
@@ -58,6 +59,7 @@ class ObjectBatch:
     models: Sequence[ContourModel]
     intrinsics: Float[Tensor, "b 4"]
     centre_obj: Float[Tensor, "b 3"]
+    half_extent: Float[Tensor, "b 3"]
     diameter_m: Float[Tensor, "b"]
     stream_index: Int[Tensor, "b"]
     image_shape: tuple[int, int, int]
@@ -117,10 +119,10 @@ class ObjectBatch:
         # A shallow copy shares all tensors but the list of members.
         model = copy.copy(has_it)
         model.numbers, model._buffers = tuple(range(count)), {**has_it._buffers, "members": streams}
-        intrinsics, centre_obj, diameter_m = (repeat_row(value, number, count) for value in (self.intrinsics, self.centre_obj, self.diameter_m))
+        own = [repeat_row(value, number, count) for value in (self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m)]
         learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))
         shown, polarity = (None if values is None else repeat_row(values, number, count) for values in (self.shown, self.polarity))
-        return ObjectBatch([model], intrinsics, centre_obj, diameter_m, streams, (count, *self.image_size), False, learned, shown, polarity)
+        return ObjectBatch([model], *own, streams, (count, *self.image_size), False, learned, shown, polarity)
 
 
 def repeat_row(values: Tensor, number: int, count: int) -> Tensor:

@@ -4,6 +4,7 @@ The sensor is laid out in tiles of whole pixels. One look at each event's tile, 
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
@@ -11,18 +12,22 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchtrack.camera import MIN_DEPTH_M, project
+from torchtrack.constants import constant
 from torchtrack.events import EventBatch, check_on_sensor
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import TileSettings
+from torchtrack.lie import transform_points
 from torchtrack.prediction import Prediction
 
 # Side of a tile (px, as a power of two).
-TILE_BITS = 4
+TILE_BITS = 3
 # Objects are expected within this many standard deviations of their prediction.
 _SIGMAS = 4.0
 # What is looked up near contours is so much coarser than a pixel (px).
 _SLACK_PX = 4.0
+# Corners of a box, in halves of its sides from its middle.
+_CORNERS = tuple(product((-1.0, 1.0), repeat=3))
 
 
 @dataclass(frozen=True)
@@ -73,18 +78,18 @@ class SensorTiles(nn.Module):
         objects, (turning, speed_m_s) = prediction.objects, prediction.velocity.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
         turned, moved, *_ = prediction.covariance.diagonal(dim1=-2, dim2=-1).unflatten(1, (4, 3)).amax(-1).sqrt().to(turning.dtype).unbind(1)
         rim_m = 0.5 * objects.diameter_m
-        radius_m = rim_m + (speed_m_s + rim_m * turning) * window_s + _SIGMAS * (moved + rim_m * turned)
-        x, y, z = prediction.centre_cam.unbind(1)
-        # No point of a sphere is farther from its middle in the image: by the derivative of x/z along any way in it.
-        slant = (1 + (x * x + y * y) / (z * z)).sqrt()
-        radius_px = objects.intrinsics[:, :2].amax(1) * slant * radius_m / (z - radius_m).clamp(min=MIN_DEPTH_M)
-        u, v = (
-            tiles - objects_at
-            for tiles, objects_at in zip(self.middle.T, project(prediction.centre_cam[:, None], objects.intrinsics).unbind(-1), strict=True)
-        )
-        away_px = (u * u + v * v).sqrt() - self.reach_px
-        # Written so that what is not a number is near.
-        return ~(away_px > radius_px[:, None] + (margin_px + _SLACK_PX))
+        within_m = ((speed_m_s + rim_m * turning) * window_s + _SIGMAS * (moved + rim_m * turned))[:, None]
+        corners_obj = objects.centre_obj[:, None] + constant(_CORNERS, turning.dtype, turning.device) * objects.half_extent[:, None]
+        corners = transform_points(prediction.T_cam_obj, corners_obj)
+        nearest_m, slope = corners[..., 2] - within_m, corners[..., :2] / corners[..., 2:]
+        # No point of a ball is farther from its middle along an axis of the image: by the derivative of x/z along any way in it.
+        around_px = objects.intrinsics[:, None, :2] * (1 + slope * slope).sqrt() * (within_m / nearest_m)[..., None]
+        # Written so that what is not a number, or may lie beside or behind the camera, is near everywhere.
+        around_px = torch.where((nearest_m > MIN_DEPTH_M)[..., None], around_px, torch.inf) + (margin_px + _SLACK_PX)
+        at = project(corners, objects.intrinsics)
+        low, high = (at - around_px).amin(1), (at + around_px).amax(1)
+        reach_px = self.reach_px[:, None]
+        return ((self.middle + reach_px >= low[:, None]) & (self.middle - reach_px <= high[:, None])).all(-1)
 
     def _near_by_kernel(self, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
         """:meth:`near`, tile by tile."""
@@ -94,8 +99,10 @@ class SensorTiles(nn.Module):
         objects = prediction.objects
         near = torch.empty(len(window_s), len(self.middle), dtype=torch.bool)
         variance = prediction.covariance.diagonal(dim1=-2, dim2=-1)[:, :6]
-        of_objects = as_arrays(prediction.velocity, variance, prediction.centre_cam, objects.diameter_m, objects.intrinsics, window_s)
-        near_tiles(*as_arrays(self.middle, self.reach_px), *of_objects, TileSettings(_SIGMAS, margin_px + _SLACK_PX), near.numpy())
+        moving = as_arrays(prediction.velocity, variance, prediction.T_cam_obj, window_s)
+        own = as_arrays(objects.centre_obj, objects.half_extent, objects.diameter_m, objects.intrinsics)
+        settings = TileSettings(_SIGMAS, margin_px + _SLACK_PX, MIN_DEPTH_M)
+        near_tiles(*as_arrays(self.middle, self.reach_px), *moving, *own, settings, near.numpy())
         return near
 
     def keep(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> NearbyEvents:

@@ -31,6 +31,7 @@ class TrackedObjects(nn.Module):
     stream_index: Tensor
     element_groups: Tensor
     centre_obj: Tensor
+    half_extent: Tensor
     diameter_m: Tensor
     revolution_axes: Tensor
     symmetry_points: Tensor
@@ -65,6 +66,7 @@ class TrackedObjects(nn.Module):
         self.register_buffer("sensor_pixels", sensor_pixels)
         self.tiles = SensorTiles(self.ideal_pixels[0]) if len(cameras) == 1 else None
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
+        self.register_buffer("half_extent", torch.stack([model.half_extent for model in objects]))
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
         self.register_buffer("revolution_axes", revolution_axes(objects))
         self.revolves = bool(self.revolution_axes.any())
@@ -93,7 +95,8 @@ class TrackedObjects(nn.Module):
     def objects(self) -> ObjectBatch:
         """The objects as one batch."""
         shape = (self.streams, *self.image_size)
-        return ObjectBatch(self.models, self.intrinsics, self.centre_obj, self.diameter_m, self.stream_index, shape, self._shared)
+        own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m, self.stream_index
+        return ObjectBatch(self.models, *own, shape, self._shared)
 
     @property
     def planes(self) -> SymmetryPlanes:

@@ -3,12 +3,14 @@
 import numpy as np
 
 from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.motion import inverse_depth
+from torchtrack.kernels.motion import Numbers, entries, lens, placed
 from torchtrack.kernels.settings import TileSettings
 
 # Rows of what an object sees of an event.
 PIXELS, AGE, INTO_BURST, POLARITY = 0, 2, 3, 4
 SEEN = 5
+# Events that are looked at together: what is found of them stays in the processor's nearest memory.
+_BLOCK = 1024
 
 
 @kernel(fastmath=FAST)
@@ -17,10 +19,12 @@ def near_tiles(
     reach_px: Array,
     velocity: Array,
     variance: Array,
-    centre_cam: Array,
+    T_cam_obj: Array,
+    window_s: Array,
+    centre_obj: Array,
+    half_extent: Array,
     diameter_m: Array,
     intrinsics: Array,
-    window_s: Array,
     tiles: TileSettings,
     near: Array,
 ) -> None:
@@ -32,21 +36,42 @@ def near_tiles(
         near: ``[b, t]``, filled.
     """
     for b in range(len(near)):
-        x, y, z = centre_cam[b]
         rim_m = 0.5 * diameter_m[b]
         turning = np.sqrt((velocity[b, :3] ** 2).sum())
         speed_m_s = np.sqrt((velocity[b, 3:] ** 2).sum())
         turned, moved = np.sqrt(variance[b, :3].max()), np.sqrt(variance[b, 3:].max())
-        radius_m = rim_m + (speed_m_s + rim_m * turning) * window_s[b] + tiles.sigmas * (moved + rim_m * turned)
-        # No point of a sphere is farther from its middle in the image: by the derivative of x/z along any way in it.
-        slant = np.sqrt(1.0 + (x * x + y * y) / (z * z))
-        radius_px = max(intrinsics[b, 0], intrinsics[b, 1]) * slant * radius_m * inverse_depth(z - radius_m) + tiles.margin_px
-        inverse = inverse_depth(z)
-        u, v = x * inverse * intrinsics[b, 0] + intrinsics[b, 2], y * inverse * intrinsics[b, 1] + intrinsics[b, 3]
+        within_m = (speed_m_s + rim_m * turning) * window_s[b] + tiles.sigmas * (moved + rim_m * turned)
+        pose, of_lens = entries(T_cam_obj[b]), lens(intrinsics[b])
+        left, top, right, bottom = _around(pose, centre_obj[b], half_extent[b], of_lens, within_m, tiles.least_depth_m)
         for t in range(len(middle)):
-            du, dv = middle[t, 0] - u, middle[t, 1] - v
-            # Written so that what is not a number is near.
-            near[b, t] = not np.sqrt(du * du + dv * dv) - reach_px[t] > radius_px
+            u, v, away_px = middle[t, 0], middle[t, 1], reach_px[t] + tiles.margin_px
+            near[b, t] = u + away_px >= left and u - away_px <= right and v + away_px >= top and v - away_px <= bottom
+
+
+@kernel(fastmath=FAST)
+def _around(
+    pose: Numbers, centre_obj: Array, half_extent: Array, intrinsics: Numbers, within_m: float, least_depth_m: float
+) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom of all pixels that any point so close to an object's bounding box may be seen at."""
+    left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
+    for corner in range(8):
+        # Each axis one way or the other, by a bit of the number.
+        x, y, z = placed(
+            pose,
+            centre_obj[0] + half_extent[0] * ((corner & 1) * 2.0 - 1.0),
+            centre_obj[1] + half_extent[1] * ((corner & 2) - 1.0),
+            centre_obj[2] + half_extent[2] * ((corner & 4) * 0.5 - 1.0),
+        )
+        # Written so that what is not a number, or may lie beside or behind the camera, is near everywhere.
+        if not z - within_m > least_depth_m:
+            return -np.inf, -np.inf, np.inf, np.inf
+        # No point of a ball is farther from its middle along an axis of the image: by the derivative of x/z along any way in it.
+        around, slope_u, slope_v = within_m / (z - within_m), x / z, y / z
+        u, across = intrinsics[0] * slope_u + intrinsics[2], intrinsics[0] * np.sqrt(1.0 + slope_u * slope_u) * around
+        v, down = intrinsics[1] * slope_v + intrinsics[3], intrinsics[1] * np.sqrt(1.0 + slope_v * slope_v) * around
+        left, right = min(left, u - across), max(right, u + across)
+        top, bottom = min(top, v - down), max(bottom, v + down)
+    return left, top, right, bottom
 
 
 @kernel()
@@ -63,18 +88,28 @@ def keep(x: Array, y: Array, is_near: Array, tile_bits: int, columns: int, width
         kept: ``[e + 1]``, filled as far as there are any, and a zero after them.
         is_near: ``[t]``, tiles near any object.
     """
-    count, outside = np.uint64(0), False
+    count, tiles = np.uint64(0), np.empty(_BLOCK, np.uint32)
+    for first in range(0, len(x), _BLOCK):
+        if not _tiles_of(x[first : first + _BLOCK], y[first : first + _BLOCK], tile_bits, columns, width, height, tiles):
+            return np.int64(-1)
+        for i in range(first, min(first + _BLOCK, len(x))):
+            # Products in the place of branches, of which a processor would guess many wrong.
+            kept[count] = i
+            count += np.uint64(is_near[np.uint64(tiles[i - first])])
+    kept[count] = 0
+    return np.int64(count)
+
+
+@kernel()
+def _tiles_of(x: Array, y: Array, tile_bits: int, columns: int, width: int, height: int, tiles: Array) -> bool:
+    """The tile of each event, several at once, and whether all are on the sensor."""
+    right, bottom = np.uint32(0), np.uint32(0)
     for i in range(len(x)):
         # Unsigned, a negative number is a large one.
         u, v = np.uint32(x[i]), np.uint32(y[i])
-        if u >= width or v >= height:
-            outside = True
-            continue
-        # Products in the place of branches, of which a processor would guess many wrong.
-        kept[count] = i
-        count += np.uint64(is_near[_tile(u, v, tile_bits, columns)])
-    kept[count] = 0
-    return np.int64(-1) if outside else np.int64(count)
+        right, bottom = max(right, u), max(bottom, v)
+        tiles[i] = (u >> np.uint32(tile_bits)) + (v >> np.uint32(tile_bits)) * np.uint32(columns)
+    return right < width and bottom < height
 
 
 @kernel(fastmath=FAST)

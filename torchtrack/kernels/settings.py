@@ -147,10 +147,12 @@ class TileSettings(NamedTuple):
     Args:
         sigmas: objects are expected within so many standard deviations of their prediction.
         margin_px: how far from an object what is near it is.
+        least_depth_m: what is nearer to the camera is not seen.
     """
 
     sigmas: float
     margin_px: float
+    least_depth_m: float
 
 
 class QualitySettings(NamedTuple):

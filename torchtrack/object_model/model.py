@@ -33,8 +33,9 @@ class ObjectModel:
 
     Attributes:
         name: for messages and files.
-        centre: centre of the bounding box.
-        diameter_m: diagonal of the bounding box.
+        centre: of the bounding box.
+        half_extent: from there to its sides, along the axes.
+        diameter_m: its diagonal.
         edge_points: end points of the mesh edges that can ever be a contour, or are a crease.
         edge_normals: unit outward normals of the two faces beside each; ``(n, -n)`` at a border.
         edge_is_crease: bent by more than the crease angle: to be drawn whenever one of its faces is in front.
@@ -49,6 +50,7 @@ class ObjectModel:
 
     name: str
     centre: Float[Tensor, "3"]
+    half_extent: Float[Tensor, "3"]
     diameter_m: float
     edge_points: Float[Tensor, "e 2 3"]
     edge_normals: Float[Tensor, "e 2 3"]
@@ -164,6 +166,7 @@ class ObjectModel:
         return cls(
             name=name,
             centre=_tensor((low + high) / 2),
+            half_extent=_tensor((high - low) / 2),
             diameter_m=float(np.linalg.norm(high - low)),
             edge_points=_tensor(edges.points),
             edge_normals=_tensor(edges.normals),
