@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from both_ways import both_ways
 from helpers import SMALL_CAMERA, box_model, generator, pose, random_events
 from tracked_boxes import WINDOW_US, follow, merged, moving_box, tracker_of, windows
 
@@ -38,7 +39,8 @@ def test_every_pixel_lies_within_the_reach_of_its_tile(camera):
 def test_what_can_be_seen_of_an_object_is_near(margin_px, shift_m):
     T_cam_obj = pose(translation=(shift_m, 0.0, 0.5))
     tracker, prediction = prediction_at(T_cam_obj)
-    near = tracker.tiles.near(prediction, torch.tensor([0.005]), margin_px)
+    near, by_pytorch = both_ways(lambda: tracker.tiles.near(prediction, torch.tensor([0.005]), margin_px))
+    assert torch.equal(near, by_pytorch)
     pixels = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours).pixels[0]
     angle = torch.linspace(0, 6.28, 32)
     around = pixels[:, None] + margin_px * torch.stack([angle.cos(), angle.sin()], -1)
@@ -53,10 +55,31 @@ def test_tiles_far_from_all_objects_are_not_near():
     assert 0 < int(near.sum()) < near.shape[1] // 2
 
 
+@pytest.mark.parametrize("turn_rad", [0.0, 0.5])
+def test_few_tiles_beside_the_box_around_an_object_are_near(turn_rad):
+    T_cam_obj = pose(rotation=(0.0, 0.0, turn_rad), translation=(0.0, 0.0, 0.8))
+    tracker, prediction = prediction_at(T_cam_obj)
+    prediction.covariance[:] = 0.0
+    near, by_pytorch = both_ways(lambda: tracker.tiles.near(prediction, torch.tensor([0.005]), 0.0))
+    assert torch.equal(near, by_pytorch)
+    pixels = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours).pixels[0]
+    # A tile on either side, and what is looked up coarsely.
+    sides = pixels.amax(0) - pixels.amin(0) + 2 * (2 * 8 + 4)
+    assert int(near.sum()) * 64 <= float(sides.prod())
+
+
+def test_an_object_that_may_reach_the_camera_is_near_everywhere():
+    tracker, prediction = prediction_at(pose(translation=(0.0, 0.0, 0.5)))
+    prediction.covariance[:, 5, 5] = 0.15**2
+    for near in both_ways(lambda: tracker.tiles.near(prediction, torch.tensor([0.005]), 0.0)):
+        assert near.all()
+
+
 def test_an_object_that_is_not_known_where_to_be_is_near_everywhere():
     tracker, prediction = prediction_at(pose())
     prediction.covariance[:] = torch.nan
-    assert tracker.tiles.near(prediction, torch.tensor([0.005]), 0.0).all()
+    for near in both_ways(lambda: tracker.tiles.near(prediction, torch.tensor([0.005]), 0.0)):
+        assert near.all()
 
 
 def test_kept_events_keep_their_order_and_tell_their_numbers():

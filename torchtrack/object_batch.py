@@ -119,10 +119,12 @@ class ObjectBatch:
         # A shallow copy shares all tensors but the list of members.
         model = copy.copy(has_it)
         model.numbers, model._buffers = tuple(range(count)), {**has_it._buffers, "members": streams}
-        own = [repeat_row(value, number, count) for value in (self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m)]
+        own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m
+        intrinsics, centre_obj, half_extent, diameter_m = (repeat_row(value, number, count) for value in own)
         learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))
         shown, polarity = (None if values is None else repeat_row(values, number, count) for values in (self.shown, self.polarity))
-        return ObjectBatch([model], *own, streams, (count, *self.image_size), False, learned, shown, polarity)
+        size = (count, *self.image_size)
+        return ObjectBatch([model], intrinsics, centre_obj, half_extent, diameter_m, streams, size, False, learned, shown, polarity)
 
 
 def repeat_row(values: Tensor, number: int, count: int) -> Tensor:

@@ -109,7 +109,7 @@ def _tiles_of(x: Array, y: Array, tile_bits: int, columns: int, width: int, heig
         u, v = np.uint32(x[i]), np.uint32(y[i])
         right, bottom = max(right, u), max(bottom, v)
         tiles[i] = (u >> np.uint32(tile_bits)) + (v >> np.uint32(tile_bits)) * np.uint32(columns)
-    return right < width and bottom < height
+    return bool(right < width and bottom < height)
 
 
 @kernel(fastmath=FAST)
