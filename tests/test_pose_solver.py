@@ -10,6 +10,7 @@ from torch.autograd import gradcheck
 from torchtrack import pose_solver
 from torchtrack.camera import project
 from torchtrack.config.tracker import SolverConfig
+from torchtrack.kernels import switch
 from torchtrack.lie import retract_about, se3_exp, small_difference_about, transform_points
 from torchtrack.pose_problem import PoseProblem
 from torchtrack.pose_solver import pose_jacobian, robust_cost, solve_pose, solve_positive
@@ -19,6 +20,13 @@ LOSSES = ["tukey", "huber", "none"]
 THOROUGH = SolverConfig(iterations=20)
 # How far from the truth a solution may be: degrees, and millimetres.
 EXACT = {torch.float32: (2e-3, 2e-2), torch.float64: (1e-9, 1e-8)}
+
+
+@pytest.fixture(autouse=True, params=[True, False], ids=["kernels", "operations"])
+def way(request):
+    """Kernels, where there are any, and PyTorch's operations."""
+    with switch.kernels(wanted=request.param):
+        yield
 
 
 def problem_at(T_true, count=60, *, outliers=0, noise_px=0.0, prior=0.0, seed=0, dtype=torch.float64, scale_px=5.0):
@@ -276,7 +284,8 @@ def before_the_last_step(problem, start, config):
             places.append(self)
             return Watched(**vars(super().moved(step)))
 
-    with pytest.MonkeyPatch.context() as patch:
+    # Kernels cannot be watched; tests/test_kernels_solver.py has that they go the same way.
+    with pytest.MonkeyPatch.context() as patch, switch.kernels(wanted=False):
         patch.setattr(pose_solver, "_Place", Watched)
         solve_pose(problem, start, config)
     return places[-1].pose(problem)

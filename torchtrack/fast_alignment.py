@@ -13,7 +13,7 @@ from torchtrack.kernels.settings import MatchingSettings, RoundSettings
 from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SLOW_PX_S, SMEAR_PX, ContourTable, Matches
 from torchtrack.observations import Observations
 from torchtrack.pose_problem import Linearisation
-from torchtrack.pose_solver import rounding_floor
+from torchtrack.pose_solver import damping_settings
 from torchtrack.prediction import Prediction
 
 
@@ -63,7 +63,8 @@ def align_rounds(
         *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, objects.intrinsics, objects.centre_obj),
         *as_arrays(torch.tensor(config.matching.gates_px, dtype=offset.dtype), torch.stack(list(wider)), finely),
         _matching_settings(config),
-        RoundSettings(config.matching.motion_compensation, config.solver.velocity_in_window, config.solver.damping, *rounding_floor()),
+        RoundSettings(config.matching.motion_compensation, config.solver.velocity_in_window),
+        damping_settings(config.solver, information),
         *as_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
     )
     return Linearisation(T_cam_obj, gradient, hessian, offset), _matches(contour, is_near, is_matched, matches)

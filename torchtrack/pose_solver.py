@@ -16,9 +16,12 @@ from torchtrack import readback
 from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.constants import constant
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
+from torchtrack.kernels.settings import DampingSettings, SolvingSettings
 from torchtrack.lie import small_difference_about, turned
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
-from torchtrack.robust_loss import robust_loss, robust_weight
+from torchtrack.robust_loss import LOSSES, robust_loss, robust_weight
 
 # Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
 _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
@@ -169,21 +172,24 @@ def solve_positive(matrix: Float[Tensor, "b n n"], right: Float[Tensor, "b n k"]
     return torch.where(good[:, None, None], solution, 0), good
 
 
+def _least_share(hessian: Tensor) -> float:
+    """Share of the largest entry that is added to a diagonal.
+
+    It keeps directions that nothing observes solvable: their step is zero, as their gradient is, but for rounding. Poses alone
+    may have no prior that holds them: then it has to be above that.
+    """
+    return max(_LEAST_SHARE, torch.finfo(hessian.dtype).eps) if hessian.shape[-1] == 6 else _LEAST_SHARE
+
+
 def _damped(hessian: Tensor, damping: Tensor) -> Tensor:
     """The Hessian, damped along its diagonal."""
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
-    # A floor keeps directions that nothing observes solvable: their step is zero, as their gradient is, but for rounding. Poses
-    # alone may have no prior that holds them: then it has to be above that.
-    least = max(_LEAST_SHARE, torch.finfo(hessian.dtype).eps) if hessian.shape[-1] == 6 else _LEAST_SHARE
-    floor = torch.add(constant((_LEAST_DIAGONAL,), hessian.dtype, hessian.device), diagonal[:, :6].amax(-1, keepdim=True), alpha=least)
+    floor = torch.add(
+        constant((_LEAST_DIAGONAL,), hessian.dtype, hessian.device), diagonal[:, :6].amax(-1, keepdim=True), alpha=_least_share(hessian)
+    )
     damped = hessian.clone()
     damped.diagonal(dim1=-2, dim2=-1).add_(torch.addcmul(floor, diagonal, damping[:, None]))
     return damped
-
-
-def rounding_floor() -> tuple[float, float]:
-    """What a kernel adds to a Hessian's diagonal beside its damping: so much, and this share of its largest entry."""
-    return _LEAST_DIAGONAL, _LEAST_SHARE
 
 
 def _judged_step(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
@@ -214,9 +220,11 @@ def solve_pose(
     Returns:
         The last linearisation, with the pose that its step led to.
     """
-    rows = _as_rows(problem)
     if from_prior is None:
         from_prior = _from_prior(problem, T_start)
+    if switch.apply_to(T_start):
+        return _solved_by_kernel(problem, T_start, config, from_prior)
+    rows = _as_rows(problem)
     damping = torch.full_like(problem.scale_px, config.damping)
     place = _Place.of(problem, T_start, from_prior)
     gradient, hessian, cost = _look(problem, rows, place, config.loss, judged=config.iterations > 1)
@@ -231,6 +239,37 @@ def solve_pose(
         place = _Place(*where)
     found = place.moved(_last_step(gradient, hessian, damping))
     return Linearisation(found.pose(problem), gradient, hessian, found.from_prior)
+
+
+def _solved_by_kernel(problem: PoseProblem, T_start: Tensor, config: SolverConfig, from_prior: Tensor) -> Linearisation:
+    """:func:`solve_pose`, object by object."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.solving import solve_poses
+
+    window = problem.window or _no_window(problem)
+    T_cam_obj, offset = (value.detach().clone(memory_format=torch.contiguous_format) for value in (T_start, from_prior))
+    gradient, hessian = torch.empty_like(offset), torch.empty_like(problem.prior_information, memory_format=torch.contiguous_format)
+    observed = problem.points_obj, problem.targets, problem.directions, problem.weights, window.age_s, window.outward
+    of_objects = window.velocity, window.rate_hz, problem.intrinsics, problem.centre_obj, problem.scale_px, problem.prior_information
+    rounding = _ROUNDINGS * torch.finfo(T_start.dtype).eps
+    solve_poses(
+        *as_arrays(*(value.detach() for value in (*observed, *of_objects))),
+        SolvingSettings(config.iterations, LOSSES.index(config.loss), rounding, _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY),
+        damping_settings(config, hessian),
+        *as_arrays(T_cam_obj, offset, gradient, hessian),
+    )
+    return Linearisation(T_cam_obj, gradient, hessian, offset)
+
+
+def _no_window(problem: PoseProblem) -> WindowTerms:
+    """What stands for terms that a problem has not."""
+    nothing, no_motion = problem.weights.new_empty(len(problem.weights), 0), problem.weights.new_empty(len(problem.weights), 6)
+    return WindowTerms(nothing, no_motion, nothing, no_motion)
+
+
+def damping_settings(config: SolverConfig, hessian: Float[Tensor, "b k k"]) -> DampingSettings:
+    """What a kernel goes by that damps Hessians like this one as :func:`solve_pose` does."""
+    return DampingSettings(config.damping, _LEAST_DIAGONAL, _least_share(hessian))
 
 
 def _look(problem: PoseProblem, rows: _Rows, place: _Place, loss: str, *, judged: bool) -> tuple[Tensor, Tensor, Tensor]:

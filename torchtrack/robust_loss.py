@@ -6,6 +6,9 @@ from torch import Tensor
 
 from torchtrack.constants import one
 
+# By these numbers, kernels know them.
+LOSSES = ("none", "huber", "tukey")
+
 
 def robust_loss(
     residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], loss: str, weight: Float[Tensor, "b n"] | None = None

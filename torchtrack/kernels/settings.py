@@ -46,9 +46,36 @@ class RoundSettings(NamedTuple):
 
     compensated: bool
     velocity_in_window: bool
+
+
+class DampingSettings(NamedTuple):
+    """How a Hessian is damped along its diagonal, as :mod:`torchtrack.pose_solver` does.
+
+    Args:
+        damping: share of each entry, at first.
+        least_diagonal, least_share: what is added beside it: so much, and this share of the pose's largest entry.
+    """
+
     damping: float
     least_diagonal: float
     least_share: float
+
+
+class SolvingSettings(NamedTuple):
+    """What :mod:`torchtrack.kernels.solving` goes by beside that.
+
+    Args:
+        loss: none (0), Huber (1) or Tukey (2).
+        rounding: share of a cost that it is known to.
+        least_raised, growth, decay: damping after a step that was rejected is no less, times that; after another, times this.
+    """
+
+    iterations: int
+    loss: int
+    rounding: float
+    least_raised: float
+    growth: float
+    decay: float
 
 
 class IndexSettings(NamedTuple):

@@ -1,0 +1,207 @@
+"""Levenberg-Marquardt of :func:`torchtrack.pose_solver.solve_pose`, object by object, and the parts of a step that rounds share."""
+
+import numpy as np
+
+from torchtrack.kernels.cholesky import factorise, solve
+from torchtrack.kernels.compiler import FAST, Array, kernel
+from torchtrack.kernels.motion import Numbers, centre_of, entries, inverse_depth, is_finite, lens, turn, turned
+from torchtrack.kernels.settings import DampingSettings, SolvingSettings
+
+# Sums of products run along as many observations at a time: what they need stays in the fastest memory.
+_ALONG = FAST | {"reassoc"}
+# Unknowns of a pose; beside it there may be as many of its velocity, and a swelling.
+_POSE = 6
+
+
+@kernel()
+def solve_poses(
+    points_obj: Array,
+    targets: Array,
+    directions: Array,
+    weights: Array,
+    age_s: Array,
+    outward: Array,
+    velocity: Array,
+    rate_hz: Array,
+    intrinsics: Array,
+    centre_obj: Array,
+    scale_px: Array,
+    information: Array,
+    solving: SolvingSettings,
+    damping: DampingSettings,
+    T_cam_obj: Array,
+    offset: Array,
+    gradient: Array,
+    hessian: Array,
+) -> None:
+    """Solve each problem: :class:`torchtrack.pose_problem.PoseProblem` by its fields.
+
+    Args:
+        age_s, outward, velocity, rate_hz: of what is unknown beside the pose; not read where there is nothing.
+        T_cam_obj, offset: ``[b, 4, 4]`` and ``[b, k]`` from the prior, where the search starts; changed to where it ends.
+        gradient, hessian: ``[b, k]`` and ``[b, k, k]``, of the last linearisation; filled.
+    """
+    count, unknowns = weights.shape[1], offset.shape[1]
+    rows, robust = np.empty((unknowns + 1, count), weights.dtype), np.empty(count, weights.dtype)
+    (pose, next_pose), (offset_of, next_offset) = np.empty((2, 4, 4)), np.empty((2, unknowns))
+    step, next_gradient, next_hessian = np.empty(unknowns), np.empty(unknowns), np.empty((unknowns, unknowns))
+    for b in range(len(offset)):
+        pose[:], offset_of[:] = T_cam_obj[b], offset[b]
+        problem = (points_obj[b], targets[b], directions[b], weights[b], age_s[b], outward[b], velocity[b], rate_hz[b])
+        of_object = (lens(intrinsics[b]), centre_obj[b], scale_px[b], information[b])
+        cost = _look(problem, of_object, pose, offset_of, solving.loss, rows, robust, gradient[b], hessian[b])
+        damped = damping.damping
+        for _ in range(solving.iterations - 1):
+            next_pose[:], next_offset[:] = pose, offset_of
+            possible = damped_step(gradient[b], hessian[b], damped, damping, step)
+            move(next_pose, centre_obj[b], next_offset, step)
+            next_cost = _look(problem, of_object, next_pose, next_offset, solving.loss, rows, robust, next_gradient, next_hessian)
+            # Near the optimum, rounding must not decide.
+            if possible and next_cost <= cost * (1.0 + solving.rounding):
+                cost, damped = next_cost, damped * solving.decay
+                pose[:], offset_of[:], gradient[b], hessian[b] = next_pose, next_offset, next_gradient, next_hessian
+            else:
+                damped = max(damped, solving.least_raised) * solving.growth
+        damped_step(gradient[b], hessian[b], damped, damping, step)
+        move(pose, centre_obj[b], offset_of, step)
+        T_cam_obj[b], offset[b] = pose, offset_of
+
+
+@kernel(fastmath=FAST)
+def _look(
+    problem: tuple[Array, ...],
+    of_object: tuple[Numbers, Array, float, Array],
+    pose: Array,
+    offset: Array,
+    loss: int,
+    rows: Array,
+    robust: Array,
+    gradient: Array,
+    hessian: Array,
+) -> float:
+    """Gradient and Hessian at a pose and an offset from the prior, filled, and the cost there."""
+    points, targets, directions, weights, age_s, outward, velocity, rate_hz = problem
+    intrinsics, centre_obj, scale_px, information = of_object
+    unknowns, centre, cost, used, beside = len(offset), np.empty(3), 0.0, 0, np.zeros(_POSE)
+    centre_of(pose, centre_obj, centre)
+    numbers, c, middle = entries(pose), (centre_obj[0], centre_obj[1], centre_obj[2]), (centre[0], centre[1], centre[2])
+    if unknowns > _POSE:
+        beside[:] = offset[_POSE : 2 * _POSE] - velocity
+    for i in range(len(weights)):
+        if not weights[i] > 0:
+            continue
+        nu, nv = directions[i, 0], directions[i, 1]
+        there = (targets[i, 0] - intrinsics[2]) * nu + (targets[i, 1] - intrinsics[3]) * nv
+        row, residual = row_of(numbers, points[i, 0] - c[0], points[i, 1] - c[1], points[i, 2] - c[2], middle, intrinsics, nu, nv, there)
+        for k in range(_POSE):
+            rows[k, used] = row[k]
+        if unknowns > _POSE:
+            # Linear in all that is unknown beside the pose; the targets have been moved with one velocity already.
+            for k in range(_POSE):
+                rows[_POSE + k, used] = row[k] * age_s[i] * (0.5 * age_s[i] * rate_hz[k] - 1.0)
+                residual += rows[_POSE + k, used] * beside[k]
+            rows[2 * _POSE, used] = outward[i]
+            residual += outward[i] * offset[2 * _POSE]
+        weight, lost = robustly(residual, scale_px, loss)
+        cost += weights[i] * lost
+        rows[unknowns, used], robust[used] = residual, weights[i] * weight
+        used += 1
+    return cost + 0.5 * normal_equations(rows, robust, used, information, offset, gradient, hessian)
+
+
+@kernel(fastmath=FAST)
+def row_of(
+    pose: Numbers, x: float, y: float, z: float, centre: Numbers, intrinsics: Numbers, nu: float, nv: float, there: float
+) -> tuple[Numbers, float]:
+    """The Jacobian of a residual by the pose, and the residual: :func:`torchtrack.pose_solver.pose_jacobian`.
+
+    Args:
+        x, y, z: the point from the object's centre, in the object's axes.
+        nu, nv: the direction along which the distance counts.
+        there: where the target is along it, from the principal point.
+    """
+    ax, ay, az = turned(pose, x, y, z)
+    inverse = inverse_depth(az + centre[2])
+    gx, gy = nu * intrinsics[0] * inverse, nv * intrinsics[1] * inverse
+    along = gx * (ax + centre[0]) + gy * (ay + centre[1])
+    gz = -along * inverse
+    return (ay * gz - az * gy, az * gx - ax * gz, ax * gy - ay * gx, gx, gy, gz), along - there
+
+
+@kernel(fastmath=FAST)
+def robustly(residual: float, scale_px: float, loss: int) -> tuple[float, float]:
+    """Weight and loss of a residual: :mod:`torchtrack.robust_loss`, of none (0), Huber (1) and Tukey (2)."""
+    size = abs(residual)
+    if loss == 0 or (loss == 1 and size <= scale_px):
+        return 1.0, 0.5 * residual * residual
+    if loss == 1:
+        return scale_px / size, scale_px * (size - 0.5 * scale_px)
+    relative = residual / scale_px
+    inside = 1.0 - relative * relative
+    # Not the other way round: what is not a number stays that.
+    if inside < 0.0:
+        inside = 0.0
+    return inside * inside, scale_px * scale_px / 6.0 * (1.0 - inside * inside * inside)
+
+
+@kernel(fastmath=_ALONG)
+def normal_equations(rows: Array, weights: Array, used: int, information: Array, offset: Array, gradient: Array, hessian: Array) -> float:
+    """Gradient of the cost, and its Gauss-Newton Hessian, prior included, filled; and twice the prior's part of the cost.
+
+    Args:
+        rows: ``[k + 1, n]`` of the Jacobian, and the residuals.
+    """
+    unknowns, weighted, priors = len(offset), np.empty(used, rows.dtype), 0.0
+    for j in range(unknowns + 1):
+        row = rows[j]
+        for i in range(used):
+            weighted[i] = weights[i] * row[i]
+        for k in range(min(j + 1, unknowns)):
+            other, total = rows[k], rows.dtype.type(0)
+            for i in range(used):
+                total += weighted[i] * other[i]
+            if j == unknowns:
+                gradient[k] = total
+            else:
+                hessian[j, k] = hessian[k, j] = total
+    for j in range(unknowns):
+        pull = 0.0
+        for k in range(unknowns):
+            pull += information[j, k] * offset[k]
+            hessian[j, k] += information[j, k]
+        gradient[j] += pull
+        priors += offset[j] * pull
+    return priors
+
+
+@kernel()
+def damped_step(gradient: Array, hessian: Array, damped: float, damping: DampingSettings, step: Array) -> bool:
+    """The damped step to the optimum, filled, and whether there is one; none where the Hessian is not positive definite."""
+    unknowns = len(step)
+    matrix, factor, largest = hessian.astype(np.float64), np.empty((unknowns, unknowns)), 0.0
+    for k in range(_POSE):
+        largest = max(largest, matrix[k, k])
+    for k in range(unknowns):
+        matrix[k, k] += damping.least_diagonal + damping.least_share * largest + damped * matrix[k, k]
+        step[k] = -gradient[k]
+    if factorise(matrix, factor):
+        solve(factor, step)
+        if is_finite(step):
+            return True
+    step[:] = 0.0
+    return False
+
+
+@kernel()
+def move(T_cam_obj: Array, centre_obj: Array, offset: Array, step: Array) -> None:
+    """Take a step: turn about the object's centre, and move the centre."""
+    rotation, into, centre = T_cam_obj[:3, :3].astype(np.float64), np.empty((3, 3)), np.empty(3)
+    centre_of(T_cam_obj, centre_obj, centre)
+    turn(rotation, step, into)
+    for j in range(3):
+        back = into[j, 0] * centre_obj[0] + into[j, 1] * centre_obj[1] + into[j, 2] * centre_obj[2]
+        T_cam_obj[j, 3] = centre[j] + step[3 + j] - back
+        for k in range(3):
+            T_cam_obj[j, k] = into[j, k]
+    for k in range(len(step)):
+        offset[k] += step[k]
