@@ -67,3 +67,13 @@ def device(request) -> torch.device:
 def dtype(request) -> torch.dtype:
     """Both floating types that the tracker runs in."""
     return request.param
+
+
+@pytest.fixture(params=[True, False], ids=["kernels", "operations"])
+def way(request):
+    """Kernels, where there are any, and PyTorch's operations: that of this test."""
+    # Not at the top: what it imports must find the hook in place.
+    from torchtrack.kernels import switch
+
+    with switch.kernels(wanted=request.param):
+        yield

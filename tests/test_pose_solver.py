@@ -16,17 +16,11 @@ from torchtrack.pose_problem import PoseProblem
 from torchtrack.pose_solver import pose_jacobian, robust_cost, solve_pose, solve_positive
 from torchtrack.robust_loss import robust_loss, robust_weight
 
+pytestmark = pytest.mark.usefixtures("way")
 LOSSES = ["tukey", "huber", "none"]
 THOROUGH = SolverConfig(iterations=20)
 # How far from the truth a solution may be: degrees, and millimetres.
 EXACT = {torch.float32: (2e-3, 2e-2), torch.float64: (1e-9, 1e-8)}
-
-
-@pytest.fixture(autouse=True, params=[True, False], ids=["kernels", "operations"])
-def way(request):
-    """Kernels, where there are any, and PyTorch's operations."""
-    with switch.kernels(wanted=request.param):
-        yield
 
 
 def problem_at(T_true, count=60, *, outliers=0, noise_px=0.0, prior=0.0, seed=0, dtype=torch.float64, scale_px=5.0):

@@ -8,22 +8,15 @@ from helpers import SMALL_CAMERA, generator, pose_errors, random_pose
 
 from torchtrack.camera import project
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.kernels import switch
 from torchtrack.lie import retract_about, transform_points
 from torchtrack.pose_problem import PoseProblem, WindowTerms
 from torchtrack.pose_solver import robust_cost, solve_pose
 
+pytestmark = pytest.mark.usefixtures("way")
 THOROUGH = SolverConfig(iterations=20)
 WINDOW_S = 0.01
 # How far the true velocity is from the predicted one (rad/s, m/s).
 FASTER = torch.tensor([0.6, -0.4, 0.8, 0.1, -0.08, 0.06], dtype=torch.float64)
-
-
-@pytest.fixture(autouse=True, params=[True, False], ids=["kernels", "operations"])
-def way(request):
-    """Kernels, where there are any, and PyTorch's operations."""
-    with switch.kernels(wanted=request.param):
-        yield
 
 
 def windowed(T_true, *, count=300, faster=FASTER, swelling_px=0.0, noise_px=0.0, prior=1e-6, age_s=None, seed=0, dtype=torch.float64):

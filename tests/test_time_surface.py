@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers import generator, random_events
 
+from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch, concatenate
 from torchtrack.time_surface import NEVER_US, Regions, empty_last_event, object_regions, time_surface, update_last_event
 
@@ -38,12 +39,14 @@ def test_the_age_of_a_pixel_that_never_fired_fits_int64():
     assert 0 < 2**53 - NEVER_US < 2**63
 
 
+@pytest.mark.usefixtures("way")
 def test_an_event_is_kept_at_row_y_and_column_x():
     last = update_last_event(empty_last_event(1, 3, 5), events_at((4, 1, 70)))
     assert int(last[0, 1, 4]) == 70
     assert int((last != NEVER_US).sum()) == 1
 
 
+@pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("seed", range(3))
 def test_the_newest_event_of_a_pixel_is_kept_whatever_the_order(seed):
     events = random_events(2000, width=8, height=6, seed=seed)
@@ -55,23 +58,33 @@ def test_the_newest_event_of_a_pixel_is_kept_whatever_the_order(seed):
         assert torch.equal(update_last_event(empty_last_event(1, 6, 8), order), expected)
 
 
+@pytest.mark.usefixtures("way")
 def test_older_events_do_not_overwrite_newer_ones_of_earlier_windows():
     last = update_last_event(empty_last_event(1, 2, 2), events_at((0, 0, 100)))
     assert int(update_last_event(last, events_at((0, 0, 40)))[0, 0, 0]) == 100
 
 
+@pytest.mark.usefixtures("way")
 def test_windows_add_up_to_the_whole():
     events = random_events(500)
     halves = update_last_event(update_last_event(empty_last_event(1, 48, 64), events[:200]), events[200:])
     assert torch.equal(halves, update_last_event(empty_last_event(1, 48, 64), events))
 
 
+@pytest.mark.usefixtures("way")
 def test_streams_are_kept_apart():
     both = concatenate([events_at((1, 0, 5)), events_at((1, 0, 9), stream=1)])
     last = update_last_event(empty_last_event(2, 2, 3), both)
     assert last[:, 0, 1].tolist() == [5, 9]
 
 
+def test_an_event_outside_the_sensor_is_told():
+    pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
+    with pytest.raises(EventDataError, match=r"event 1 is at \(5, 1\), outside the sensor of 5x3 pixels"):
+        update_last_event(empty_last_event(1, 3, 5), events_at((0, 0, 10), (5, 1, 70)))
+
+
+@pytest.mark.usefixtures("way")
 def test_the_input_is_left_as_it_was():
     before = update_last_event(empty_last_event(1, 48, 64), random_events(100, seed=1))
     copy = before.clone()

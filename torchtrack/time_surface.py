@@ -12,7 +12,9 @@ from torch import Tensor
 from torchtrack import readback
 from torchtrack.bounds import bounds
 from torchtrack.constants import constant
-from torchtrack.events import EventBatch
+from torchtrack.events import EventBatch, check_on_sensor
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 
 # Time of a pixel that never fired: far in the past, and its age still fits int64 microseconds.
 NEVER_US = -(2**62)
@@ -35,11 +37,17 @@ def empty_last_event(streams: int, height: int, width: int, device: torch.device
     return torch.full((streams, height, width), NEVER_US, dtype=torch.int64, device=device)
 
 
+@torch.no_grad()
 def update_last_event(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -> Int[Tensor, "s h w"]:
     """The map of newest event times (µs) after ``events``; the input is left as it was.
 
     A maximum, not an assignment: with repeated indices the order of assignment is not defined.
+
+    Raises:
+        EventDataError: if an event is outside the sensor, where kernels are used.
     """
+    if switch.apply_to(last_event_us):
+        return _update_by_kernel(last_event_us, events)
     streams, height, width = last_event_us.shape
     # In the type of the coordinates, which is narrower than that of an index.
     pixel = torch.add(events.x, events.y, alpha=width).long()
@@ -48,6 +56,17 @@ def update_last_event(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -
     updated = last_event_us.clone()
     # In place on the copy: out of place, the whole map is copied twice.
     updated.view(-1).scatter_reduce_(0, pixel, events.t_us, "amax")
+    return updated
+
+
+def _update_by_kernel(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -> Int[Tensor, "s h w"]:
+    """:func:`update_last_event`, one event after the other."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.events import newest
+
+    updated = last_event_us.clone(memory_format=torch.contiguous_format)
+    if not newest(*as_arrays(events.x, events.y, events.t_us, events.stream_index, updated)):
+        check_on_sensor(events, width=last_event_us.shape[2], height=last_event_us.shape[1])
     return updated
 
 

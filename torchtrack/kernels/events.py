@@ -75,6 +75,23 @@ def _around(
 
 
 @kernel()
+def newest(x: Array, y: Array, t_us: Array, stream_index: Array, times_us: Array) -> bool:
+    """Bring a map of newest times ``[s, h, w]`` up, and tell whether all events are on the sensor: those after one that is not are not looked at."""
+    streams, height, width = np.uint64(times_us.shape[0]), np.uint32(times_us.shape[1]), np.uint32(times_us.shape[2])
+    times, size = times_us.ravel(), np.uint64(height) * np.uint64(width)
+    for i in range(len(x)):
+        # Unsigned, a negative number is a large one.
+        s, u, v = np.uint64(stream_index[i]), np.uint32(x[i]), np.uint32(y[i])
+        if s >= streams:
+            continue
+        if u >= width or v >= height:
+            return False
+        place = s * size + np.uint64(v) * np.uint64(width) + np.uint64(u)
+        times[place] = max(times[place], t_us[i])
+    return True
+
+
+@kernel()
 def _tile(x: int, y: int, tile_bits: int, columns: int) -> np.uint64:
     """The tile that a pixel lies in; unsigned, as an index needs no look then whether it is negative."""
     return np.uint64(x >> tile_bits) + np.uint64(y >> tile_bits) * np.uint64(columns)
