@@ -1,10 +1,13 @@
 """Shifts in the image that are tried all at once: that the right one is found, and only what is allowed."""
 
+import pytest
 import torch
+from both_ways import both_ways
+from helpers import generator
 from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
-from torchtrack.image_shifts import shifted
+from torchtrack.image_shifts import _peaks, shifted
 from torchtrack.views import outlines_at
 
 CONFIG = TrackerConfig(search=SearchConfig(kept=12))
@@ -70,3 +73,14 @@ def test_events_that_are_nowhere_count_for_nothing():
     assert torch.equal(shifted(prediction, steps, sigma, spoilt, CONFIG), shifted(prediction, steps, sigma, (pixels, mask), CONFIG))
     none = shifted(prediction, steps, sigma, (pixels, torch.zeros_like(mask)), CONFIG)
     assert torch.isfinite(none).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 1.0])
+def test_peaks_are_higher_than_all_around_them(share, dtype):
+    fit = torch.randn((20, 96, 96), generator=generator(), dtype=torch.float64).to(dtype)
+    allowed = torch.rand((96, 96), generator=generator(1)) < share
+    (best, place), (others, other_place) = both_ways(lambda: _peaks(fit, allowed))
+    assert torch.equal(best, others)
+    there = best > -9
+    assert torch.equal(place[there], other_place[there])
+    assert bool(there.any()) == (share > 0)

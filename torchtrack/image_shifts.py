@@ -8,12 +8,14 @@ left to draw are turns and depths, of which some hundreds are enough.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.fft import irfft2, rfft2
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 from torchtrack.prediction import Prediction
 from torchtrack.views import outlines_by_view
 
@@ -25,6 +27,8 @@ _SIGMAS, _DIAMETERS = 2.5, 1.3
 _BLUR, _BESIDE = 1, 3
 # Shifts that are kept of each turn, the best within so many cells to each side.
 _SHIFTS, _APART = 3, 2
+# Outlines that are correlated together: what they need stays in a processor's nearer memory.
+_TOGETHER = 32
 # What is no shift at all: less than any correlation.
 _NONE = -9.0
 
@@ -83,9 +87,12 @@ def _correlation(events: Float[Tensor, "h w"], outlines: Float[Tensor, "n h w"])
     """
     enough = events.clamp(max=1)
     denser = _blurred(enough, _BLUR) - _blurred(enough, _BESIDE)
-    shares = outlines / outlines.sum((1, 2), keepdim=True).clamp(min=1)
-    fit = irfft2(rfft2(denser) * rfft2(shares).conj(), s=(_SIDE, _SIDE))
-    return fit.roll((_SIDE // 2, _SIDE // 2), (1, 2))
+    spectrum = rfft2(denser.roll((_SIDE // 2, _SIDE // 2), (0, 1)))
+    fits = []
+    for some in outlines.split(_TOGETHER):
+        fit = irfft2(rfft2(some).conj() * spectrum, s=(_SIDE, _SIDE))
+        fits.append(fit.div_(some.sum((1, 2), keepdim=True).clamp(min=1)))
+    return torch.cat(fits)
 
 
 def _blurred(cells: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
@@ -98,9 +105,22 @@ def _best(fit: Float[Tensor, "n h w"], sigma_cells: Float[Tensor, ""], count: in
     """Numbers of the outlines that fit best, and their shifts (cells)."""
     step = torch.arange(_SIDE, dtype=fit.dtype, device=fit.device) - _SIDE // 2
     allowed = step[:, None].square() + step.square() <= (_SIGMAS * sigma_cells).square()
-    fit = torch.where(allowed, fit, _NONE)
-    highest = fit >= max_pool2d(fit[:, None], 2 * _APART + 1, 1, _APART)[:, 0]
-    best, place = torch.where(highest, fit, _NONE).flatten(1).topk(_SHIFTS)
+    best, place = _peaks(fit, allowed)
     chosen = best.flatten().topk(min(count, best.numel())).indices
     place = place.flatten()[chosen]
     return chosen // _SHIFTS, torch.stack([step[place % _SIDE], step[place // _SIDE]], -1)
+
+
+def _peaks(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
+    """The highest cells of each map, none of which is close to a higher one, and which they are; of cells that are allowed alone."""
+    if switch.apply_to(fit):
+        # Not at the top: Numba is an extra.
+        from torchtrack.kernels.shifts import peaks
+
+        best, place = fit.new_full((len(fit), _SHIFTS), _NONE), torch.empty(len(fit), _SHIFTS, dtype=torch.int64)
+        peaks(*as_arrays(fit, allowed), _APART, *as_arrays(best, place))
+        return best, place
+    fit = torch.where(allowed, fit, _NONE)
+    highest = fit >= max_pool2d(fit[:, None], 2 * _APART + 1, 1, _APART)[:, 0]
+    best, place = torch.where(highest, fit, _NONE).flatten(1).topk(_SHIFTS)
+    return best, place
