@@ -1,5 +1,7 @@
 """Statuses one by one, the explained share, what is in view, and how far a pose is trusted."""
 
+import math
+
 import pytest
 import torch
 
@@ -7,7 +9,7 @@ from torchtrack.config.tracker import QualityConfig
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours
 from torchtrack.matching import Matches
-from torchtrack.quality import Status, explained_share, gathered_share, judge, needed_share, trust, visible_share
+from torchtrack.quality import Status, explained_share, gathered_share, judge, needed_share, partly_hidden, trust, visible_share
 
 IMAGE_SIZE = (150, 200)
 CONFIG = QualityConfig()
@@ -140,6 +142,29 @@ def test_more_is_asked_of_finds_in_many_places_by_what_is_usual():
     config = QualityConfig(lost_below=0.1, uncertain_below=0.4, certain_at=0.75)
     share, usual, widening = torch.tensor([0.4, 0.4, 0.6, 0.4]), torch.tensor([0.8, 0.8, 0.8, 0.2]), torch.tensor([1.0, 2.0, 3.0, 2.0])
     assert trust(share, config, usual, widening).tolist() == pytest.approx([1.0, 0.6, 1.0, 1.0])
+
+
+def hidden(gathered=0.8, usually=0.8, count=200, elsewhere=False, config=CONFIG):
+    return float(partly_hidden(torch.tensor([gathered]), torch.tensor([usually]), torch.tensor([count]), torch.tensor([elsewhere]), config))
+
+
+@pytest.mark.parametrize(("gathered", "expected"), [(0.0, 0), (0.64, 0), (0.7, 0.5), (0.76, 1), (1.0, 1), (math.nan, 0)])
+def test_what_gathers_as_ever_counts_however_little_is_explained(gathered, expected):
+    assert hidden(gathered) == pytest.approx(expected, abs=1e-6)
+
+
+def test_nothing_counts_as_hidden_that_does_not_tell():
+    # Found by a search, too few observations, hardly gathering when seen well, never seen well, switched off.
+    assert hidden(elsewhere=True) == hidden(count=100) == hidden(0.5, 0.5) == hidden(usually=0.0) == 0
+    assert hidden(config=QualityConfig(partly_hidden=False)) == 0
+    assert hidden(count=30, config=QualityConfig(min_observations=7)) == 1
+
+
+def test_of_a_hidden_object_no_more_is_asked_in_more_places():
+    config, widening = QualityConfig(lost_below=0.2, caught_above=0.4), torch.full((3,), 2.0)
+    assert needed_share(widening, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.4, 0.3, 0.2])
+    told = torch.full((2,), 0.3), torch.full((2,), 100), torch.ones(2), torch.zeros(2, 6), torch.ones(2)
+    assert judge(*told, config, widening[:2], torch.tensor([0.0, 1.0])).tolist() == [Status.LOST, Status.UNCERTAIN]
 
 
 def test_an_uncertain_object_may_be_found_farther_away():

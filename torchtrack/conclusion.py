@@ -68,13 +68,14 @@ def _judged(
     in_view = quality.visible_share(found.fit.contours, objects.image_size)
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     step = solution.from_prior[:, :6] * ~(found.elsewhere & may_be_anywhere(widening))[:, None]
-    status = quality.judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening)
+    hidden = quality.partly_hidden(found.gathered, found.full_gathered, found.count, found.elsewhere, config.quality)
+    status = quality.judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening, hidden)
     status = torch.where(prediction.usable, status, int(quality.Status.DIVERGED))
     failed = status >= int(quality.Status.LOST)
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
-    trusted = torch.where(failed, 0, quality.trust(share, config.quality, state.full_share, widening))
+    trusted = torch.where(failed, 0, torch.maximum(hidden, quality.trust(share, config.quality, state.full_share, widening)))
     doubted = ~failed & in_doubt(found.score, state.full_share, found.gathered, found.full_gathered, config.search)
     status = torch.where(doubted, status.clamp(min=int(quality.Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
@@ -154,6 +155,11 @@ def _settings(config: TrackerConfig) -> ConclusionSettings:
         lost_below=config.quality.lost_below,
         caught_above=config.quality.caught_above,
         certain_at=config.quality.certain_at,
+        partly_hidden=config.quality.partly_hidden,
+        hidden_from=quality.HIDDEN_FROM,
+        hidden_fully=quality.HIDDEN_FULLY,
+        hidden_least=quality.HIDDEN_LEAST,
+        hidden_observations=quality.HIDDEN_TIMES * config.quality.min_observations,
         min_observations=config.quality.min_observations,
         min_visible_share=config.quality.min_visible_share,
         max_step_rotation_rad=config.quality.max_step_rotation_rad,

@@ -22,6 +22,10 @@ from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SMEAR_PX, Ma
 _LEAST_SHARE = 0.5
 # Fewer moving contour points than this say nothing.
 _MIN_MOVING_POINTS = 16
+# What gathers no more than this share of how far it does when an object is seen well says nothing for a pose; from the other one on, all.
+HIDDEN_FROM, HIDDEN_FULLY = 0.8, 0.95
+# It says nothing of objects on which less gathers even then, nor by fewer observations than so many times the least.
+HIDDEN_LEAST, HIDDEN_TIMES = 0.5, 4
 # How far around a contour observations are that should gather on it (px).
 _AROUND_PX = 5.0
 
@@ -128,9 +132,36 @@ def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tens
     return seen.sum(-1) / contours.mask.sum(-1).clamp(min=1)
 
 
-def needed_share(widening: Float[Tensor, "b"], config: QualityConfig) -> Float[Tensor, "b"]:
-    """The explained share below which an object is lost: the more places it was looked for in, the more is asked of a find."""
-    return config.lost_below + (max(config.caught_above, config.lost_below) - config.lost_below) * (widening - 1).clamp(0, 1)
+def needed_share(widening: Float[Tensor, "b"], config: QualityConfig, hidden: Float[Tensor, "b"] | None = None) -> Float[Tensor, "b"]:
+    """The explained share below which an object is lost: the more places it was looked for in, the more is asked of a find.
+
+    No more than of any, as far as it is ``hidden``, as :func:`partly_hidden` has it.
+    """
+    wider = (widening - 1).clamp(0, 1)
+    if hidden is not None:
+        wider = wider * (1 - hidden)
+    return config.lost_below + (max(config.caught_above, config.lost_below) - config.lost_below) * wider
+
+
+def partly_hidden(
+    gathered: Float[Tensor, "b"], full_gathered: Float[Tensor, "b"], count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: QualityConfig
+) -> Float[Tensor, "b"]:
+    """How far a pose counts, 0 to 1, by events that gather on its contours as they do when the object is seen well, however few these are.
+
+    Of an object that is partly hidden little is explained, but what is seen of it gathers as ever. Were it believed the less,
+    it would be expected in ever more places, lost, and hidden parts or not, it would be tracked no more. What a search found
+    is the best of many poses: on one of them, events gather by chance.
+
+    Args:
+        gathered: share of the events near the contours that are on them; not a number where it does not tell.
+        full_gathered: the same of when the object is seen well; zero where that is not known.
+        count: matched observations.
+        elsewhere: objects that a search found.
+    """
+    ramp = (gathered / full_gathered.clamp(min=1e-6) - HIDDEN_FROM) / (HIDDEN_FULLY - HIDDEN_FROM)
+    # Written so that what is not a number counts for nothing.
+    tells = (ramp > 0) & ~elsewhere & (full_gathered > HIDDEN_LEAST) & (count >= HIDDEN_TIMES * config.min_observations)
+    return torch.where(tells & config.partly_hidden, ramp.clamp(max=1), 0)
 
 
 def trust(
@@ -154,16 +185,18 @@ def judge(
     diameters_m: Float[Tensor, "b"],
     config: QualityConfig,
     widening: Float[Tensor, "b"] | None = None,
+    hidden: Float[Tensor, "b"] | None = None,
 ) -> Int[Tensor, "b"]:
     """The :class:`Status` of each object, the gravest reason first.
 
-    ``widening`` is of each object's first gate: an uncertain one may be found so much farther away.
+    ``widening`` is of each object's first gate: an uncertain one may be found so much farther away. ``hidden`` is from
+    :func:`partly_hidden`.
     """
     widening = torch.ones_like(quality) if widening is None else widening
     turned, moved = (step_from_prediction.unflatten(1, (2, 3)).norm(dim=-1) / widening[:, None]).unbind(1)
     reasons: dict[Status, Bool[Tensor, "b"]] = {
         Status.UNCERTAIN: quality < config.uncertain_below,
-        Status.LOST: quality < needed_share(widening, config),
+        Status.LOST: quality < needed_share(widening, config, hidden),
         Status.TOO_FEW_EVENTS: observation_count < config.min_observations,
         Status.OUT_OF_VIEW: in_view < config.min_visible_share,
         # Written so that what is not a number has diverged.

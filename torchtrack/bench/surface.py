@@ -31,7 +31,8 @@ def measure(setup: Setup) -> Report:
     for width, height in dict.fromkeys(window[:2] for window in WINDOWS):
         results.append(_of_surface(setup, width, height, (REGION_PX, REGION_PX)))
         results.append(_of_surface(setup, width, height, (height, width)))
-    return Report("surface", f"Time surface; {setup.clock.meaning}", tuple(results))
+    note = "The map before a window is kept: in short windows, most of the time is that of copying it."
+    return Report("surface", f"Time surface; {setup.clock.meaning}", tuple(results), (note,))
 
 
 def _of_map(setup: Setup, width: int, height: int, count: int) -> Result:

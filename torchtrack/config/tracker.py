@@ -275,6 +275,10 @@ class QualityConfig(Settings):
         0.35, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object is found again."
     )
     certain_at: float = Field(0.75, ge=0, le=1, description="Share of the quality when seen well, from which the find of an uncertain object counts.")
+    partly_hidden: bool = Field(
+        True,
+        description="A pose that explains little counts where events gather on its contours as when the object is seen well: it is partly hidden.",
+    )
     min_on_contour: int = Field(3, ge=1, description="Observations on the contours of a patch of the image from which these are explained.")
     min_speed_px_s: float = Field(30.0, ge=0, description="Contours moving slower than this across themselves need not fire (px/s).")
     max_step_rotation_rad: float = Field(0.5, gt=0, description="A larger rotation against the prediction within one window has diverged (rad).")

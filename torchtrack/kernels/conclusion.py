@@ -63,12 +63,13 @@ def conclude(
     inverses, centre = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(3)
     for b in range(len(usable)):
         full_share, share, dt = remembered[FULL_SHARE, b], found[SHARE, b], dt_s[b]
-        status[b] = _judge(b, usable, offset, elsewhere, matched, found, diameter_m[b], settings)
+        hidden = _hidden(b, elsewhere, matched, found, settings)
+        status[b] = _judge(b, usable, offset, elsewhere, matched, found, hidden, diameter_m[b], settings)
         failed = status[b] >= LOST
         _orthonormalise(T_prior[b] if failed else T_found[b], T_cam_obj[b])
         if failed and (settings.holds or not usable[b]):
             T_cam_obj[b] = T_before[b]
-        trusted = 0.0 if failed else _trust(share, full_share, found[WIDENING, b], settings)
+        trusted = 0.0 if failed else max(hidden, _trust(share, full_share, found[WIDENING, b], settings))
         doubted = not failed and _in_doubt(b, found, full_share, settings)
         if doubted:
             status[b] = max(status[b], UNCERTAIN)
@@ -92,11 +93,19 @@ def _clamped(value: float, least: float, most: float) -> float:
 
 @kernel()
 def _judge(
-    b: int, usable: Array, offset: Array, elsewhere: Array, matched: Array, found: Array, diameter_m: float, settings: ConclusionSettings
+    b: int,
+    usable: Array,
+    offset: Array,
+    elsewhere: Array,
+    matched: Array,
+    found: Array,
+    hidden: float,
+    diameter_m: float,
+    settings: ConclusionSettings,
 ) -> int:
     """The status of an object: :func:`torchtrack.quality.judge`."""
     widening, share, status = found[WIDENING, b], found[SHARE, b], TRACKING
-    wider, turned, moved = _clamped(widening - 1.0, 0.0, 1.0), 0.0, 0.0
+    wider, turned, moved = _clamped(widening - 1.0, 0.0, 1.0) * (1.0 - hidden), 0.0, 0.0
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     counts = 0.0 if elsewhere[b] and widening >= settings.anywhere else 1.0
     for k in range(3):
@@ -114,6 +123,17 @@ def _judge(
     if not (turned_ok and np.sqrt(moved) / widening < settings.max_step_translation * diameter_m) or not usable[b]:
         status = DIVERGED
     return status
+
+
+@kernel()
+def _hidden(b: int, elsewhere: Array, matched: Array, found: Array, settings: ConclusionSettings) -> float:
+    """How far a pose counts as that of an object that is partly hidden: :func:`torchtrack.quality.partly_hidden`."""
+    usual = found[USUALLY_GATHERED, b]
+    if not settings.partly_hidden or elsewhere[b] or not usual > settings.hidden_least or matched[b] < settings.hidden_observations:
+        return 0.0
+    ramp = (found[GATHERED, b] / usual - settings.hidden_from) / (settings.hidden_fully - settings.hidden_from)
+    # Written so that what is not a number counts for nothing.
+    return min(ramp, 1.0) if ramp > 0.0 else 0.0
 
 
 @kernel()

@@ -223,11 +223,12 @@ class ForecastSettings(NamedTuple):
 
 
 class ConclusionSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.conclusion` goes by: settings, and constants of :mod:`torchtrack.conclusion`, ``alignment`` and ``doubt``.
+    """What :mod:`torchtrack.kernels.conclusion` goes by: settings, and constants of the stages that it stands for.
 
     Args:
         holds: whether what failed stays where it was.
         anywhere: widening of the first gate from which an object may be anywhere.
+        hidden_from, hidden_fully, hidden_least, hidden_observations: what :func:`torchtrack.quality.partly_hidden` goes by.
         smeared: events that gather less than this share of how far they usually do are smeared.
         usual_gain, fall_gain: share of a new window in what is usual, and in what is seen well where it is less.
         certain_share: of what it explains when it is seen well, from which a pose is remembered as one.
@@ -239,6 +240,11 @@ class ConclusionSettings(NamedTuple):
     lost_below: float
     caught_above: float
     certain_at: float
+    partly_hidden: bool
+    hidden_from: float
+    hidden_fully: float
+    hidden_least: float
+    hidden_observations: int
     min_observations: int
     min_visible_share: float
     max_step_rotation_rad: float
