@@ -10,9 +10,10 @@ from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, poses_of, st
 from torchtrack import Tracker
 from torchtrack.config.tracker import SearchConfig, TrackerConfig
 from torchtrack.events import concatenate
+from torchtrack.kernels.switch import numba_is_installed
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
-from torchtrack.search import _is_likely, _least, _likeliest, _search_slipped, explained_at_rest, search
+from torchtrack.search import _is_likely, _least, _likeliest, _search_slipped, explained_at_rest, rehearse, search
 
 SEARCHED = TrackerConfig()
 UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
@@ -27,6 +28,15 @@ LEAST = torch.tensor([0.1, 0.0, 0.0, 0.0])
 
 def test_rest_explains_nothing_of_what_was_looked_for_in_many_places():
     assert explained_at_rest(torch.tensor([1.0, 1.5, 2.0, 3.2])).tolist() == [1.0, 0.5, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("hypotheses", "times"), [(24, 1), (0, 0)])
+def test_a_search_is_rehearsed_before_the_first_window(hypotheses, times, monkeypatch):
+    rehearsed = []
+    monkeypatch.setattr("torchtrack.tracker.rehearse", lambda prediction, config: (rehearsed.append(prediction), rehearse(prediction, config)))
+    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(hypotheses=hypotheses)))
+    tracker.prepare(tracker.init(pose()[None], 0))
+    assert len(rehearsed) == times * numba_is_installed()
 
 
 # ---- what is found

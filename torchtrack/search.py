@@ -244,6 +244,13 @@ def _search_around(
     return found if readback.none_of(better) else _replaced(found, number, tried, best, better)
 
 
+def rehearse(prediction: Prediction, config: TrackerConfig) -> None:
+    """Call what a wide search of one object calls beside what any window does: kernels are compiled, or read from the disk, at that."""
+    one = prediction.copies(0, 1)
+    outline, nowhere = one.objects.contours(one.T_cam_obj, config.contours), one.T_cam_obj.new_zeros(1, 1, 2)
+    promising(one, outline, one.covariance[0], 2 * config.search.wide_sigma_px, (nowhere, torch.zeros(1, 1, dtype=torch.bool)), config)
+
+
 def _is_likely(from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Bool[Tensor, "n"]:
     """Which poses lie where all but one in a hundred of a covariance do: edges of what hides an object explain much of it, farther away."""
     return _squared_deviations(from_prior[:, :6], covariance[:6, :6]) < _LIKELY

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchtrack import readback
 from torchtrack.bounds import bounds
 from torchtrack.constants import constant
-from torchtrack.events import EventBatch, check_on_sensor
+from torchtrack.events import EventBatch, check_on_sensor, stream_bounds
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 
@@ -65,8 +65,10 @@ def _update_by_kernel(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -
     from torchtrack.kernels.events import newest
 
     updated = last_event_us.clone(memory_format=torch.contiguous_format)
-    if not newest(*as_arrays(events.x, events.y, events.t_us, events.stream_index, updated)):
-        check_on_sensor(events, width=last_event_us.shape[2], height=last_event_us.shape[1])
+    ends = stream_bounds(events, len(updated)).tolist()
+    for times_us, begin, end in zip(updated, ends, ends[1:], strict=False):
+        if not newest(*as_arrays(events.x[begin:end], events.y[begin:end], events.t_us[begin:end], times_us)):
+            check_on_sensor(events, width=last_event_us.shape[2], height=last_event_us.shape[1])
     return updated
 
 

@@ -17,7 +17,7 @@ from torchtrack.camera import Camera
 from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.doubt import Doubt, gathered_when_known, has_strayed, is_adrift, is_due, is_wanted
+from torchtrack.doubt import Doubt, gathered_when_known, has_strayed, is_adrift, is_due, is_wanted, searches
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.forecast import forecast
@@ -31,7 +31,7 @@ from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.polarity_memory import nothing_remembered
 from torchtrack.prediction import Prediction
 from torchtrack.probation import after_probation
-from torchtrack.search import explained_at_rest, judge_fit, search_wanted
+from torchtrack.search import explained_at_rest, judge_fit, rehearse, search_wanted
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.sensors import farthest_event_px
 from torchtrack.setup_check import check_start
@@ -160,6 +160,8 @@ class Tracker(TrackedObjects):
             if switch.apply_to(self.intrinsics):
                 # Kernels are compiled, or read from the disk, when they are first called: for a window without events.
                 self._advance(state, EventBatch.empty(), state.t_us + 1)
+                if searches(self.config):
+                    rehearse(self._predict(state, torch.full_like(self.diameter_m, 1e-6)), self.config)
 
     def _steady(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult] | None:
         """A window by a compiled graph, where there is one and it holds."""

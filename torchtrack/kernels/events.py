@@ -75,18 +75,18 @@ def _around(
 
 
 @kernel()
-def newest(x: Array, y: Array, t_us: Array, stream_index: Array, times_us: Array) -> bool:
-    """Bring a map of newest times ``[s, h, w]`` up, and tell whether all events are on the sensor: those after one that is not are not looked at."""
-    streams, height, width = np.uint64(times_us.shape[0]), np.uint32(times_us.shape[1]), np.uint32(times_us.shape[2])
-    times, size = times_us.ravel(), np.uint64(height) * np.uint64(width)
+def newest(x: Array, y: Array, t_us: Array, times_us: Array) -> bool:
+    """Bring a map of newest times ``[h, w]`` up, if all events are on the sensor, and tell whether they are."""
+    height, width, right, bottom = np.uint32(times_us.shape[0]), np.uint32(times_us.shape[1]), np.uint32(0), np.uint32(0)
+    # Looked at before: several events at once, and none of the writes waits for it.
     for i in range(len(x)):
         # Unsigned, a negative number is a large one.
-        s, u, v = np.uint64(stream_index[i]), np.uint32(x[i]), np.uint32(y[i])
-        if s >= streams:
-            continue
-        if u >= width or v >= height:
-            return False
-        place = s * size + np.uint64(v) * np.uint64(width) + np.uint64(u)
+        right, bottom = max(right, np.uint32(x[i])), max(bottom, np.uint32(y[i]))
+    if len(x) > 0 and not (right < width and bottom < height):
+        return False
+    times = times_us.ravel()
+    for i in range(len(x)):
+        place = np.uint64(np.uint32(y[i]) * width + np.uint32(x[i]))
         times[place] = max(times[place], t_us[i])
     return True
 
