@@ -15,9 +15,8 @@ from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.errors import EventDataError
 from torchtrack.kernels import switch
-from torchtrack.runner import run
+from torchtrack.runner import run, track
 from torchtrack.sensor_tiles import NearbyEvents
-from torchtrack.stepping import track
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 

@@ -16,7 +16,7 @@ from torchtrack.events import EventBatch, concatenate
 from torchtrack.io import read_sequence
 from torchtrack.object_model import ObjectModel
 from torchtrack.quality import Status
-from torchtrack.stepping import track
+from torchtrack.runner import track
 
 MOTIONS = {
     "mixed": ((0.5, 0.6, 0.1), {}),

@@ -18,9 +18,9 @@ from torchtrack.errors import CalibrationError, ConfigError, EventDataError, Mis
 from torchtrack.events import EventBatch
 from torchtrack.io import read_sequence, read_tum
 from torchtrack.lie import rotation_angle_deg
-from torchtrack.runner import run
+from torchtrack.runner import run, track
 from torchtrack.session import open_session
-from torchtrack.stepping import clipped, track
+from torchtrack.stepping import clipped
 from torchtrack.streams import build_tracker
 
 

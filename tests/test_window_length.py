@@ -14,8 +14,8 @@ from torchtrack.config.tracker import WindowConfig
 from torchtrack.events import EventBatch
 from torchtrack.lie import se3_exp
 from torchtrack.quality import Status
+from torchtrack.runner import track
 from torchtrack.session import open_session
-from torchtrack.stepping import track
 from torchtrack.streams import build_tracker
 from torchtrack.window_length import WindowLength, contour_speed, next_window_us, tell_lengths
 

@@ -1,25 +1,58 @@
 """Runs, one or many: source → tracker → outputs."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.run import RunConfig, TrackingConfig
-from torchtrack.errors import ConfigError, TorchtrackError
+from torchtrack.config.tracker import WindowConfig
+from torchtrack.errors import ConfigError, EventDataError, TorchtrackError
+from torchtrack.events import EventBatch
 from torchtrack.executor import TaskFailure, Tell
 from torchtrack.executor.groups import run_in_groups
 from torchtrack.executor.tasks import without_errors
 from torchtrack.interrupt import Interrupt
+from torchtrack.io import EventSource
 from torchtrack.run_outputs import RunOutputs
 from torchtrack.session import Session, open_session
 from torchtrack.sinks import Sink
 from torchtrack.sinks.summary import RunSummary
-from torchtrack.stepping import track
+from torchtrack.smoothed_steps import SmoothedObjects, smoothed_steps
+from torchtrack.state import StepResult, TrackerState
+from torchtrack.stepping import clipped, cut_windows, steps
 from torchtrack.streams import follow
 from torchtrack.threads import threads
+from torchtrack.tracker import Tracker
+from torchtrack.window_length import WindowLength
 
 __all__ = ["run", "run_many", "track"]
+
+
+def track(
+    source: EventSource | Iterable[EventBatch], tracker: Tracker, state: TrackerState, window: WindowConfig | None = None
+) -> Iterator[StepResult]:
+    """Track one stream from ``state`` on, one result per window, in constant memory; smoothed where the tracker's settings say so.
+
+    Args:
+        source: a source of events, or batches of them in time order; events up to the state's time are passed over.
+        tracker: the tracker, of one stream.
+        state: where it starts, from :meth:`Tracker.init`.
+        window: how to cut the stream; as the tracker is configured when not given.
+
+    Raises:
+        EventDataError: if the stream has no events after the state's time, or they are malformed.
+    """
+    start_us = int(state.t_us[0])
+    chunks = source.chunks() if isinstance(source, EventSource) else source
+    seen, length = False, WindowLength(window or tracker.config.window)
+    objects = SmoothedObjects(tracker.centre_obj.double().cpu(), tracker.diameter_m.double().cpu(), tracker.intrinsics.double().cpu())
+    taken = steps(cut_windows(clipped(chunks, start_us), start_us, length), tracker, state, length)
+    for step in smoothed_steps(taken, objects, tracker.config):
+        seen = True
+        yield step.result
+    if not seen:
+        raise EventDataError(f"the stream has no events after {start_us} µs, where tracking starts. Check the start time and the file.")
 
 
 def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None = None) -> RunSummary:

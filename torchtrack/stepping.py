@@ -8,10 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchtrack.config.tracker import WindowConfig
-from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch, EventWindow, windows_by_count, windows_by_time
-from torchtrack.io import EventSource
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracker import Tracker
 from torchtrack.window_length import WindowLength, tell_lengths
@@ -19,7 +16,10 @@ from torchtrack.window_length import WindowLength, tell_lengths
 
 @dataclass(frozen=True)
 class Step:
-    """One window, what the tracker made of it, and how long that took (s); of streams that are tracked together, an equal part."""
+    """One window, what the tracker made of it, and how long that took (s); of streams that are tracked together, an equal part.
+
+    States of smoothed steps have no maps of events.
+    """
 
     window: EventWindow
     state: TrackerState
@@ -55,30 +55,6 @@ def timed_step(
             # Work on the GPU is queued: without waiting, the time measured is that of queueing.
             torch.cuda.synchronize(device)
     return next_state, result, time.perf_counter() - begun
-
-
-def track(
-    source: EventSource | Iterable[EventBatch], tracker: Tracker, state: TrackerState, window: WindowConfig | None = None
-) -> Iterator[StepResult]:
-    """Track one stream from ``state`` on, one result per window, in constant memory.
-
-    Args:
-        source: a source of events, or batches of them in time order; events up to the state's time are passed over.
-        tracker: the tracker, of one stream.
-        state: where it starts, from :meth:`Tracker.init`.
-        window: how to cut the stream; as the tracker is configured when not given.
-
-    Raises:
-        EventDataError: if the stream has no events after the state's time, or they are malformed.
-    """
-    start_us = int(state.t_us[0])
-    chunks = source.chunks() if isinstance(source, EventSource) else source
-    seen, length = False, WindowLength(window or tracker.config.window)
-    for step in steps(cut_windows(clipped(chunks, start_us), start_us, length), tracker, state, length):
-        seen = True
-        yield step.result
-    if not seen:
-        raise EventDataError(f"the stream has no events after {start_us} µs, where tracking starts. Check the start time and the file.")
 
 
 def clipped(chunks: Iterable[EventBatch], start_us: int, end_us: int | None = None) -> Iterator[EventBatch]:

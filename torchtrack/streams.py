@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import torch
 
@@ -16,6 +16,7 @@ from torchtrack.config.run import TrackingConfig
 from torchtrack.errors import ConfigError, TorchtrackError
 from torchtrack.events import EventWindow, concatenate
 from torchtrack.session import Session
+from torchtrack.smoothed_steps import SmoothedObjects, Smoother
 from torchtrack.state import TrackerState, joined, take_part
 from torchtrack.stepping import Step, timed_step
 from torchtrack.tracker import Tracker
@@ -66,7 +67,7 @@ def follow(
     with ExitStack() as stack:
         for number, opening in enumerate(followers):
             try:
-                opened[number] = stack.enter_context(closing(opening()))
+                opened[number] = _smoothed(stack.enter_context(closing(opening())), config)
             except TorchtrackError as error:
                 outcomes[number] = error
         for number, step in _steps(opened, config):
@@ -77,6 +78,33 @@ def follow(
         for number in opened.keys() - outcomes.keys():
             _take(number, Ended(), opened[number], outcomes)
     return [outcomes[number] for number in range(len(followers))]
+
+
+class _Smoothed(Generic[R]):
+    """A follower that is given steps once they are smoothed."""
+
+    def __init__(self, follower: Follower[R], smoother: Smoother) -> None:
+        self._follower, self._smoother = follower, smoother
+        self.session, self.windows, self.close = follower.session, follower.windows, follower.close
+
+    def add(self, step: Step) -> None:
+        """Take one step, and give on those that are due."""
+        for due in self._smoother.add(step):
+            self._follower.add(due)
+
+    def finish(self) -> R:
+        """Give on what was held back."""
+        for left in self._smoother.rest():
+            self._follower.add(left)
+        return self._follower.finish()
+
+
+def _smoothed(follower: Follower[R], config: TrackingConfig) -> Follower[R]:
+    """The follower, of smoothed steps where the settings ask for them."""
+    session = follower.session
+    if not config.tracker.smoothing.lag_s or not session.models:
+        return follower
+    return _Smoothed(follower, Smoother(SmoothedObjects.of(session.models, session.camera), config.tracker))
 
 
 def _take(number: int, step: "Step | Ended", follower: Follower[R], outcomes: dict[int, R | TorchtrackError]) -> None:

@@ -285,6 +285,14 @@ class QualityConfig(Settings):
     max_step_translation: float = Field(0.5, gt=0, description="A larger move against the prediction within one window has diverged (diameters).")
 
 
+class SmoothingConfig(Settings):
+    """Poses of a recording refined by what came after them, see :mod:`torchtrack.smoothing`."""
+
+    lag_s: float = Field(
+        0.0, ge=0, le=10, description="Each pose is refined by the windows of so much time after it, and comes that much later (s); 0 for not at all."
+    )
+
+
 class TrackerConfig(Settings):
     """All settings of the tracker."""
 
@@ -300,3 +308,13 @@ class TrackerConfig(Settings):
     model_trust: ModelTrustConfig = ModelTrustConfig()
     search: SearchConfig = SearchConfig()
     quality: QualityConfig = QualityConfig()
+    smoothing: SmoothingConfig = SmoothingConfig()
+
+    @model_validator(mode="after")
+    def _smoothed_by_a_filter(self) -> "TrackerConfig":
+        if self.smoothing.lag_s and not (self.solver.prior and self.motion.model == "constant_velocity"):
+            raise ValueError(
+                "smoothing weighs poses by what the filter knows of their motion: it needs solver.prior true and motion.model constant_velocity; "
+                "otherwise set smoothing.lag_s to 0"
+            )
+        return self
