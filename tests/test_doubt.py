@@ -46,9 +46,10 @@ def doubt(
     symmetric=False,
     unseen_s=1.0,
     strayed=False,
+    off_in_depth=False,
 ):
     sigma_px = torch.as_tensor(sigma_px)
-    values = score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric, unseen_s, strayed
+    values = score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric, unseen_s, strayed, off_in_depth
     return Doubt(sigma_px, *(torch.as_tensor(value).expand_as(sigma_px) for value in values))
 
 

@@ -45,6 +45,7 @@ def boxes(config=None, dtype=torch.float64):
     T_cam_obj = retract_about(state.T_cam_obj, random_twist(OBJECTS, rotation_rad=1.0, translation_m=0.05), tracker.centre_obj.double())
     velocity, acceleration = (random_twist(OBJECTS, rotation_rad=3.0, translation_m=0.8, seed=seed).to(dtype) for seed in (1, 2))
     shares = {name: uniform(OBJECTS, seed=number).to(dtype) for number, name in enumerate(("usual_score", "full_share", "full_gathered", "score"))}
+    shares["full_count"] = 80 * uniform(OBJECTS, seed=7).to(dtype)
     times = {name: 0.2 * uniform(OBJECTS, seed=5 + number).to(dtype) for number, name in enumerate(("doubted_s", "unseen_s"))}
     darker = uniform(OBJECTS, 8, low=-1, seed=9).to(dtype)
     motion = {"velocity": velocity, "acceleration": acceleration * 10, "covariance": 1e-4 * random_covariances(OBJECTS)}

@@ -13,7 +13,8 @@ from torchtrack.events import concatenate
 from torchtrack.kernels.switch import numba_is_installed
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
-from torchtrack.search import _is_likely, _least, _likeliest, _search_slipped, explained_at_rest, rehearse, search
+from torchtrack.recovery import _least, _search_slipped
+from torchtrack.search import _is_likely, _likeliest, explained_at_rest, rehearse, search
 
 SEARCHED = TrackerConfig()
 UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
@@ -132,10 +133,10 @@ def test_what_was_merely_not_seen_well_has_to_explain_nearly_all_elsewhere_and_n
     assert strayed.strayed.tolist() == strayed.adrift.tolist() == [True]
     torch.testing.assert_close(strayed.doubted_s, state.unseen_s)
     assert in_place.adrift.tolist() == [False]
-    near, elsewhere = _least(strayed, found, tracker.config.search)[..., 0]
+    near, elsewhere = _least(strayed, found, tracker.config)[:2, :, 0]
     torch.testing.assert_close(near, torch.tensor([0.15, 0.72, 0.0, 0.8 * float(found.count)]))
     torch.testing.assert_close(elsewhere, torch.tensor([0.15, 0.72, 0.0, 0.0]))
-    torch.testing.assert_close(_least(in_place, found, tracker.config.search)[0, :, 0], torch.tensor([0.1, 0.0, 0.0, 0.0]))
+    torch.testing.assert_close(_least(in_place, found, tracker.config)[0, :, 0], torch.tensor([0.1, 0.0, 0.0, 0.0]))
 
 
 def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
@@ -143,10 +144,10 @@ def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
     tracker, state, _, _, _ = started()
     _, _, _, found, _ = in_motion()
     doubts = [tracker._doubt(state, state.t_us, torch.ones(1), torch.tensor([starting])) for starting in (True, False)]
-    least = [_least(doubt, found, tracker.config.search) for doubt in doubts]
+    least = [_least(doubt, found, tracker.config) for doubt in doubts]
     assert 0.5 < float(least[0][0, 2]) < float(found.gathered) < float(least[0][0, 2]) + 0.05
     assert least[1][0, 2].tolist() == least[0][1, 2].tolist() == [0.0]
-    assert _least(doubts[0], replace(found, gathered=torch.full((1,), torch.nan)), tracker.config.search)[0, 2] <= 0
+    assert _least(doubts[0], replace(found, gathered=torch.full((1,), torch.nan)), tracker.config)[0, 2] <= 0
 
 
 def test_a_search_leaves_what_it_was_given_as_it_was():

@@ -26,8 +26,9 @@ from torchtrack.state import StepResult, TrackerState
 _USUAL_GAIN = 0.1
 # And in the full one where it is less: what is hidden for a while is not seen well.
 _FALL_GAIN = 0.005
-# A pose that explains this share of what it does when seen well is remembered as one: most that slipped explain less.
-_CERTAIN = 0.9
+# A pose that explains this share of what it does when seen well, by this share of the observations, is remembered as one: most that
+# slipped explain less, or are far away, where few explain all.
+_CERTAIN, _CERTAIN_COUNT = 0.9, 0.5
 
 
 def conclude(
@@ -84,7 +85,8 @@ def _judged(
     acceleration = _acceleration(prediction, found, torch.where(seen_well, trusted, 0), dt_s)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     certain = (share >= _CERTAIN * state.full_share) & (status == int(quality.Status.TRACKING))
-    usual_score, full_share, full_gathered = _usual(state, found, failed)
+    certain &= (found.count >= _CERTAIN_COUNT * state.full_count) | (not config.search.by_events)
+    usual_score, full_share, full_gathered, full_count = _usual(state, found, failed)
     after = replace(
         state,
         T_cam_obj=T_cam_obj,
@@ -94,6 +96,7 @@ def _judged(
         usual_score=usual_score,
         full_share=full_share,
         full_gathered=full_gathered,
+        full_count=full_count,
         # One good window among bad ones does not end a doubt.
         doubted_s=(state.doubted_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0),
         T_last_seen=torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen),
@@ -118,7 +121,7 @@ def _judged_by_kernel(
     objects, solution, batch = prediction.objects, found.fit.solution, len(dt_s)
     in_view = quality.visible_share(found.fit.contours, objects.image_size)
     told = torch.stack([found.share, found.score, found.gathered, found.full_gathered, in_view, widening])
-    remembered = torch.stack([state.usual_score, state.full_share, state.full_gathered, state.doubted_s, state.unseen_s])
+    remembered = torch.stack([state.usual_score, state.full_share, state.full_gathered, state.full_count, state.doubted_s, state.unseen_s])
     T_last_seen = state.T_last_seen.clone(memory_format=torch.contiguous_format)
     T_cam_obj, covariance, left = (T_last_seen.new_empty(batch, size, size) for size in (4, 12, 6))
     (velocity, acceleration), status = dt_s.new_empty(2, batch, 6), found.count.new_empty(batch)
@@ -129,7 +132,7 @@ def _judged_by_kernel(
         _settings(config),
         *as_arrays(remembered, T_last_seen, T_cam_obj, velocity, acceleration, covariance, left, status),
     )
-    usual_score, full_share, full_gathered, doubted_s, unseen_s = remembered.unbind()
+    usual_score, full_share, full_gathered, full_count, doubted_s, unseen_s = remembered.unbind()
     after = replace(
         state,
         T_cam_obj=T_cam_obj,
@@ -139,6 +142,7 @@ def _judged_by_kernel(
         usual_score=usual_score,
         full_share=full_share,
         full_gathered=full_gathered,
+        full_count=full_count,
         doubted_s=doubted_s,
         T_last_seen=T_last_seen,
         unseen_s=unseen_s,
@@ -171,6 +175,7 @@ def _settings(config: TrackerConfig) -> ConclusionSettings:
         usual_gain=_USUAL_GAIN,
         fall_gain=_FALL_GAIN,
         certain_share=_CERTAIN,
+        certain_count=_CERTAIN_COUNT if config.search.by_events else 0.0,
     )
 
 
@@ -189,11 +194,12 @@ def _darker_outside(
 
 
 def _usual(state: TrackerState, found: Found, failed: Bool[Tensor, "b"]) -> tuple[Float[Tensor, "b"], ...]:
-    """Score as a rule, and share and gathering when seen well, with a window more; of objects that failed, as before."""
+    """Score as a rule, and share, gathering and observations when seen well, with a window more; of objects that failed, as before."""
     usual = torch.where(failed, state.usual_score, torch.lerp(state.usual_score, found.score, _USUAL_GAIN))
     full_share = torch.where(failed, state.full_share, _seen_well(state.full_share, found.share))
     full_gathered = torch.where(failed | found.gathered.isnan(), state.full_gathered, _seen_well(state.full_gathered, found.gathered))
-    return usual, full_share, full_gathered
+    full_count = torch.where(failed, state.full_count, _seen_well(state.full_count, found.count.to(state.full_count.dtype)))
+    return usual, full_share, full_gathered, full_count
 
 
 def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:

@@ -41,6 +41,7 @@ class Doubt:
         has_symmetry: objects with a plane of symmetry.
         unseen_s: how long ago each was last seen well (s).
         strayed: which of those adrift merely explain less than when seen well.
+        off_in_depth: which are to be looked for where they were last seen well: :func:`torchtrack.relocation.is_off_in_depth`.
     """
 
     sigma_px: Float[Tensor, "b"]
@@ -55,6 +56,7 @@ class Doubt:
     has_symmetry: Bool[Tensor, "b"]
     unseen_s: Float[Tensor, "b"]
     strayed: Bool[Tensor, "b"]
+    off_in_depth: Bool[Tensor, "b"]
 
     def reasons(self, score: Float[Tensor, "b"], config: SearchConfig) -> tuple[Bool[Tensor, "b"], ...]:
         """Which objects a search is wanted for: beside the prediction, where they may have slipped to, and mirrored."""
@@ -117,7 +119,7 @@ def is_wanted(doubt: Doubt, score: Float[Tensor, "b"], config: TrackerConfig) ->
         return torch.zeros_like(doubt.starting)
     # Those that have run off are asked for already, as uncertain ones or as those in doubt.
     asks, slips, is_mirrored = doubt.reasons(score, config.search)
-    return asks | slips | is_mirrored
+    return asks | slips | is_mirrored | doubt.off_in_depth
 
 
 def in_doubt(

@@ -10,24 +10,20 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import quality, readback
-from torchtrack.alignment import Fit, align, gate_widening, index_for
-from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.alignment import Fit, align, index_for
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours
-from torchtrack.doubt import Doubt, drifted, less_certain
+from torchtrack.doubt import less_certain
 from torchtrack.hypotheses import promising
 from torchtrack.observations import ObjectEvents, WindowEvents, select_events
 from torchtrack.once import once
-from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
 from torchtrack.pose_problem import Linearisation
 from torchtrack.prediction import Prediction
-from torchtrack.readback import Answer
 
 # Shares that differ by less are the same: which of them is larger is chance.
-_AS_MUCH = 0.02
+AS_MUCH = 0.02
 # The 99th percentile of the squared distance of a pose, of six dimensions, in standard deviations (chi-square).
 _LIKELY = 16.8
-# A pose explains no fewer events than another where it explains this share of theirs.
-_AS_MANY = 0.8
 # From this share of how far they do when an object is seen well, events gather in full.
 _AS_GATHERED = 0.9
 
@@ -91,118 +87,6 @@ def explained_at_rest(widening: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     return 2 - widening.clamp(1, 2)
 
 
-def search_wanted(
-    prediction: Prediction,
-    doubt: Doubt,
-    events: ObjectEvents,
-    found: Found,
-    widening: Float[Tensor, "b"],
-    config: TrackerConfig,
-    T_last_seen: Float[Tensor, "b 4 4"],
-    planes: SymmetryPlanes,
-) -> tuple[Found, Prediction, Float[Tensor, "b"]]:
-    """Try other poses for the objects that need it, one object after the other: beside the prediction, where it may have slipped to, and so on.
-
-    Args:
-        T_last_seen: poses of the objects when they were last seen well.
-        planes: of symmetry.
-
-    Returns:
-        What was found, the prediction that it is to be weighed against, and the widening of the first gates: of an object that had
-        drifted off, those of one as uncertain as it turned out to be.
-    """
-    # Without events no pose is better than another.
-    enough = events.counts() >= config.quality.min_observations
-    reasons = (*doubt.reasons(found.score, config.search), doubt.has_run_off(config.search))
-    least_near, least_far = _least(doubt, found, config.search)
-    uncertain = drifted(prediction, doubt, config.search)
-    sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
-    answers = (Answer.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px, doubt.sigma_px))
-    for number, (is_tried, may_have_slipped, is_mirrored, has_run_off, own_sigma_px, predicted_px) in enumerate(zip(*answers, strict=True)):
-        if is_tried:
-            found = search(number, uncertain, own_sigma_px, least_near[:, number], events, found, config)
-        if may_have_slipped:
-            found = _search_slipped(number, uncertain, own_sigma_px, least_far[:, number], events, found, config)
-        if has_run_off:
-            other = as_last_seen(uncertain.copies(number, 1), T_last_seen[number])
-            found, prediction = _search_from(number, other, own_sigma_px, least_far[:, number], events, found, prediction, config)
-        for plane in planes.of(number) if is_mirrored else ():
-            other = less_certain(mirrored(_as_found(number, prediction, found), *plane), 0, predicted_px, config.search.slip_sigma_px)
-            found, prediction = _search_from(number, other, config.search.slip_sigma_px, least_far[:, number], events, found, prediction, config)
-    was_adrift = doubt.adrift & found.elsewhere
-    prediction = replace(prediction, covariance=torch.where(was_adrift[:, None, None], uncertain.covariance, prediction.covariance))
-    return found, prediction, torch.where(was_adrift, gate_widening(sigma_px, config), widening)
-
-
-def _least(doubt: Doubt, found: Found, config: SearchConfig) -> Float[Tensor, "2 4 b"]:
-    """By how much other poses must explain more, how much they must explain and gather, and by how many events at least.
-
-    And the same of where an object is not predicted at all.
-
-    While a motion is not known nothing says how far events gather when all is well, and dense print explains as much of many poses:
-    one that smears the events more than the prediction's own is not better.
-    """
-    margin = torch.where(doubt.starting, config.start_margin, config.margin)
-    # What is far away has to explain about as much as usual; so has what is found step by step, while a motion is lost, ever farther away.
-    needed = torch.where(doubt.adrift | doubt.starting, config.adrift_share * doubt.full_share, 0)
-    # What is partly hidden explains less, too: nothing but the whole object, seen elsewhere, speaks against that. A part of its edges does not.
-    margin = torch.where(doubt.strayed, config.slip_margin, margin)
-    needed = torch.where(doubt.strayed, config.slip_share * doubt.full_share, needed)
-    count = torch.where(doubt.strayed, _AS_MANY * found.count.to(margin.dtype), 0)
-    # Of a new object, only what explains nearly all is surely better: edges of what hides it explain half.
-    new = doubt.is_new(found.score, config)
-    needed = torch.where(new, config.new_share, needed)
-    gathered = torch.where(doubt.starting | new, found.gathered.nan_to_num(0.0) - _AS_MUCH, 0)
-    elsewhere = torch.full_like(margin, config.slip_margin), config.slip_share * doubt.full_share, torch.zeros_like(margin), torch.zeros_like(count)
-    return torch.stack([margin, needed, gathered, count, *elsewhere]).unflatten(0, (2, 4))
-
-
-def _search_slipped(
-    number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "4"], events: ObjectEvents, found: Found, config: TrackerConfig
-) -> Found:
-    """:func:`search` for an object that is sure of where it is, and may be farther off than that.
-
-    Held by its prediction, no pose some pixels away is found, however much it explains. What is found goes on as certain as
-    if it had been predicted: who is not held at all wanders off from one find to the next.
-    """
-    slip_px = config.search.slip_sigma_px
-    other = search(number, less_certain(prediction, number, sigma_px, slip_px), slip_px, least, events, found, config)
-    if other is found:
-        return found
-    solution = other.fit.solution
-    let_go = config.solver.observation_px**2 * (1 - (sigma_px / slip_px) ** 2) * prediction.information[number]
-    hessian = solution.hessian.clone()
-    hessian[number, :12, :12] += (let_go * _is_taken(number, other, found)).to(hessian.dtype)
-    return replace(other, fit=replace(other.fit, solution=replace(solution, hessian=hessian)))
-
-
-def _is_taken(number: int, other: Found, found: Found) -> Bool[Tensor, ""]:
-    """Whether a search found the object ``number`` in another pose; a GPU is not waited for to know."""
-    return (other.fit.solution.T_cam_obj[number] != found.fit.solution.T_cam_obj[number]).any()
-
-
-def _as_found(number: int, prediction: Prediction, found: Found) -> Prediction:
-    """The prediction of one object alone, moved to where it was found."""
-    solution = found.fit.solution
-    return prediction.copies(number, 1).at(solution.T_cam_obj[number : number + 1], solution.from_prior[number : number + 1])
-
-
-def _search_from(
-    number: int,
-    other: Prediction,
-    sigma_px: float,
-    least: Float[Tensor, "4"],
-    events: ObjectEvents,
-    found: Found,
-    prediction: Prediction,
-    config: TrackerConfig,
-) -> tuple[Found, Prediction]:
-    """:func:`search` around another prediction of the object, which takes the place of its own if it is found there."""
-    outline = other.objects.contours(other.T_cam_obj, config.contours)
-    better = _search_around(number, other, outline, sigma_px, least, events, found, config)
-    return (found, prediction) if better is found else (better, prediction.exchanged(number, other, _is_taken(number, better, found)))
-
-
 def search(
     number: int, prediction: Prediction, sigma_px: float, least: Float[Tensor, "4"], events: ObjectEvents, found: Found, config: TrackerConfig
 ) -> Found:
@@ -214,10 +98,10 @@ def search(
             how many events it must explain.
         events: of all objects.
     """
-    return _search_around(number, prediction.copies(number, 1), found.fit.contours.of(number), sigma_px, least, events, found, config)
+    return search_around(number, prediction.copies(number, 1), found.fit.contours.of(number), sigma_px, least, events, found, config)
 
 
-def _search_around(
+def search_around(
     number: int,
     one: Prediction,
     outline: Contours,
@@ -238,10 +122,16 @@ def _search_around(
     # Written so that what does not tell how far it gathers counts.
     counts = (tried.count >= count.clamp(min=config.quality.min_observations)) & _is_likely(offset, covariance) & ~(tried.gathered < gathered)
     score = torch.where(counts, tried.score, 0)
-    best = _likeliest(score, offset, one.covariance[0])
+    wide = config.search.by_events and sigma_px > config.search.wide_sigma_px
+    best = _likeliest(_by_events(score, tried.count) if wide else score, offset, one.covariance[0])
     mine = torch.where(found.count[number] >= config.quality.min_observations, found.score[number], 0.0)
     better = score.index_select(0, best) > torch.maximum(mine + margin, needed)
     return found if readback.none_of(better) else _replaced(found, number, tried, best, better)
+
+
+def is_taken(number: int, other: Found, found: Found) -> Bool[Tensor, ""]:
+    """Whether a search found the object ``number`` in another pose; a GPU is not waited for to know."""
+    return (other.fit.solution.T_cam_obj[number] != found.fit.solution.T_cam_obj[number]).any()
 
 
 def rehearse(prediction: Prediction, config: TrackerConfig) -> None:
@@ -262,10 +152,16 @@ def _squared_deviations(offsets: Float[Tensor, "n k"], covariance: Float[Tensor,
     return torch.linalg.solve_triangular(root, offsets.to(root.dtype).T, upper=False).square().sum(0)
 
 
+def _by_events(score: Float[Tensor, "n"], count: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Scores of poses, less where fewer events are explained than by others: of small ones, far away, chance explains all."""
+    matched = torch.where(score > 0, count, 0).to(score.dtype)
+    return score * (matched / matched.max().clamp(min=1)).sqrt()
+
+
 def _likeliest(score: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Int[Tensor, "1"]:
     """Of the poses that explain as much as the best does, the one that the prediction expects most: a turn of a vase explains nothing."""
     away = _squared_deviations(from_prior[:, :12], covariance)
-    return torch.where(score >= score.max() - _AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]
+    return torch.where(score >= score.max() - AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]
 
 
 def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: TrackerConfig, full_gathered: Float[Tensor, ""]) -> Found:

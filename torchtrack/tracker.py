@@ -31,7 +31,9 @@ from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.polarity_memory import nothing_remembered
 from torchtrack.prediction import Prediction
 from torchtrack.probation import after_probation
-from torchtrack.search import explained_at_rest, judge_fit, rehearse, search_wanted
+from torchtrack.recovery import search_wanted
+from torchtrack.relocation import LastSeen, anywhere, is_lost, is_off_in_depth
+from torchtrack.search import explained_at_rest, judge_fit, rehearse
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.sensors import farthest_event_px
 from torchtrack.setup_check import check_start
@@ -97,7 +99,7 @@ class Tracker(TrackedObjects):
         learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
         trust = ModelTrust.none(self.element_groups, velocity) if self.judges else None
         probation = Probation.none(T_cam_obj, covariance)
-        motion, shares, seen = (velocity, velocity, covariance), (nothing,) * 5, (T_cam_obj.clone(), nothing, nothing_remembered(velocity))
+        motion, shares, seen = (velocity, velocity, covariance), (nothing,) * 6, (T_cam_obj.clone(), nothing, nothing_remembered(velocity))
         return TrackerState(T_cam_obj.clone(), *motion, *shares, *seen, times, last_event_us, burst_age_us, probation, learned, trust)
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
@@ -172,8 +174,10 @@ class Tracker(TrackedObjects):
         dt_s = self._window_s(state, t_us)[self.stream_index]
         return None if self.tiles is None else self.tiles.near(self._predict(state, dt_s), dt_s, farthest_event_px(self.config))
 
-    def _near(self, events: NearbyEvents, prediction: Prediction, dt_s: Tensor) -> NearbyEvents:
-        """Those of the events that can have to do with the objects; a weigher is shown all."""
+    def _near(self, events: NearbyEvents, prediction: Prediction, off_in_depth: Tensor, dt_s: Tensor) -> NearbyEvents:
+        """Those of the events that can have to do with the objects: with those ``off_in_depth``, any; a weigher is shown all."""
+        if not readback.none_of(off_in_depth):
+            prediction = replace(prediction, covariance=anywhere(prediction.covariance, off_in_depth))
         return events if self.weigher is not None else self.sensors.near_objects(events, prediction, dt_s, self.config)
 
     def _window_s(self, state: TrackerState, t_us: Tensor) -> Tensor:
@@ -226,14 +230,15 @@ class Tracker(TrackedObjects):
         config, sensors, last_event_us = self.config, self.sensors, state.last_event_us
         window_s = self._window_s(state, t_us)
         dt_s = window_s[self.stream_index]
-        recorded = self._predict(self._held_back(state, events.events, t_us, dt_s, questions), dt_s)
+        recorded = self._predict(self._expected(state, events.events, t_us, dt_s, questions), dt_s)
         prediction = recorded.detached()
-        nearby = self._near(events, prediction, dt_s)
+        off_in_depth = is_off_in_depth(state, self.objects, is_due(state.t_us, t_us, config.search.doubt_us)[self.stream_index], config.search)
+        nearby = self._near(events, prediction, off_in_depth, dt_s)
         seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, t_us - state.t_us, config.matching.burst_us)
         contours = prediction.contours(dt_s, config.contours)
         sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(self.diameter_m)
         starting = torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
-        doubt = self._doubt(state, t_us, sigma_px, starting)
+        doubt = self._doubt(state, t_us, sigma_px, starting, off_in_depth)
         widening = gate_widening(sigma_px, config)
         # Asked for here: a GPU answers while corners are looked for.
         radius_px = questions.ask(index_radius(widening, config), usual_index_radius(config))
@@ -251,7 +256,8 @@ class Tracker(TrackedObjects):
         # A GPU is waited for: a pose that begins to slip is farther off a window later.
         wanted = questions.ask(is_wanted(doubt, found.score, config), False)
         if wanted.any():
-            found, recorded, widening = search_wanted(recorded, doubt, seen, found, widening, config, state.T_last_seen, self.planes)
+            last_seen = LastSeen.of(state, self.objects, t_us, config)
+            found, recorded, widening = search_wanted(recorded, doubt, seen, found, widening, config, last_seen, self.planes)
             prediction = recorded.detached()
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
         if config.search.probation:
@@ -272,7 +278,7 @@ class Tracker(TrackedObjects):
         objects = objects_as_known(self.objects, state, self.element_groups, self.on_surfaces is not None, self.config)
         return forecast(state, dt_s, objects, self.revolution_axes if self.revolves else None, self.far_pose, self.config)
 
-    def _doubt(self, state: TrackerState, t_us: Tensor, sigma_px: Tensor, starting: Tensor) -> Doubt:
+    def _doubt(self, state: TrackerState, t_us: Tensor, sigma_px: Tensor, starting: Tensor, off_in_depth: Tensor) -> Doubt:
         """What speaks for trying other poses in the window that ends at ``t_us``."""
         config = self.config.search
         due, far_due = (is_due(state.t_us, t_us, interval_us)[self.stream_index] for interval_us in (config.interval_us, config.doubt_us))
@@ -280,7 +286,13 @@ class Tracker(TrackedObjects):
         strayed = ~(adrift | starting) & has_strayed(state.score, state.full_share, state.unseen_s, sigma_px, far_due, config)
         since_s = torch.where(strayed, state.unseen_s, state.doubted_s)
         told = sigma_px, state.score, state.usual_score, starting, due, adrift | strayed, since_s, state.full_share, far_due
-        return Doubt(*told, self.has_symmetry, state.unseen_s, strayed)
+        return Doubt(*told, self.has_symmetry, state.unseen_s, strayed, off_in_depth)
+
+    def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:
+        """The state that a window is predicted from: of what is lost for long, where it was last seen well."""
+        lost = is_lost(state, self.diameter_m, self.config.search)
+        state = self._held_back(state, events, t_us, dt_s, questions)
+        return state if questions.none_of(lost) else LastSeen.of(state, self.objects, t_us, self.config).in_place_of(state, lost)
 
     @torch.no_grad()
     def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:

@@ -242,6 +242,14 @@ class SearchConfig(Settings):
     unseen_us: int = Field(
         200_000, ge=0, description="What may be far away and was not seen well for so long is also looked for as it was then (µs); 0 for never."
     )
+    anew_us: int = Field(
+        100_000,
+        ge=0,
+        description="What was not seen well for so long, and is lost or far off in depth, is looked for all around where it was then (µs); 0: never.",
+    )
+    by_events: bool = Field(
+        True, description="Poses of very uncertain objects are also compared by how many events they explain: far away, a few explain all."
+    )
     least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
     slip_sigma_px: float = Field(6.0, gt=0, description="The same of what may have slipped, however sure it is of itself (px).")
     at_start: bool = Field(True, description="Others are also tried while an object's motion is not known: dense print fits many.")

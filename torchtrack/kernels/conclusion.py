@@ -10,8 +10,8 @@ from torchtrack.kernels.settings import ConclusionSettings
 # As torchtrack.quality.Status.
 TRACKING, UNCERTAIN, LOST, TOO_FEW_EVENTS, OUT_OF_VIEW, DIVERGED = range(6)
 # What is remembered of each object as a number, before a window and after it.
-USUAL_SCORE, FULL_SHARE, FULL_GATHERED, DOUBTED_S, UNSEEN_S = range(5)
-REMEMBERED = 5
+USUAL_SCORE, FULL_SHARE, FULL_GATHERED, FULL_COUNT, DOUBTED_S, UNSEEN_S = range(6)
+REMEMBERED = 6
 # What was found of it.
 SHARE, SCORE, GATHERED, USUALLY_GATHERED, IN_VIEW, WIDENING = range(6)
 FOUND = 6
@@ -80,7 +80,8 @@ def conclude(
         centre_of(T_cam_obj[b], centre_obj[b], centre)
         _to_left(posterior[b], centre, left[b])
         certain = share >= settings.certain_share * full_share and status[b] == TRACKING
-        _remember(b, failed, doubted, certain, dt, found, settings, remembered)
+        certain = certain and matched[b] >= settings.certain_count * remembered[FULL_COUNT, b]
+        _remember(b, failed, doubted, certain, dt, found, matched[b], settings, remembered)
         if certain:
             T_last_seen[b] = T_cam_obj[b]
 
@@ -235,7 +236,17 @@ def _to_left(covariance: Array, centre_cam: Array, left: Array) -> None:
 
 
 @kernel()
-def _remember(b: int, failed: bool, doubted: bool, certain: bool, dt: float, found: Array, settings: ConclusionSettings, remembered: Array) -> None:
+def _remember(
+    b: int,
+    failed: bool,
+    doubted: bool,
+    certain: bool,
+    dt: float,
+    found: Array,
+    matched: int,
+    settings: ConclusionSettings,
+    remembered: Array,
+) -> None:
     """What is remembered of an object with a window more: running means, and for how long it is in doubt, or was not seen well."""
     known = remembered[:, b]
     if not failed:
@@ -243,6 +254,7 @@ def _remember(b: int, failed: bool, doubted: bool, certain: bool, dt: float, fou
         known[FULL_SHARE] = _seen_well(known[FULL_SHARE], found[SHARE, b], settings)
         if not np.isnan(found[GATHERED, b]):
             known[FULL_GATHERED] = _seen_well(known[FULL_GATHERED], found[GATHERED, b], settings)
+        known[FULL_COUNT] = _seen_well(known[FULL_COUNT], float(matched), settings)
         # One good window among bad ones does not end a doubt.
         known[DOUBTED_S] += dt if doubted else -dt
     known[DOUBTED_S] = _clamped(known[DOUBTED_S], 0.0, np.inf)

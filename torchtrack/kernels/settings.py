@@ -231,7 +231,7 @@ class ConclusionSettings(NamedTuple):
         hidden_from, hidden_fully, hidden_least, hidden_observations: what :func:`torchtrack.quality.partly_hidden` goes by.
         smeared: events that gather less than this share of how far they usually do are smeared.
         usual_gain, fall_gain: share of a new window in what is usual, and in what is seen well where it is less.
-        certain_share: of what it explains when it is seen well, from which a pose is remembered as one.
+        certain_share, certain_count: of what it explains when it is seen well, and by how many, from which a pose is remembered as one.
     """
 
     holds: bool
@@ -256,3 +256,4 @@ class ConclusionSettings(NamedTuple):
     usual_gain: float
     fall_gain: float
     certain_share: float
+    certain_count: float
