@@ -167,7 +167,7 @@ def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(unseen_us):
             state, T_cam_obj=T_cam_obj, doubted_s=torch.full((1,), 0.1), unseen_s=torch.full((1,), 0.2), velocity=torch.zeros_like(state.velocity)
         )
 
-    search = SearchConfig(doubt_us=10_000, mirrored_to=0, unseen_us=unseen_us)
+    search = SearchConfig(doubt_us=10_000, mirrored_to=0, unseen_us=unseen_us, anew_us=0)
     results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), search=search), run_off)
     degrees, _ = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
     assert (float(degrees) < 1) == (unseen_us > 0)

@@ -129,7 +129,9 @@ def test_what_was_merely_not_seen_well_has_to_explain_nearly_all_elsewhere_and_n
     tracker, state, _, _, _ = started()
     _, _, _, found, _ = in_motion()
     state = replace(state, score=torch.full((1,), 0.5), full_share=torch.full((1,), 0.8), unseen_s=torch.full((1,), 0.2))
-    strayed, in_place = (tracker._doubt(state, state.t_us + later_us, torch.ones(1), torch.tensor([False])) for later_us in (50_000, 0))
+    strayed, in_place = (
+        tracker._doubt(state, state.t_us + later_us, torch.ones(1), torch.tensor([False]), torch.tensor([False])) for later_us in (50_000, 0)
+    )
     assert strayed.strayed.tolist() == strayed.adrift.tolist() == [True]
     torch.testing.assert_close(strayed.doubted_s, state.unseen_s)
     assert in_place.adrift.tolist() == [False]
@@ -143,7 +145,7 @@ def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
     """Of any two poses, dense print explains about as much."""
     tracker, state, _, _, _ = started()
     _, _, _, found, _ = in_motion()
-    doubts = [tracker._doubt(state, state.t_us, torch.ones(1), torch.tensor([starting])) for starting in (True, False)]
+    doubts = [tracker._doubt(state, state.t_us, torch.ones(1), torch.tensor([starting]), torch.tensor([False])) for starting in (True, False)]
     least = [_least(doubt, found, tracker.config) for doubt in doubts]
     assert 0.5 < float(least[0][0, 2]) < float(found.gathered) < float(least[0][0, 2]) + 0.05
     assert least[1][0, 2].tolist() == least[0][1, 2].tolist() == [0.0]
@@ -212,14 +214,14 @@ def test_what_slipped_goes_on_as_certain_as_if_it_had_been_predicted():
 @pytest.mark.parametrize("config", [UNSEARCHED, SEARCHED.model_copy(update={"solver": SEARCHED.solver.model_copy(update={"prior": False})})])
 def test_without_hypotheses_or_a_prior_nothing_is_searched_for(config, monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.recovery.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
     displaced_runs(config, 100.0, count=2)
     assert searched == []
 
 
 def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.recovery.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
     _, events = moving_box(pose(), 10)
     # As a new object it would be, once in a while.
     tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(new_share=0)))
@@ -253,7 +255,7 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
 @pytest.mark.parametrize(("count", "times"), [(0, 0), (29, 0), (200, 1)])
 def test_without_enough_events_there_is_nothing_to_search_in(count, times, monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.search.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr("torchtrack.recovery.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
     tracker, state, _, _, _ = started(config=TrackerConfig(search=SearchConfig(interval_us=0, new_share=0)))
     noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
     after, result = tracker.step(replace(state, covariance=1e3 * state.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)

@@ -1,0 +1,159 @@
+"""Where objects are looked for that were not seen well for long: around the pose that they had then."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import SMALL_CAMERA, box_model, pose
+from tracked_boxes import follow, in_motion, moving_box, started, windows
+
+from torchtrack import Tracker
+from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.lie import retract_about
+from torchtrack.quality import Status
+from torchtrack.recovery import _least
+from torchtrack.relocation import LastSeen, anywhere, is_lost, is_off_in_depth
+from torchtrack.search import _by_events
+from torchtrack.state import joined
+
+CONFIG = TrackerConfig()
+# A fifth of the image's diagonal.
+_WIDEST_PX = 0.2 * (SMALL_CAMERA.width**2 + SMALL_CAMERA.height**2) ** 0.5
+
+
+def unseen(state, unseen_s=0.2, **changes):
+    """The state of an object that was seen well once, but not for a while."""
+    return replace(state, unseen_s=torch.full_like(state.unseen_s, unseen_s), **changes)
+
+
+def uncertain(state, turn_rad=0.45):
+    """Covariance of an object of which hardly anything is known."""
+    return torch.eye(12, dtype=torch.float64).expand(len(state.covariance), 12, 12) * turn_rad**2
+
+
+def moved_away(tracker, state, metres):
+    """Pose so much farther from the camera."""
+    step = torch.zeros(len(state.T_cam_obj), 6, dtype=torch.float64)
+    step[:, 5] = metres
+    return retract_about(state.T_cam_obj, step, tracker.centre_obj.double())
+
+
+# ---- when
+
+
+def test_an_object_is_lost_once_nothing_is_known_of_it_and_it_was_not_seen_for_long():
+    tracker, state, *_ = started()
+    gone = unseen(state, covariance=uncertain(state))
+    assert is_lost(gone, tracker.diameter_m, CONFIG.search).tolist() == [True]
+    assert not is_lost(unseen(gone, 0.05), tracker.diameter_m, CONFIG.search)
+    assert not is_lost(unseen(state), tracker.diameter_m, CONFIG.search)
+    assert not is_lost(replace(gone, usual_score=torch.zeros(1)), tracker.diameter_m, CONFIG.search)
+    assert not is_lost(gone, tracker.diameter_m, SearchConfig(anew_us=0))
+
+
+@pytest.mark.parametrize(("metres", "off"), [(0.0, False), (0.05, False), (0.3, True), (-0.2, True)])
+def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(metres, off):
+    tracker, state, *_ = started()
+    away, due = unseen(state, T_cam_obj=moved_away(tracker, state, metres)), torch.tensor([True])
+    assert is_off_in_depth(away, tracker.objects, due, CONFIG.search).tolist() == [off]
+    assert not is_off_in_depth(away, tracker.objects, ~due, CONFIG.search)
+    assert not is_off_in_depth(unseen(away, 0.05), tracker.objects, due, CONFIG.search)
+    # What is lost is expected there as it is.
+    assert not is_off_in_depth(replace(away, covariance=uncertain(away)), tracker.objects, due, CONFIG.search)
+
+
+# ---- where
+
+
+def test_the_longer_it_was_not_seen_the_farther_it_is_looked_for_and_one_look_after_the_other():
+    tracker, state, *_ = started()
+    first_us = 30_000
+    sigma = [
+        LastSeen.of(unseen(state, unseen_s), tracker.objects, torch.tensor([first_us + 10_000 * look]), CONFIG).covariance[0].diagonal().sqrt()
+        for unseen_s, look in ((0.1, 0), (0.1, 1), (0.1, 2), (0.2, 2), (5.0, 2))
+    ]
+    assert [float(values[0]) for values in sigma[:3]] == pytest.approx([1 / 3, 2 / 3, 1.0])
+    px_per_m = float(tracker.objects.px_per_m(state.T_last_seen.float()))
+    assert [float(values[3]) * px_per_m for values in sigma[2:]] == pytest.approx([40.0, _WIDEST_PX, _WIDEST_PX], rel=1e-5)
+    assert float(sigma[2][5]) == pytest.approx(0.1 * float(tracker.objects.depth_m(state.T_last_seen.float())), rel=1e-6)
+
+
+def test_what_is_lost_rests_where_it_was_seen_well_and_its_neighbour_goes_on():
+    tracker = Tracker([box_model()] * 2, SMALL_CAMERA)
+    _, state, *_ = started()
+    both = joined([unseen(state), state])
+    both = replace(both, t_us=state.t_us, last_event_us=state.last_event_us, burst_age_us=state.burst_age_us)
+    both = replace(both, T_cam_obj=moved_away(tracker, both, 0.4), velocity=both.velocity + 1)
+    last_seen = LastSeen.of(both, tracker.objects, torch.tensor([30_000]), CONFIG)
+    after = last_seen.in_place_of(both, torch.tensor([True, False]))
+    assert torch.equal(after.T_cam_obj[0], both.T_last_seen[0]) and torch.equal(after.T_cam_obj[1], both.T_cam_obj[1])
+    assert not after.velocity[0].any() and torch.equal(after.velocity[1], both.velocity[1])
+    assert torch.equal(after.covariance[1], both.covariance[1]) and torch.equal(after.covariance[0], last_seen.covariance[0])
+
+
+def test_an_object_that_may_be_anywhere_has_a_covariance_without_bounds_of_its_own():
+    _, state, *_ = started()
+    assert torch.equal(anywhere(state.covariance, torch.tensor([False])), state.covariance)
+    assert torch.equal(anywhere(state.covariance, torch.tensor([True]))[0], torch.eye(12, dtype=torch.float64))
+
+
+# ---- what is asked of a find
+
+
+def test_small_poses_that_few_events_explain_are_worth_less():
+    score, count = torch.tensor([0.9, 0.8, 0.0]), torch.tensor([100, 900, 2000])
+    assert _by_events(score, count).tolist() == pytest.approx([0.3, 0.8, 0.0])
+    assert _by_events(torch.zeros(3), count).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_what_is_off_in_depth_gives_way_to_far_more_events():
+    tracker, state, *_ = started()
+    t_us = state.t_us + 50_000
+    tracked = tracker._doubt(state, t_us, torch.ones(1), torch.tensor([False]), torch.tensor([True]))
+    found = in_motion()[3]
+    margin, needed, gathered, count = _least(tracked, found, tracker.config)[2, :, 0].tolist()
+    assert margin == -torch.inf and gathered == 0
+    assert needed == pytest.approx(0.75 * float(state.full_share))
+    assert count == 2 * int(found.count)
+
+
+def test_an_object_seen_by_few_events_is_not_remembered_as_seen_well(way):
+    """Far more were explained when it was seen well than now, though they explain all of it."""
+    tracker, state, _, (events, end_us), _ = started()
+    much = replace(state, full_count=10 * state.full_count)
+    assert float(state.full_count) > 0
+    after, result = tracker.step(much, events, end_us)
+    assert int(result.status) == Status.TRACKING
+    assert torch.equal(after.T_last_seen, much.T_last_seen) and float(after.unseen_s) > 0
+    usual, _ = tracker.step(state, events, end_us)
+    assert not torch.equal(usual.T_last_seen, state.T_last_seen) and float(usual.unseen_s) == 0
+    by_share = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(by_events=False)))
+    assert float(by_share.step(much, events, end_us)[0].unseen_s) == 0
+
+
+# ---- all together
+
+
+LOST = {"lost": {"turn_rad": 0.45, "metres": 0.3, "sideways_m": 0.4}, "small, far behind": {"turn_rad": 0.01, "metres": 0.35, "sideways_m": 0.0}}
+
+
+@pytest.mark.many_windows
+@pytest.mark.parametrize("name", LOST)
+def test_an_object_that_ran_off_is_found_again_where_it_was_seen_well(name):
+    """Its pose has left the image, or is that of a small thing behind it; a box that was never lost stays as it was."""
+    lost = LOST[name]
+    trajectory, events = moving_box(pose(), 30)
+
+    def after(anew_us):
+        tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(anew_us=anew_us)))
+        state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 8))
+        away = moved_away(tracker, state, lost["metres"])
+        away[:, 0, 3] += lost["sideways_m"]
+        gone = unseen(state, T_cam_obj=away, covariance=uncertain(state, lost["turn_rad"]), velocity=torch.zeros_like(state.velocity))
+        state, results = follow(tracker, gone, windows(events, 30)[8:])
+        true = trajectory.at(torch.tensor([150_000]))[0]
+        return float((results[-1].T_cam_obj[0] - true)[:3, 3].norm()), int(results[-1].status[0])
+
+    found_m, status = after(100_000)
+    assert found_m < 5e-3 and status == Status.TRACKING
+    assert after(0)[0] > 0.05
