@@ -44,22 +44,24 @@ def moved_away(tracker, state, metres):
 def test_an_object_is_lost_once_nothing_is_known_of_it_and_it_was_not_seen_for_long():
     tracker, state, *_ = started()
     gone = unseen(state, covariance=uncertain(state))
-    assert is_lost(gone, tracker.diameter_m, CONFIG.search).tolist() == [True]
-    assert not is_lost(unseen(gone, 0.05), tracker.diameter_m, CONFIG.search)
-    assert not is_lost(unseen(state), tracker.diameter_m, CONFIG.search)
-    assert not is_lost(replace(gone, usual_score=torch.zeros(1)), tracker.diameter_m, CONFIG.search)
-    assert not is_lost(gone, tracker.diameter_m, SearchConfig(anew_us=0))
+    assert is_lost(gone, tracker.diameter_m, CONFIG).tolist() == [True]
+    assert not is_lost(unseen(gone, 0.05), tracker.diameter_m, CONFIG)
+    assert not is_lost(unseen(state), tracker.diameter_m, CONFIG)
+    assert not is_lost(replace(gone, usual_score=torch.zeros(1)), tracker.diameter_m, CONFIG)
+    assert not is_lost(gone, tracker.diameter_m, TrackerConfig(search=SearchConfig(anew_us=0)))
+    # Without searches nothing would find it there.
+    assert not is_lost(gone, tracker.diameter_m, TrackerConfig(search=SearchConfig(hypotheses=0)))
 
 
 @pytest.mark.parametrize(("metres", "off"), [(0.0, False), (0.05, False), (0.3, True), (-0.2, True)])
 def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(metres, off):
     tracker, state, *_ = started()
     away, due = unseen(state, T_cam_obj=moved_away(tracker, state, metres)), torch.tensor([True])
-    assert is_off_in_depth(away, tracker.objects, due, CONFIG.search).tolist() == [off]
-    assert not is_off_in_depth(away, tracker.objects, ~due, CONFIG.search)
-    assert not is_off_in_depth(unseen(away, 0.05), tracker.objects, due, CONFIG.search)
+    assert is_off_in_depth(away, tracker.objects, due, CONFIG).tolist() == [off]
+    assert not is_off_in_depth(away, tracker.objects, ~due, CONFIG)
+    assert not is_off_in_depth(unseen(away, 0.05), tracker.objects, due, CONFIG)
     # What is lost is expected there as it is.
-    assert not is_off_in_depth(replace(away, covariance=uncertain(away)), tracker.objects, due, CONFIG.search)
+    assert not is_off_in_depth(replace(away, covariance=uncertain(away)), tracker.objects, due, CONFIG)
 
 
 # ---- where

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import readback
-from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.doubt import searches
 from torchtrack.motion import MOST_UNCERTAIN, rim_and_centre
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.prediction import Prediction
@@ -80,7 +81,7 @@ class LastSeen:
         return Prediction(one.objects, T_cam_obj, torch.ones_like(one.usable), velocity, self.covariance[own], acceleration)
 
 
-def is_lost(state: TrackerState, diameter_m: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+def is_lost(state: TrackerState, diameter_m: Float[Tensor, "b"], config: TrackerConfig) -> Bool[Tensor, "b"]:
     """Which objects nothing is known of any more but where they were last seen well, which is long ago."""
     unseen = _unseen_for_long(state, config)
     if readback.none_of(unseen):
@@ -91,7 +92,7 @@ def is_lost(state: TrackerState, diameter_m: Float[Tensor, "b"], config: SearchC
     return unknown & unseen
 
 
-def is_off_in_depth(state: TrackerState, objects: ObjectBatch, due: Bool[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+def is_off_in_depth(state: TrackerState, objects: ObjectBatch, due: Bool[Tensor, "b"], config: TrackerConfig) -> Bool[Tensor, "b"]:
     """Which objects are much farther away, or nearer, than when they were last seen well, long ago, and which it is time for."""
     possible = due & _unseen_for_long(state, config)
     if readback.none_of(possible):
@@ -107,8 +108,8 @@ def anywhere(covariance: Float[Tensor, "b 12 12"], chosen: Bool[Tensor, "b"]) ->
     return torch.where(chosen[:, None, None], unknown, covariance)
 
 
-def _unseen_for_long(state: TrackerState, config: SearchConfig) -> Bool[Tensor, "b"]:
+def _unseen_for_long(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """Which objects were found once, and then not seen well for long."""
-    if not config.anew_us:
+    if not (config.search.anew_us and searches(config)):
         return torch.zeros_like(state.unseen_s, dtype=torch.bool)
-    return (state.unseen_s >= 1e-6 * config.anew_us) & (state.usual_score > 0)
+    return (state.unseen_s >= 1e-6 * config.search.anew_us) & (state.usual_score > 0)

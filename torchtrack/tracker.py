@@ -232,7 +232,7 @@ class Tracker(TrackedObjects):
         dt_s = window_s[self.stream_index]
         recorded = self._predict(self._expected(state, events.events, t_us, dt_s, questions), dt_s)
         prediction = recorded.detached()
-        off_in_depth = is_off_in_depth(state, self.objects, is_due(state.t_us, t_us, config.search.doubt_us)[self.stream_index], config.search)
+        off_in_depth = is_off_in_depth(state, self.objects, is_due(state.t_us, t_us, config.search.doubt_us)[self.stream_index], config)
         nearby = self._near(events, prediction, off_in_depth, dt_s)
         seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, t_us - state.t_us, config.matching.burst_us)
         contours = prediction.contours(dt_s, config.contours)
@@ -290,7 +290,7 @@ class Tracker(TrackedObjects):
 
     def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:
         """The state that a window is predicted from: of what is lost for long, where it was last seen well."""
-        lost = is_lost(state, self.diameter_m, self.config.search)
+        lost = is_lost(state, self.diameter_m, self.config)
         state = self._held_back(state, events, t_us, dt_s, questions)
         return state if questions.none_of(lost) else LastSeen.of(state, self.objects, t_us, self.config).in_place_of(state, lost)
 
