@@ -25,6 +25,7 @@ from torchtrack.config.tracker import (
     FlowConfig,
     MotionConfig,
     QualityConfig,
+    SearchConfig,
     TrackerConfig,
 )
 from torchtrack.errors import ModelError, PoseError
@@ -234,7 +235,9 @@ def test_without_events_the_pose_is_held_and_the_status_says_so(dtype):
 
 @pytest.mark.many_windows
 def test_without_events_the_motion_goes_on_where_asked_for_and_dies_away(dtype):
-    tracker, state, _, _, trajectory = started(dtype, PREDICT.model_copy(update={"motion": MotionConfig(turn_s=0)}))
+    # What is lost for long rests where it was last seen well, unless it is never looked for there.
+    config = PREDICT.model_copy(update={"motion": MotionConfig(turn_s=0), "search": SearchConfig(anew_us=0)})
+    tracker, state, _, _, trajectory = started(dtype, config)
     after, result = tracker.step(state, EventBatch.empty(), 30_000)
     assert Status(int(result.status)) == Status.TOO_FEW_EVENTS
     expected = retract_about(state.T_cam_obj, 5e-3 * state.velocity.double(), torch.zeros(1, 3, dtype=torch.float64))

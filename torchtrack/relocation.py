@@ -27,8 +27,8 @@ _OFF_IN_DEPTH = 1.25
 _TURN_RAD, _DEPTH_SHARE = 1.0, 0.1
 # And way across the image (px/s, and as a share of its diagonal), the longer the object was not seen well.
 _SPEED_PX_S, _DIAGONALS = 400.0, 0.2
-# One look after the other: as far as in these shares of all that. A few hundred poses come near the right one but rarely in all.
-_LOOKS = (1 / 3, 2 / 3, 1.0)
+# One look after the other: as far as in a third of all that, in two, in all. A few hundred poses come near the right one but rarely in all.
+_LOOKS = 3
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class LastSeen:
             t_us: end of the window: it says which look it is.
         """
         T_cam_obj = state.T_last_seen.to(objects.intrinsics.dtype)
-        look = (t_us // max(config.search.interval_us, 1) % len(_LOOKS))[objects.stream_index]
-        share = torch.tensor(_LOOKS, dtype=torch.float64, device=look.device)[look]
+        look = (t_us // max(config.search.interval_us, 1) % _LOOKS)[objects.stream_index]
+        share = (look + 1).double() / _LOOKS
         height, width = objects.image_size
         across_px = (_SPEED_PX_S * state.unseen_s.double()).clamp(max=_DIAGONALS * (height**2 + width**2) ** 0.5)
         across_m, depth_m = across_px / objects.px_per_m(T_cam_obj).double(), _DEPTH_SHARE * objects.depth_m(T_cam_obj).double()
