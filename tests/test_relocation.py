@@ -56,9 +56,9 @@ def test_an_object_is_lost_once_nothing_is_known_of_it_and_it_was_not_seen_for_l
 @pytest.mark.parametrize(("metres", "off"), [(0.0, False), (0.05, False), (0.3, True), (-0.2, True)])
 def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(metres, off):
     tracker, state, *_ = started()
-    away, due = unseen(state, T_cam_obj=moved_away(tracker, state, metres)), torch.tensor([True])
+    away, due = unseen(state, T_cam_obj=moved_away(tracker, state, metres)), state.t_us + 1_000_000
     assert is_off_in_depth(away, tracker.objects, due, CONFIG).tolist() == [off]
-    assert not is_off_in_depth(away, tracker.objects, ~due, CONFIG)
+    assert not is_off_in_depth(away, tracker.objects, state.t_us, CONFIG)
     assert not is_off_in_depth(unseen(away, 0.05), tracker.objects, due, CONFIG)
     # What is lost is expected there as it is.
     assert not is_off_in_depth(replace(away, covariance=uncertain(away)), tracker.objects, due, CONFIG)

@@ -121,7 +121,7 @@ def test_interrupt_ends_the_run_with_complete_outputs(sequence_path, tmp_path):
             pass
 
     handler = signal.getsignal(signal.SIGINT)
-    summary = run(quick(sequence_path, tmp_path / "out"), [InterruptAtThird()])
+    summary = run(quick(sequence_path, tmp_path / "out", preset="causal"), [InterruptAtThird()])
     assert summary.interrupted
     assert signal.getsignal(signal.SIGINT) is handler
     assert len(read_tum(tmp_path / "out" / "trajectory_box.tum")) == summary.windows == 3

@@ -16,7 +16,10 @@ from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import SmoothingConfig, TrackerConfig
 from torchtrack.errors import EventDataError
+from torchtrack.events import EventBatch
 from torchtrack.io import read_tum
+from torchtrack.io.columns import Columns
+from torchtrack.io.live import LiveSource
 from torchtrack.lie import rotation_angle_deg
 from torchtrack.runner import run, track
 from torchtrack.session import open_session
@@ -55,7 +58,7 @@ def path(tmp_path_factory):
 def followed(path, **tracker):
     """The steps of a sequence."""
     kept = Kept(path)
-    follow([lambda: kept], RunConfig(source=path, tracker=tracker))
+    follow([lambda: kept], RunConfig(source=path, preset="causal", tracker=tracker))
     return kept.steps
 
 
@@ -153,13 +156,13 @@ def test_an_object_left_out_altogether_is_no_matter(path):
 
 
 def test_a_run_writes_smoothed_poses(path, tmp_path):
-    summaries = [run(RunConfig(source=path, output=tmp_path / name, preset=name, overlay={"enabled": False})) for name in ("default", "smoothed")]
-    plain, smooth = (read_tum(tmp_path / name / "trajectory_left.tum") for name in ("default", "smoothed"))
+    summaries = [run(RunConfig(source=path, output=tmp_path / name, preset=name, overlay={"enabled": False})) for name in ("causal", "default")]
+    plain, smooth = (read_tum(tmp_path / name / "trajectory_left.tum") for name in ("causal", "default"))
     assert torch.equal(plain.t_us, smooth.t_us)
     assert float((plain.T_cam_obj - smooth.T_cam_obj).abs().max()) > 1e-4
     assert summaries[1].windows == summaries[0].windows == len(smooth)
-    assert load(RunConfig, tmp_path / "smoothed" / "config.yaml").tracker.smoothing.lag_s == 0.05
-    rows = list(csv.DictReader((tmp_path / "smoothed" / "poses.csv").read_text().splitlines()))
+    assert load(RunConfig, tmp_path / "default" / "config.yaml").tracker.smoothing.lag_s == 0.05
+    rows = list(csv.DictReader((tmp_path / "default" / "poses.csv").read_text().splitlines()))
     mean = np.mean([float(row["rotation_error_deg"]) for row in rows if row["label"] == "left" and row["rotation_error_deg"]])
     assert summaries[1].objects["left"].errors.mean_rotation_deg == pytest.approx(mean, rel=1e-4)
 
@@ -167,14 +170,41 @@ def test_a_run_writes_smoothed_poses(path, tmp_path):
 def test_track_gives_smoothed_results_where_the_tracker_is_set_so():
     _, events = moving_box(pose(), 12)
     found = {}
-    for name in ("default", "smoothed"):
+    for name in ("causal", "default"):
         tracker = Tracker([box_model()], SMALL_CAMERA, preset(name))
         found[name] = list(track([events], tracker, tracker.init(pose()[None], 0)))
     times = [[int(result.t_us[0]) for result in results] for results in found.values()]
     assert times[0] == times[1] == [5000 * number for number in range(1, 13)]
-    moved = [float((ours.T_cam_obj - theirs.T_cam_obj).abs().max()) for ours, theirs in zip(found["default"], found["smoothed"], strict=True)]
+    moved = [float((ours.T_cam_obj - theirs.T_cam_obj).abs().max()) for ours, theirs in zip(found["causal"], found["default"], strict=True)]
     assert max(moved[:-1]) > 1e-5
     assert moved[-1] < 1e-9
+
+
+class Camera(LiveSource):
+    """A live camera that has seen some events."""
+
+    def __init__(self, events):
+        super().__init__("camera", SMALL_CAMERA.width, SMALL_CAMERA.height)
+        self.events = [Columns(events.t_us.numpy(), events.x.numpy(), events.y.numpy(), events.polarity.numpy())]
+
+    def _receive(self):
+        return self.events.pop() if self.events else None
+
+
+def test_a_live_source_is_never_held_back():
+    _, events = moving_box(pose(), 12)
+    found = []
+    for name in ("causal", "default"):
+        tracker = Tracker([box_model()], SMALL_CAMERA, preset(name))
+        found.append(torch.stack([result.T_cam_obj for result in track(Camera(events), tracker, tracker.init(pose()[None], 0))]))
+    assert torch.equal(*found)
+
+
+def test_the_followers_of_a_live_source_get_its_steps_as_they_come(path):
+    kept, windows = Kept(path), []
+    kept.session = replace(kept.session, live=Camera(EventBatch.empty()))
+    follow([lambda: kept], RunConfig(source=path, tracker=SMOOTHED), lambda: windows.append(len(kept.steps)) or len(windows) == 5)
+    assert windows == [1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize("lacking", [{"solver": {"prior": False}}, {"motion": {"model": "hold"}}], ids=["prior", "velocity"])

@@ -133,12 +133,12 @@ class Counting:
 @pytest.mark.parametrize(("fault", "message"), [({"broken_after": 2}, "time goes back"), ({"full_after": 2}, "disk of the test is full")])
 def test_a_stream_that_fails_on_its_way_leaves_and_the_others_go_on(paths, fault, message):
     followers = [Counting(paths[0], **fault), Counting(paths[2])]
-    failed, windows = follow([partial(lambda one: one, follower) for follower in followers], RunConfig(source=paths[0]))
+    failed, windows = follow([partial(lambda one: one, follower) for follower in followers], RunConfig(source=paths[0], preset="causal"))
     assert message in str(failed)
     assert (len(followers[0].steps), windows) == (2, 8)
     assert all(follower.closed for follower in followers)
     alone = Counting(paths[2])
-    follow([lambda: alone], RunConfig(source=paths[2]))
+    follow([lambda: alone], RunConfig(source=paths[2], preset="causal"))
     torch.testing.assert_close(followers[1].steps[-1].result.T_cam_obj, alone.steps[-1].result.T_cam_obj, rtol=0, atol=5e-4)
 
 
@@ -158,7 +158,7 @@ def test_a_step_holds_its_own_stream_alone(paths):
 def test_whoever_is_stopped_finishes_with_what_there_is(paths):
     followers = [Counting(path) for path in paths]
     opening = [partial(lambda one: one, follower) for follower in followers]
-    assert follow(opening, RunConfig(source=paths[0]), lambda: len(followers[2].steps) == 2) == [2, 2, 2]
+    assert follow(opening, RunConfig(source=paths[0], preset="causal"), lambda: len(followers[2].steps) == 2) == [2, 2, 2]
 
 
 @pytest.mark.many_windows

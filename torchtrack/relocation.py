@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchtrack import readback
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.doubt import searches
+from torchtrack.doubt import is_due, searches
 from torchtrack.motion import MOST_UNCERTAIN, rim_and_centre
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.prediction import Prediction
@@ -92,14 +92,15 @@ def is_lost(state: TrackerState, diameter_m: Float[Tensor, "b"], config: Tracker
     return unknown & unseen
 
 
-def is_off_in_depth(state: TrackerState, objects: ObjectBatch, due: Bool[Tensor, "b"], config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """Which objects are much farther away, or nearer, than when they were last seen well, long ago, and which it is time for."""
-    possible = due & _unseen_for_long(state, config)
-    if readback.none_of(possible):
-        return possible
+def is_off_in_depth(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Which objects are much farther away, or nearer, than when they were last seen well, long ago, and due in the window to ``t_us``."""
+    unseen = _unseen_for_long(state, config)
+    if readback.none_of(unseen):
+        return unseen
+    due = is_due(state.t_us, t_us, config.search.doubt_us)[objects.stream_index]
     now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.T_last_seen))
     off = torch.maximum(now_m / then_m, then_m / now_m) > _OFF_IN_DEPTH
-    return possible & off & ~is_lost(state, objects.diameter_m, config)
+    return unseen & due & off & ~is_lost(state, objects.diameter_m, config)
 
 
 def anywhere(covariance: Float[Tensor, "b 12 12"], chosen: Bool[Tensor, "b"]) -> Float[Tensor, "b 12 12"]:

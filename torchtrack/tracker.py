@@ -232,7 +232,7 @@ class Tracker(TrackedObjects):
         dt_s = window_s[self.stream_index]
         recorded = self._predict(self._expected(state, events.events, t_us, dt_s, questions), dt_s)
         prediction = recorded.detached()
-        off_in_depth = is_off_in_depth(state, self.objects, is_due(state.t_us, t_us, config.search.doubt_us)[self.stream_index], config)
+        off_in_depth = is_off_in_depth(state, self.objects, t_us, config)
         nearby = self._near(events, prediction, off_in_depth, dt_s)
         seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, t_us - state.t_us, config.matching.burst_us)
         contours = prediction.contours(dt_s, config.contours)

@@ -1,4 +1,4 @@
-"""Presets: ``default``, ``smoothed`` and ``learned`` (ours), ``paper`` (the paper's letter), and its comparison methods."""
+"""Presets: ``default``, ``causal`` and ``learned`` (ours), ``paper`` (the paper's letter), and its comparison methods."""
 
 from collections.abc import Callable
 from typing import Literal, get_args
@@ -19,17 +19,21 @@ from torchtrack.config.tracker import (
 )
 from torchtrack.errors import ConfigError
 
-PresetName = Literal["default", "smoothed", "learned", "paper", "line", "ls", "nns"]
+PresetName = Literal["default", "causal", "learned", "paper", "line", "ls", "nns"]
 
 
-def _smoothed() -> TrackerConfig:
-    """The default, for recordings: each pose is refined by the 50 ms after it, more of which tell hardly anything."""
-    return TrackerConfig(smoothing=SmoothingConfig(lag_s=0.05))
+# More than this (s) tells hardly anything of a pose.
+_SMOOTHED = SmoothingConfig(lag_s=0.05)
+
+
+def _default() -> TrackerConfig:
+    """Our best of recordings and of live cameras; of recordings, each pose is refined by the 50 ms after it."""
+    return TrackerConfig(smoothing=_SMOOTHED)
 
 
 def _learned() -> TrackerConfig:
     """The default, with a network's word on how far each observation is to be believed."""
-    return TrackerConfig(matching=MatchingConfig(learned_trust=True))
+    return TrackerConfig(matching=MatchingConfig(learned_trust=True), smoothing=_SMOOTHED)
 
 
 def _paper() -> TrackerConfig:
@@ -100,8 +104,9 @@ def preset(name: PresetName | str) -> TrackerConfig:
         ConfigError: if there is no such preset.
     """
     makers: dict[str, Callable[[], TrackerConfig]] = {
-        "default": TrackerConfig,
-        "smoothed": _smoothed,
+        "default": _default,
+        # The default as of a live camera: poses stand on what came before them.
+        "causal": TrackerConfig,
         "learned": _learned,
         "paper": _paper,
         "line": _line,

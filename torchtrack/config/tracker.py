@@ -297,7 +297,7 @@ class SmoothingConfig(Settings):
     """Poses of a recording refined by what came after them, see :mod:`torchtrack.smoothing`."""
 
     lag_s: float = Field(
-        0.0, ge=0, le=10, description="Each pose is refined by the windows of so much time after it, and comes that much later (s); 0 for not at all."
+        0.0, ge=0, le=10, description="Each pose of a recording is refined by the windows of so much time after it (s); 0 for not at all."
     )
 
 
