@@ -11,6 +11,7 @@ from torchtrack.config.tracker import (
     MatchingConfig,
     MotionConfig,
     QualityConfig,
+    SearchConfig,
     SmoothingConfig,
     SolverConfig,
     SurfaceConfig,
@@ -32,8 +33,11 @@ def _default() -> TrackerConfig:
 
 
 def _learned() -> TrackerConfig:
-    """The default, with a network's word on how far each observation is to be believed."""
-    return TrackerConfig(matching=MatchingConfig(learned_trust=True), smoothing=_SMOOTHED)
+    """The default, with a network's word on how far each observation is to be believed.
+
+    It believes less where an object is seen badly, and explains less there: that is no sign of having strayed.
+    """
+    return TrackerConfig(matching=MatchingConfig(learned_trust=True), search=SearchConfig(strayed_to=0), smoothing=_SMOOTHED)
 
 
 def _paper() -> TrackerConfig:
