@@ -102,7 +102,7 @@ class _Smoothed(Generic[R]):
 def _smoothed(follower: Follower[R], config: TrackingConfig) -> Follower[R]:
     """The follower, of smoothed steps where the settings ask for them; poses of a live source are not held back."""
     session = follower.session
-    if not config.tracker.smoothing.lag_s or not session.models or session.live:
+    if not config.tracker.smoothing.lag_s or not session.models or session.live is not None:
         return follower
     return _Smoothed(follower, Smoother(SmoothedObjects.of(session.models, session.camera), config.tracker))
 

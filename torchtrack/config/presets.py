@@ -23,7 +23,7 @@ from torchtrack.errors import ConfigError
 PresetName = Literal["default", "causal", "learned", "paper", "line", "ls", "nns"]
 
 
-# More than this (s) tells hardly anything of a pose.
+# What comes later than this tells hardly anything of a pose.
 _SMOOTHED = SmoothingConfig(lag_s=0.05)
 
 
