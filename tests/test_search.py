@@ -1,6 +1,7 @@
 """The search over many poses: what is drawn, how it is marked, that lost objects are found again and others left alone."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -13,7 +14,8 @@ from torchtrack.events import concatenate
 from torchtrack.kernels.switch import numba_is_installed
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
-from torchtrack.recovery import _least, _search_slipped
+from torchtrack.recovery import _least, _search_slipped, _stands, search_wanted
+from torchtrack.relocation import LastSeen
 from torchtrack.search import _is_likely, _likeliest, explained_at_rest, rehearse, search
 
 SEARCHED = TrackerConfig()
@@ -139,6 +141,45 @@ def test_what_was_merely_not_seen_well_has_to_explain_nearly_all_elsewhere_and_n
     torch.testing.assert_close(near, torch.tensor([0.15, 0.72, 0.0, 0.8 * float(found.count)]))
     torch.testing.assert_close(elsewhere, torch.tensor([0.15, 0.72, 0.0, 0.0]))
     torch.testing.assert_close(_least(in_place, found, tracker.config)[0, :, 0], torch.tensor([0.1, 0.0, 0.0, 0.0]))
+
+
+def in_doubt_and_sure():
+    """A tracker, what is found of a box that was in doubt for long, and the doubt of it."""
+    tracker, state, _, _, _ = started()
+    _, _, _, found, _ = in_motion()
+    found = replace(found, count=torch.full_like(found.count, 200))
+    state = replace(state, score=torch.full((1,), 0.3), full_share=torch.full((1,), 0.8), doubted_s=torch.full((1,), 0.2))
+    doubt = tracker._doubt(state, state.t_us + 50_000, torch.ones(1), torch.tensor([False]), torch.tensor([False]))
+    assert doubt.adrift.tolist() == [True] and doubt.strayed.tolist() == [False]
+    return tracker, found, doubt
+
+
+def test_what_is_in_doubt_but_explains_enough_by_many_events_stands():
+    tracker, found, doubt = in_doubt_and_sure()
+    stands = partial(_stands, config=tracker.config)
+    assert stands(doubt, found).tolist() == [True]
+    # Of 0.8 that it explains when seen well, a quarter.
+    less = replace(found, measured=torch.full((1,), 0.19))
+    assert stands(doubt, less).tolist() == stands(doubt, replace(found, count=torch.full_like(found.count, 119))).tolist() == [False]
+    others = {"adrift": False, "strayed": True, "starting": True, "sigma_px": 6.5}
+    assert not any(stands(replace(doubt, **{name: torch.tensor([value])}), found).any() for name, value in others.items())
+    never = TrackerConfig(search=SearchConfig(stands_from=0))
+    assert _stands(doubt, found, never).tolist() == [False]
+
+
+def test_what_stands_is_looked_for_as_if_it_had_slipped_and_gives_way_to_far_more_events_elsewhere(monkeypatch):
+    tracker, found, doubt = in_doubt_and_sure()
+    assert _least(doubt, found, tracker.config)[3, :, 0].tolist() == pytest.approx([0.15, 0.72, 0.0, 400.0])
+    _, prediction, seen, _, _ = in_motion()
+    looked = {}
+    for stands in (True, False):
+        monkeypatch.setattr("torchtrack.recovery._stands", lambda *_, stands=stands: torch.tensor([stands]))
+        monkeypatch.setattr("torchtrack.recovery.search", lambda *args, stands=stands: looked.setdefault(stands, args[2]) and args[5])
+        last_seen = LastSeen(prediction.T_cam_obj.double(), prediction.covariance)
+        told = replace(doubt, unseen_s=torch.zeros(1), has_symmetry=torch.tensor([False]))
+        search_wanted(prediction, told, seen, found, torch.ones(1), tracker.config, last_seen, tracker.planes)
+    assert looked[True] == tracker.config.search.slip_sigma_px
+    assert looked[False] > 2 * looked[True]
 
 
 def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():

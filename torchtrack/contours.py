@@ -59,6 +59,10 @@ class Contours:
         """Those of one object."""
         return Contours(*(value[number : number + 1] for value in vars(self).values()))
 
+    def rows(self, chosen: Int[Tensor, "k"]) -> "Contours":
+        """Those of some objects."""
+        return Contours(*(value.index_select(0, chosen) for value in vars(self).values()))
+
     def widened(self, count: int) -> "Contours":
         """The same with at least ``count`` places for the points of each object."""
         return Contours(*(_widened(value, count) for value in vars(self).values()))

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.alignment import gate_widening
@@ -20,6 +20,8 @@ from torchtrack.search import AS_MUCH, Found, is_taken, search, search_around
 _AS_MANY = 0.8
 # What explains so many times as many events as a pose far off in depth is no smaller thing that chance explains.
 _FAR_MORE = 2.0
+# A pose stands by no fewer than so many times the least number of observations.
+_STANDING_TIMES = 4
 
 
 def search_wanted(
@@ -44,19 +46,24 @@ def search_wanted(
     """
     # Without events no pose is better than another.
     enough = events.counts() >= config.quality.min_observations
-    reasons = (*doubt.reasons(found.score, config.search), doubt.has_run_off(config.search))
-    least_near, least_far, least_anew = _least(doubt, found, config)
+    stands = _stands(doubt, found, config)
+    reasons = (stands, *doubt.reasons(found.score, config.search), doubt.has_run_off(config.search))
+    least_near, least_far, least_anew, least_last_seen = _least(doubt, found, config)
+    doubt = replace(doubt, adrift=doubt.adrift & ~stands)
     uncertain = drifted(prediction, doubt, config.search)
     sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
     answers = (Answer.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px, doubt.sigma_px))
-    for number, (is_tried, may_have_slipped, is_mirrored, has_run_off, own_sigma_px, predicted_px) in enumerate(zip(*answers, strict=True)):
-        if is_tried:
+    for number, told in enumerate(zip(*answers, strict=True)):
+        it_stands, is_tried, may_have_slipped, is_mirrored, has_run_off, own_sigma_px, predicted_px = told
+        if it_stands:
+            found = _search_slipped(number, uncertain, own_sigma_px, least_near[:, number], events, found, config)
+        elif is_tried:
             found = search(number, uncertain, own_sigma_px, least_near[:, number], events, found, config)
         if may_have_slipped:
             found = _search_slipped(number, uncertain, own_sigma_px, least_far[:, number], events, found, config)
         if has_run_off:
             other = as_last_seen(uncertain.copies(number, 1), last_seen.T_cam_obj[number])
-            found, prediction = _search_from(number, other, own_sigma_px, least_far[:, number], events, found, prediction, config)
+            found, prediction = _search_from(number, other, own_sigma_px, least_last_seen[:, number], events, found, prediction, config)
         for plane in planes.of(number) if is_mirrored else ():
             other = less_certain(mirrored(_as_found(number, prediction, found), *plane), 0, predicted_px, config.search.slip_sigma_px)
             found, prediction = _search_from(number, other, config.search.slip_sigma_px, least_far[:, number], events, found, prediction, config)
@@ -87,10 +94,22 @@ def _search_anew(
     return found, prediction, widening
 
 
-def _least(doubt: Doubt, found: Found, config: TrackerConfig) -> Float[Tensor, "3 4 b"]:
+def _stands(doubt: Doubt, found: Found, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Which objects, long in doubt and yet sure of their place, explain enough there: they are looked for as if they had slipped, not far away.
+
+    Where something passes before an object, its edges smear the events around it, and what is laid along them explains more.
+    """
+    sure = doubt.adrift & ~doubt.strayed & ~doubt.starting & (doubt.sigma_px < config.search.slip_sigma_px)
+    explains = found.score >= config.search.stands_from * doubt.full_share
+    many = found.count >= _STANDING_TIMES * config.quality.min_observations
+    return sure & explains & many & (config.search.stands_from > 0)
+
+
+def _least(doubt: Doubt, found: Found, config: TrackerConfig) -> Float[Tensor, "4 4 b"]:
     """By how much other poses must explain more, how much they must explain and gather, and by how many events at least.
 
-    And the same of where an object is not predicted at all, and of where it was last seen well, if it is far off in depth.
+    And the same of where an object is not predicted at all, of where it was last seen well, if it is far off in depth, and if it is
+    in doubt.
 
     While a motion is not known nothing says how far events gather when all is well, and dense print explains as much of many poses:
     one that smears the events more than the prediction's own is not better.
@@ -111,7 +130,8 @@ def _least(doubt: Doubt, found: Found, config: TrackerConfig) -> Float[Tensor, "
     elsewhere = none + search.slip_margin, search.slip_share * doubt.full_share, none, none
     # A small thing that is all explained says nothing against one of which far more events are explained.
     anew = none - torch.inf, config.quality.certain_at * doubt.full_share, none, _FAR_MORE * matched
-    return torch.stack([margin, needed, gathered, count, *elsewhere, *anew]).unflatten(0, (3, 4))
+    last_seen = *elsewhere[:3], torch.where(_stands(doubt, found, config), _FAR_MORE * matched, 0)
+    return torch.stack([margin, needed, gathered, count, *elsewhere, *anew, *last_seen]).unflatten(0, (4, 4))
 
 
 def _search_slipped(

@@ -15,6 +15,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours
 from torchtrack.doubt import less_certain
 from torchtrack.hypotheses import promising
+from torchtrack.line_ends import running_on
 from torchtrack.observations import ObjectEvents, WindowEvents, select_events
 from torchtrack.once import once
 from torchtrack.pose_problem import Linearisation
@@ -121,11 +122,14 @@ def search_around(
     margin, needed, gathered, count = least.unbind()
     # Written so that what does not tell how far it gathers counts.
     counts = (tried.count >= count.clamp(min=config.quality.min_observations)) & _is_likely(offset, covariance) & ~(tried.gathered < gathered)
-    score = torch.where(counts, tried.score, 0)
-    wide = config.search.by_events and sigma_px > config.search.wide_sigma_px
-    best = _likeliest(_by_events(score, tried.count) if wide else score, offset, one.covariance[0])
+    score, wide = torch.where(counts, tried.score, 0), sigma_px > config.search.wide_sigma_px
     mine = torch.where(found.count[number] >= config.quality.min_observations, found.score[number], 0.0)
-    better = score.index_select(0, best) > torch.maximum(mine + margin, needed)
+    asked = torch.maximum(mine + margin, needed)
+    if config.search.line_ends and wide:
+        score = _less_where_lines_run_on(score, score > asked, tried.fit.contours, places, one.objects.image_size)
+    by_events = config.search.by_events and wide
+    best = _likeliest(_by_events(score, tried.count) if by_events else score, offset, one.covariance[0])
+    better = score.index_select(0, best) > asked
     return found if readback.none_of(better) else _replaced(found, number, tried, best, better)
 
 
@@ -150,6 +154,20 @@ def _squared_deviations(offsets: Float[Tensor, "n k"], covariance: Float[Tensor,
     """Squared distance of offsets in standard deviations (Mahalanobis)."""
     root = torch.linalg.cholesky_ex(covariance).L
     return torch.linalg.solve_triangular(root, offsets.to(root.dtype).T, upper=False).square().sum(0)
+
+
+def _less_where_lines_run_on(
+    score: Float[Tensor, "n"],
+    concerned: Bool[Tensor, "n"],
+    contours: Contours,
+    places: tuple[Float[Tensor, "1 e 2"], Bool[Tensor, "1 e"]],
+    image_size: tuple[int, int],
+) -> Float[Tensor, "n"]:
+    """Scores of poses, less where the lines that explain them are of something larger; of those alone that are ``concerned``, which saves time."""
+    if readback.none_of(concerned):
+        return score
+    rows = concerned.nonzero()[:, 0] if readback.read_at_once(concerned) else torch.arange(len(score), device=score.device)
+    return score.index_copy(0, rows, score[rows] * (1 - running_on(contours.rows(rows), places, image_size)))
 
 
 def _by_events(score: Float[Tensor, "n"], count: Int[Tensor, "n"]) -> Float[Tensor, "n"]:

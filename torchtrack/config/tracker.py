@@ -250,6 +250,9 @@ class SearchConfig(Settings):
     by_events: bool = Field(
         True, description="Poses of very uncertain objects are also compared by how many events they explain: far away, a few explain all."
     )
+    line_ends: bool = Field(
+        True, description="Poses of very uncertain objects count less where events go on, in line, beyond the ends of their straight contours."
+    )
     least_sigma_px: float = Field(3.0, gt=0, description="Others are drawn with at least this standard deviation in the image (px).")
     slip_sigma_px: float = Field(6.0, gt=0, description="The same of what may have slipped, however sure it is of itself (px).")
     at_start: bool = Field(True, description="Others are also tried while an object's motion is not known: dense print fits many.")
@@ -262,6 +265,12 @@ class SearchConfig(Settings):
     doubt_us: int = Field(50_000, ge=0, description="What is in doubt for so long is looked for farther away, once in this time (µs); 0 for never.")
     strayed_to: float = Field(
         0.85, ge=0, le=1, description="Share of what an object explains when seen well below which, as long, it is looked for as well; 0 for never."
+    )
+    stands_from: float = Field(
+        0.25,
+        ge=0,
+        le=1,
+        description="Share of what an object explains when seen well from which, in doubt, it is looked for near its place alone; 0 for never.",
     )
     drift_px_s: float = Field(200.0, gt=0, description="How fast it may have drifted off since the doubt began (px/s).")
     drift_diameters_s: float = Field(1.5, gt=0, description="The same for objects that are small in the image (diameters/s); the slower counts.")
