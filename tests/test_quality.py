@@ -9,7 +9,7 @@ from torchtrack.config.tracker import QualityConfig
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours
 from torchtrack.matching import Matches
-from torchtrack.quality import Status, explained_share, gathered_share, judge, needed_share, partly_hidden, trust, visible_share
+from torchtrack.quality import Status, explained_share, gathered_share, holding_on, judge, needed_share, partly_hidden, trust, visible_share
 
 IMAGE_SIZE = (150, 200)
 CONFIG = QualityConfig()
@@ -165,6 +165,13 @@ def test_of_a_hidden_object_no_more_is_asked_in_more_places():
     assert needed_share(widening, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.4, 0.3, 0.2])
     told = torch.full((2,), 0.3), torch.full((2,), 100), torch.ones(2), torch.zeros(2, 6), torch.ones(2)
     assert judge(*told, config, widening[:2], torch.tensor([0.0, 1.0])).tolist() == [Status.LOST, Status.UNCERTAIN]
+
+
+def test_what_goes_on_by_many_events_holds_on():
+    count, elsewhere = torch.tensor([120, 119, 120]), torch.tensor([False, False, True])
+    config = QualityConfig(min_observations=30)
+    assert holding_on(count, elsewhere, config).tolist() == [True, False, False]
+    assert not holding_on(count, elsewhere, config.model_copy(update={"holds_on": False})).any()
 
 
 def test_an_uncertain_object_may_be_found_farther_away():

@@ -70,7 +70,8 @@ def _judged(
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     step = solution.from_prior[:, :6] * ~(found.elsewhere & may_be_anywhere(widening))[:, None]
     hidden = quality.partly_hidden(found.gathered, found.full_gathered, found.count, found.elsewhere, config.quality)
-    status = quality.judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening, hidden)
+    asked_less = torch.where(quality.holding_on(found.count, found.elsewhere, config.quality), 1, hidden)
+    status = quality.judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening, asked_less)
     status = torch.where(prediction.usable, status, int(quality.Status.DIVERGED))
     failed = status >= int(quality.Status.LOST)
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
@@ -164,6 +165,7 @@ def _settings(config: TrackerConfig) -> ConclusionSettings:
         hidden_fully=quality.HIDDEN_FULLY,
         hidden_least=quality.HIDDEN_LEAST,
         hidden_observations=quality.HIDDEN_TIMES * config.quality.min_observations,
+        holds_on=config.quality.holds_on,
         min_observations=config.quality.min_observations,
         min_visible_share=config.quality.min_visible_share,
         max_step_rotation_rad=config.quality.max_step_rotation_rad,

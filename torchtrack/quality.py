@@ -164,6 +164,15 @@ def partly_hidden(
     return torch.where(tells & config.partly_hidden, ramp.clamp(max=1), 0)
 
 
+def holding_on(count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: QualityConfig) -> Bool[Tensor, "b"]:
+    """Which poses go on from the one before by many events: what little is explained of an object that is hidden ever more is still it.
+
+    Given up, it would coast away from where it is, and be looked for among the edges of what hides it. Arguments are those of
+    :func:`partly_hidden`.
+    """
+    return ~elsewhere & (count >= HIDDEN_TIMES * config.min_observations) & config.holds_on
+
+
 def trust(
     share: Float[Tensor, "b"], config: QualityConfig, full_share: Float[Tensor, "b"] | None = None, widening: Float[Tensor, "b"] | None = None
 ) -> Float[Tensor, "b"]:

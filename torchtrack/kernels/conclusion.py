@@ -106,6 +106,9 @@ def _judge(
 ) -> int:
     """The status of an object: :func:`torchtrack.quality.judge`."""
     widening, share, status = found[WIDENING, b], found[SHARE, b], TRACKING
+    # As torchtrack.quality.holding_on has it.
+    if settings.holds_on and not elsewhere[b] and matched[b] >= settings.hidden_observations:
+        hidden = 1.0
     wider, turned, moved = _clamped(widening - 1.0, 0.0, 1.0) * (1.0 - hidden), 0.0, 0.0
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     counts = 0.0 if elsewhere[b] and widening >= settings.anywhere else 1.0
