@@ -180,18 +180,18 @@ def test_conclusions(settings, dtype):
     assert_as_close((state, result), (other_state, other_result), tolerance=CONCLUDED_TO[dtype])
 
 
-@pytest.mark.parametrize("partly_hidden", [True, False])
-def test_conclusions_of_what_may_be_partly_hidden(partly_hidden, dtype):
+@pytest.mark.parametrize(("partly_hidden", "holds_on"), [(True, False), (False, True), (False, False)])
+def test_conclusions_of_what_may_be_partly_hidden(partly_hidden, holds_on, dtype):
     def spoil(found):
         found.measured[:] = 0.2
         found.full_gathered[:] = torch.linspace(0.4, 0.9, OBJECTS)
         found.gathered[:] = found.full_gathered * torch.tensor([1.0, 0.95, 0.9, 0.85, 1.0, 1.1, torch.nan])
 
-    config = TrackerConfig.model_validate({"quality": {"partly_hidden": partly_hidden}})
+    config = TrackerConfig.model_validate({"quality": {"partly_hidden": partly_hidden, "holds_on": holds_on}})
     (state, result), (other_state, other_result) = both_ways(conclusions(config, dtype, spoil))
     assert_as_close((state, result), (other_state, other_result), tolerance=CONCLUDED_TO[dtype])
     # Looked for in many places, it would be lost.
-    assert int(result.status[5]) == (Status.UNCERTAIN if partly_hidden else Status.LOST)
+    assert int(result.status[5]) == (Status.UNCERTAIN if partly_hidden or holds_on else Status.LOST)
 
 
 @pytest.mark.parametrize("what", ["T_cam_obj", "hessian", "from_prior"])
