@@ -160,8 +160,13 @@ def partly_hidden(
     """
     ramp = (gathered / full_gathered.clamp(min=1e-6) - HIDDEN_FROM) / (HIDDEN_FULLY - HIDDEN_FROM)
     # Written so that what is not a number counts for nothing.
-    tells = (ramp > 0) & ~elsewhere & (full_gathered > HIDDEN_LEAST) & (count >= HIDDEN_TIMES * config.min_observations)
+    tells = (ramp > 0) & ~elsewhere & (full_gathered > HIDDEN_LEAST) & are_many(count, config)
     return torch.where(tells & config.partly_hidden, ramp.clamp(max=1), 0)
+
+
+def are_many(count: Int[Tensor, "b"], config: QualityConfig) -> Bool[Tensor, "b"]:
+    """Whether observations are so many that they tell of an object of which little is explained."""
+    return count >= HIDDEN_TIMES * config.min_observations
 
 
 def holding_on(count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: QualityConfig) -> Bool[Tensor, "b"]:
@@ -170,7 +175,7 @@ def holding_on(count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: Qu
     Given up, it would coast away from where it is, and be looked for among the edges of what hides it. Arguments are those of
     :func:`partly_hidden`.
     """
-    return ~elsewhere & (count >= HIDDEN_TIMES * config.min_observations) & config.holds_on
+    return ~elsewhere & are_many(count, config) & config.holds_on
 
 
 def trust(

@@ -12,6 +12,7 @@ from torchtrack.doubt import Doubt, drifted, less_certain
 from torchtrack.observations import ObjectEvents
 from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
 from torchtrack.prediction import Prediction
+from torchtrack.quality import are_many
 from torchtrack.readback import Answer
 from torchtrack.relocation import LastSeen
 from torchtrack.search import AS_MUCH, Found, is_taken, search, search_around
@@ -20,8 +21,6 @@ from torchtrack.search import AS_MUCH, Found, is_taken, search, search_around
 _AS_MANY = 0.8
 # What explains so many times as many events as a pose far off in depth is no smaller thing that chance explains.
 _FAR_MORE = 2.0
-# A pose stands by no fewer than so many times the least number of observations.
-_STANDING_TIMES = 4
 
 
 def search_wanted(
@@ -101,8 +100,7 @@ def _stands(doubt: Doubt, found: Found, config: TrackerConfig) -> Bool[Tensor, "
     """
     sure = doubt.adrift & ~doubt.strayed & ~doubt.starting & (doubt.sigma_px < config.search.slip_sigma_px)
     explains = found.score >= config.search.stands_from * doubt.full_share
-    many = found.count >= _STANDING_TIMES * config.quality.min_observations
-    return sure & explains & many & (config.search.stands_from > 0)
+    return sure & explains & are_many(found.count, config.quality) & (config.search.stands_from > 0)
 
 
 def _least(doubt: Doubt, found: Found, config: TrackerConfig) -> Float[Tensor, "4 4 b"]:
