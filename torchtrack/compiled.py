@@ -1,8 +1,9 @@
-"""Steady windows as one compiled graph: fused kernels in the place of some three thousand small operations.
+"""Steady windows as one graph: on a GPU a recording of some three thousand small operations; compiled, fused kernels in their place.
 
-What a step of one object costs is the calls of operations, not what they compute. ``torch.compile`` turns the part of it in
-which nothing has to be decided into fewer and larger kernels; on a GPU, a CUDA graph holds them. Shapes are those of a GPU
-(:mod:`torchtrack.readback`), and the number of events is left open.
+What a step of one object costs is the calls of operations, not what they compute. On a GPU, the part of it in which nothing
+has to be decided is recorded once, and then started as a whole (:mod:`torchtrack.cuda_graphs`). ``torch.compile`` turns it into
+fewer and larger kernels, there and on a CPU. Shapes are those of a GPU (:mod:`torchtrack.readback`), and the number of events
+is left open.
 
 Where a window turns out not to be steady, as an object is to be searched for, or is very uncertain, what the graph gave is
 dropped and the window is taken as without one; so are windows that contours are learned from. Poses are the same, to rounding.
@@ -23,10 +24,12 @@ from torch.nn.functional import pad
 
 from torchtrack.bursts import update_bursts
 from torchtrack.constants import cells_within
+from torchtrack.cuda_graphs import CudaGraphs
 from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch, check_on_sensor, pad_streams
 from torchtrack.kernels import switch
 from torchtrack.online_learning import learning_is_due
+from torchtrack.readback import Answer
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.state import S, StepResult, TrackerState, each_tensor
 
@@ -37,8 +40,6 @@ P, R = ParamSpec("P"), TypeVar("R")
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
 # At a start, it is looked at more than later on which contours a model lacks.
 _FIRST_WINDOWS = 5
-# What takes Python out of the calls of kernels.
-_WITHOUT_PYTHON = {"cpu": "cpp_wrapper", "cuda": "triton.cudagraphs"}
 # Of more events than this, those that are near no object are left out first.
 _MANY = 16_384
 # Events are filled up to numbers of this many binary digits, so that a GPU needs few graphs, and to multiples of this: loops
@@ -47,25 +48,28 @@ _DIGITS, _MULTIPLE = 3, 64
 
 
 class CompiledStep:
-    """Takes steady windows by graphs, compiled when they are first needed: for a minute or more, and for seconds from a cache on disk.
+    """Takes steady windows by graphs, made when they are first needed: compiled for a minute or more, and for seconds from a cache on disk.
 
     Args:
         tracker: whose windows they are.
+        compiles: whether they are compiled; else there are graphs on a GPU alone.
 
     Raises:
         ConfigError: if this version of PyTorch cannot.
     """
 
-    def __init__(self, tracker: "Tracker") -> None:
-        if "isolate_recompiles" not in signature(torch.compile).parameters:
+    def __init__(self, tracker: "Tracker", *, compiles: bool = True) -> None:
+        if compiles and "isolate_recompiles" not in signature(torch.compile).parameters:
             raise ConfigError(f"compiled: PyTorch {torch.__version__} cannot compile a tracker. Update it to 2.13 or later, or go without.")
-        self._tracker = tracker
+        self._tracker, self._compiles = tracker, compiles
         # By how many events a stream has at most, where there are several.
         self._graphs: dict[int | None, _Graph] = {}
         self._near_tiles: Callable[[TrackerState, Tensor], Tensor | None] | None = None
 
     def __call__(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult] | None:
-        """State and result of a window, not counted yet; None where it is not steady, or there is hardly any event in it."""
+        """State and result of a window, not counted yet; None where there is no graph, it is not steady, or there is hardly any event in it."""
+        if not self._compiles and not t_us.is_cuda:
+            return None
         starts = state.learned is not None and state.learned.windows < _FIRST_WINDOWS
         if starts or learning_is_due(state, self._tracker.on_surfaces, self._tracker.config):
             return None
@@ -75,7 +79,8 @@ class CompiledStep:
             if len(nearby.events) < 2:
                 return None
             next_state, result, wrong = self._taken(self._tracker.opened(plain, events), nearby, t_us)
-        return None if bool(wrong) else (_own(next_state).numbered(state), _own(result))
+            is_wrong = Answer.to(wrong[None])
+        return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
     def __len__(self) -> int:
         """How many graphs there are."""
@@ -84,7 +89,7 @@ class CompiledStep:
     @torch.inference_mode()
     def prepare(self, state: TrackerState) -> None:
         """Compile the graphs of one stream, from the state that it begins with; with several, more than that would have to be known."""
-        if len(state.t_us) > 1:
+        if len(state.t_us) > 1 or not (self._compiles or state.t_us.is_cuda):
             return
         t_us, nothing = state.t_us + 1, torch.zeros_like(state.t_us).expand(2)
         events = EventBatch(nothing.int(), nothing.int(), t_us.expand(2), nothing > 0, nothing)
@@ -111,19 +116,21 @@ class CompiledStep:
             opened, filled = _in_bursts(opened, filled, t_us, self._tracker.config.matching.burst_us)
         kind = filled.events.most_of_one
         if kind not in self._graphs:
-            _of_any_number(filled)
-            self._graphs[kind] = _compiled(self._tracker.steady_advance, t_us.device)
-            return _for_the_first_time(self._graphs[kind], opened, filled, t_us)
-        if t_us.is_cuda:
-            # What the last window gave may be written over.
-            torch.compiler.cudagraph_mark_step_begin()
+            self._graphs[kind] = self._graph(t_us.device)
+            if self._compiles:
+                return _for_the_first_time(self._graphs[kind], opened, filled, t_us)
         return self._graphs[kind](opened, filled, t_us)
+
+    def _graph(self, device: torch.device) -> _Graph:
+        """A graph, made when it is first called."""
+        advance = _of_any_number(_compiled(self._tracker.steady_advance, device)) if self._compiles else self._tracker.steady_advance
+        return CudaGraphs(advance) if device.type == "cuda" else advance
 
 
 def _compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
     """The function as a graph of its own."""
     # All that it hangs on is fixed with the tracker: to look whether it is takes a tenth of a step.
-    options = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe, _WITHOUT_PYTHON[device.type]: True}
+    options = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe, "cpp_wrapper": device.type == "cpu"}
     # Not where it is defined: that would import the compiler, which takes as long as PyTorch itself, wherever a tracker is.
     torch.compiler.assume_constant_result(cells_within)
     # Without guards, no two functions may share what is compiled.
@@ -167,8 +174,8 @@ def _plain(value: Tensor) -> Tensor:
 
 
 def _own(value: S) -> S:
-    """The state or the result as the caller may keep it: a CUDA graph writes its results to the same places every time."""
-    return each_tensor(Tensor.clone, value) if value.t_us.is_cuda or not torch.is_inference_mode_enabled() else value
+    """The state or the result as the caller may use it, for gradients too."""
+    return value if torch.is_inference_mode_enabled() else each_tensor(Tensor.clone, value)
 
 
 def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
@@ -178,8 +185,10 @@ def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
     x, y, t_us, polarity = (pad(values, (0, missing)) for values in (events.x, events.y, events.t_us, events.polarity))
     most = None if streams == 1 else 1 << (events.most_of_one or len(events)).bit_length()
     filled = EventBatch(x, y, t_us, polarity, pad(events.stream_index, (0, missing), value=streams), most_of_one=most)
-    number = torch.arange(len(filled), device=x.device) if nearby.number is None else pad(nearby.number, (0, missing))
-    return NearbyEvents(filled, number)
+    if nearby.number is not None:
+        return NearbyEvents(filled, pad(nearby.number, (0, missing)))
+    # Of one stream, events are where they were; of several, each is numbered in its own.
+    return NearbyEvents(filled, torch.arange(len(filled), device=x.device) if streams == 1 else None)
 
 
 def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest_us: int) -> tuple[TrackerState, NearbyEvents]:
@@ -199,14 +208,19 @@ def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest
     return replace(opened, burst_age_us=burst_age_us), replace(filled, into_burst_us=into_burst_us)
 
 
-def _of_any_number(filled: NearbyEvents) -> None:
-    """Say that there may be another number of events another time."""
-    events = filled.events
-    for values in (events.x, events.y, events.t_us, events.polarity, events.stream_index, filled.number):
-        if values is not None:
-            torch._dynamo.mark_dynamic(values, 0)
-    if filled.into_burst_us is not None:
-        torch._dynamo.mark_dynamic(filled.into_burst_us, 1)
+def _of_any_number(graph: _Graph) -> _Graph:
+    """A graph that is told, when it is compiled, that there may be another number of events another time."""
+
+    def of_any_number(opened: TrackerState, filled: NearbyEvents, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:
+        events = filled.events
+        for values in (events.x, events.y, events.t_us, events.polarity, events.stream_index, filled.number):
+            if values is not None:
+                torch._dynamo.mark_dynamic(values, 0)
+        if filled.into_burst_us is not None:
+            torch._dynamo.mark_dynamic(filled.into_burst_us, 1)
+        return graph(opened, filled, t_us)
+
+    return of_any_number
 
 
 def _rounded_up(count: int) -> int:

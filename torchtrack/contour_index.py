@@ -127,6 +127,10 @@ def index_contours(
     low = _first_cells(centre, inside, margin)
     local = torch.where(inside[..., None], centre - low[:, None], margin)
     rows, columns = _size(local, image_size, margin, cell_px)
+    if not readback.read_at_once(local):
+        # Those that are not inside write, too: not all of them to one cell, where each would wait for the others.
+        spread = torch.arange(count, device=local.device) % (columns - 2 * margin) + margin
+        local[..., 0] = torch.where(inside, local[..., 0], spread.to(local.dtype))
     # Distance and number of a point in one integer, as narrow as will do.
     dtype = torch.int32 if _DISTANCE_STEPS * (max([0, *radii_px]) + 1) ** 2 * count < 2**31 else torch.int64
     keys = torch.full((batch * rows * columns,), torch.iinfo(dtype).max, dtype=dtype, device=radius.device)

@@ -6,6 +6,7 @@ ones of one place, all short ones that are bent but little, a segment, the print
 
 from collections.abc import Sequence
 from enum import IntEnum
+from math import ceil
 
 import numpy as np
 import torch
@@ -21,6 +22,8 @@ from torchtrack.object_model import ObjectModel
 _SHARP_COSINE = 0.5
 # Places on an object are told apart by this share of its diameter.
 _PLACE = 0.04
+# Directions that a model is looked at from, and how many times more points may face a camera between two of them, or near it.
+_VIEWS, _MORE_FACING = 512, 1.1
 
 
 class ContourKind(IntEnum):
@@ -75,6 +78,7 @@ class ContourModel(nn.Module):
         for name in ("texture_points", "texture_tangents", "texture_normals"):
             self.register_buffer(name, getattr(model, name)[spread].clone())
         self.texture_spacing_m = _spacing(self.texture_points)
+        self.most_texture_facing = _most_facing(self.texture_normals)
         edges = _edge_table(points, normals, is_segment)
         self.register_buffer("edges", edges)
         self.register_buffer("is_bent", edges[-1] == int(ContourKind.LIMB))
@@ -104,6 +108,13 @@ class ContourModel(nn.Module):
     def elements_of_edges(self, limb: Bool[Tensor, "b e"]) -> Int[Tensor, "b e"]:
         """The element of each edge; 0 on the limb of what may be smooth: it shows, whether or not its facets do."""
         return self.edge_element * ~(limb & self.is_bent)
+
+
+def _most_facing(normals: Float[Tensor, "n 3"]) -> int:
+    """How many of some points on faces look at a camera at once, at most: places for them, where they cannot be counted first."""
+    views = torch.nn.functional.normalize(torch.randn(_VIEWS, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    facing = (normals @ views.to(normals).T > 0).sum(0)
+    return min(ceil(_MORE_FACING * int(facing.amax())), len(normals)) if len(normals) else 0
 
 
 def _edge_table(points: Float[Tensor, "e 2 3"], face_normals: Float[Tensor, "e 2 3"], is_segment: Bool[Tensor, "e"]) -> Float[Tensor, "13 e"]:

@@ -159,8 +159,8 @@ def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, 
     facing = _texture_mask(model, T_cam_obj) & (number % every[:, None] == 0)
     if shown is not None:
         facing = facing & shown[:, model.texture_element]
-    # On a GPU, which would have to be waited for to know how many there are, all keep their places.
-    count = int(facing.sum(1).amax()) if readback.read_at_once(facing) else facing.shape[1]
+    # On a GPU, which would have to be waited for to know how many there are, there are places for as many as there can be.
+    count = int(facing.sum(1).amax()) if readback.read_at_once(facing) else model.most_texture_facing
     chosen, mask = select_ranked(facing, count)
     points, tangents = (values.T[:, chosen].permute(1, 2, 0) for values in (model.texture_points, model.texture_tangents))
     made = points, tangents, torch.full_like(chosen, int(ContourKind.TEXTURE)), mask

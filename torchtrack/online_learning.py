@@ -95,4 +95,4 @@ def learning_is_due(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, 
     if trust is not None and trust.due(config.model_trust):
         return True
     wanted = None if learned is None or on_surfaces is None else learned.wanted(on_surfaces, config.learning)
-    return wanted is not None and bool(wanted.any())
+    return wanted is not None and readback.Answer.to(wanted).any()

@@ -116,7 +116,7 @@ class StepResult:
     observation_count: Int[Tensor, "b"]
 
 
-S = TypeVar("S", TrackerState, StepResult)
+S, D = TypeVar("S", TrackerState, StepResult), TypeVar("D")
 # What belongs to streams; everything else belongs to objects.
 _OF_STREAMS = ("t_us", "last_event_us", "burst_age_us")
 
@@ -146,9 +146,9 @@ def take_part(value: S, objects: slice, streams: slice) -> S:
     return part
 
 
-def each_tensor(change: Callable[[Tensor], Tensor], value: S) -> S:
-    """The state or the result with each of its tensors changed."""
-    changed: S = _mapped(change, change, value)
+def each_tensor(change: Callable[[Tensor], Tensor], value: D) -> D:
+    """The state, the result or another dataclass with each of its tensors changed, in order; or a tensor changed."""
+    changed: D = _mapped(change, change, value)
     return changed
 
 

@@ -80,7 +80,7 @@ class Tracker(TrackedObjects):
     ) -> None:
         super().__init__(objects, camera, config, stream_index, dtype, weigher)
         self.kernels = kernels
-        self.graphs = CompiledStep(self) if compiled else None
+        self.graphs = CompiledStep(self, compiles=compiled)
 
     def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
         """The state before the first window, from each object's pose at ``t_us``.
@@ -156,8 +156,7 @@ class Tracker(TrackedObjects):
         Args:
             state: from :meth:`init`.
         """
-        if self.graphs is not None:
-            self.graphs.prepare(state)
+        self.graphs.prepare(state)
         with torch.inference_mode(), switch.kernels(wanted=self.kernels):
             if switch.apply_to(self.intrinsics):
                 # Kernels are compiled, or read from the disk, when they are first called: for a window without events.
@@ -166,8 +165,8 @@ class Tracker(TrackedObjects):
                     rehearse(self._predict(state, torch.full_like(self.diameter_m, 1e-6)), self.config)
 
     def _steady(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult] | None:
-        """A window by a compiled graph, where there is one and it holds."""
-        return None if self.graphs is None or torch.is_grad_enabled() else self.graphs(state, events, t_us)
+        """A window by a graph, where there is one and it holds."""
+        return None if torch.is_grad_enabled() else self.graphs(state, events, t_us)
 
     def near_tiles(self, state: TrackerState, t_us: Int[Tensor, "s"]) -> Bool[Tensor, "b t"] | None:
         """Tiles of the one sensor with events of the window after ``state`` that can have to do with each object; none of several sensors."""

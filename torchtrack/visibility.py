@@ -280,7 +280,8 @@ def _tested_exactly(scene: Scene) -> Tensor:
     """Which objects are tested against their own faces: a column."""
     exact = torch.zeros(len(scene.T_cam_obj), 1, dtype=torch.bool, device=scene.T_cam_obj.device)
     for model in scene.models:
-        exact[model.members] = len(model.triangles) > 0
+        # By `exact[members] = ...`, the value would be copied to a GPU each time, and waited for.
+        exact.index_fill_(0, model.members, len(model.triangles) > 0)
     return exact
 
 

@@ -1,0 +1,132 @@
+"""CUDA graphs: what they are given and give, with graphs that are called anew in the place of recorded ones; and real ones on a GPU."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from helpers import SMALL_CAMERA, box_model, pose
+from tracked_boxes import follow, moving_box, windows
+
+from torchtrack import Tracker, compiled, cuda_graphs, readback
+from torchtrack.config.tracker import LearningConfig, TrackerConfig
+from torchtrack.cuda_graphs import CudaGraphs
+from torchtrack.events import concatenate
+from torchtrack.state import each_tensor
+
+COUNT = 12
+# Windows that something is learned from are taken without a graph: every third.
+LEARNING = TrackerConfig(learning=LearningConfig(first_windows=0, every=3, up_to_share=1.0))
+
+
+@dataclass(frozen=True)
+class Pair:
+    moved: torch.Tensor
+    kept: torch.Tensor
+    number: int = 3
+    inner: "Pair | None" = None
+
+
+class CalledAgain:
+    """A graph that calls its function again, and writes where the function's first results are."""
+
+    def __init__(self, function, held, results):
+        self.function, self.held, self.results, self.starts = function, held, results, 0
+
+    def replay(self):
+        self.starts += 1
+        for place, value in zip(cuda_graphs._tensors(*self.results), cuda_graphs._tensors(*self.function(*self.held)), strict=True):
+            place.copy_(value)
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    """All that is recorded, without a GPU."""
+    made = []
+
+    def record(self, values):
+        held = tuple(each_tensor(cuda_graphs._held, value) for value in values)
+        results = self._function(*held)
+        reads = list(cuda_graphs._tensors(*held))
+        numbers = {id(tensor): number for number, tensor in enumerate(reads)}
+        passed_on = [numbers.get(id(tensor)) for tensor in cuda_graphs._tensors(*results)]
+        made.append(CalledAgain(self._function, held, results))
+        return cuda_graphs._Recorded(made[-1].replay, reads, reads, results, passed_on)
+
+    monkeypatch.setattr(CudaGraphs, "_record", record)
+    return made
+
+
+def advance(pair, by):
+    """Moves what moves, and passes on the rest."""
+    inner = Pair(pair.inner.moved - by, pair.inner.kept)
+    return Pair(pair.moved + by, pair.kept, pair.number, inner), (pair.moved > 0).any()
+
+
+def pair_of(random, size=4):
+    one, two, three, four = (torch.randn(size, 3, generator=random) for _ in range(4))
+    return Pair(one, two.T.contiguous().T, 5, Pair(three.double(), four > 0))
+
+
+def test_what_a_graph_gives_is_what_the_function_does(recorded):
+    random, graphs = torch.Generator().manual_seed(0), CudaGraphs(advance)
+    pair = pair_of(random)
+    earlier = []
+    for _ in range(3):
+        by = torch.randn((), generator=random)
+        (expected, any_positive), (found, told) = advance(pair, by), graphs(pair, by)
+        assert told == any_positive
+        assert found.number == 5
+        for name in ("moved", "kept"):
+            assert torch.equal(getattr(found, name), getattr(expected, name))
+            assert torch.equal(getattr(found.inner, name), getattr(expected.inner, name))
+        # Nothing that was given out is written to again.
+        assert all(torch.equal(value, copy) for value, copy in earlier)
+        earlier += [(value, value.clone()) for value in cuda_graphs._tensors(found)]
+        pair = found
+    assert recorded[0].starts == 3
+
+
+def test_what_is_passed_on_is_not_copied(recorded, monkeypatch):
+    copied, copy = [], cuda_graphs._copy
+    monkeypatch.setattr(cuda_graphs, "_copy", lambda to, values: copied.append(len(values)) or copy(to, values))
+    pair, by, graphs = pair_of(torch.Generator().manual_seed(0)), torch.tensor(1.0), CudaGraphs(advance)
+    for _ in range(2):
+        result, _ = graphs(pair, by)
+        assert result.kept is pair.kept
+        assert result.inner.kept is pair.inner.kept
+        pair = result
+    # All five that it reads, the three that it makes; then the two of these that come back.
+    assert copied == [5, 3, 2, 3]
+
+
+def test_there_is_a_graph_for_each_size(recorded):
+    random, graphs = torch.Generator().manual_seed(0), CudaGraphs(advance)
+    for size in (4, 5, 4):
+        graphs(pair_of(random, size), torch.tensor(1.0))
+    assert len(graphs) == len(recorded) == 2
+
+
+@pytest.mark.many_windows
+@pytest.mark.parametrize("streams", [1, 2])
+def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams):
+    parts = [moving_box(pose(), COUNT, SMALL_CAMERA, seed=stream, stream=stream)[1] for stream in range(streams)]
+    cut = [(concatenate([window[0] for window in step]), step[0][1]) for step in zip(*(windows(events, COUNT) for events in parts), strict=True)]
+    found = []
+    for by_graphs in (False, True):
+        tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, LEARNING, list(range(streams)))
+        if by_graphs:
+            # As on a GPU: there is a graph, and nothing is read back within it.
+            def advance_as_there(*args, tracker=tracker):
+                with pytest.MonkeyPatch.context() as patch:
+                    patch.setattr(readback, "read_at_once", lambda values: False)
+                    return tracker.steady_advance(*args)
+
+            tracker.graphs._compiles = True
+            monkeypatch.setattr(compiled.CompiledStep, "_graph", lambda self, device, advance=advance_as_there: CudaGraphs(advance))
+            monkeypatch.setattr(compiled.CompiledStep, "_near", lambda self, state, events, t_us: compiled.NearbyEvents(events))
+            monkeypatch.setattr(compiled, "_in_bursts", lambda opened, filled, t_us, longest_us: (opened, filled))
+        with torch.inference_mode():
+            found.append(follow(tracker, tracker.init(pose().expand(streams, 4, 4), 0), cut)[1])
+    assert sum(graph.starts for graph in recorded) >= COUNT // 3
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(other.T_cam_obj, one.T_cam_obj, rtol=0, atol=1e-6)
