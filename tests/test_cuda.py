@@ -1,5 +1,7 @@
 """What a GPU needs: that a step never waits for it, and that its poses are those of the CPU."""
 
+import warnings
+
 import pytest
 import torch
 from helpers import box_model, pose_errors
@@ -7,12 +9,15 @@ from host_reads import host_reads
 from tracked_boxes import SCENES, follow
 
 from torchtrack import Tracker, readback
-from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.compiled import CompiledStep
+from torchtrack.config.tracker import LearningConfig, SearchConfig, TrackerConfig
 from torchtrack.quality import Status
 
 COUNT = 8
 # All objects are searched for in all windows.
 SEARCHED = TrackerConfig(search=SearchConfig(from_sigma_px=1e-3, hypotheses=4, drawn=50))
+# What is new is not looked for elsewhere, and nothing is learned: windows are steady.
+ONE_POSE = TrackerConfig(search=SearchConfig(new_share=0), learning=LearningConfig(points=0))
 
 
 @pytest.fixture
@@ -26,8 +31,11 @@ def cuda():
 def sync_is_an_error(cuda):
     """Whatever makes the CPU wait for the GPU raises, within ``torch.cuda.set_sync_debug_mode('error')``."""
     before = torch.cuda.get_sync_debug_mode()
-    yield lambda: torch.cuda.set_sync_debug_mode("error")
-    torch.cuda.set_sync_debug_mode(before)
+    with warnings.catch_warnings():
+        # That it does not find all.
+        warnings.filterwarnings("ignore", "Synchronization debug mode is a prototype feature")
+        yield lambda: torch.cuda.set_sync_debug_mode("error")
+        torch.cuda.set_sync_debug_mode(before)
 
 
 def on_device(stream_windows, device):
@@ -43,11 +51,16 @@ def set_up(scene, device, config=None):
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_a_step_never_waits_for_the_gpu(cuda, sync_is_an_error, scene):
-    tracker, state, ready = set_up(scene, cuda)
+@pytest.mark.parametrize("by_graph", [True, False])
+def test_a_step_never_waits_for_the_gpu(cuda, sync_is_an_error, scene, by_graph, monkeypatch):
+    tracker, state, ready = set_up(scene, cuda, ONE_POSE)
+    if not by_graph:
+        monkeypatch.setattr(CompiledStep, "__call__", lambda *args: None)
     with torch.inference_mode():
-        # The first steps load kernels, and may wait.
+        # The first steps load kernels and record graphs, and may wait.
         state, _ = follow(tracker, state, ready[:-1])
+        tracker.step(state, *ready[-1])
+        assert (len(tracker.graphs) > 0) == by_graph
         torch.cuda.synchronize(cuda)
         sync_is_an_error()
         _, result = tracker.step(state, *ready[-1])
@@ -69,7 +82,7 @@ def test_the_gpu_finds_the_poses_of_the_cpu(cuda, scene):
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_cuda_graph_holds_a_steady_step(cuda, scene):
-    tracker, state, ready = set_up(scene, cuda)
+    tracker, state, ready = set_up(scene, cuda, ONE_POSE)
     with torch.inference_mode():
         state, _ = follow(tracker, state, ready[:-1])
         aside = torch.cuda.Stream()

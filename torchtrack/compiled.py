@@ -74,7 +74,8 @@ class CompiledStep:
         if starts or learning_is_due(state, self._tracker.on_surfaces, self._tracker.config):
             return None
         with torch.inference_mode():
-            plain = each_tensor(_plain, state)
+            # CUDA graphs copy whatever they are given.
+            plain = state if t_us.is_cuda else each_tensor(_plain, state)
             nearby = self._near(plain, events, t_us) if len(events) > _MANY else NearbyEvents(events)
             if len(nearby.events) < 2:
                 return None
@@ -187,8 +188,8 @@ def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
     filled = EventBatch(x, y, t_us, polarity, pad(events.stream_index, (0, missing), value=streams), most_of_one=most)
     if nearby.number is not None:
         return NearbyEvents(filled, pad(nearby.number, (0, missing)))
-    # Of one stream, events are where they were; of several, each is numbered in its own.
-    return NearbyEvents(filled, torch.arange(len(filled), device=x.device) if streams == 1 else None)
+    # Where some may be left out another time, all are numbered. Of several streams none are, nor on a GPU.
+    return NearbyEvents(filled, torch.arange(len(filled)) if streams == 1 and not x.is_cuda else None)
 
 
 def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest_us: int) -> tuple[TrackerState, NearbyEvents]:

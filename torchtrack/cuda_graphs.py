@@ -7,7 +7,6 @@ is copied from there. Both are many small tensors, which few kernels copy.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, is_dataclass
-from itertools import groupby
 from typing import Any
 
 import torch
@@ -120,11 +119,10 @@ def _copied(recorded: _Recorded) -> tuple[Any, ...]:
 
 def _copy(to: Sequence[Tensor], values: Sequence[Tensor]) -> None:
     """Copy many tensors: those of one type that lie alike in memory by one kernel."""
-
-    def kind(pair: tuple[Tensor, Tensor]) -> tuple[str, bool]:
-        place, value = pair
-        return str(value.dtype), place.stride() == value.stride()
-
-    for _, alike in groupby(sorted(zip(to, values, strict=True), key=kind), key=kind):
-        places, others = zip(*alike, strict=True)
+    alike: dict[tuple[torch.dtype, bool], tuple[list[Tensor], list[Tensor]]] = {}
+    for place, value in zip(to, values, strict=True):
+        places, others = alike.setdefault((value.dtype, place.stride() == value.stride()), ([], []))
+        places.append(place)
+        others.append(value)
+    for places, others in alike.values():
         torch._foreach_copy_(places, others)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import MotionConfig
+from torchtrack.factored import solve_factored
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.lie import hat
@@ -185,7 +186,7 @@ def inverse(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:
     factor, info = torch.linalg.cholesky_ex(matrices * scales)
     good, unknown = (info == 0)[:, None, None], torch.full_like(scale, torch.inf).diag_embed()
     eye = torch.eye(matrices.shape[-1], dtype=matrices.dtype, device=matrices.device).expand_as(matrices)
-    return torch.where(good, torch.cholesky_solve(eye, torch.where(good, factor, eye)) * scales, unknown)
+    return torch.where(good, solve_factored(eye, torch.where(good, factor, eye)) * scales, unknown)
 
 
 def left_covariance(covariance: Float[Tensor, "b 6 6"], centre_cam: Float[Tensor, "b 3"]) -> Float[Tensor, "b 6 6"]:

@@ -16,6 +16,7 @@ from torchtrack import readback
 from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.constants import constant
+from torchtrack.factored import solve_factored
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import DampingSettings, SolvingSettings
@@ -162,13 +163,13 @@ def solve_positive(matrix: Float[Tensor, "b n n"], right: Float[Tensor, "b n k"]
     are not finite.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
-    solution = torch.cholesky_solve(right, factor)
+    solution = solve_factored(right, factor)
     # A sum is finite only where every entry is.
     good = (info == 0) & (solution.sum((-1, -2)).abs() < torch.inf)
     if solution.requires_grad:
         eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
         factor = torch.linalg.cholesky_ex(torch.where(good[:, None, None], matrix, eye)).L
-        solution = torch.cholesky_solve(torch.where(good[:, None, None], right, 0), factor)
+        solution = solve_factored(torch.where(good[:, None, None], right, 0), factor)
     return torch.where(good[:, None, None], solution, 0), good
 
 
@@ -194,7 +195,7 @@ def _damped(hessian: Tensor, damping: Tensor) -> Tensor:
 
 def _judged_step(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
     """The Levenberg-Marquardt step; wrong where the Hessian is not positive definite, which its cost will show."""
-    return -torch.cholesky_solve(gradient[..., None], torch.linalg.cholesky_ex(_damped(hessian, damping)).L)[..., 0]
+    return -solve_factored(gradient[..., None], torch.linalg.cholesky_ex(_damped(hessian, damping)).L)[..., 0]
 
 
 def _last_step(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:

@@ -116,7 +116,8 @@ class StepResult:
     observation_count: Int[Tensor, "b"]
 
 
-S, D = TypeVar("S", TrackerState, StepResult), TypeVar("D")
+S = TypeVar("S", TrackerState, StepResult)
+D = TypeVar("D")
 # What belongs to streams; everything else belongs to objects.
 _OF_STREAMS = ("t_us", "last_event_us", "burst_age_us")
 
