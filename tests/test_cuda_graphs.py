@@ -1,6 +1,7 @@
 """CUDA graphs: what they are given and give, with graphs that are called anew in the place of recorded ones; and real ones on a GPU."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import pytest
 import torch
@@ -116,13 +117,15 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
         tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, LEARNING, list(range(streams)))
         if by_graphs:
             # As on a GPU: there is a graph, and nothing is read back within it.
-            def advance_as_there(*args, tracker=tracker):
+            def advance_as_there(*args, tracker=tracker, learns):
                 with pytest.MonkeyPatch.context() as patch:
                     patch.setattr(readback, "read_at_once", lambda values: False)
-                    return tracker.steady_advance(*args)
+                    return tracker.steady_advance(*args, learns=learns)
 
             tracker.graphs._compiles = True
-            monkeypatch.setattr(compiled.CompiledStep, "_graph", lambda self, device, advance=advance_as_there: CudaGraphs(advance))
+            monkeypatch.setattr(
+                compiled.CompiledStep, "_graph", lambda self, device, learns, advance=advance_as_there: CudaGraphs(partial(advance, learns=learns))
+            )
             monkeypatch.setattr(compiled.CompiledStep, "_near", lambda self, state, events, t_us: compiled.NearbyEvents(events))
             monkeypatch.setattr(compiled, "_in_bursts", lambda opened, filled, t_us, longest_us: (opened, filled))
         with torch.inference_mode():

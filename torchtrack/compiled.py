@@ -6,7 +6,8 @@ fewer and larger kernels, there and on a CPU. Shapes are those of a GPU (:mod:`t
 is left open.
 
 Where a window turns out not to be steady, as an object is to be searched for, or is very uncertain, what the graph gave is
-dropped and the window is taken as without one; so are windows that contours are learned from. Poses are the same, to rounding.
+dropped and the window is taken as without one; so are windows that contours are learned from, on a CPU. Poses are the same, to
+rounding.
 """
 
 import logging
@@ -14,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -28,7 +30,7 @@ from torchtrack.cuda_graphs import CudaGraphs
 from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch, check_on_sensor, pad_streams
 from torchtrack.kernels import switch
-from torchtrack.online_learning import learning_is_due
+from torchtrack.online_learning import due_lessons, learning_is_due
 from torchtrack.readback import Answer
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.state import S, StepResult, TrackerState, each_tensor
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
 
 P, R = ParamSpec("P"), TypeVar("R")
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
+# Of the model's parts, and of contours that it lacks.
+_Lessons = tuple[bool, bool]
 # At a start, it is looked at more than later on which contours a model lacks.
 _FIRST_WINDOWS = 5
 # Of more events than this, those that are near no object are left out first.
@@ -62,8 +66,8 @@ class CompiledStep:
         if compiles and "isolate_recompiles" not in signature(torch.compile).parameters:
             raise ConfigError(f"compiled: PyTorch {torch.__version__} cannot compile a tracker. Update it to 2.13 or later, or go without.")
         self._tracker, self._compiles = tracker, compiles
-        # By how many events a stream has at most, where there are several.
-        self._graphs: dict[int | None, _Graph] = {}
+        # By how many events a stream has at most, where there are several, and by what is learned.
+        self._graphs: dict[tuple[int | None, _Lessons | None], _Graph] = {}
         self._near_tiles: Callable[[TrackerState, Tensor], Tensor | None] | None = None
 
     def __call__(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult] | None:
@@ -71,7 +75,8 @@ class CompiledStep:
         if not self._compiles and not t_us.is_cuda:
             return None
         starts = state.learned is not None and state.learned.windows < _FIRST_WINDOWS
-        if starts or learning_is_due(state, self._tracker.on_surfaces, self._tracker.config):
+        lessons = self._lessons(state)
+        if starts or (lessons is not None and not t_us.is_cuda):
             return None
         with torch.inference_mode():
             # CUDA graphs copy whatever they are given.
@@ -79,7 +84,7 @@ class CompiledStep:
             nearby = self._near(plain, events, t_us) if len(events) > _MANY else NearbyEvents(events)
             if len(nearby.events) < 2:
                 return None
-            next_state, result, wrong = self._taken(self._tracker.opened(plain, events), nearby, t_us)
+            next_state, result, wrong = self._taken(self._tracker.opened(plain, events), nearby, t_us, lessons)
             is_wrong = Answer.to(wrong[None])
         return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
@@ -98,6 +103,11 @@ class CompiledStep:
         self._near(plain, events, t_us)
         self._taken(plain, NearbyEvents(events), t_us)
 
+    def _lessons(self, state: TrackerState) -> _Lessons | None:
+        """What is learned from the window after ``state``; None where nothing is."""
+        config = self._tracker.config
+        return due_lessons(state, config) if learning_is_due(state, self._tracker.on_surfaces, config) else None
+
     def _near(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> NearbyEvents:
         """The events that can have to do with the objects; all on a GPU, which would have to be waited for."""
         tiles = self._tracker.tiles
@@ -110,21 +120,25 @@ class CompiledStep:
             near = self._near_tiles(state, t_us)
         return NearbyEvents(events) if near is None else tiles.keep(events, near)
 
-    def _taken(self, opened: TrackerState, nearby: NearbyEvents, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:
+    def _taken(
+        self, opened: TrackerState, nearby: NearbyEvents, t_us: Tensor, lessons: _Lessons | None = None
+    ) -> tuple[TrackerState, StepResult, Tensor]:
         """What the graph makes of a window, and whether that does not hold."""
         filled = _filled(nearby, len(t_us))
         if t_us.device.type == "cpu":
             opened, filled = _in_bursts(opened, filled, t_us, self._tracker.config.matching.burst_us)
-        kind = filled.events.most_of_one
+        kind = filled.events.most_of_one, lessons
         if kind not in self._graphs:
-            self._graphs[kind] = self._graph(t_us.device)
+            self._graphs[kind] = self._graph(t_us.device, learns=lessons is not None)
             if self._compiles:
                 return _for_the_first_time(self._graphs[kind], opened, filled, t_us)
         return self._graphs[kind](opened, filled, t_us)
 
-    def _graph(self, device: torch.device) -> _Graph:
-        """A graph, made when it is first called."""
-        advance = _of_any_number(_compiled(self._tracker.steady_advance, device)) if self._compiles else self._tracker.steady_advance
+    def _graph(self, device: torch.device, *, learns: bool) -> _Graph:
+        """A graph, made when it is first called. Few windows are learned from: to compile theirs, too, would take longer than it saves."""
+        advance: _Graph = partial(self._tracker.steady_advance, learns=learns)
+        if self._compiles and not learns:
+            advance = _of_any_number(_compiled(self._tracker.steady_advance, device))
         return CudaGraphs(advance) if device.type == "cuda" else advance
 
 

@@ -226,7 +226,11 @@ def _reach(radius_px: int, cell_px: int) -> int:
 
 
 def _squared_distances(to_centre: Float[Tensor, "p 2"], offsets: Float[Tensor, "d 2"]) -> Float[Tensor, "p d"]:
-    """``|c + o|²`` of every ``c`` and every offset ``o``, as one matrix product."""
+    """``|c + o|²`` of every ``c`` and every offset ``o``: on a CPU as one matrix product."""
+    if to_centre.is_cuda:
+        # Which a compiler makes a part of what is done with them.
+        x, y = (to_centre[:, None] + offsets).unbind(-1)
+        return torch.addcmul(x * x, y, y)
     point_part = torch.cat([to_centre.square().sum(-1, keepdim=True), torch.ones_like(to_centre[:, :1]), 2 * to_centre], -1)
     offset_part = torch.cat([torch.ones_like(offsets[:, :1]), offsets.square().sum(-1, keepdim=True), offsets], -1)
     return point_part @ offset_part.T

@@ -17,7 +17,7 @@ from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourKind, ContourModel
 from torchtrack.kernels import switch
 from torchtrack.kernels.settings import SamplingSettings
-from torchtrack.lie import transform_points
+from torchtrack.lie import affine, transform_points
 
 # Of a model with no more edges than this, all are looked at.
 _FEW_EDGES = 512
@@ -291,7 +291,7 @@ def assemble(
         shown, *seen = fast_contours.shown(points_obj, tangents_obj, mask, T_cam_obj, intrinsics, sampling_settings())
         return Contours(points_obj, tangents_obj, kind, shown, *seen)
     points_cam = transform_points(T_cam_obj, points_obj)
-    tangents_cam = torch.bmm(T_cam_obj[:, :3, :3], tangents_obj.transpose(1, 2)).transpose(1, 2)
+    tangents_cam = affine(T_cam_obj[:, :3, :3], tangents_obj.transpose(1, 2)).transpose(1, 2)
     normals, has_normal = image_normals(points_cam, tangents_cam, intrinsics)
     mask = mask & has_normal & (points_cam[..., 2] > MIN_DEPTH_M)
     return Contours(points_obj, tangents_obj, kind, mask, points_cam, project(points_cam, intrinsics), normals)

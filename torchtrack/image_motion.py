@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.camera import MIN_DEPTH_M
-from torchtrack.lie import hat, transform_points
+from torchtrack.lie import affine, hat, transform_points
 
 
 def pixel_velocity(
@@ -17,7 +17,7 @@ def pixel_velocity(
     turning, drift = _turning_and_drift(velocity, centre_cam)
     depth = points_cam[..., 2].clamp(min=MIN_DEPTH_M)[:, None]
     points = points_cam.transpose(1, 2)
-    return _across_the_ray(points[:, :2] / depth, torch.baddbmm(drift, turning, points) / depth, intrinsics)
+    return _across_the_ray(points[:, :2] / depth, affine(turning, points, drift) / depth, intrinsics)
 
 
 def _turning_and_drift(velocity: Tensor, centre_cam: Tensor) -> tuple[Tensor, Tensor]:
@@ -57,11 +57,11 @@ class MovingObjects:
         inverse_depth = points_cam[:, 2:].clamp(min=MIN_DEPTH_M).reciprocal()
         ray = points_cam[:, :2] * inverse_depth
         pixels = torch.addcmul(self.intrinsics[:, 2:, None], ray, self.intrinsics[:, :2, None])
-        velocity = _across_the_ray(ray, torch.baddbmm(drift, turning, points_cam) * inverse_depth, self.intrinsics)
+        velocity = _across_the_ray(ray, affine(turning, points_cam, drift) * inverse_depth, self.intrinsics)
         if self.acceleration is None:
             return pixels.transpose(1, 2), velocity, None
         turning, drift = _turning_and_drift(self.acceleration, self.centre_cam)
-        change = _across_the_ray(ray, torch.baddbmm(drift, turning, points_cam) * inverse_depth, self.intrinsics)
+        change = _across_the_ray(ray, affine(turning, points_cam, drift) * inverse_depth, self.intrinsics)
         return pixels.transpose(1, 2), velocity, change
 
     def plane_velocity(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:

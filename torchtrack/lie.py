@@ -145,6 +145,18 @@ def se3_inverse(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     return _assemble(rotation_t, -(rotation_t @ T[..., :3, 3:]).squeeze(-1))
 
 
+def affine(matrix: Float[Tensor, "b r 3"], rows: Float[Tensor, "b 3 n"], offset: Float[Tensor, "b r #n"] | None = None) -> Float[Tensor, "b r n"]:
+    """``matrix @ rows + offset``, of points with their coordinates as rows.
+
+    On a CPU it is one operation, which takes a third of the time for the few points of one object. On a GPU, libraries take several times
+    as long for products this thin as three sums do, which a compiler makes a part of what comes before and after.
+    """
+    if not rows.is_cuda:
+        return torch.bmm(matrix, rows) if offset is None else torch.baddbmm(offset, matrix, rows)
+    first = matrix[..., :1] * rows[:, :1] if offset is None else torch.addcmul(offset, matrix[..., :1], rows[:, :1])
+    return torch.addcmul(torch.addcmul(first, matrix[..., 1:2], rows[:, 1:2]), matrix[..., 2:], rows[:, 2:])
+
+
 def transform_points(T_a_b: Float[Tensor, "*b 4 4"], points_b: Float[Tensor, "*b n 3"]) -> Float[Tensor, "*b n 3"]:
     """Points of frame b, seen in frame a.
 
@@ -152,8 +164,7 @@ def transform_points(T_a_b: Float[Tensor, "*b 4 4"], points_b: Float[Tensor, "*b
     """
     rotation, translation = T_a_b[..., :3, :3], T_a_b[..., :3, 3:]
     if T_a_b.dim() == points_b.dim() == 3 and len(T_a_b) == len(points_b):
-        # The same in one operation, in a third of the time for the few points of one object.
-        return torch.baddbmm(translation, rotation, points_b.transpose(-1, -2)).transpose(-1, -2)
+        return affine(rotation, points_b.transpose(-1, -2), translation).transpose(-1, -2)
     return (rotation @ points_b.transpose(-1, -2) + translation).transpose(-1, -2)
 
 

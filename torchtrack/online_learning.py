@@ -89,6 +89,12 @@ def learned_after(
     return replace(state, model_trust=trust, learned=learned)
 
 
+def due_lessons(state: TrackerState, config: TrackerConfig) -> tuple[bool, bool]:
+    """Which lessons the window after ``state`` may be for, by its number alone: of the model's parts, of contours that it lacks."""
+    learned, trust = state.learned, state.model_trust
+    return trust is not None and trust.due(config.model_trust), learned is not None and learned.due(config.learning)
+
+
 def learning_is_due(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, config: TrackerConfig) -> bool:
     """Whether anything is to be learned from the window after ``state``."""
     learned, trust = state.learned, state.model_trust

@@ -20,7 +20,7 @@ from torchtrack.factored import solve_factored
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import DampingSettings, SolvingSettings
-from torchtrack.lie import small_difference_about, turned
+from torchtrack.lie import affine, small_difference_about, turned
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
 from torchtrack.robust_loss import LOSSES, robust_loss, robust_weight
 
@@ -69,7 +69,7 @@ class _Place:
     def of(cls, problem: PoseProblem, T_cam_obj: Tensor, from_prior: Tensor) -> "_Place":
         """The place of a pose."""
         rotation = T_cam_obj[:, :3, :3]
-        return cls(rotation, torch.baddbmm(T_cam_obj[:, :3, 3:], rotation, problem.centre_obj[..., None]), from_prior)
+        return cls(rotation, affine(rotation, problem.centre_obj[..., None], T_cam_obj[:, :3, 3:]), from_prior)
 
     def moved(self, step: Float[Tensor, "b k"]) -> "_Place":
         """The place that a step leads to: steps add up to the offset from the prior, to second order."""
@@ -104,7 +104,7 @@ class _Seen:
 
 def _see(problem: PoseProblem, rows: _Rows, place: _Place) -> _Seen:
     """Project the matched points, and take residuals and gradients ``g = dπᵀ n`` of them."""
-    arms = torch.bmm(place.rotation, rows.arms)
+    arms = affine(place.rotation, rows.arms)
     x, y, z = (arms + place.centre_cam).unbind(1)
     inverse_depth = z.clamp(min=MIN_DEPTH_M).reciprocal()
     gx, gy = (rows.slope * inverse_depth[:, None]).unbind(1)

@@ -183,11 +183,13 @@ class Tracker(TrackedObjects):
         """Length of the window after ``state``, of each stream (s)."""
         return (t_us - state.t_us).to(self.intrinsics.dtype) * 1e-6
 
-    def steady_advance(self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
-        """:meth:`advance` with nothing to decide and to learn; and whether anything of the first, or windows in parts, may be called for."""
+    def steady_advance(
+        self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"], *, learns: bool = False
+    ) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
+        """:meth:`advance` with nothing to decide; and whether anything was, or windows in parts may be called for."""
         assumptions = readback.Assumptions()
         assumptions.ask(of_unknown_motion(state, t_us, self.objects, self.config), False)
-        return *self.advance(state, events, t_us, questions=assumptions, learns=False), assumptions.wrong()
+        return *self.advance(state, events, t_us, questions=assumptions, learns=learns), assumptions.wrong()
 
     def _advance_in_parts(self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor) -> tuple[TrackerState, StepResult]:
         """The window as several short ones, with a search for objects that are ``starting``."""
