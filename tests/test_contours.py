@@ -8,6 +8,7 @@ import torch
 import trimesh
 from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, generator, pose, random_pose
 
+from torchtrack import readback
 from torchtrack.camera import project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourKind, ContourModel, group_by_model
@@ -234,6 +235,18 @@ def test_texture_is_left_out_only_where_it_is_seen_edge_on(turn_rad, is_drawn):
     printed = points[kind == int(ContourKind.TEXTURE)]
     on_the_side = (printed[:, 2].abs() - BOX_EXTENTS_M[2] / 2).abs() > 1e-6
     assert bool(on_the_side.any()) == is_drawn
+
+
+def test_there_are_places_for_all_texture_that_looks_at_a_camera(monkeypatch):
+    """On a GPU, it cannot be counted first: with as many places as there can be need of, nothing is left out."""
+    model, T = cube_with_prints(), random_pose(20)
+    counted = contours_of(model, T)
+    monkeypatch.setattr(readback, "read_at_once", lambda values: False)
+    bounded = contours_of(model, T)
+    assert bounded.mask.shape[1] < CONFIG.max_edge_points + len(model.texture_points)
+    for number in range(len(T)):
+        for one, other in zip(visible(counted, number), visible(bounded, number), strict=True):
+            assert torch.equal(one, other)
 
 
 def test_texture_can_be_switched_off_and_thinned():

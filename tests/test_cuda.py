@@ -153,6 +153,22 @@ def test_a_step_reads_nothing_back(monkeypatch, scene, config):
     assert (result.status == int(Status.TRACKING)).all()
 
 
+@pytest.mark.many_windows
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_ways_of_a_gpu_lead_to_the_poses_of_the_cpu(monkeypatch, scene):
+    """On the CPU: sums in the place of thin products, triangular systems, sizes that hang on no value."""
+    found = []
+    for as_on_gpu in (False, True):
+        tracker, state, ready = set_up(scene, torch.device("cpu"))
+        monkeypatch.setattr(readback, "on_gpu", lambda values, answer=as_on_gpu: answer)
+        monkeypatch.setattr(readback, "read_at_once", lambda values, answer=as_on_gpu: not answer)
+        _, results = follow(tracker, state, ready)
+        found.append(torch.stack([result.T_cam_obj for result in results]))
+    degrees, millimetres = pose_errors(found[1], found[0])
+    assert float(degrees.max()) < 0.02
+    assert float(millimetres.max()) < 0.1
+
+
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_steady_step_asks_for_nothing(monkeypatch, scene):
     """A CUDA graph cannot hold so much as an answer that is waited for."""

@@ -1,5 +1,6 @@
 """CUDA graphs: what they are given and give, with graphs that are called anew in the place of recorded ones; and real ones on a GPU."""
 
+import copy
 from dataclasses import dataclass
 from functools import partial
 
@@ -133,3 +134,29 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
     assert sum(graph.starts for graph in recorded) >= COUNT // 3
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(other.T_cam_obj, one.T_cam_obj, rtol=0, atol=1e-6)
+
+
+def test_a_copy_begins_without_graphs(recorded):
+    graphs = CudaGraphs(advance)
+    graphs(pair_of(torch.Generator().manual_seed(0)), torch.tensor(1.0))
+    copied = copy.deepcopy(graphs)
+    assert (len(graphs), len(copied)) == (1, 0)
+    assert copied(pair_of(torch.Generator().manual_seed(0)), torch.tensor(1.0))[0].number == 5
+
+
+def test_a_tracker_that_is_moved_begins_without_graphs():
+    tracker = Tracker([box_model()], SMALL_CAMERA)
+    tracker.graphs._graphs[None, None] = tracker.steady_advance
+    assert len(tracker.graphs) == 1
+    assert len(tracker.to("cpu").graphs) == 0
+    assert copy.deepcopy(tracker).graphs._tracker is not tracker
+
+
+def test_with_a_weigher_graphs_have_to_be_asked_for():
+    class OnGpu:
+        is_cuda = True
+
+    plain, judged = (Tracker([box_model()], SMALL_CAMERA, weigher=weigher).graphs for weigher in (None, torch.nn.Identity()))
+    assert plain._are_for(OnGpu)
+    assert not judged._are_for(OnGpu)
+    assert not plain._are_for(torch.zeros(1))

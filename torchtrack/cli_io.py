@@ -85,7 +85,7 @@ class Bench:
     sequence: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Of pipeline and stages: a sequence (.npz), in place of simulated scenes."""
     compiled: bool = False
-    """Of pipeline: one object by compiled graphs too; compiling takes some minutes."""
+    """Of pipeline: one object, on a GPU many too, also by compiled graphs; compiling takes some minutes."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""

@@ -72,7 +72,7 @@ class CompiledStep:
 
     def __call__(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult] | None:
         """State and result of a window, not counted yet; None where there is no graph, it is not steady, or there is hardly any event in it."""
-        if not self._compiles and not t_us.is_cuda:
+        if not self._are_for(t_us):
             return None
         starts = state.learned is not None and state.learned.windows < _FIRST_WINDOWS
         lessons = self._lessons(state)
@@ -88,6 +88,10 @@ class CompiledStep:
             is_wrong = Answer.to(wrong[None])
         return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
+    def _are_for(self, t_us: Any) -> bool:
+        """Whether there are graphs for windows of that device. A weigher may do what cannot be recorded: it has to be asked for."""
+        return self._compiles or (t_us.is_cuda and self._tracker.weigher is None)
+
     def __len__(self) -> int:
         """How many graphs there are."""
         return len(self._graphs)
@@ -95,7 +99,7 @@ class CompiledStep:
     @torch.inference_mode()
     def prepare(self, state: TrackerState) -> None:
         """Compile the graphs of one stream, from the state that it begins with; with several, more than that would have to be known."""
-        if len(state.t_us) > 1 or not (self._compiles or state.t_us.is_cuda):
+        if len(state.t_us) > 1 or not self._are_for(state.t_us):
             return
         t_us, nothing = state.t_us + 1, torch.zeros_like(state.t_us).expand(2)
         events = EventBatch(nothing.int(), nothing.int(), t_us.expand(2), nothing > 0, nothing)

@@ -227,7 +227,7 @@ def _reach(radius_px: int, cell_px: int) -> int:
 
 def _squared_distances(to_centre: Float[Tensor, "p 2"], offsets: Float[Tensor, "d 2"]) -> Float[Tensor, "p d"]:
     """``|c + o|²`` of every ``c`` and every offset ``o``: on a CPU as one matrix product."""
-    if to_centre.is_cuda:
+    if readback.on_gpu(to_centre):
         # Which a compiler makes a part of what is done with them.
         x, y = (to_centre[:, None] + offsets).unbind(-1)
         return torch.addcmul(x * x, y, y)

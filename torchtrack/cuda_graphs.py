@@ -41,6 +41,8 @@ class CudaGraphs:
 
     Args:
         function: of values that are never changed in place; what it does is to hang on nothing but their sizes.
+
+    Calls are to come from one thread at a time, and on one stream of the GPU.
     """
 
     def __init__(self, function: _Function) -> None:
@@ -61,6 +63,10 @@ class CudaGraphs:
         recorded.given = given
         recorded.replay()
         return _copied(recorded)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Of a copy: graphs are of this memory and this process."""
+        return {"_function": self._function, "_of_sizes": {}, "_memory": None}
 
     def __len__(self) -> int:
         """How many graphs there are."""

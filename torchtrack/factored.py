@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack import readback
+
 
 def solve_factored(right: Float[Tensor, "b n k"], factor: Float[Tensor, "b n n"]) -> Float[Tensor, "b n k"]:
     """The ``x`` of ``L Lᵀ x = right``, for lower triangular ``L``.
@@ -11,7 +13,7 @@ def solve_factored(right: Float[Tensor, "b n k"], factor: Float[Tensor, "b n n"]
     On a GPU, :func:`torch.cholesky_solve` leaves several matrices to a library that waits, and that CUDA graphs cannot hold: there,
     two triangular systems are solved.
     """
-    if not right.is_cuda:
+    if not readback.on_gpu(right):
         return torch.cholesky_solve(right, factor)
     halfway = torch.linalg.solve_triangular(factor, right, upper=False)
     return torch.linalg.solve_triangular(factor.mT, halfway, upper=True)

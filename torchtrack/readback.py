@@ -23,6 +23,11 @@ def read_at_once(values: Tensor) -> bool:
     return values.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
+def on_gpu(values: Tensor) -> bool:
+    """Whether values are on a GPU, where another way to the same result may be the faster one."""
+    return values.is_cuda
+
+
 def none_of(values: Tensor) -> bool:
     """Whether it is certain, at no cost, that no value is true: what only true ones need can then be left out."""
     return read_at_once(values) and not bool(values.any())

@@ -3,7 +3,7 @@
 The only state is an immutable :class:`TrackerState`; ``step`` is pure: the same state and events give the same result.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -78,9 +78,15 @@ class Tracker(TrackedObjects):
         compiled: bool = False,
         kernels: bool = True,
     ) -> None:
+        # First: as it is made, it is brought to its type, and has graphs from then on.
+        self._compiled = compiled
         super().__init__(objects, camera, config, stream_index, dtype, weigher)
         self.kernels = kernels
-        self.graphs = CompiledStep(self, compiles=compiled)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Tracker":
+        """All of the tracker elsewhere, or in another type, and without the graphs of where it was."""
+        self.graphs = CompiledStep(self, compiles=self._compiled)
+        return super()._apply(fn, recurse)
 
     def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
         """The state before the first window, from each object's pose at ``t_us``.

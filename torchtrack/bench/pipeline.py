@@ -51,7 +51,9 @@ def _of_scenes(setup: Setup) -> Iterator[_Part]:
             yield _latency(setup, f"1 object ({shape})", simulated((shape,)), *ONE_OBJECT_MS[kind], compiled=compiled)
     for count, columns, streams, target_ms in MANY[kind]:
         name = f"{count * streams} objects" + (f" in {streams} streams" if streams > 1 else "")
-        yield _latency(setup, name, simulated(shapes_of(count), columns), target_ms, streams=streams)
+        # On a CPU, graphs gain little where kernels work on many objects.
+        for compiled in setup.ways if kind == "cuda" else (False,):
+            yield _latency(setup, name, simulated(shapes_of(count), columns), target_ms, streams=streams, compiled=compiled)
     if kind == "cpu" and numba_is_installed():
         yield _latency(setup, f"1 object ({SHAPES[0]})", simulated(SHAPES[:1]), kernels=False)
         count, columns, _, _ = MANY[kind][0]

@@ -24,7 +24,7 @@ class Setup:
         threads: of PyTorch on the CPU.
         events: of the files of the part ``io``.
         sequence: a sequence to track in place of simulated scenes.
-        compiled: whether one object is also tracked by compiled graphs, which takes minutes to prepare.
+        compiled: whether one object, and on a GPU many, are also tracked by compiled graphs, which takes minutes to prepare.
         show: called with the name of what is measured next.
     """
 
@@ -43,7 +43,7 @@ class Setup:
 
     @property
     def ways(self) -> tuple[bool, ...]:
-        """Whether one object is tracked by compiled graphs: not, and where that is asked for also so."""
+        """Whether objects are tracked by compiled graphs: not, and where that is asked for also so."""
         return (False, True) if self.compiled else (False,)
 
     def cpu_target(self, target: float | None) -> float | None:
