@@ -69,11 +69,14 @@ def test_a_step_never_waits_for_the_gpu(cuda, sync_is_an_error, scene, by_graph,
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_the_gpu_finds_the_poses_of_the_cpu(cuda, scene):
+@pytest.mark.parametrize("mode", [torch.enable_grad, torch.inference_mode], ids=["without graphs", "by graphs"])
+def test_the_gpu_finds_the_poses_of_the_cpu(cuda, scene, mode):
     found = []
     for device in (torch.device("cpu"), cuda):
         tracker, state, ready = set_up(scene, device)
-        _, results = follow(tracker, state, ready)
+        with mode():
+            _, results = follow(tracker, state, ready)
+        assert (len(tracker.graphs) > 0) == (device == cuda and mode is torch.inference_mode)
         found.append(torch.stack([result.T_cam_obj.cpu() for result in results]))
     degrees, millimetres = pose_errors(found[1], found[0])
     assert float(degrees.max()) < 0.02
