@@ -88,6 +88,10 @@ class CompiledStep:
             is_wrong = Answer.to(wrong[None])
         return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Of a copy of the tracker, which has none yet: graphs are of this one's tensors, and of this process."""
+        return {**vars(self), "_graphs": {}, "_near_tiles": None}
+
     def _are_for(self, t_us: Any) -> bool:
         """Whether there are graphs for windows of that device. A weigher may do what cannot be recorded: it has to be asked for."""
         return self._compiles or (t_us.is_cuda and self._tracker.weigher is None)
@@ -135,14 +139,17 @@ class CompiledStep:
         if kind not in self._graphs:
             self._graphs[kind] = self._graph(t_us.device, learns=lessons is not None)
             if self._compiles:
-                return _for_the_first_time(self._graphs[kind], opened, filled, t_us)
+                return _for_the_first_time(self._graphs[kind], opened, _of_any_number(filled), t_us)
         return self._graphs[kind](opened, filled, t_us)
 
     def _graph(self, device: torch.device, *, learns: bool) -> _Graph:
         """A graph, made when it is first called. Few windows are learned from: to compile theirs, too, would take longer than it saves."""
         advance: _Graph = partial(self._tracker.steady_advance, learns=learns)
         if self._compiles and not learns:
-            advance = _of_any_number(_compiled(self._tracker.steady_advance, device))
+            advance = _compiled(self._tracker.steady_advance, device)
+            if device.type == "cuda":
+                # What is recorded, and compiled for that, are copies.
+                return CudaGraphs(lambda opened, filled, t_us: advance(opened, _of_any_number(filled), t_us))
         return CudaGraphs(advance) if device.type == "cuda" else advance
 
 
@@ -227,19 +234,15 @@ def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest
     return replace(opened, burst_age_us=burst_age_us), replace(filled, into_burst_us=into_burst_us)
 
 
-def _of_any_number(graph: _Graph) -> _Graph:
-    """A graph that is told, when it is compiled, that there may be another number of events another time."""
-
-    def of_any_number(opened: TrackerState, filled: NearbyEvents, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:
-        events = filled.events
-        for values in (events.x, events.y, events.t_us, events.polarity, events.stream_index, filled.number):
-            if values is not None:
-                torch._dynamo.mark_dynamic(values, 0)
-        if filled.into_burst_us is not None:
-            torch._dynamo.mark_dynamic(filled.into_burst_us, 1)
-        return graph(opened, filled, t_us)
-
-    return of_any_number
+def _of_any_number(filled: NearbyEvents) -> NearbyEvents:
+    """The events, marked for the compiler: there may be another number of them another time."""
+    events = filled.events
+    for values in (events.x, events.y, events.t_us, events.polarity, events.stream_index, filled.number):
+        if values is not None:
+            torch._dynamo.mark_dynamic(values, 0)
+    if filled.into_burst_us is not None:
+        torch._dynamo.mark_dynamic(filled.into_burst_us, 1)
+    return filled
 
 
 def _rounded_up(count: int) -> int:

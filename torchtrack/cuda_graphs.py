@@ -64,10 +64,6 @@ class CudaGraphs:
         recorded.replay()
         return _copied(recorded)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Of a copy: graphs are of this memory and this process."""
-        return {"_function": self._function, "_of_sizes": {}, "_memory": None}
-
     def __len__(self) -> int:
         """How many graphs there are."""
         return len(self._of_sizes)
