@@ -145,11 +145,10 @@ def test_trackers_that_are_copied_or_moved_begin_without_graphs():
     assert len(tracker.to("cpu").graphs) == 0
 
 
-def test_with_a_weigher_graphs_have_to_be_asked_for():
-    class OnGpu:
-        is_cuda = True
-
+def test_with_a_weigher_graphs_have_to_be_asked_for(monkeypatch):
     plain, judged = (Tracker([box_model()], SMALL_CAMERA, weigher=weigher).graphs for weigher in (None, torch.nn.Identity()))
-    assert plain._are_for(OnGpu)
-    assert not judged._are_for(OnGpu)
-    assert not plain._are_for(torch.zeros(1))
+    t_us = torch.zeros(1, dtype=torch.int64)
+    assert not plain._are_for(t_us)
+    monkeypatch.setattr(readback, "on_gpu", lambda values: True)
+    assert plain._are_for(t_us)
+    assert not judged._are_for(t_us)

@@ -24,14 +24,14 @@ from jaxtyping import Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchtrack import readback
 from torchtrack.bursts import update_bursts
 from torchtrack.constants import cells_within
 from torchtrack.cuda_graphs import CudaGraphs
 from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch, check_on_sensor, pad_streams
 from torchtrack.kernels import switch
-from torchtrack.online_learning import due_lessons, learning_is_due
-from torchtrack.readback import Answer
+from torchtrack.online_learning import due_lessons
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.state import S, StepResult, TrackerState, each_tensor
 
@@ -75,26 +75,26 @@ class CompiledStep:
         if not self._are_for(t_us):
             return None
         starts = state.learned is not None and state.learned.windows < _FIRST_WINDOWS
-        lessons = self._lessons(state)
-        if starts or (lessons is not None and not t_us.is_cuda):
+        lessons = due_lessons(state, self._tracker.on_surfaces, self._tracker.config)
+        if starts or (lessons is not None and not readback.on_gpu(t_us)):
             return None
         with torch.inference_mode():
             # CUDA graphs copy whatever they are given.
-            plain = state if t_us.is_cuda else each_tensor(_plain, state)
+            plain = state if readback.on_gpu(t_us) else each_tensor(_plain, state)
             nearby = self._near(plain, events, t_us) if len(events) > _MANY else NearbyEvents(events)
             if len(nearby.events) < 2:
                 return None
             next_state, result, wrong = self._taken(self._tracker.opened(plain, events), nearby, t_us, lessons)
-            is_wrong = Answer.to(wrong[None])
+            is_wrong = readback.Answer.to(wrong[None])
         return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
     def __getstate__(self) -> dict[str, Any]:
         """Of a copy of the tracker, which has none yet: graphs are of this one's tensors, and of this process."""
         return {**vars(self), "_graphs": {}, "_near_tiles": None}
 
-    def _are_for(self, t_us: Any) -> bool:
+    def _are_for(self, t_us: Tensor) -> bool:
         """Whether there are graphs for windows of that device. A weigher may do what cannot be recorded: it has to be asked for."""
-        return self._compiles or (t_us.is_cuda and self._tracker.weigher is None)
+        return self._compiles or (readback.on_gpu(t_us) and self._tracker.weigher is None)
 
     def __len__(self) -> int:
         """How many graphs there are."""
@@ -110,11 +110,6 @@ class CompiledStep:
         plain = each_tensor(_plain, state.numbered(state, _FIRST_WINDOWS))
         self._near(plain, events, t_us)
         self._taken(plain, NearbyEvents(events), t_us)
-
-    def _lessons(self, state: TrackerState) -> _Lessons | None:
-        """What is learned from the window after ``state``; None where nothing is."""
-        config = self._tracker.config
-        return due_lessons(state, config) if learning_is_due(state, self._tracker.on_surfaces, config) else None
 
     def _near(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> NearbyEvents:
         """The events that can have to do with the objects; all on a GPU, which would have to be waited for."""
@@ -214,7 +209,7 @@ def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
     if nearby.number is not None:
         return NearbyEvents(filled, pad(nearby.number, (0, missing)))
     # Where some may be left out another time, all are numbered. Of several streams none are, nor on a GPU.
-    return NearbyEvents(filled, torch.arange(len(filled)) if streams == 1 and not x.is_cuda else None)
+    return NearbyEvents(filled, torch.arange(len(filled)) if streams == 1 and not readback.on_gpu(x) else None)
 
 
 def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest_us: int) -> tuple[TrackerState, NearbyEvents]:

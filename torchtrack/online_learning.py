@@ -89,16 +89,11 @@ def learned_after(
     return replace(state, model_trust=trust, learned=learned)
 
 
-def due_lessons(state: TrackerState, config: TrackerConfig) -> tuple[bool, bool]:
-    """Which lessons the window after ``state`` may be for, by its number alone: of the model's parts, of contours that it lacks."""
+def due_lessons(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, config: TrackerConfig) -> tuple[bool, bool] | None:
+    """Which lessons the window after ``state`` is for: of the model's parts, of contours that it lacks; None where nothing is to be learned."""
     learned, trust = state.learned, state.model_trust
-    return trust is not None and trust.due(config.model_trust), learned is not None and learned.due(config.learning)
-
-
-def learning_is_due(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, config: TrackerConfig) -> bool:
-    """Whether anything is to be learned from the window after ``state``."""
-    learned, trust = state.learned, state.model_trust
-    if trust is not None and trust.due(config.model_trust):
-        return True
+    is_judged = trust is not None and trust.due(config.model_trust)
     wanted = None if learned is None or on_surfaces is None else learned.wanted(on_surfaces, config.learning)
-    return wanted is not None and readback.Answer.to(wanted).any()
+    if is_judged or (wanted is not None and readback.Answer.to(wanted).any()):
+        return is_judged, wanted is not None
+    return None
