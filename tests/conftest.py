@@ -1,4 +1,4 @@
-"""Fixtures that every test may use. Shapes and types of the whole package are checked while tests run, but for long ones."""
+"""Fixtures that every test may use. Shapes and types of the whole package are checked in the first calls of each test."""
 
 import importlib.util
 import os
@@ -7,23 +7,20 @@ from pathlib import Path
 import jaxtyping
 import pytest
 import torch
+from first_calls import check_again
 
 # Must come before the first import of torchtrack: it wraps the package's functions as they are loaded.
-jaxtyping.install_import_hook("torchtrack", "beartype.beartype")
+jaxtyping.install_import_hook("torchtrack", "first_calls.checked")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs ray: pip install 'torchtrack[cluster]'")
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item):
-    """Runs a test and its fixtures; of many windows, nearly two thirds of the time would be checks that other tests make as well."""
-    jaxtyping.config.update("jaxtyping_disable", item.get_closest_marker("many_windows") is not None)
-    try:
-        return (yield)
-    finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup():
+    """What has been checked in another test is checked again."""
+    check_again()
 
 
 @pytest.fixture(scope="session", autouse=True)

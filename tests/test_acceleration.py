@@ -149,7 +149,6 @@ def swings(config):
     return errors, velocity - 7.5 * phase.sin(), acceleration, 225 * phase.cos()
 
 
-@pytest.mark.many_windows
 def test_the_velocity_of_what_is_swung_does_not_lag():
     # At a constant velocity it lags by half a window's gain, 0.6 rad/s at most, and by what it takes to be believed.
     lagging, followed = (swings(config)[1][SWINGING].square().mean().sqrt() for config in (STEADY, ALWAYS))

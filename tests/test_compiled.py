@@ -77,7 +77,6 @@ def both_ways(config=None, streams=1, count=COUNT, mode=torch.inference_mode):
     return found
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("streams", [1, 2])
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_poses_are_those_of_a_step(graphs, streams, mode):
@@ -92,7 +91,6 @@ def test_poses_are_those_of_a_step(graphs, streams, mode):
     assert found[-1].T_cam_obj.is_inference() == (mode is torch.inference_mode)
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("config", [LEARNING, TrackerConfig(model_trust=ModelTrustConfig(least_share=0.1, first_windows=0, every=3))])
 def test_windows_that_are_learned_from_are_taken_without_a_graph(graphs, config):
     (state, _), (compiled_state, _) = both_ways(config)

@@ -141,7 +141,6 @@ def test_what_does_not_wait_is_not_found(mode):
     assert found == []
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("config", [None, SEARCHED], ids=["steady", "searched"])
 def test_a_step_reads_nothing_back(monkeypatch, scene, config):
@@ -156,7 +155,6 @@ def test_a_step_reads_nothing_back(monkeypatch, scene, config):
     assert (result.status == int(Status.TRACKING)).all()
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_ways_of_a_gpu_lead_to_the_poses_of_the_cpu(monkeypatch, scene):
     """On the CPU: sums in the place of thin products, triangular systems, sizes that hang on no value."""

@@ -108,7 +108,6 @@ def test_there_is_a_graph_for_each_size(recorded):
     assert len(graphs) == len(recorded) == 2
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("streams", [1, 2])
 def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams):
     parts = [moving_box(pose(), COUNT, SMALL_CAMERA, seed=stream, stream=stream)[1] for stream in range(streams)]

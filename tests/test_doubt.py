@@ -238,7 +238,6 @@ def test_of_what_slipped_one_is_less_certain_in_all_ways_and_of_others_as_before
     torch.testing.assert_close(two.covariance[1], prediction.covariance[0])
 
 
-@pytest.mark.many_windows
 def test_a_pose_that_slipped_is_in_doubt_and_found_again():
     after, results, T_true = slipped(SEARCHED, count=20)
     doubted, without, _ = slipped(NEVER_ADRIFT, count=20)
@@ -252,7 +251,6 @@ def test_a_pose_that_slipped_is_in_doubt_and_found_again():
     assert float(doubted.doubted_s) > 0.05
 
 
-@pytest.mark.many_windows
 def test_a_pose_that_strayed_is_found_again_though_it_was_never_in_doubt():
     after, results, T_true = slipped(STRAYING, count=30)
     lost, without, _ = slipped(NEVER_STRAYED, count=30)
@@ -265,7 +263,6 @@ def test_a_pose_that_strayed_is_found_again_though_it_was_never_in_doubt():
     assert float(after.doubted_s) == float(lost.doubted_s) == 0
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize(("config", "count"), [(SEARCHED, 10), (STRAYING, 20)])
 def test_finding_one_that_slipped_changes_nothing_for_its_neighbour(config, count):
     _, alone, _ = slipped(config, count, streams=2, displaced=-1)
@@ -282,7 +279,6 @@ def test_what_is_tracked_well_is_never_in_doubt():
     assert 0.5 < float(state.full_gathered) <= 1
 
 
-@pytest.mark.many_windows
 def test_how_far_events_gather_can_be_left_out():
     """Then poses are compared by what they explain alone."""
     config = TrackerConfig(search=SearchConfig(by_gathering=False))

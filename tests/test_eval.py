@@ -122,7 +122,6 @@ def test_a_sequence_that_fails_is_reported_and_the_rest_completes(folder, tmp_pa
     assert len(json.loads((tmp_path / "out" / "metrics.json").read_text())) == 2
 
 
-@pytest.mark.many_windows
 def test_processes_give_the_same_as_one(folder, tmp_path):
     alone = evaluate(EvaluateConfig(paths=(folder,), jobs=1, output=tmp_path / "alone"))
     shared = evaluate(EvaluateConfig(paths=(folder,), jobs=2, output=tmp_path / "shared"))
@@ -176,7 +175,6 @@ def figures(evaluation):
     return rows, [entry.as_json() for entry in evaluation.not_applicable], [entry.errors.rotation_deg.tolist() for entry in evaluation.results]
 
 
-@pytest.mark.many_windows
 def test_an_evaluation_that_was_broken_off_is_taken_up_again(folder, tmp_path, monkeypatch):
     (tmp_path / "mixed").mkdir()
     config = broken_off((folder, write_ball_and_box(tmp_path / "mixed")), tmp_path, 3)
@@ -190,7 +188,6 @@ def test_an_evaluation_that_was_broken_off_is_taken_up_again(folder, tmp_path, m
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["errors.csv", "metrics.json"]
 
 
-@pytest.mark.many_windows
 def test_all_is_measured_anew_unless_it_is_to_be_resumed(folder, tmp_path, monkeypatch):
     config = broken_off((folder,), tmp_path, 3)
     tracked = measured_by(monkeypatch)
@@ -198,7 +195,6 @@ def test_all_is_measured_anew_unless_it_is_to_be_resumed(folder, tmp_path, monke
     assert len(tracked) == 4
 
 
-@pytest.mark.many_windows
 def test_what_was_measured_otherwise_or_not_to_the_end_is_measured_anew(folder, tmp_path, monkeypatch):
     config = broken_off((folder,), tmp_path, 3).model_copy(update={"resume": True})
     journal = tmp_path / "out" / "outcomes.jsonl"
@@ -217,7 +213,6 @@ def test_what_counts_as_lost_may_change_before_it_is_resumed(folder, tmp_path, m
     assert all(result.metrics.lost_fraction == 1 for result in resumed.results)
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("line", ["no json", "{}", '{"identity": "a"}', '{"identity": "a", "measured": [{}]}', "[1]", "\x00"])
 def test_a_file_of_measurements_that_is_none_is_told_and_kept(folder, tmp_path, line):
     config = broken_off((folder,), tmp_path, 2).model_copy(update={"resume": True})

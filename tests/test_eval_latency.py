@@ -33,14 +33,12 @@ def found(late):
     return estimate_latency(open_session(RunConfig(source=late)))
 
 
-@pytest.mark.many_windows
 def test_the_latency_of_the_sensor_is_found(found):
     assert found.latency_us == pytest.approx(LATENCY_US, abs=min(1500, 2 * found.deviation_us))
     assert found.after_px < 0.6 * found.before_px
     assert found.events > 1000
 
 
-@pytest.mark.many_windows
 def test_a_latency_that_is_taken_off_is_gone(late, found):
     rest = estimate_latency(open_session(RunConfig(source=late, sensor_latency_us=LATENCY_US)))
     assert found.latency_us - rest.latency_us == pytest.approx(LATENCY_US, abs=150)
@@ -54,7 +52,6 @@ def test_a_latency_shifts_the_stream_and_nothing_else(late):
     assert torch.equal(second.x[: len(first)], first.x)
 
 
-@pytest.mark.many_windows
 def test_without_truth_or_motion_there_is_nothing_to_find(late, tmp_path):
     pytest.importorskip("numba")
     session = open_session(RunConfig(source=late))

@@ -237,7 +237,6 @@ def sender():
         process.stdout.close()
 
 
-@pytest.mark.many_windows
 def test_two_million_events_over_tcp_are_tracked_without_loss(tmp_path, sender):
     count = 2_000_000
     port = sender(count, 5_000_000)

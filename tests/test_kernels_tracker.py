@@ -58,7 +58,6 @@ def both_steps(config, count=6, dtype=torch.float64):
     return pairs
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
 def test_a_step_is_the_same_by_kernels(settings):
     for ours, theirs in both_steps(TrackerConfig.model_validate(settings)):

@@ -68,7 +68,6 @@ def test_the_same_seed_gives_the_same_weights(sequence):
     assert weights[0] == weights[1] != weights[2]
 
 
-@pytest.mark.many_windows
 def test_the_script_writes_weights(sequence, tmp_path):
     options = {"clip.windows": 2, "clip.past-us": 5000, "batch-size": 2, "watched-epochs": 1, "fit-steps": 5, "tracked-epochs": 1}
     arguments = [text for name, value in options.items() for text in (f"--config.{name}", str(value))]

@@ -46,7 +46,6 @@ def errors_of(results):
     return pose_errors(poses_of(results), plate_sequence()[0].at(times))
 
 
-@pytest.mark.many_windows
 def test_a_plate_with_print_that_its_model_lacks_is_followed():
     _, results = plate_followed()
     rotation_deg, translation_mm = errors_of(results)

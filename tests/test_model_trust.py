@@ -55,7 +55,6 @@ def trust_of(explained, expected):
     return ModelTrust(explained, expected, torch.ones(1), 0)
 
 
-@pytest.mark.many_windows
 def test_grooves_that_the_object_does_not_have_are_left_out():
     tracker, state, results, truth = followed()
     shown = state.model_trust.shown(tracker.element_groups, CONFIG)[0]
@@ -72,7 +71,6 @@ def test_grooves_that_the_object_does_not_have_are_left_out():
     assert float(translation_mm.max()) < 1
 
 
-@pytest.mark.many_windows
 def test_nothing_of_a_true_model_is_left_out():
     _, events = moving_box(pose(), COUNT)
     runs = []

@@ -142,7 +142,6 @@ def mirrored_state(tracker, state):
     return replace(state, T_cam_obj=other.T_cam_obj.double(), velocity=other.velocity, covariance=other.covariance)
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("mirrored_to", [0.0, 0.8])
 def test_a_box_that_followed_its_mirror_image_is_found(mirrored_to):
     search = SearchConfig(doubt_us=10_000, mirrored_to=mirrored_to, slipped_to=0, adrift_share=1, unseen_us=0, dropped_to=0)
@@ -155,7 +154,6 @@ def test_a_box_that_followed_its_mirror_image_is_found(mirrored_to):
         assert float(degrees) > 5
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("unseen_us", [0, 200_000])
 def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(unseen_us):
     """Turned off by nearly a right angle and far away: much farther than it is looked for from there."""

@@ -110,7 +110,6 @@ def test_a_stream_may_start_at_any_time():
     assert torch.equal(*runs)
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize(
     ("model", "coefficients"),
     [("plumb_bob", (-0.3, 0.1, 2e-3, -1e-3)), ("fisheye", (0.1, -0.05, 0.02, 0.0))],
@@ -248,7 +247,6 @@ def lbracket_runs(lbracket):
     return {dtype: followed(model, camera, events, T_start, dtype=dtype, start_us=start_us) for dtype in (torch.float32, torch.float64)}
 
 
-@pytest.mark.many_windows
 def test_a_recorded_object_is_followed_to_half_a_degree(lbracket, lbracket_runs, dtype):
     results = lbracket_runs[dtype][:40]
     degrees, millimetres = errors_of(results, lbracket[2])

@@ -173,7 +173,6 @@ def tracked(config=None, *, turned_round=False, dtype=torch.float32):
     return tracker, *follow(tracker, tracker.init(start, 0), [(events.slice_time(end - WINDOW_US, end), end) for end in ends])
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize(("turned_round", "sign"), [(False, 1.0), (True, -1.0)])
 def test_a_bright_object_before_a_dark_wall_is_darker_outside(turned_round, sign, dtype):
     _, state, results = tracked(turned_round=turned_round, dtype=dtype)

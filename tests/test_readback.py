@@ -154,7 +154,6 @@ def test_of_a_larger_object_the_middle_is_taken(nothing_is_read):
 # ---- whole steps
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize(
     "config",

@@ -61,7 +61,6 @@ def is_key(key, settings):
     return any(known == key or known.startswith(f"{key}.") for known in dotted_keys(settings))
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("code", blocks("python"))
 def test_python_runs(code, tmp_path):
     (tmp_path / "example.py").write_text(code, encoding="utf-8")
@@ -225,7 +224,6 @@ def test_length_and_places():
     assert re.findall(r"(?<![\w.])/(?:work|home|tmp|root)/", README) == []
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("code", blocks("python learn"))
 def test_learning_runs(code, tmp_path):
     (tmp_path / "outputs" / "demo").mkdir(parents=True)

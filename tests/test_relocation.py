@@ -139,7 +139,6 @@ def test_an_object_seen_by_few_events_is_not_remembered_as_seen_well(way):
 LOST = {"lost": {"turn_rad": 0.45, "metres": 0.3, "sideways_m": 0.4}, "small, far behind": {"turn_rad": 0.01, "metres": 0.35, "sideways_m": 0.0}}
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("name", LOST)
 def test_an_object_that_ran_off_is_found_again_where_it_was_seen_well(name):
     """Its pose has left the image, or is that of a small thing behind it; a box that was never lost stays as it was."""

@@ -215,7 +215,6 @@ def displaced_runs(config, covariance_scale, count=10, displaced=DISPLACED):
     return results, trajectory.at(results[-1].t_us)
 
 
-@pytest.mark.many_windows
 def test_a_lost_box_is_found_again_and_without_the_search_it_is_not():
     # A little nearer, and it may come back by itself.
     with_search, T_true = displaced_runs(SEARCHED, 1.0, displaced=1.15 * DISPLACED)
@@ -227,7 +226,6 @@ def test_a_lost_box_is_found_again_and_without_the_search_it_is_not():
     assert float(pose_errors(without[-1].T_cam_obj, T_true)[0]) > 3
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("farther", [1.0, 1.3, 1.5])
 def test_a_box_that_slipped_is_found_within_a_window_however_sure_it_is_of_itself(farther):
     """Ten to fifteen degrees off, with the covariance of one that is tracked well; held by that, no search finds it."""

@@ -108,7 +108,6 @@ def test_cutoff_falls_with_the_light_to_a_floor():
     assert cutoff.tolist() == pytest.approx([300 * 20 / 275, 300 * (0.5 + 20 / 255) / (1 + 20 / 255), 300])
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("frequency_hz", [20, 300, 1500])
 def test_flicker_beyond_the_bandwidth_fades(frequency_hz):
     """Light that flickers by a factor e^±0.6: the swing that is left says how many events a period has."""

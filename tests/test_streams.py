@@ -49,7 +49,6 @@ def assert_same_runs(together, alone):
 METHODS = [{}, {"tracker": {"window": {"mode": "count", "count": 300}}}, {"preset": "line"}, {"preset": "nns"}]
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("settings", METHODS, ids=["default", "count", "line", "nns"])
 def test_streams_are_tracked_as_each_alone_until_each_ends(paths, tmp_path, settings):
     starts_us = (None, 7_000, 3_300)
@@ -64,7 +63,6 @@ def test_streams_are_tracked_as_each_alone_until_each_ends(paths, tmp_path, sett
         assert stored["windows"] == summaries[paths.index(path)].windows > 2
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("name", ["default", "line"])
 def test_each_stream_has_windows_of_its_own_length(paths, tmp_path, name):
     """To the microsecond lengths hang on poses, whose rounding is not the same in a batch: later windows drift apart."""
@@ -81,7 +79,6 @@ def test_each_stream_has_windows_of_its_own_length(paths, tmp_path, name):
         assert together[number].objects["box"].errors.max_rotation_deg < 2
 
 
-@pytest.mark.many_windows
 def test_images_of_different_sizes_and_settings_are_batches_of_their_own(paths, tmp_path):
     differing = [{}, {"events": {"region": (10, 5, 105, 80)}}, {"tracker": {"window": {"duration_us": 4000}}}]
     for path, settings in zip(paths, differing, strict=True):
@@ -161,7 +158,6 @@ def test_whoever_is_stopped_finishes_with_what_there_is(paths):
     assert follow(opening, RunConfig(source=paths[0], preset="causal"), lambda: len(followers[2].steps) == 2) == [2, 2, 2]
 
 
-@pytest.mark.many_windows
 def test_processes_give_the_same_as_one(paths, tmp_path):
     summaries = [dict(run_many([quick(path, tmp_path / name) for path in paths[:2]], jobs=jobs)) for name, jobs in (("alone", 1), ("shared", 2))]
     assert all(isinstance(summary, RunSummary) for of_run in summaries for summary in of_run.values())
@@ -185,7 +181,6 @@ def test_runs_that_do_not_go_together_are_errors(sources, options, message, tmp_
         next(run_many(configs, **options))
 
 
-@pytest.mark.many_windows
 def test_shared_sequences_are_tracked_as_each_alone(data_dir, tmp_path):
     found = [data_dir / "sequences" / f"{name}.npz" for name in ("ape_normal", "lbracket_normal")]
     ends_us = (40_000, 30_000)

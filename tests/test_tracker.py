@@ -233,7 +233,6 @@ def test_without_events_the_pose_is_held_and_the_status_says_so(dtype):
     assert (speed_sigma >= state.velocity[0].abs()).all()
 
 
-@pytest.mark.many_windows
 def test_without_events_the_motion_goes_on_where_asked_for_and_dies_away(dtype):
     # What is lost for long rests where it was last seen well, unless it is never looked for there.
     config = PREDICT.model_copy(update={"motion": MotionConfig(turn_s=0), "search": SearchConfig(anew_us=0)})
@@ -257,7 +256,6 @@ def test_without_events_the_motion_goes_on_where_asked_for_and_dies_away(dtype):
     assert float((rotation @ rotation.T - torch.eye(3).double()).abs().max()) < 1e-6
 
 
-@pytest.mark.many_windows
 def test_after_a_gap_tracking_goes_on(dtype):
     trajectory, events = moving_box(pose(), 14)
     tracker = tracker_of(dtype=dtype)

@@ -31,7 +31,6 @@ def two_boxes(count):
     return starts, (left[0], right[0]), merged(left[1], right[1])
 
 
-@pytest.mark.many_windows
 def test_objects_of_one_stream_are_tracked_as_each_alone(dtype):
     starts, trajectories, events = two_boxes(6)
     together = Tracker([box_model(), box_model()], WIDE_CAMERA, dtype=dtype)
@@ -62,7 +61,6 @@ def joint_windows(streams, count):
     return [(concatenate([stream[k][0] for stream in cut]), (k + 1) * WINDOW_US) for k in range(count)]
 
 
-@pytest.mark.many_windows
 @pytest.mark.parametrize("cameras", [(SMALL_CAMERA,) * 3, (SMALL_CAMERA, WIDE_CAMERA, SMALL_CAMERA)], ids=["same", "different"])
 def test_streams_are_tracked_as_each_alone(cameras, dtype):
     starts, trajectories, streams = streams_of_boxes(6, cameras)

@@ -65,7 +65,6 @@ def test_without_events_nothing_gets_more_certain_and_with_them_it_does_again(dt
     assert (sigmas(seen)[:6] < sigmas(states[-1])[:6]).all()
 
 
-@pytest.mark.many_windows
 def test_errors_are_as_large_as_the_covariance_says():
     """Over many boxes: squared errors in units of the covariance are of the order of one, and none is far beyond it."""
     ratios = []
@@ -133,7 +132,6 @@ def test_a_window_that_failed_does_not_change_what_is_usual():
 # ---- back after an outage
 
 
-@pytest.mark.many_windows
 def test_a_box_that_turned_away_during_an_outage_is_found_again(dtype):
     """It goes on for 60 ms unseen, and turns back meanwhile: what was predicted is off by several pixels."""
     count, outage = 6, 12
