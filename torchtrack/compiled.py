@@ -88,6 +88,10 @@ class CompiledStep:
             is_wrong = readback.Answer.to(wrong[None])
         return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
+    def anew(self) -> "CompiledStep":
+        """The same without graphs yet."""
+        return CompiledStep(self._tracker, compiles=self._compiles)
+
     def __getstate__(self) -> dict[str, Any]:
         """Of a copy of the tracker, which has none yet: graphs are of this one's tensors, and of this process."""
         return {**vars(self), "_graphs": {}, "_near_tiles": None}

@@ -78,15 +78,17 @@ class Tracker(TrackedObjects):
         compiled: bool = False,
         kernels: bool = True,
     ) -> None:
-        # First: as it is made, it is brought to its type, and has graphs from then on.
-        self._compiled = compiled
         super().__init__(objects, camera, config, stream_index, dtype, weigher)
         self.kernels = kernels
+        self.graphs = CompiledStep(self, compiles=compiled)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Tracker":
         """All of the tracker elsewhere, or in another type, and without the graphs of where it was."""
-        self.graphs = CompiledStep(self, compiles=self._compiled)
-        return super()._apply(fn, recurse)
+        super()._apply(fn, recurse)
+        # While it is made, and brought to its type, there are none yet.
+        if hasattr(self, "graphs"):
+            self.graphs = self.graphs.anew()
+        return self
 
     def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
         """The state before the first window, from each object's pose at ``t_us``.
