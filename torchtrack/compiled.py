@@ -88,12 +88,8 @@ class CompiledStep:
             is_wrong = readback.Answer.to(wrong[None])
         return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
-    def anew(self) -> "CompiledStep":
-        """The same without graphs yet."""
-        return CompiledStep(self._tracker, compiles=self._compiles)
-
     def __getstate__(self) -> dict[str, Any]:
-        """Of a copy of the tracker, which has none yet: graphs are of this one's tensors, and of this process."""
+        """Of a copy, which has no graphs yet: these are of this tracker's tensors where they are now, and of this process."""
         return {**vars(self), "_graphs": {}, "_near_tiles": None}
 
     def _are_for(self, t_us: Tensor) -> bool:

@@ -3,6 +3,7 @@
 The only state is an immutable :class:`TrackerState`; ``step`` is pure: the same state and events give the same result.
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -87,7 +88,7 @@ class Tracker(TrackedObjects):
         super()._apply(fn, recurse)
         # While it is made, and brought to its type, there are none yet.
         if hasattr(self, "graphs"):
-            self.graphs = self.graphs.anew()
+            self.graphs = copy.copy(self.graphs)
         return self
 
     def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
