@@ -93,8 +93,8 @@ class CompiledStep:
         return {**vars(self), "_graphs": {}, "_near_tiles": None}
 
     def _are_for(self, t_us: Tensor) -> bool:
-        """Whether there are graphs for windows of that device. A weigher may do what cannot be recorded: it has to be asked for."""
-        return self._compiles or (readback.on_gpu(t_us) and self._tracker.weigher is None)
+        """Whether there are graphs for windows of that device. A weigher of one's own may do what cannot be recorded: they have to be asked for."""
+        return self._compiles or (readback.on_gpu(t_us) and not self._tracker.shows_all)
 
     def __len__(self) -> int:
         """How many graphs there are."""
@@ -114,7 +114,7 @@ class CompiledStep:
     def _near(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> NearbyEvents:
         """The events that can have to do with the objects; all on a GPU, which would have to be waited for."""
         tiles = self._tracker.tiles
-        if tiles is None or self._tracker.weigher is not None or t_us.device.type != "cpu":
+        if tiles is None or self._tracker.shows_all or t_us.device.type != "cpu":
             return NearbyEvents(events)
         if self._near_tiles is None:
             self._near_tiles = _compiled(self._tracker.near_tiles, t_us.device)

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import Contours
-from torchtrack.observations import Observations, WindowEvents
+from torchtrack.observations import ObjectEvents, Observations, WindowEvents
 from torchtrack.prediction import Prediction
 
 AgeAt = Callable[[Tensor], Tensor]
@@ -20,7 +20,7 @@ class Evidence:
 
     Args:
         observations: what is to be judged.
-        events: all events of the window.
+        seen: events of the window; all of them, where a weigher of one's own is to judge.
         prediction: pose, motion and uncertainty of each object at the window's end.
         contours: visible contours there.
         index: which of them is nearest to a pixel.
@@ -28,11 +28,16 @@ class Evidence:
     """
 
     observations: Observations
-    events: WindowEvents
+    seen: ObjectEvents
     prediction: Prediction
     contours: Contours
     index: ContourIndex
     age_s: AgeAt
+
+    @property
+    def events(self) -> WindowEvents:
+        """Events of the window, a row for each object."""
+        return self.seen.rows()
 
 
 def judged(evidence: Evidence, weigher: nn.Module) -> Observations:

@@ -19,7 +19,7 @@ from torchtrack.prediction import far_pose
 from torchtrack.sensor_tiles import SensorTiles
 from torchtrack.sensors import Sensors, sensor_tables
 from torchtrack.setup_check import check_setup
-from torchtrack.trust import TrustNetwork
+from torchtrack.trust import LimbTrust, TrustNetwork, shipped_weigher
 
 
 class TrackedObjects(nn.Module):
@@ -77,7 +77,7 @@ class TrackedObjects(nn.Module):
         self.register_buffer("symmetry_normals", torch.stack([pad(each, (0, 0, 0, 3 - len(each))) for each in normals]))
         self.register_buffer("has_symmetry", torch.tensor(self.symmetry_counts) > 0)
         self.register_buffer("far_pose", far_pose(self.centre_obj))
-        self.weigher = TrustNetwork.shipped() if weigher is None and self.config.matching.learned_trust else weigher
+        self.weigher = shipped_weigher(self.models, self.config.matching) if weigher is None else weigher
         # On dense meshes no line of sight is followed.
         with_surface = torch.zeros(len(objects), dtype=torch.bool)
         for model in self.models:
@@ -114,9 +114,14 @@ class TrackedObjects(nn.Module):
         return self.with_surface if self._any_surface else None
 
     @property
+    def shows_all(self) -> bool:
+        """Whether all events of a window have to be kept, and those before it: a weigher of one's own may look at any."""
+        return self.weigher is not None and not isinstance(self.weigher, TrustNetwork | LimbTrust)
+
+    @property
     def looks_back(self) -> bool:
         """Whether anything needs the events of earlier windows: they are not kept for nothing."""
-        return self.config.corners.max_corners > 0 or self.weigher is not None
+        return self.config.corners.max_corners > 0 or self.shows_all
 
     @property
     def judges(self) -> bool:

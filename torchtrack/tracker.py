@@ -58,7 +58,7 @@ class Tracker(TrackedObjects):
         dtype: precision of the pipeline; poses are kept in float64.
         weigher: judges every window's :class:`torchtrack.evidence.Evidence`: how far each observation is to be believed,
             ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
-            comes with the package where ``matching.learned_trust`` is on, and none otherwise. Other poses that a search
+            comes with the package, for what ``matching.learned_trust`` says. Other poses that a search
             tries are aligned without it.
         compiled: whether steady windows are taken by compiled graphs, see :mod:`torchtrack.compiled`.
         kernels: whether Numba's kernels are used where they apply, see :mod:`torchtrack.kernels`.
@@ -183,10 +183,10 @@ class Tracker(TrackedObjects):
         return None if self.tiles is None else self.tiles.near(self._predict(state, dt_s), dt_s, farthest_event_px(self.config))
 
     def _near(self, events: NearbyEvents, prediction: Prediction, off_in_depth: Tensor, dt_s: Tensor) -> NearbyEvents:
-        """Those of the events that can have to do with the objects: with those ``off_in_depth``, any; a weigher is shown all."""
+        """Those of the events that can have to do with the objects: with those ``off_in_depth``, any; a weigher of one's own is shown all."""
         if not readback.none_of(off_in_depth):
             prediction = replace(prediction, covariance=anywhere(prediction.covariance, off_in_depth))
-        return events if self.weigher is not None else self.sensors.near_objects(events, prediction, dt_s, self.config)
+        return events if self.shows_all else self.sensors.near_objects(events, prediction, dt_s, self.config)
 
     def _window_s(self, state: TrackerState, t_us: Tensor) -> Tensor:
         """Length of the window after ``state``, of each stream (s)."""
@@ -259,7 +259,7 @@ class Tracker(TrackedObjects):
             near = select_events(seen, index, prediction.moving(compensated=True), config.matching.max_events)
             observations = join(observations, near)
         if self.weigher is not None:
-            evidence = Evidence(observations, seen.rows(), prediction, contours, index, sensors.history(last_event_us, t_us))
+            evidence = Evidence(observations, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
             observations = judged(evidence, self.weigher)
         fit = align(recorded, contours, index, widening, observations, config)
         found = judge_fit(prediction, fit, config, explained_at_rest(widening), gathered_when_known(doubt, state.full_gathered, config.search))

@@ -1,5 +1,6 @@
-"""How far each observation is to be believed, as a small network learned it (``scripts/train_weights.py``): preset ``learned``."""
+"""How far each observation is to be believed, as a small network learned it (``scripts/train_weights.py``)."""
 
+from collections.abc import Sequence
 from importlib.resources import files
 
 import torch
@@ -8,15 +9,18 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
+from torchtrack.config.tracker import MatchingConfig
+from torchtrack.contour_model import ContourModel
 from torchtrack.errors import UnknownFormatError
 from torchtrack.evidence import Evidence
-from torchtrack.trust_features import FEATURES, trust_features
+from torchtrack.kernels import switch
+from torchtrack.trust_features import FEATURES, limb_features, of_limb, trust_features
 
 _SHIPPED = "learned.safetensors"
 
 
 class TrustNetwork(nn.Module):
-    """A weigher: believes an observation by the space-time patch of events around it (:mod:`torchtrack.trust_features`).
+    """A weigher: believes an observation by the patch of events around it (:mod:`torchtrack.trust_features`).
 
     Args:
         hidden: widths of its two hidden layers.
@@ -57,3 +61,33 @@ class TrustNetwork(nn.Module):
     def as_bytes(self) -> bytes:
         """Its weights as a safetensors file."""
         return save({name: value.contiguous() for name, value in self.state_dict().items()})
+
+
+class LimbTrust(nn.Module):
+    """A weigher: believes observations of the limbs of smooth surfaces as a network does, and all others in full.
+
+    What fires beside a sharp edge is nearly always of that edge, and few of them hold a pose: whatever is believed less there
+    is missed. Before a limb lies the shading of the surface, which fires, too, and moves otherwise.
+    """
+
+    def __init__(self, network: TrustNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, evidence: Evidence) -> Float[Tensor, "b n"]:
+        """How far each observation is to be believed, 0 to 1."""
+        if switch.apply_to(evidence.observations.age_s):
+            features, is_limb = limb_features(evidence)
+            everything = torch.ones_like(evidence.observations.age_s)
+            return everything.masked_scatter(is_limb, torch.sigmoid(self.network.logits(features)))
+        features = trust_features(evidence)
+        return torch.where(of_limb(features), torch.sigmoid(self.network.logits(features)), 1.0)
+
+
+def shipped_weigher(models: Sequence[ContourModel], config: MatchingConfig) -> nn.Module | None:
+    """The weigher that ``learned_trust`` asks for; none where it has nothing to say of these models."""
+    if config.learned_trust == "all":
+        return TrustNetwork.shipped()
+    if config.learned_trust == "limbs" and any(bool(model.is_bent.any()) for model in models):
+        return LimbTrust(TrustNetwork.shipped())
+    return None

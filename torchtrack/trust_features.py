@@ -1,17 +1,17 @@
-"""What tells whether an observation is of the contour near it: its place, and a space-time patch of events around it.
+"""What tells whether an observation is of the contour near it: its place, and the events in the patch of the image around it.
 
 Everything is measured in the frame of the nearest predicted contour: its normal, turned to where the object moves, and
 its tangent. The events of the object's own edges, moved to the window's end with the object, gather on lines along the
-tangent, and the time surface rises along the normal as the edge's speed says; those of occluders, of the background and
-of noise do neither. How far the observation lies from the contour is not told: the gates and the robust loss see to that,
-and better with every round. Trust that fell with the distance would hold a pose fast that has begun to slip.
+tangent; those of occluders, of the background, of shading and of noise do not. How far the observation lies from the
+contour is not told: the gates and the robust loss see to that, and better with every round. Trust that fell with the
+distance would hold a pose fast that has begun to slip.
 """
 
 from dataclasses import dataclass
 from itertools import product
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import one_hot, softsign
 
@@ -19,19 +19,22 @@ from torchtrack.constants import constant
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import take_points
 from torchtrack.evidence import Evidence
+from torchtrack.kernels.arrays import as_arrays
+from torchtrack.kernels.settings import PatchSettings
+from torchtrack.observations import Observations, SharedEvents
 
 # Where the patch is sampled: across the contour and along it (px). Negative is behind the moving edge.
-_ACROSS_PX = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)
-_ALONG_PX = (-2.0, 0.0, 2.0)
-# What is older than this, in px of the edge's motion, says no more.
-_OLDEST_PX = 6.0
-# Slower than this (px/s), an edge has no direction that it moves to.
-_SLOW_PX_S = 10.0
-# Events this far outside the image are counted too; beyond them a row of nothing (px).
-_BORDER_PX = 8
+_PATCH_PX = tuple(product((-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0), (-2.0, 0.0, 2.0)))
+# Slower than this (px/s), an edge has no direction that it moves to. Speeds are told in this unit, by their logarithm.
+_SLOW_PX_S, _SPEED_UNIT_PX_S = 10.0, 100.0
+# Events are counted by pixel, a power of two of them a side: what is that far apart shares a place, and hardly ever fires at once.
+_SIDE = 256
+# A place beyond this is nowhere (px).
+_FARTHEST_PX = 1e6
 # Kinds of contours that a model has.
 _KINDS = int(ContourKind.SPLAT) + 1
-FEATURES = len(_ACROSS_PX) * (2 * len(_ALONG_PX) + 1) + _KINDS + 6
+_COUNTS, _SINGLE = 2 * len(_PATCH_PX), 6
+FEATURES = _COUNTS + _KINDS + _SINGLE
 """How many numbers describe an observation."""
 
 
@@ -53,30 +56,60 @@ class _Frame:
     speed_px_s: Tensor
     moved: Tensor
 
-    def around(self, centre: Float[Tensor, "b n 2"], along_px: tuple[float, ...]) -> tuple[Float[Tensor, "b n p"], Float[Tensor, "b n p"]]:
-        """Columns and rows of the places of a patch around each centre."""
-        across, along = constant(tuple(product(_ACROSS_PX, along_px)), centre.dtype, centre.device).T
-        (u, v), (nu, nv) = centre[..., None].unbind(-2), self.normal[..., None].unbind(-2)
+    def patch(self) -> tuple[Float[Tensor, "b n p"], Float[Tensor, "b n p"]]:
+        """Columns and rows of the places of the patch around each observation."""
+        across, along = constant(_PATCH_PX, self.moved.dtype, self.moved.device).T
+        (u, v), (nu, nv) = self.moved[..., None].unbind(-2), self.normal[..., None].unbind(-2)
         return u + across * nu - along * nv, v + across * nv + along * nu
 
 
 def trust_features(evidence: Evidence) -> Float[Tensor, "b n f"]:
     """What describes each observation: numbers of about unit size."""
-    observations = evidence.observations
-    frame = _frame(evidence)
+    observations, frame = evidence.observations, _frame(evidence)
     polarity = observations.polarity
-    single = [
-        (frame.speed_px_s / 100).log1p(),
-        polarity,
-        polarity * frame.outward,
-        polarity.abs(),
-        observations.age_s / evidence.events.age_s.amax(-1, keepdim=True).clamp(min=1e-6),
-        frame.exists.to(polarity.dtype),
-    ]
     # Contours that were learned are print.
     kind = torch.where(frame.kind == int(ContourKind.LEARNED), int(ContourKind.TEXTURE), frame.kind)
     kinds = one_hot(kind, _KINDS).to(polarity.dtype)
-    return torch.cat([_counts(evidence, frame), _ages(evidence, frame), kinds, torch.stack(single, -1)], -1)
+    single = [
+        frame.exists.to(polarity.dtype),
+        (frame.speed_px_s / _SPEED_UNIT_PX_S).log1p(),
+        polarity,
+        frame.outward,
+        polarity * frame.outward,
+        _age_share(observations),
+    ]
+    return torch.cat([_counts(evidence, frame), kinds, torch.stack(single, -1)], -1)
+
+
+def of_limb(features: Float[Tensor, "b n f"]) -> Bool[Tensor, "b n"]:
+    """Whether the contour nearest to an observation is the limb of a smooth surface, by :func:`trust_features`."""
+    return features[..., _COUNTS + int(ContourKind.LIMB)] * features[..., _COUNTS + _KINDS] > 0
+
+
+def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "k f"], Bool[Tensor, "b n"]]:
+    """:func:`trust_features` of the observations :func:`of_limb` alone, one after another, and which these are: by a kernel."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.trust import describe
+
+    observations, contours, index = evidence.observations, evidence.contours, evidence.index
+    moving, seen = evidence.prediction.moving(compensated=True), evidence.seen
+    own, counts = torch.empty(0, 0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)
+    if isinstance(seen, SharedEvents):
+        events, own, counts = seen.shared, seen.own, seen.count
+    else:
+        # Of what many have in common, one row is enough.
+        events = seen.of(0) if seen.pixels.stride(0) == 0 else seen
+    told = torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.polarity, _age_share(observations)], 1)
+    rows, is_limb = told.new_empty(observations.mask.numel(), FEATURES), torch.empty_like(observations.mask)
+    count = describe(
+        *as_arrays(*events.pixels.unbind(-1), events.age_s, events.polarity, events.mask, own, counts, told, observations.mask),
+        *as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.kind, index.nearest, index.first),
+        index.cells,
+        *as_arrays(moving.velocity, moving.centre_cam, moving.intrinsics, constant(_PATCH_PX, told.dtype, told.device)),
+        PatchSettings(_SIDE, int(ContourKind.LIMB), _COUNTS, _KINDS, _SLOW_PX_S, _SPEED_UNIT_PX_S),
+        *as_arrays(rows, is_limb),
+    )
+    return rows[:count], is_limb
 
 
 def _frame(evidence: Evidence) -> _Frame:
@@ -92,35 +125,26 @@ def _frame(evidence: Evidence) -> _Frame:
     return _Frame(found >= 0, kind[..., 0].long(), outward[..., None] * normals, outward, speed.abs().clamp(min=_SLOW_PX_S), moved)
 
 
-def _ages(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
-    """How much older than the observation the time surface is across the contour, in px of the edge's motion."""
-    observations = evidence.observations
-    places = torch.stack(frame.around(observations.pixels, (0.0,)), -1)
-    newest_s = evidence.age_s(places.flatten(1, 2)).view(places.shape[:3])
-    behind_px = (newest_s - observations.age_s[..., None]) * frame.speed_px_s[..., None]
-    return behind_px.clamp(-_OLDEST_PX, _OLDEST_PX) / _OLDEST_PX
+def _age_share(observations: Observations) -> Float[Tensor, "b n"]:
+    """How old each observation is, of the oldest of the object."""
+    oldest_s = (observations.age_s * observations.mask).amax(-1, keepdim=True)
+    return observations.age_s / oldest_s.clamp(min=1e-6)
 
 
 def _counts(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
     """Events of the observation's own polarity and of the other, around it, all moved to the window's end with the object."""
-    events, prediction = evidence.events, evidence.prediction
-    moved = prediction.carried(events.pixels, events.age_s)
-    height, width = (size + 2 * _BORDER_PX for size in prediction.objects.image_size)
-    cell = _cells(moved[..., 0], moved[..., 1], height, width) + (events.polarity > 0)
-    counts = torch.zeros(len(cell), 2 * height * width, dtype=moved.dtype, device=moved.device)
-    counts = counts.scatter_add(1, cell, events.mask.to(moved.dtype)).view(len(cell), height, width, 2)
-    for border in (0, -1):
-        counts[:, border] = counts[:, :, border] = 0
-    u, v = frame.around(frame.moved, _ALONG_PX)
-    places = _cells(u, v, height, width)
+    events = evidence.events
+    moved = evidence.prediction.carried(events.pixels, events.age_s)
+    cell = 2 * _cells(moved[..., 0], moved[..., 1]) + (events.polarity > 0)
+    counts = torch.zeros(len(cell), 2 * _SIDE**2, dtype=moved.dtype, device=moved.device)
+    counts = counts.scatter_add(1, cell, events.mask.to(moved.dtype))
+    places = 2 * _cells(*frame.patch())
     own = places + (evidence.observations.polarity >= 0)[..., None]
     of_both = torch.cat([own, 2 * places + 1 - own], -1)
-    found = counts.view(len(cell), -1).gather(1, of_both.flatten(1)).view(of_both.shape)
-    return softsign(found)
+    return softsign(counts.gather(1, of_both.flatten(1)).view(of_both.shape))
 
 
-def _cells(u: Float[Tensor, "*b"], v: Float[Tensor, "*b"], height: int, width: int) -> Int[Tensor, "*b"]:
-    """Twice the cell of each pixel in the bordered image; its outermost cells stand for all beyond."""
-    column = (u.round() + _BORDER_PX).nan_to_num(0.0).clamp(0, width - 1)
-    row = (v.round() + _BORDER_PX).nan_to_num(0.0).clamp(0, height - 1)
-    return 2 * torch.add(column, row, alpha=width).long()
+def _cells(u: Float[Tensor, "*b"], v: Float[Tensor, "*b"]) -> Int[Tensor, "*b"]:
+    """The place that each pixel is counted at."""
+    column, row = (value.round().nan_to_num(0.0).clamp(-_FARTHEST_PX, _FARTHEST_PX).long() & (_SIDE - 1) for value in (u, v))
+    return torch.add(column, row, alpha=_SIDE)

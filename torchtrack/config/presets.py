@@ -33,11 +33,11 @@ def _default() -> TrackerConfig:
 
 
 def _learned() -> TrackerConfig:
-    """The default, with a network's word on how far each observation is to be believed.
+    """The default, with a network's word on how far each observation is to be believed, not on those of limbs alone.
 
     It believes less where an object is seen badly, and explains less there: that is no sign of having strayed.
     """
-    return TrackerConfig(matching=MatchingConfig(learned_trust=True), search=SearchConfig(strayed_to=0), smoothing=_SMOOTHED)
+    return TrackerConfig(matching=MatchingConfig(learned_trust="all"), search=SearchConfig(strayed_to=0), smoothing=_SMOOTHED)
 
 
 def _paper() -> TrackerConfig:
@@ -57,6 +57,7 @@ def _paper() -> TrackerConfig:
             concentration=False,
             polarity=False,
             polarity_memory_s=0.0,
+            learned_trust="none",
         ),
         solver=SolverConfig(iterations=5, loss="none", damping=1e-3, prior=False),
         motion=MotionConfig(model="hold", without_events="hold"),
@@ -70,7 +71,7 @@ def _lines(loss: Literal["tukey", "none"]) -> TrackerConfig:
     return TrackerConfig(
         window=WindowConfig(duration_us=3_000),
         corners=CornerConfig(max_corners=0),
-        matching=MatchingConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500),
+        matching=MatchingConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500, learned_trust="none"),
         solver=SolverConfig(iterations=3, loss=loss, damping=1e-4, prior=False),
         learning=LearningConfig(points=0),
     )
@@ -94,7 +95,9 @@ def _nns() -> TrackerConfig:
     return TrackerConfig(
         window=WindowConfig(duration_us=3_000),
         corners=CornerConfig(max_corners=400, cell_px=5),
-        matching=MatchingConfig(gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False, polarity=False, polarity_memory_s=0.0),
+        matching=MatchingConfig(
+            gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False, polarity=False, polarity_memory_s=0.0, learned_trust="none"
+        ),
         solver=SolverConfig(iterations=2),
         learning=LearningConfig(points=0),
         quality=QualityConfig(min_observations=10, min_on_contour=1),

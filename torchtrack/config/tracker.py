@@ -145,7 +145,9 @@ class MatchingConfig(Settings):
         1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow circuits fire on (px)."
     )
     burst_us: int = Field(10_000, ge=0, le=30_000, description="A burst is what a pixel fires of one polarity in this time (µs); 0 for no bursts.")
-    learned_trust: bool = Field(False, description="Trust observations as a small network has learned from the events around them.")
+    learned_trust: Literal["none", "limbs", "all"] = Field(
+        "limbs", description="Which observations to trust as a small network has learned from the events around them: those of smooth limbs, or all."
+    )
     max_events: int = Field(1500, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
     @model_validator(mode="after")

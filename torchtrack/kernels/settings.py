@@ -259,3 +259,21 @@ class ConclusionSettings(NamedTuple):
     fall_gain: float
     certain_share: float
     certain_count: float
+
+
+class PatchSettings(NamedTuple):
+    """What :mod:`torchtrack.kernels.trust` goes by: constants of :mod:`torchtrack.trust_features`.
+
+    Args:
+        side: pixels of a side of what events are counted in, a power of two.
+        limb: number of the kind of contours whose observations are described.
+        counts, kinds: how many numbers of counts there are in a description, and of kinds after them.
+        slow_px_s: slower, an edge has no direction; ``unit_px_s`` that speeds are told in.
+    """
+
+    side: int
+    limb: int
+    counts: int
+    kinds: int
+    slow_px_s: float
+    unit_px_s: float
