@@ -75,6 +75,15 @@ def box_model(extents_m: tuple[float, float, float] = BOX_EXTENTS_M) -> ObjectMo
     return ObjectModel.from_mesh(trimesh.creation.box(extents_m), name="box")
 
 
+def bevelled_model(extents_m: tuple[float, float, float] = BOX_EXTENTS_M, bevel_m: float = 0.001) -> ObjectModel:
+    """A box whose edges are bevelled: its events are a box's, and its contours those of what is smooth."""
+    half = torch.tensor(extents_m, dtype=torch.float64) / 2
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+    inset = half - bevel_m
+    points = torch.cat([corners * torch.where(torch.arange(3) == axis, half, inset) for axis in range(3)])
+    return ObjectModel.from_mesh(trimesh.convex.convex_hull(points.numpy()), name="bevelled")
+
+
 def pose(rotation: Sequence[float] = (0.5, 0.6, 0.1), translation: Sequence[float] = (0.0, 0.0, 0.5), dtype=torch.float64) -> Tensor:
     """A pose ``[4, 4]`` from a rotation vector (rad) and a translation (m)."""
     T = torch.eye(4, dtype=dtype)

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from helpers import SMALL_CAMERA, box_model, pose
+from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import follow, moving_box, windows
 
 from torchtrack import Tracker, compiled, cuda_graphs, readback
@@ -144,10 +144,11 @@ def test_trackers_that_are_copied_or_moved_begin_without_graphs():
     assert len(tracker.to("cpu").graphs) == 0
 
 
-def test_with_a_weigher_graphs_have_to_be_asked_for(monkeypatch):
+def test_with_a_weigher_of_ones_own_graphs_have_to_be_asked_for(monkeypatch):
     plain, judged = (Tracker([box_model()], SMALL_CAMERA, weigher=weigher).graphs for weigher in (None, torch.nn.Identity()))
     t_us = torch.zeros(1, dtype=torch.int64)
     assert not plain._are_for(t_us)
     monkeypatch.setattr(readback, "on_gpu", lambda values: True)
     assert plain._are_for(t_us)
     assert not judged._are_for(t_us)
+    assert Tracker([bevelled_model()], SMALL_CAMERA).graphs._are_for(t_us)

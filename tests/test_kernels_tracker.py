@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from both_ways import ROUNDINGS
-from helpers import SMALL_CAMERA, box_model, pose
+from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import SCENES, WIDE_CAMERA, assert_same, follow, merged, moving_box, poses_of, started, tensors_of, windows
 
 from torchtrack import Tracker, compiled, fast_alignment
@@ -29,7 +29,7 @@ SETTINGS = {
     "one gate": {"matching": {"gates_px": (5.0,)}},
     "no close edges": {"matching": {"close_edges_px": 0.0, "dark_shift_px": 0.0}},
     "corners": {"corners": {"max_corners": 64}},
-    "learned trust": {"matching": {"learned_trust": True}},
+    "learned trust": {"matching": {"learned_trust": "all"}},
     "no velocity": {"solver": {"velocity_in_window": False}},
     "no acceleration": {"solver": {"acceleration_in_window": False}, "motion": {"acceleration_s": 0.0}},
     "no swelling": {"solver": {"swelling_px": 0.0, "common_px": 0.0}},
@@ -45,11 +45,12 @@ SETTINGS = {
 }
 
 
-def both_steps(config, count=6, dtype=torch.float64):
+def both_steps(config, count=6, dtype=torch.float64, model=None):
     """Results of every window, each from the same state, by kernels and without."""
     _, events = moving_box(pose(), count)
-    plain = Tracker([box_model()], SMALL_CAMERA, config, dtype=dtype, kernels=False)
-    fast = Tracker([box_model()], SMALL_CAMERA, config, dtype=dtype)
+    model = model or box_model()
+    plain = Tracker([model], SMALL_CAMERA, config, dtype=dtype, kernels=False)
+    fast = Tracker([model], SMALL_CAMERA, config, dtype=dtype)
     state, pairs = plain.init(pose()[None], 0), []
     with torch.inference_mode():
         for of_window, end_us in windows(events, count):
@@ -73,16 +74,22 @@ def test_a_step_is_the_same_in_few_digits():
         torch.testing.assert_close(ours.T_cam_obj, theirs.T_cam_obj, rtol=0, atol=ROUNDINGS[torch.float32])
 
 
+def test_a_step_of_a_smooth_object_is_the_same():
+    for ours, theirs in both_steps(TrackerConfig(), model=bevelled_model()):
+        torch.testing.assert_close(ours.T_cam_obj, theirs.T_cam_obj, rtol=0, atol=ROUNDINGS[torch.float64])
+
+
 @pytest.mark.parametrize("name", ["paper", "nns", "learned"])
 def test_a_step_of_other_presets_is_the_same(name):
     for ours, theirs in both_steps(preset(name), count=3):
         torch.testing.assert_close(ours.T_cam_obj, theirs.T_cam_obj, rtol=0, atol=ROUNDINGS[torch.float64])
 
 
+@pytest.mark.parametrize("model", [box_model, bevelled_model])
 @pytest.mark.parametrize("scene", SCENES)
-def test_scenes_of_several_objects_and_streams_are_the_same(scene):
+def test_scenes_of_several_objects_and_streams_are_the_same(scene, model):
     starts, streams, cameras, of_windows = scene(6)
-    tracker = Tracker([box_model()] * len(starts), cameras, stream_index=streams, dtype=torch.float64)
+    tracker = Tracker([model()] * len(starts), cameras, stream_index=streams, dtype=torch.float64)
     state = tracker.init(torch.stack(starts), 0)
     with torch.inference_mode():
         _, ours = follow(tracker, state, of_windows)

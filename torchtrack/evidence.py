@@ -1,17 +1,15 @@
 """What a weigher sees of a window before it is aligned: all that tells whether an observation is of the contour near it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import Contours
+from torchtrack.history import History
 from torchtrack.observations import ObjectEvents, Observations, WindowEvents
 from torchtrack.prediction import Prediction
-
-AgeAt = Callable[[Tensor], Tensor]
-"""Time since the newest event (s) at ideal pixels ``[b, n, 2]``, rounded to whole ones; huge where there never was any."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +22,7 @@ class Evidence:
         prediction: pose, motion and uncertainty of each object at the window's end.
         contours: visible contours there.
         index: which of them is nearest to a pixel.
-        age_s: the time surface, also of the past before the window.
+        history: the time surface, also of the past before the window.
     """
 
     observations: Observations
@@ -32,12 +30,16 @@ class Evidence:
     prediction: Prediction
     contours: Contours
     index: ContourIndex
-    age_s: AgeAt
+    history: History
 
     @property
     def events(self) -> WindowEvents:
         """Events of the window, a row for each object."""
         return self.seen.rows()
+
+    def age_s(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n"]:
+        """Time since the newest event (s) at ideal pixels, rounded to whole ones; huge where there never was any."""
+        return self.history.age_s(pixels)
 
 
 def judged(evidence: Evidence, weigher: nn.Module) -> Observations:

@@ -14,12 +14,11 @@ from torchtrack import readback
 from torchtrack.bursts import LONG_AGO_US, update_bursts
 from torchtrack.camera import Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.constants import constant
 from torchtrack.contours import Contours
 from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.events import EventBatch, PaddedEvents, check_on_sensor, of_streams, pad_streams
-from torchtrack.evidence import AgeAt
 from torchtrack.flow import estimate_flow
+from torchtrack.history import BORDER_PX, History, on_sensor
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.observations import ObjectEvents, SharedEvents, WindowEvents
@@ -27,8 +26,6 @@ from torchtrack.prediction import Prediction
 from torchtrack.sensor_tiles import TILE_BITS, NearbyEvents, SensorTiles
 from torchtrack.time_surface import at_pixels, object_regions, time_surface
 
-# Contours this far outside the image still find their place on a distorted sensor (px).
-_BORDER_PX = 64
 # Poses that a search draws lie within this many of its least standard deviations.
 _DRAWN_SIGMAS = 4.0
 
@@ -37,7 +34,7 @@ def sensor_tables(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "s h w 2"], 
     """The tables that :class:`Sensors` looks up: ideal pixels of the sensor's, and sensor pixels of ideal ones."""
     ideal_pixels = stack_tables([undistortion_table(c) for c in cameras])
     # What lies beyond a smaller sensor lies outside it on the sensor too.
-    return ideal_pixels, stack_tables([distortion_table(c, _BORDER_PX) for c in cameras], beyond_px=-_BORDER_PX)
+    return ideal_pixels, stack_tables([distortion_table(c, BORDER_PX) for c in cameras], beyond_px=-BORDER_PX)
 
 
 def farthest_event_px(config: TrackerConfig) -> float:
@@ -167,22 +164,11 @@ class Sensors:
 
     def on_sensor(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
         """Where the lens puts ideal pixels."""
-        height, width = self.sensor_pixels.shape[1:3]
-        # Clamped before the conversion: a far-off pixel does not fit an integer.
-        limit = constant((width - 1, height - 1), pixels.dtype, pixels.device)
-        u, v = torch.minimum((pixels + _BORDER_PX).clamp(min=0), limit).round().long().unbind(-1)
-        return at_pixels(self.sensor_pixels, self.stream_index[:, None], u, v)
+        return on_sensor(self.sensor_pixels, self.stream_index, pixels)
 
-    def history(self, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"]) -> AgeAt:
+    def history(self, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"]) -> History:
         """How long ago anything happened at a pixel."""
-
-        def age_s(pixels: Tensor) -> Tensor:
-            limit = constant((self.image_size[1] - 1, self.image_size[0] - 1), pixels.dtype, pixels.device)
-            u, v = torch.minimum(self.on_sensor(pixels).round().clamp(min=0), limit).long().unbind(-1)
-            age_us = t_us[self.stream_index, None] - at_pixels(last_event_us, self.stream_index[:, None], u, v)
-            return age_us.to(pixels.dtype) * 1e-6
-
-        return age_s
+        return History(self.sensor_pixels, self.stream_index, last_event_us, t_us)
 
 
 def _of_rows(seen: Float[Tensor, "5 b e"], exists: Bool[Tensor, "b e"]) -> WindowEvents:

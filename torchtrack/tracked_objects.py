@@ -115,13 +115,13 @@ class TrackedObjects(nn.Module):
 
     @property
     def shows_all(self) -> bool:
-        """Whether all events of a window have to be kept, and those before it: a weigher of one's own may look at any."""
+        """Whether a window's events are kept that cannot have to do with the objects: a weigher of one's own may look at any."""
         return self.weigher is not None and not isinstance(self.weigher, TrustNetwork | LimbTrust)
 
     @property
     def looks_back(self) -> bool:
         """Whether anything needs the events of earlier windows: they are not kept for nothing."""
-        return self.config.corners.max_corners > 0 or self.shows_all
+        return self.config.corners.max_corners > 0 or self.weigher is not None
 
     @property
     def judges(self) -> bool:

@@ -1,10 +1,10 @@
-"""What tells whether an observation is of the contour near it: its place, and the events in the patch of the image around it.
+"""What tells whether an observation is of the contour near it: its place, and a space-time patch of events around it.
 
 Everything is measured in the frame of the nearest predicted contour: its normal, turned to where the object moves, and
 its tangent. The events of the object's own edges, moved to the window's end with the object, gather on lines along the
-tangent; those of occluders, of the background, of shading and of noise do not. How far the observation lies from the
-contour is not told: the gates and the robust loss see to that, and better with every round. Trust that fell with the
-distance would hold a pose fast that has begun to slip.
+tangent, and the time surface rises along the normal as the edge's speed says; those of occluders, of the background, of
+shading and of noise do neither. How far the observation lies from the contour is not told: the gates and the robust loss
+see to that, and better with every round. Trust that fell with the distance would hold a pose fast that has begun to slip.
 """
 
 from dataclasses import dataclass
@@ -19,12 +19,15 @@ from torchtrack.constants import constant
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import take_points
 from torchtrack.evidence import Evidence
+from torchtrack.history import BORDER_PX
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import PatchSettings
 from torchtrack.observations import Observations, SharedEvents
 
 # Where the patch is sampled: across the contour and along it (px). Negative is behind the moving edge.
-_PATCH_PX = tuple(product((-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0), (-2.0, 0.0, 2.0)))
+_ACROSS_PX, _ALONG_PX = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0), (-2.0, 0.0, 2.0)
+# What is older than this, in px of the edge's motion, says no more.
+_OLDEST_PX = 6.0
 # Slower than this (px/s), an edge has no direction that it moves to. Speeds are told in this unit, by their logarithm.
 _SLOW_PX_S, _SPEED_UNIT_PX_S = 10.0, 100.0
 # Events are counted by pixel, a power of two of them a side: what is that far apart shares a place, and hardly ever fires at once.
@@ -33,8 +36,9 @@ _SIDE = 256
 _FARTHEST_PX = 1e6
 # Kinds of contours that a model has.
 _KINDS = int(ContourKind.SPLAT) + 1
-_COUNTS, _SINGLE = 2 * len(_PATCH_PX), 6
-FEATURES = _COUNTS + _KINDS + _SINGLE
+_COUNTS, _SINGLE = 2 * len(_ACROSS_PX) * len(_ALONG_PX), 6
+_OF_KIND = _COUNTS + len(_ACROSS_PX)
+FEATURES = _OF_KIND + _KINDS + _SINGLE
 """How many numbers describe an observation."""
 
 
@@ -56,10 +60,10 @@ class _Frame:
     speed_px_s: Tensor
     moved: Tensor
 
-    def patch(self) -> tuple[Float[Tensor, "b n p"], Float[Tensor, "b n p"]]:
-        """Columns and rows of the places of the patch around each observation."""
-        across, along = constant(_PATCH_PX, self.moved.dtype, self.moved.device).T
-        (u, v), (nu, nv) = self.moved[..., None].unbind(-2), self.normal[..., None].unbind(-2)
+    def around(self, centre: Float[Tensor, "b n 2"], along_px: tuple[float, ...]) -> tuple[Float[Tensor, "b n p"], Float[Tensor, "b n p"]]:
+        """Columns and rows of the places of a patch around each centre."""
+        across, along = constant(tuple(product(_ACROSS_PX, along_px)), centre.dtype, centre.device).T
+        (u, v), (nu, nv) = centre[..., None].unbind(-2), self.normal[..., None].unbind(-2)
         return u + across * nu - along * nv, v + across * nv + along * nu
 
 
@@ -71,19 +75,19 @@ def trust_features(evidence: Evidence) -> Float[Tensor, "b n f"]:
     kind = torch.where(frame.kind == int(ContourKind.LEARNED), int(ContourKind.TEXTURE), frame.kind)
     kinds = one_hot(kind, _KINDS).to(polarity.dtype)
     single = [
-        frame.exists.to(polarity.dtype),
         (frame.speed_px_s / _SPEED_UNIT_PX_S).log1p(),
         polarity,
-        frame.outward,
         polarity * frame.outward,
+        polarity.abs(),
         _age_share(observations),
+        frame.exists.to(polarity.dtype),
     ]
-    return torch.cat([_counts(evidence, frame), kinds, torch.stack(single, -1)], -1)
+    return torch.cat([_counts(evidence, frame), _ages(evidence, frame), kinds, torch.stack(single, -1)], -1)
 
 
 def of_limb(features: Float[Tensor, "b n f"]) -> Bool[Tensor, "b n"]:
     """Whether the contour nearest to an observation is the limb of a smooth surface, by :func:`trust_features`."""
-    return features[..., _COUNTS + int(ContourKind.LIMB)] * features[..., _COUNTS + _KINDS] > 0
+    return features[..., _OF_KIND + int(ContourKind.LIMB)] * features[..., -1] > 0
 
 
 def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "k f"], Bool[Tensor, "b n"]]:
@@ -91,7 +95,7 @@ def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "k f"], Bool[Tensor
     # Not at the top: Numba is an extra.
     from torchtrack.kernels.trust import describe
 
-    observations, contours, index = evidence.observations, evidence.contours, evidence.index
+    observations, contours, index, history = evidence.observations, evidence.contours, evidence.index, evidence.history
     moving, seen = evidence.prediction.moving(compensated=True), evidence.seen
     own, counts = torch.empty(0, 0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)
     if isinstance(seen, SharedEvents):
@@ -105,8 +109,9 @@ def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "k f"], Bool[Tensor
         *as_arrays(*events.pixels.unbind(-1), events.age_s, events.polarity, events.mask, own, counts, told, observations.mask),
         *as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.kind, index.nearest, index.first),
         index.cells,
-        *as_arrays(moving.velocity, moving.centre_cam, moving.intrinsics, constant(_PATCH_PX, told.dtype, told.device)),
-        PatchSettings(_SIDE, int(ContourKind.LIMB), _COUNTS, _KINDS, _SLOW_PX_S, _SPEED_UNIT_PX_S),
+        *as_arrays(moving.velocity, moving.centre_cam, moving.intrinsics),
+        *as_arrays(history.sensor_pixels, history.stream_index, history.last_event_us, history.t_us),
+        PatchSettings(_ACROSS_PX, _ALONG_PX, _SIDE, BORDER_PX, int(ContourKind.LIMB), _OF_KIND, _SLOW_PX_S, _SPEED_UNIT_PX_S, _OLDEST_PX),
         *as_arrays(rows, is_limb),
     )
     return rows[:count], is_limb
@@ -131,6 +136,15 @@ def _age_share(observations: Observations) -> Float[Tensor, "b n"]:
     return observations.age_s / oldest_s.clamp(min=1e-6)
 
 
+def _ages(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
+    """How much older than the observation the time surface is across the contour, in px of the edge's motion."""
+    observations = evidence.observations
+    places = torch.stack(frame.around(observations.pixels, (0.0,)), -1)
+    newest_s = evidence.age_s(places.flatten(1, 2)).view(places.shape[:3])
+    behind_px = (newest_s - observations.age_s[..., None]) * frame.speed_px_s[..., None]
+    return behind_px.clamp(-_OLDEST_PX, _OLDEST_PX) / _OLDEST_PX
+
+
 def _counts(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
     """Events of the observation's own polarity and of the other, around it, all moved to the window's end with the object."""
     events = evidence.events
@@ -138,7 +152,7 @@ def _counts(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
     cell = 2 * _cells(moved[..., 0], moved[..., 1]) + (events.polarity > 0)
     counts = torch.zeros(len(cell), 2 * _SIDE**2, dtype=moved.dtype, device=moved.device)
     counts = counts.scatter_add(1, cell, events.mask.to(moved.dtype))
-    places = 2 * _cells(*frame.patch())
+    places = 2 * _cells(*frame.around(frame.moved, _ALONG_PX))
     own = places + (evidence.observations.polarity >= 0)[..., None]
     of_both = torch.cat([own, 2 * places + 1 - own], -1)
     return softsign(counts.gather(1, of_both.flatten(1)).view(of_both.shape))

@@ -265,15 +265,21 @@ class PatchSettings(NamedTuple):
     """What :mod:`torchtrack.kernels.trust` goes by: constants of :mod:`torchtrack.trust_features`.
 
     Args:
+        across_px, along_px: where the patch is sampled.
         side: pixels of a side of what events are counted in, a power of two.
+        border_px: of the table of sensor pixels.
         limb: number of the kind of contours whose observations are described.
-        counts, kinds: how many numbers of counts there are in a description, and of kinds after them.
+        of_kind: where the kinds begin in a description, after counts and ages.
         slow_px_s: slower, an edge has no direction; ``unit_px_s`` that speeds are told in.
+        oldest_px: ages are told up to this, by the way of the edge.
     """
 
+    across_px: tuple[float, ...]
+    along_px: tuple[float, ...]
     side: int
+    border_px: int
     limb: int
-    counts: int
-    kinds: int
+    of_kind: int
     slow_px_s: float
     unit_px_s: float
+    oldest_px: float

@@ -9,8 +9,8 @@ from torchtrack.kernels.settings import Cells, PatchSettings
 
 # Rows of what is told of an observation.
 U, V, AGE, POLARITY, AGE_SHARE = range(5)
-# Numbers of a description after those of counts and kinds.
-_EXISTS, _SPEED, _POLARITY, _OUTWARD, _SIDE, _AGE = range(6)
+# The last numbers of a description.
+_SPEED, _POLARITY, _SIDE, _KNOWN, _AGE, _EXISTS = range(-6, 0)
 
 
 @kernel(fastmath=FAST)
@@ -33,7 +33,10 @@ def describe(
     velocity: Array,
     centre_cam: Array,
     intrinsics: Array,
-    patch_px: Array,
+    sensor_pixels: Array,
+    stream_index: Array,
+    last_event_us: Array,
+    t_us: Array,
     settings: PatchSettings,
     rows: Array,
     is_limb: Array,
@@ -47,7 +50,7 @@ def describe(
         points_cam, normals, kind: ``[b, 3, m]``, ``[b, 2, m]`` and ``[b, m]`` of contour points; ``nearest_of_cell [b, p]`` and
             ``first [b, 2]`` are their index.
         velocity, centre_cam, intrinsics: of each object.
-        patch_px: ``[k, 2]``, across the contour and along it.
+        sensor_pixels, stream_index, last_event_us, t_us: of a :class:`torchtrack.history.History`.
         rows: ``[b * n, f]``; the first are filled.
         is_limb: ``[b, n]``, filled.
     """
@@ -66,7 +69,11 @@ def describe(
             found = nearest(nearest_of_cell[b], first[b], told[b, U, i] + speed_u * age, told[b, V, i] + speed_v * age, cells)
             is_limb[b, i] = exists[b, i] and found >= 0 and kind[b, max(found, 0)] == settings.limb
             if is_limb[b, i]:
-                _describe_one(i, found, told[b], points_cam[b], normals[b], motion, of_lens, patch_px, counted, settings, rows[described])
+                s = stream_index[b]
+                _describe_one(
+                    i, found, told[b], points_cam[b], normals[b], motion, of_lens, counted, sensor_pixels[s], last_event_us[s], t_us[s],
+                    settings, rows[described],
+                )  # fmt: skip
                 described += 1
     return described
 
@@ -97,7 +104,21 @@ def _count(
         i = np.uint64(own[j]) if len(own) else np.uint64(j)
         speed_u, speed_v = at_depth(motion, depth_m, u[i], v[i], intrinsics)
         place = _place(u[i] + speed_u * age_s[i], v[i] + speed_v * age_s[i], settings.side)
-        counted[place, 1 if polarity[i] > 0 else 0] += mask[i]
+        if mask[i]:
+            # Of n events, n / (1 + n) is kept: with one more, that is one over two less it.
+            sign = 1 if polarity[i] > 0 else 0
+            counted[place, sign] = 1.0 / (2.0 - counted[place, sign])
+
+
+@kernel(fastmath=FAST)
+def _newest_us(u: float, v: float, sensor_pixels: Array, last_event_us: Array, border_px: int) -> int:
+    """When anything last happened at an ideal pixel: as :meth:`torchtrack.history.History.age_s` looks it up."""
+    column = int(np.rint(min(max(u + border_px, 0.0), sensor_pixels.shape[1] - 1.0)))
+    row = int(np.rint(min(max(v + border_px, 0.0), sensor_pixels.shape[0] - 1.0)))
+    placed = sensor_pixels[row, column]
+    x = int(min(max(np.rint(placed[0]), 0.0), last_event_us.shape[1] - 1.0))
+    y = int(min(max(np.rint(placed[1]), 0.0), last_event_us.shape[0] - 1.0))
+    return last_event_us[y, x]
 
 
 @kernel(fastmath=FAST)
@@ -109,8 +130,10 @@ def _describe_one(
     normals: Array,
     motion: Numbers,
     intrinsics: Numbers,
-    patch_px: Array,
     counted: Array,
+    sensor_pixels: Array,
+    last_event_us: Array,
+    t_us: int,
     settings: PatchSettings,
     row: Array,
 ) -> None:
@@ -120,16 +143,18 @@ def _describe_one(
     speed = normals[0, found] * speed_u + normals[1, found] * speed_v
     outward = -1.0 if speed < 0 else 1.0
     nu, nv, polarity = outward * normals[0, found], outward * normals[1, found], told[POLARITY, i]
-    u, v = told[U, i] + speed_u * told[AGE, i], told[V, i] + speed_v * told[AGE, i]
-    own, places = 1 if polarity >= 0 else 0, len(patch_px)
-    for k in range(places):
-        aside, along = patch_px[k, 0], patch_px[k, 1]
-        place = _place(u + aside * nu - along * nv, v + aside * nv + along * nu, settings.side)
-        same, other = counted[place, own], counted[place, 1 - own]
-        row[k], row[places + k] = same / (1.0 + same), other / (1.0 + other)
-    row[settings.counts :] = 0.0
-    row[settings.counts + settings.limb] = 1.0
-    single = settings.counts + settings.kinds
-    row[single + _EXISTS], row[single + _SPEED] = 1.0, np.log1p(max(abs(speed), settings.slow_px_s) / settings.unit_px_s)
-    row[single + _POLARITY], row[single + _OUTWARD], row[single + _SIDE] = polarity, outward, polarity * outward
-    row[single + _AGE] = told[AGE_SHARE, i]
+    u, v, age = told[U, i], told[V, i], told[AGE, i]
+    moved_u, moved_v, speed = u + speed_u * age, v + speed_v * age, max(abs(speed), settings.slow_px_s)
+    own, k, places = 1 if polarity >= 0 else 0, 0, len(settings.across_px) * len(settings.along_px)
+    for a, aside in enumerate(settings.across_px):
+        for along in settings.along_px:
+            place = _place(moved_u + aside * nu - along * nv, moved_v + aside * nv + along * nu, settings.side)
+            row[k], row[places + k] = counted[place, own], counted[place, 1 - own]
+            k += 1
+        newest_us = _newest_us(u + aside * nu, v + aside * nv, sensor_pixels, last_event_us, settings.border_px)
+        behind_px = ((t_us - newest_us) * 1e-6 - age) * speed
+        row[2 * places + a] = min(max(behind_px / settings.oldest_px, -1.0), 1.0)
+    row[settings.of_kind :] = 0.0
+    row[settings.of_kind + settings.limb] = row[_EXISTS] = 1.0
+    row[_SPEED], row[_AGE] = np.log1p(speed / settings.unit_px_s), told[AGE_SHARE, i]
+    row[_POLARITY], row[_SIDE], row[_KNOWN] = polarity, polarity * outward, abs(polarity)
