@@ -12,7 +12,7 @@ from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.events import concatenate
 from torchtrack.kernels.switch import kernels
 from torchtrack.trust import LimbTrust, TrustNetwork
-from torchtrack.trust_features import limb_features, of_limb, trust_features
+from torchtrack.trust_features import limb_features
 
 BOX, SMOOTH = box_model(), bevelled_model()
 COUNT = 6
@@ -62,7 +62,7 @@ def test_sharp_edges_are_believed_in_full(dtype):
 
 def test_limbs_are_judged_as_the_network_judges_them(dtype):
     evidence, weigher = evidence_of(dtype=dtype)
-    trust, of_all, is_limb = weigher(evidence), weigher.network(evidence), of_limb(trust_features(evidence))
+    trust, of_all, (_, is_limb) = weigher(evidence), weigher.network(evidence), limb_features(evidence)
     assert torch.equal(trust[is_limb], of_all[is_limb]) and (trust[~is_limb] == 1).all() and is_limb.any()
 
 
@@ -72,21 +72,21 @@ def test_limbs_are_judged_as_the_network_judges_them(dtype):
 def test_limbs_are_described_the_same_by_a_kernel(dtype):
     pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
     evidence, _ = evidence_of((SMOOTH, BOX, SMOOTH), dtype)
-    features = trust_features(evidence)
-    is_limb = of_limb(features) & evidence.observations.mask
-    rows, found = limb_features(evidence)
-    assert torch.equal(found, is_limb) and is_limb.sum() > 1000
+    with torch.no_grad():
+        features, is_limb = limb_features(evidence)
+        with kernels(wanted=False):
+            expected, wanted = limb_features(evidence)
+    assert torch.equal(is_limb, wanted) and is_limb.sum() > 200 and (features[~is_limb] == 0).all()
     # What lies halfway between two pixels is counted at one or the other.
-    assert ((rows - features[is_limb]).abs() < 1e-4).all(-1).double().mean() > 0.99
+    assert ((features - expected)[is_limb].abs() < 1e-4).all(-1).double().mean() > 0.99
 
 
 def test_where_there_is_no_limb_there_is_nothing_to_describe():
     pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
     evidence, weigher = evidence_of((BOX,))
-    rows, found = limb_features(evidence)
-    assert len(rows) == 0 and not found.any()
     with torch.no_grad():
-        assert (weigher(evidence) == 1).all()
+        features, is_limb = limb_features(evidence)
+        assert not features.any() and not is_limb.any() and (weigher(evidence) == 1).all()
 
 
 # ---- in the tracker
@@ -101,10 +101,11 @@ def test_it_is_in_the_default_where_an_object_has_limbs():
     assert Tracker([BOX], SMALL_CAMERA, weigher=own).weigher is own
 
 
-def test_it_looks_at_nothing_but_the_window():
+def test_it_needs_no_events_from_elsewhere_but_those_before_the_window():
     tracker = Tracker([SMOOTH], SMALL_CAMERA)
-    assert not tracker.looks_back and not tracker.shows_all
-    assert Tracker([SMOOTH], SMALL_CAMERA, weigher=torch.nn.Identity()).looks_back
+    assert tracker.looks_back and not tracker.shows_all
+    assert Tracker([SMOOTH], SMALL_CAMERA, weigher=torch.nn.Identity()).shows_all
+    assert not Tracker([BOX], SMALL_CAMERA).looks_back
 
 
 def test_it_changes_the_poses_of_what_is_smooth_and_of_nothing_else():

@@ -59,7 +59,7 @@ def test_pixels_far_off_are_somewhere_outside(sensors):
 
 def test_the_history_tells_the_age_of_the_newest_event(sensors, events):
     last_event_us = update_last_event(empty_last_event(2, *sensors.image_size), events)
-    age_s = sensors.history(last_event_us, NOW_US)
+    age_s = sensors.history(last_event_us, NOW_US).age_s
     # The straight camera's pixels are ideal ones.
     ages = age_s(torch.tensor([[[10.2, 19.8], [50.0, 50.0]]], dtype=torch.float64).expand(3, 2, 2))
     torch.testing.assert_close(ages[1:, 0], torch.tensor([4e-3, 4e-3], dtype=torch.float64))

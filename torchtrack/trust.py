@@ -13,8 +13,7 @@ from torchtrack.config.tracker import MatchingConfig
 from torchtrack.contour_model import ContourModel
 from torchtrack.errors import UnknownFormatError
 from torchtrack.evidence import Evidence
-from torchtrack.kernels import switch
-from torchtrack.trust_features import FEATURES, limb_features, of_limb, trust_features
+from torchtrack.trust_features import FEATURES, limb_features, trust_features
 
 _SHIPPED = "learned.safetensors"
 
@@ -76,12 +75,8 @@ class LimbTrust(nn.Module):
 
     def forward(self, evidence: Evidence) -> Float[Tensor, "b n"]:
         """How far each observation is to be believed, 0 to 1."""
-        if switch.apply_to(evidence.observations.age_s):
-            features, is_limb = limb_features(evidence)
-            everything = torch.ones_like(evidence.observations.age_s)
-            return everything.masked_scatter(is_limb, torch.sigmoid(self.network.logits(features)))
-        features = trust_features(evidence)
-        return torch.where(of_limb(features), torch.sigmoid(self.network.logits(features)), 1.0)
+        features, is_limb = limb_features(evidence)
+        return torch.where(is_limb, torch.sigmoid(self.network.logits(features)), 1.0)
 
 
 def shipped_weigher(models: Sequence[ContourModel], config: MatchingConfig) -> nn.Module | None:

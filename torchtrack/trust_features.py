@@ -20,6 +20,7 @@ from torchtrack.contour_model import ContourKind
 from torchtrack.contours import take_points
 from torchtrack.evidence import Evidence
 from torchtrack.history import BORDER_PX
+from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import PatchSettings
 from torchtrack.observations import Observations, SharedEvents
@@ -85,13 +86,17 @@ def trust_features(evidence: Evidence) -> Float[Tensor, "b n f"]:
     return torch.cat([_counts(evidence, frame), _ages(evidence, frame), kinds, torch.stack(single, -1)], -1)
 
 
-def of_limb(features: Float[Tensor, "b n f"]) -> Bool[Tensor, "b n"]:
-    """Whether the contour nearest to an observation is the limb of a smooth surface, by :func:`trust_features`."""
-    return features[..., _OF_KIND + int(ContourKind.LIMB)] * features[..., -1] > 0
+def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "b n f"], Bool[Tensor, "b n"]]:
+    """:func:`trust_features`, and which observations are nearest to the limb of a smooth surface; of others they need not be told."""
+    if switch.apply_to(evidence.observations.age_s):
+        return _limb_features_by_kernel(evidence)
+    features = trust_features(evidence)
+    of_limb = features[..., _OF_KIND + int(ContourKind.LIMB)] * features[..., -1] > 0
+    return features, of_limb & evidence.observations.mask
 
 
-def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "k f"], Bool[Tensor, "b n"]]:
-    """:func:`trust_features` of the observations :func:`of_limb` alone, one after another, and which these are: by a kernel."""
+def _limb_features_by_kernel(evidence: Evidence) -> tuple[Float[Tensor, "b n f"], Bool[Tensor, "b n"]]:
+    """:func:`limb_features`, observation by observation."""
     # Not at the top: Numba is an extra.
     from torchtrack.kernels.trust import describe
 
@@ -104,17 +109,18 @@ def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "k f"], Bool[Tensor
         # Of what many have in common, one row is enough.
         events = seen.of(0) if seen.pixels.stride(0) == 0 else seen
     told = torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.polarity, _age_share(observations)], 1)
-    rows, is_limb = told.new_empty(observations.mask.numel(), FEATURES), torch.empty_like(observations.mask)
-    count = describe(
+    # As many for all: how many a neighbour has would show in roundings.
+    features, is_limb = told.new_zeros(*observations.mask.shape, FEATURES), torch.empty_like(observations.mask)
+    describe(
         *as_arrays(*events.pixels.unbind(-1), events.age_s, events.polarity, events.mask, own, counts, told, observations.mask),
         *as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.kind, index.nearest, index.first),
         index.cells,
         *as_arrays(moving.velocity, moving.centre_cam, moving.intrinsics),
         *as_arrays(history.sensor_pixels, history.stream_index, history.last_event_us, history.t_us),
         PatchSettings(_ACROSS_PX, _ALONG_PX, _SIDE, BORDER_PX, int(ContourKind.LIMB), _OF_KIND, _SLOW_PX_S, _SPEED_UNIT_PX_S, _OLDEST_PX),
-        *as_arrays(rows, is_limb),
+        *as_arrays(features, is_limb),
     )
-    return rows[:count], is_limb
+    return features, is_limb
 
 
 def _frame(evidence: Evidence) -> _Frame:

@@ -38,10 +38,10 @@ def describe(
     last_event_us: Array,
     t_us: Array,
     settings: PatchSettings,
-    rows: Array,
+    features: Array,
     is_limb: Array,
-) -> int:
-    """Describe the observations whose nearest contour is a limb; how many these are.
+) -> None:
+    """Describe the observations whose nearest contour is a limb.
 
     Args:
         u, v, age_s, polarity, mask: ``[e, n]``: events of each object, or one row for all.
@@ -51,11 +51,10 @@ def describe(
             ``first [b, 2]`` are their index.
         velocity, centre_cam, intrinsics: of each object.
         sensor_pixels, stream_index, last_event_us, t_us: of a :class:`torchtrack.history.History`.
-        rows: ``[b * n, f]``; the first are filled.
-        is_limb: ``[b, n]``, filled.
+        features: ``[b, n, f]`` of zeros, filled for these.
+        is_limb: ``[b, n]``, filled: which these are.
     """
-    described = 0
-    counted = np.zeros((settings.side * settings.side, 2), rows.dtype)
+    counted = np.zeros((settings.side * settings.side, 2), features.dtype)
     for b in range(len(told)):
         e = b if len(mask) > 1 else 0
         looked_at = counts[b] if len(own) else mask.shape[1]
@@ -72,10 +71,8 @@ def describe(
                 s = stream_index[b]
                 _describe_one(
                     i, found, told[b], points_cam[b], normals[b], motion, of_lens, counted, sensor_pixels[s], last_event_us[s], t_us[s],
-                    settings, rows[described],
+                    settings, features[b, i],
                 )  # fmt: skip
-                described += 1
-    return described
 
 
 @kernel(fastmath=FAST)
