@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Train the network of the preset ``learned``, from nothing: simulate its scenes, learn, write the weights.
+"""Train the network that says which observations to believe, from nothing: simulate its scenes, learn, write the weights.
 
     .venv/bin/python scripts/train_weights.py -o outputs/learned.safetensors
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import SMALL_CAMERA, box_model, pose
+from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, windows
 
 from torchtrack import Tracker, compiled, readback
@@ -63,13 +63,13 @@ def graphs(monkeypatch):
     return Graphs(monkeypatch)
 
 
-def both_ways(config=None, streams=1, count=COUNT, mode=torch.inference_mode):
+def both_ways(config=None, streams=1, count=COUNT, mode=torch.inference_mode, model=box_model):
     """Results of a box per stream without graphs and with them, and the last states."""
     parts = [moving_box(pose(), count, SMALL_CAMERA, seed=stream, stream=stream)[1] for stream in range(streams)]
     cut = [(concatenate([window[0] for window in step]), step[0][1]) for step in zip(*(windows(events, count) for events in parts), strict=True)]
     found = []
     for is_compiled in (False, True):
-        tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, config, list(range(streams)), compiled=is_compiled)
+        tracker = Tracker([model()] * streams, [SMALL_CAMERA] * streams, config, list(range(streams)), compiled=is_compiled)
         with mode():
             state = tracker.init(pose().expand(streams, 4, 4), 0)
             tracker.prepare(state)
@@ -89,6 +89,14 @@ def test_poses_are_those_of_a_step(graphs, streams, mode):
     assert torch.equal(compiled_state.burst_age_us, state.burst_age_us)
     assert compiled_state.learned.windows == state.learned.windows == COUNT
     assert found[-1].T_cam_obj.is_inference() == (mode is torch.inference_mode)
+
+
+def test_poses_of_a_smooth_object_are_those_of_a_step(graphs):
+    (state, _), (compiled_state, _) = both_ways(LEARNING, model=bevelled_model)
+    assert sum(graphs.calls) >= COUNT // 3
+    # What lies halfway between two pixels is counted at one or the other.
+    torch.testing.assert_close(compiled_state.T_cam_obj, state.T_cam_obj, rtol=0, atol=1e-4)
+    assert torch.equal(compiled_state.last_event_us, state.last_event_us)
 
 
 @pytest.mark.parametrize("config", [LEARNING, TrackerConfig(model_trust=ModelTrustConfig(least_share=0.1, first_windows=0, every=3))])

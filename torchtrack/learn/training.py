@@ -1,4 +1,4 @@
-"""How the network of the preset ``learned`` is trained: by what observations are of, then through the tracker by its poses."""
+"""How the network that says which observations to believe is trained: by what observations are of, then through the tracker by its poses."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
