@@ -19,7 +19,7 @@ _SHIPPED = "learned.safetensors"
 
 
 class TrustNetwork(nn.Module):
-    """A weigher: believes an observation by the patch of events around it (:mod:`torchtrack.trust_features`).
+    """A weigher: believes an observation by the space-time patch of events around it (:mod:`torchtrack.trust_features`).
 
     Args:
         hidden: widths of its two hidden layers.
