@@ -4,7 +4,7 @@ import warnings
 
 import pytest
 import torch
-from helpers import box_model, pose_errors
+from helpers import bevelled_model, box_model, pose_errors
 from host_reads import host_reads
 from tracked_boxes import SCENES, follow
 
@@ -43,10 +43,10 @@ def on_device(stream_windows, device):
     return [(events.to(device), torch.as_tensor(end_us, device=device).view(-1)) for events, end_us in stream_windows]
 
 
-def set_up(scene, device, config=None):
+def set_up(scene, device, config=None, model=box_model):
     """A tracker of a scene, the state that it begins with, and the windows."""
     starts, stream_index, cameras, stream_windows = scene(COUNT)
-    tracker = Tracker([box_model()] * len(starts), cameras, config, stream_index).to(device)
+    tracker = Tracker([model()] * len(starts), cameras, config, stream_index).to(device)
     return tracker, tracker.init(torch.stack(starts), 0), on_device(stream_windows, device)
 
 
@@ -170,11 +170,12 @@ def test_the_ways_of_a_gpu_lead_to_the_poses_of_the_cpu(monkeypatch, scene):
     assert float(millimetres.max()) < 0.1
 
 
+@pytest.mark.parametrize("model", [box_model, bevelled_model])
 @pytest.mark.parametrize("scene", SCENES)
-def test_a_steady_step_asks_for_nothing(monkeypatch, scene):
+def test_a_steady_step_asks_for_nothing(monkeypatch, scene, model):
     """A CUDA graph cannot hold so much as an answer that is waited for."""
     monkeypatch.setattr(readback, "read_at_once", lambda values: False)
-    tracker, state, ready = set_up(scene, torch.device("cpu"))
+    tracker, state, ready = set_up(scene, torch.device("cpu"), model=model)
     with torch.inference_mode():
         state, _ = follow(tracker, state, ready[:-1])
         monkeypatch.setattr(readback.Answer, "to", None)

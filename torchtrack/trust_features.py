@@ -13,7 +13,7 @@ from itertools import product
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import one_hot, softsign
+from torch.nn.functional import softsign
 
 from torchtrack.constants import constant
 from torchtrack.contour_model import ContourKind
@@ -74,7 +74,8 @@ def trust_features(evidence: Evidence) -> Float[Tensor, "b n f"]:
     polarity = observations.polarity
     # Contours that were learned are print.
     kind = torch.where(frame.kind == int(ContourKind.LEARNED), int(ContourKind.TEXTURE), frame.kind)
-    kinds = one_hot(kind, _KINDS).to(polarity.dtype)
+    # Not by one_hot, which reads values back to check them.
+    kinds = (kind[..., None] == torch.arange(_KINDS, device=kind.device)).to(polarity.dtype)
     single = [
         (frame.speed_px_s / _SPEED_UNIT_PX_S).log1p(),
         polarity,
