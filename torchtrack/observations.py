@@ -161,6 +161,18 @@ def select_events(events: ObjectEvents, index: ContourIndex, objects: MovingObje
     return Observations(values[..., :2], values[..., 2], values[..., 3], values[..., 4], exists, flow, torch.zeros_like(exists))
 
 
+def laid_out(events: ObjectEvents) -> tuple[WindowEvents, Int[Tensor, "b e"], Int[Tensor, "b"]]:
+    """Events as kernels take them: a row for each object or one for all, places in it of each object's own, and how many these are.
+
+    Without a list of their own, which is empty then, all events of a row are an object's.
+    """
+    if isinstance(events, SharedEvents):
+        return events.shared, events.own, events.count
+    # Of what many have in common, one row is enough.
+    rows = events.of(0) if events.pixels.stride(0) == 0 else events
+    return rows, torch.empty(0, 0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)
+
+
 def _selected_by_kernel(
     events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int
 ) -> tuple[Float[Tensor, "b c 5"], Bool[Tensor, "b c"]]:
@@ -168,12 +180,7 @@ def _selected_by_kernel(
     # Not at the top: Numba is an extra.
     from torchtrack.kernels.selection import select
 
-    own, counts = torch.empty(0, 0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)
-    if isinstance(events, SharedEvents):
-        rows, own, counts = events.shared, events.own, events.count
-    else:
-        # Of what many have in common, one row is enough.
-        rows = events.of(0) if events.pixels.stride(0) == 0 else events
+    rows, own, counts = laid_out(events)
     number = torch.arange(rows.mask.shape[1]).expand(len(rows.mask), -1) if rows.number is None else rows.number
     batch = len(objects.velocity)
     chosen, exists = rows.pixels.new_empty(batch, 5, count), torch.empty(batch, count, dtype=torch.bool)

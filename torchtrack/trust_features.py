@@ -23,7 +23,7 @@ from torchtrack.history import BORDER_PX
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import PatchSettings
-from torchtrack.observations import Observations, SharedEvents
+from torchtrack.observations import Observations, laid_out
 
 # Where the patch is sampled: across the contour and along it (px). Negative is behind the moving edge.
 _ACROSS_PX, _ALONG_PX = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0), (-2.0, 0.0, 2.0)
@@ -102,13 +102,7 @@ def _limb_features_by_kernel(evidence: Evidence) -> tuple[Float[Tensor, "b n f"]
     from torchtrack.kernels.trust import describe
 
     observations, contours, index, history = evidence.observations, evidence.contours, evidence.index, evidence.history
-    moving, seen = evidence.prediction.moving(compensated=True), evidence.seen
-    own, counts = torch.empty(0, 0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)
-    if isinstance(seen, SharedEvents):
-        events, own, counts = seen.shared, seen.own, seen.count
-    else:
-        # Of what many have in common, one row is enough.
-        events = seen.of(0) if seen.pixels.stride(0) == 0 else seen
+    moving, (events, own, counts) = evidence.prediction.moving(compensated=True), laid_out(evidence.seen)
     told = torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.polarity, _age_share(observations)], 1)
     # As many for all: how many a neighbour has would show in roundings.
     features, is_limb = told.new_zeros(*observations.mask.shape, FEATURES), torch.empty_like(observations.mask)
