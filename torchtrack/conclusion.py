@@ -54,7 +54,8 @@ def conclude(
         after, covariance, status = _judged(state, prediction, widening, found, dt_s, config)
     contours = reproject(found.fit.contours, after.T_cam_obj.to(dt_s.dtype), prediction.objects.intrinsics)
     result = StepResult(state.t_us, after.T_cam_obj, covariance, status, found.share, contours, corners, found.count)
-    return replace(after, score=found.score, darker_outside=_darker_outside(state, found, status, dt_s, config)), result
+    sides = _darker_outside(state, found, status, dt_s, config)
+    return replace(after, score=found.score, darker_outside=sides, full_apart=_full_apart(state, after, found)), result
 
 
 # The state with what is known of poses and motions after a window, covariances of the poses' left perturbation, and statuses.
@@ -202,6 +203,11 @@ def _usual(state: TrackerState, found: Found, failed: Bool[Tensor, "b"]) -> tupl
     full_gathered = torch.where(failed | found.gathered.isnan(), state.full_gathered, _seen_well(state.full_gathered, found.gathered))
     full_count = torch.where(failed, state.full_count, _seen_well(state.full_count, found.count.to(state.full_count.dtype)))
     return usual, full_share, full_gathered, full_count
+
+
+def _full_apart(state: TrackerState, after: TrackerState, found: Found) -> Float[Tensor, "b"]:
+    """How far apart the directions of contours are when objects are seen well, with a window more."""
+    return torch.where(after.unseen_s == 0, _seen_well(state.full_apart, found.apart), state.full_apart)
 
 
 def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:

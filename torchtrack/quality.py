@@ -26,6 +26,10 @@ _MIN_MOVING_POINTS = 16
 HIDDEN_FROM, HIDDEN_FULLY = 0.8, 0.95
 # It says nothing of objects on which less gathers even then, nor by fewer observations than so many times the least.
 HIDDEN_LEAST, HIDDEN_TIMES = 0.5, 4
+# What has not been seen well for so long may not be held by parallel lines alone; after so much more, hardly anything is asked (s).
+PARALLEL_AFTER_S, _ASKED_S = 0.05, 1.0
+# Directions that lie no farther apart than this share of what is asked say nothing for a pose; from the other one on, all.
+_PARALLEL_FROM, _PARALLEL_TO = 0.1, 0.33
 # How far around a contour observations are that should gather on it (px).
 _AROUND_PX = 5.0
 
@@ -68,20 +72,21 @@ def measured_share(
 
 def shares(
     contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: QualityConfig
-) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"]]:
-    """:func:`measured_share` of contours that move with their objects, and :func:`gathered_share`."""
+) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
+    """:func:`measured_share` of contours that move with their objects, :func:`gathered_share`, and :func:`directions_apart`."""
     if not switch.apply_to(contours.pixels):
         velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
-        return measured_share(contours, matches, velocity, image_size, config), gathered_share(matches, config)
+        measured = measured_share(contours, matches, velocity, image_size, config)
+        return measured, gathered_share(matches, config), directions_apart(matches)
     # Not at the top: Numba is an extra.
     from torchtrack.kernels.quality import shares as by_kernel
 
-    measured, gathered = contours.pixels.new_empty(2, len(contours.mask))
+    measured, gathered, apart = contours.pixels.new_empty(3, len(contours.mask))
     shown = as_arrays(*(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask)
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
-    matched = as_arrays(matches.targets.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
-    by_kernel(*shown, *moving, *matched, _settings(image_size, config), measured.numpy(), gathered.numpy())
-    return measured, gathered
+    matched = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
+    by_kernel(*shown, *moving, *matched, _settings(image_size, config), measured.numpy(), gathered.numpy(), apart.numpy())
+    return measured, gathered, apart
 
 
 def _settings(image_size: tuple[int, int], config: QualityConfig) -> QualitySettings:
@@ -111,6 +116,42 @@ def gathered_share(matches: Matches, config: QualityConfig) -> Float[Tensor, "b"
     count = near.sum(-1)
     share = (near & (offsets < ON_CONTOUR_PX)).sum(-1).to(offsets.dtype) / count.clamp(min=1)
     return torch.where(count < config.min_observations, torch.nan, share)
+
+
+def directions_apart(matches: Matches) -> Float[Tensor, "b"]:
+    """How far apart the directions are of the contours that observations lie on: 0 where all are parallel, 0.5 where none prevails.
+
+    The smaller eigenvalue of the mean of ``n n^T`` over their unit normals n, by the resultant of these at twice their angles
+    (Mardia and Jupp, Directional Statistics, 1.3).
+    """
+    on = (matches.near & (matches.offsets.abs() < ON_CONTOUR_PX)).to(matches.offsets.dtype)
+    u, v = matches.directions.detach().unbind(-1)
+    doubled = torch.stack([u * u - v * v, 2 * u * v], 1)
+    count = on.sum(-1)
+    return 0.5 * (count - (doubled * on[:, None]).sum(-1).norm(dim=1)) / count.clamp(min=1)
+
+
+def asked_apart(full_apart: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], config: QualityConfig) -> Float[Tensor, "b"]:
+    """How far apart the directions of an object's contours should be, which was not seen well for a while: as far as when it was.
+
+    Less and less: an object may go on along its own edges, of which only those across its way fire then.
+
+    Args:
+        full_apart: how far apart they are when it is seen well; zero, for nothing, where that is not known.
+        unseen_s: how long ago that was (s).
+    """
+    asks = (unseen_s >= PARALLEL_AFTER_S) & config.all_directions
+    return torch.where(asks, full_apart * torch.exp(unseen_s / -_ASKED_S), 0)
+
+
+def held_all_ways(apart: Float[Tensor, "b"], asked: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
+    """How far a pose is held in all directions of the image, 0 to 1: an object laid along a bar that hides it slides along its edges.
+
+    Args:
+        apart: :func:`directions_apart` of what is explained; ``asked`` of it, zero for nothing.
+    """
+    share = (apart - _PARALLEL_FROM * asked) / ((_PARALLEL_TO - _PARALLEL_FROM) * asked).clamp(min=1e-6)
+    return torch.where(asked > 0, share.clamp(0, 1), 1)
 
 
 def inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:

@@ -40,6 +40,8 @@ class Found:
         count: matched observations.
         gathered: share of the events near the contour that are on it; not a number where it does not tell.
         full_gathered: the same of when the object is seen well.
+        apart: how far apart the directions of the contours are that events lie on.
+        asked_apart: how far apart they have to be to count in full; zero for nothing asked.
         elsewhere: which objects a search found in another place than the prediction led to.
     """
 
@@ -49,6 +51,8 @@ class Found:
     count: Int[Tensor, "b"]
     gathered: Float[Tensor, "b"]
     full_gathered: Float[Tensor, "b"]
+    apart: Float[Tensor, "b"]
+    asked_apart: Float[Tensor, "b"]
     elsewhere: Bool[Tensor, "b"]
 
     @once
@@ -64,19 +68,27 @@ class Found:
 
 
 def judge_fit(
-    prediction: Prediction, fit: Fit, config: TrackerConfig, at_rest: Float[Tensor, "b"], full_gathered: Float[Tensor, "b"] | None = None
+    prediction: Prediction,
+    fit: Fit,
+    config: TrackerConfig,
+    at_rest: Float[Tensor, "b"],
+    full_gathered: Float[Tensor, "b"] | None = None,
+    asked_apart: Float[Tensor, "b"] | None = None,
 ) -> Found:
     """A fit with its quality, by the motion that was found with it; without enough observations it explains nothing.
 
     Args:
         full_gathered: of when each object is seen well; zero, or none at all, where that is not known.
+        asked_apart: how far apart directions have to be to count in full; zero, or none at all, for nothing asked.
     """
     moving = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).moving(compensated=True)
-    measured, gathered = quality.shares(fit.contours, fit.matches, moving, prediction.objects.image_size, config.quality)
+    measured, gathered, apart = quality.shares(fit.contours, fit.matches, moving, prediction.objects.image_size, config.quality)
     # Of what does not move, events are noise.
     gathered = torch.where(measured.isnan(), torch.nan, gathered) if config.search.by_gathering else torch.full_like(measured, torch.nan)
-    full_gathered = torch.zeros_like(measured) if full_gathered is None else full_gathered
-    return Found(fit, measured, at_rest, fit.matches.mask.sum(-1), gathered, full_gathered, torch.zeros_like(measured, dtype=torch.bool))
+    nothing = torch.zeros_like(measured)
+    full_gathered, asked_apart = (nothing if value is None else value for value in (full_gathered, asked_apart))
+    measured = measured * quality.held_all_ways(apart, asked_apart)
+    return Found(fit, measured, at_rest, fit.matches.mask.sum(-1), gathered, full_gathered, apart, asked_apart, nothing.bool())
 
 
 def explained_at_rest(widening: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
@@ -117,7 +129,7 @@ def search_around(
     covariance, seen = less_certain(one, 0, sigma_px, widened_px).covariance[0], events.of(number)
     places = one.carried(seen.pixels, seen.age_s), seen.mask
     offsets = promising(one, outline, covariance, widened_px, places, config)
-    tried = _align_all(one.copies(0, len(offsets)), offsets, seen, config, found.full_gathered[number])
+    tried = _align_all(one.copies(0, len(offsets)), offsets, seen, config, found.full_gathered[number], found.asked_apart[number])
     offset = tried.fit.solution.from_prior
     margin, needed, gathered, count = least.unbind()
     # Written so that what does not tell how far it gathers counts.
@@ -182,7 +194,9 @@ def _likeliest(score: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], cova
     return torch.where(score >= score.max() - AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]
 
 
-def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: TrackerConfig, full_gathered: Float[Tensor, ""]) -> Found:
+def _align_all(
+    copies: Prediction, offsets: Tensor, seen: WindowEvents, config: TrackerConfig, full_gathered: Float[Tensor, ""], asked_apart: Float[Tensor, ""]
+) -> Found:
     """Align copies of one object, each from its own offset, on the events of the object."""
     begin = copies.moved(offsets)
     contours = copies.objects.contours(begin.T_cam_obj, config.contours)
@@ -191,7 +205,7 @@ def _align_all(copies: Prediction, offsets: Tensor, seen: WindowEvents, config: 
     events = seen.repeated(len(offsets))
     observations = select_events(events, index, begin.moving(compensated=True), config.matching.max_events)
     fit = align(copies, contours, index, tight, observations, config, offsets)
-    found = judge_fit(copies, fit, config, torch.zeros_like(tight), full_gathered.expand_as(tight))
+    found = judge_fit(copies, fit, config, torch.zeros_like(tight), full_gathered.expand_as(tight), asked_apart.expand_as(tight))
     return replace(found, elsewhere=torch.ones_like(found.elsewhere))
 
 

@@ -49,6 +49,7 @@ class TrackerState:
         full_share: of the moving contour, what events explain when the object is seen well: rises as fast, but falls slowly.
         full_gathered: the same of how far events near its contours are on them.
         full_count: matched observations when the object is seen well, likewise.
+        full_apart: how far apart the directions of contours with events on them are then (:func:`torchtrack.quality.directions_apart`).
         doubted_s: for how long, less the time it was not, the object has been in doubt of being elsewhere (s).
         T_last_seen: pose of each object when it was last seen well (float64).
         unseen_s: how long ago that was (s).
@@ -70,6 +71,7 @@ class TrackerState:
     full_share: Float[Tensor, "b"]
     full_gathered: Float[Tensor, "b"]
     full_count: Float[Tensor, "b"]
+    full_apart: Float[Tensor, "b"]
     doubted_s: Float[Tensor, "b"]
     T_last_seen: Float[Tensor, "b 4 4"]
     unseen_s: Float[Tensor, "b"]

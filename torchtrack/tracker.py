@@ -32,6 +32,7 @@ from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.polarity_memory import nothing_remembered
 from torchtrack.prediction import Prediction
 from torchtrack.probation import after_probation
+from torchtrack.quality import asked_apart
 from torchtrack.recovery import search_wanted
 from torchtrack.relocation import LastSeen, anywhere, is_lost, is_off_in_depth
 from torchtrack.search import explained_at_rest, judge_fit, rehearse
@@ -108,7 +109,7 @@ class Tracker(TrackedObjects):
         learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
         trust = ModelTrust.none(self.element_groups, velocity) if self.judges else None
         probation = Probation.none(T_cam_obj, covariance)
-        motion, shares, seen = (velocity, velocity, covariance), (nothing,) * 6, (T_cam_obj.clone(), nothing, nothing_remembered(velocity))
+        motion, shares, seen = (velocity, velocity, covariance), (nothing,) * 7, (T_cam_obj.clone(), nothing, nothing_remembered(velocity))
         return TrackerState(T_cam_obj.clone(), *motion, *shares, *seen, times, last_event_us, burst_age_us, probation, learned, trust)
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
@@ -262,7 +263,9 @@ class Tracker(TrackedObjects):
             evidence = Evidence(observations, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
             observations = judged(evidence, self.weigher)
         fit = align(recorded, contours, index, widening, observations, config)
-        found = judge_fit(prediction, fit, config, explained_at_rest(widening), gathered_when_known(doubt, state.full_gathered, config.search))
+        full_gathered = gathered_when_known(doubt, state.full_gathered, config.search)
+        apart = asked_apart(state.full_apart, state.unseen_s, config.quality)
+        found = judge_fit(prediction, fit, config, explained_at_rest(widening), full_gathered, apart)
         # A GPU is waited for: a pose that begins to slip is farther off a window later.
         wanted = questions.ask(is_wanted(doubt, found.score, config), False)
         if wanted.any():

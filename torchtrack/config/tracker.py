@@ -302,6 +302,9 @@ class QualityConfig(Settings):
         True,
         description="A pose by many events that goes on from the one before is not asked for `caught_above`: it was not lost, but is hidden more.",
     )
+    all_directions: bool = Field(
+        True, description="What has not been seen well for a while has to be held by more than parallel lines: those of what hides it are."
+    )
     min_on_contour: int = Field(3, ge=1, description="Observations on the contours of a patch of the image from which these are explained.")
     min_speed_px_s: float = Field(30.0, ge=0, description="Contours moving slower than this across themselves need not fire (px/s).")
     max_step_rotation_rad: float = Field(0.5, gt=0, description="A larger rotation against the prediction within one window has diverged (rad).")

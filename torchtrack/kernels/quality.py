@@ -18,24 +18,28 @@ def shares(
     centre_cam: Array,
     intrinsics: Array,
     targets: Array,
+    directions: Array,
     offsets: Array,
     is_near: Array,
     as_expected: Array,
     settings: QualitySettings,
     measured: Array,
     gathered: Array,
+    apart: Array,
 ) -> None:
-    """Of the contour that should fire, the share with observations on it, and of the observations near it, the share that is on it.
+    """Of the contour that should fire, the share with observations on it; of the observations near it, the share on it, and their directions.
 
     Args:
         points_cam, pixels, normals, mask: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``, ``[b, m]``.
         velocity: ``[b, 6]``, about ``centre_cam [b, 3]``.
-        targets, offsets, is_near, as_expected: of matches: ``[b, 2, n]`` and ``[b, n]``.
+        targets, directions, offsets, is_near, as_expected: of matches: ``[b, 2, n]`` and ``[b, n]``.
         measured, gathered: ``[b]``, filled; not a number where too little is there to tell.
+        apart: ``[b]``, filled: :func:`torchtrack.quality.directions_apart`.
     """
     counts = np.empty((settings.patches**2, 2))
     for b in range(len(mask)):
         gathered[b] = _count(targets[b], offsets[b], is_near[b], as_expected[b], settings, counts)
+        apart[b] = _apart(directions[b], offsets[b], is_near[b], settings.on_contour_px)
         motion, of_lens = drift(velocity[b], centre_cam[b]), lens(intrinsics[b])
         total, explained = 0, 0
         for i in range(mask.shape[1]):
@@ -69,6 +73,19 @@ def _count(targets: Array, offsets: Array, is_near: Array, as_expected: Array, s
             if away < settings.on_contour_px:
                 counts[cell, 0] += as_expected[i]
     return on / near if near >= settings.min_observations else np.nan
+
+
+@kernel()
+def _apart(directions: Array, offsets: Array, is_near: Array, on_contour_px: float) -> float:
+    """How far apart the directions are of what lies on one object's contours."""
+    count, cosine, sine = 0, 0.0, 0.0
+    for i in range(len(offsets)):
+        if is_near[i] and abs(offsets[i]) < on_contour_px:
+            u, v = directions[0, i], directions[1, i]
+            count += 1
+            cosine += u * u - v * v
+            sine += 2.0 * u * v
+    return 0.5 * (count - np.sqrt(cosine * cosine + sine * sine)) / max(count, 1)
 
 
 @kernel(fastmath=FAST)

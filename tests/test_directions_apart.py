@@ -1,0 +1,132 @@
+"""Poses that parallel lines alone hold: how it is told, when it is asked, and what becomes of such a pose."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from test_quality import matches_at
+from tracked_boxes import started
+
+from torchtrack.config.tracker import QualityConfig, TrackerConfig
+from torchtrack.quality import PARALLEL_AFTER_S, Status, asked_apart, directions_apart, held_all_ways
+
+CONFIG = QualityConfig()
+
+
+def matches_of(angles_rad, **changes):
+    """Observations on contours whose normals have these angles, of one object for each row."""
+    angles_rad = torch.as_tensor(angles_rad, dtype=torch.float64)
+    directions = torch.stack([angles_rad.cos(), angles_rad.sin()], -1)
+    return replace(matches_at(torch.zeros_like(directions)), directions=directions, **changes)
+
+
+def held(unseen_s=0.1, apart=0.3, full_apart=0.3, config=CONFIG):
+    asked = asked_apart(torch.tensor([full_apart]), torch.tensor([unseen_s]), config)
+    return float(held_all_ways(torch.tensor([apart]), asked))
+
+
+# ---- how far apart
+
+
+@pytest.mark.parametrize(
+    ("angles_deg", "expected"),
+    [
+        ([30.0, 30.0, 210.0, 30.0], 0.0),
+        ([0.0, 90.0, 180.0, 270.0], 0.5),
+        ([0.0, 60.0, 120.0], 0.5),
+        ([0.0, 0.0, 0.0, 90.0], 0.25),
+        ([10.0, 20.0], 0.5 * (1 - 0.984807753)),
+    ],
+)
+def test_directions_are_apart_as_lines_are(angles_deg, expected):
+    apart = directions_apart(matches_of(torch.tensor([angles_deg]).deg2rad()))
+    torch.testing.assert_close(apart, torch.tensor([expected], dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+def test_they_are_the_smaller_eigenvalue_of_their_scatter():
+    angles_rad = torch.rand(3, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    matches = matches_of(angles_rad)
+    scatter = torch.einsum("bni,bnj->bij", matches.directions, matches.directions) / 40
+    torch.testing.assert_close(directions_apart(matches), torch.linalg.eigvalsh(scatter)[:, 0])
+
+
+def test_only_what_lies_on_a_contour_counts():
+    angles_rad = torch.tensor([[0.0, 0.0, 1.5, 1.5]])
+    off = matches_of(angles_rad, offsets=torch.tensor([[0.0, 0.5, 0.9, -3.0]], dtype=torch.float64))
+    nowhere = matches_of(angles_rad, near=torch.tensor([[True, True, False, False]]))
+    for matches in (off, nowhere, matches_of(angles_rad, near=torch.zeros(1, 4, dtype=torch.bool))):
+        assert directions_apart(matches).tolist() == [0.0]
+
+
+# ---- when it is asked, and how much
+
+
+def test_what_is_seen_well_or_was_until_now_is_asked_nothing():
+    assert held(unseen_s=0.0, apart=0.0) == held(unseen_s=0.9 * PARALLEL_AFTER_S, apart=0.0) == 1.0
+    assert held(unseen_s=1.1 * PARALLEL_AFTER_S, apart=0.0) == 0.0
+    assert held(apart=0.0, config=QualityConfig(all_directions=False)) == 1.0
+
+
+def test_what_fires_along_parallel_edges_as_a_rule_may_do_so_for_ever():
+    assert held(apart=0.0, full_apart=0.0) == 1.0
+    assert held(apart=0.02, full_apart=0.02) == 1.0
+
+
+def test_as_much_is_asked_as_there_is_when_seen_well_and_less_the_longer_ago_that_was():
+    assert held(apart=0.3) == held(apart=0.15) == 1.0
+    assert held(apart=0.01) == 0.0
+    assert 0.0 < held(apart=0.05) < 1.0
+    assert held(apart=0.05, unseen_s=0.06) < held(apart=0.05, unseen_s=0.5) < held(apart=0.05, unseen_s=3.0) == 1.0
+
+
+# ---- in the tracker
+
+
+def of_upright_edges(events, contours):
+    """Those of the events that lie nearest to contours that are upright in the image."""
+    shown = contours.mask[0]
+    nearest = torch.cdist(torch.stack([events.x, events.y], -1).double(), contours.pixels[0][shown].double()).argmin(1)
+    return events[contours.normals[0][shown][nearest][:, 0].abs() > 0.99]
+
+
+def last_window(unseen_s, full_apart, *, all_directions=True, upright=False):
+    """State and result of the next window of a box that is seen well as a rule, of which only upright edges may be seen."""
+    config = TrackerConfig(quality=QualityConfig(all_directions=all_directions))
+    tracker, state, result, (events, end_us), _ = started(config=config)
+    if upright:
+        events = of_upright_edges(events, result.contours)
+    well = dict.fromkeys(("full_share", "usual_score", "score"), torch.full((1,), 0.9))
+    state = replace(state, unseen_s=torch.full((1,), unseen_s), full_apart=torch.full((1,), full_apart), **well)
+    return tracker.step(state, events, end_us)
+
+
+def test_how_far_apart_is_remembered_of_what_is_seen_well():
+    _, state, *_ = started()
+    assert 0.1 < float(state.full_apart) < 0.5
+    after, _ = last_window(0.0, 0.0)
+    assert float(after.unseen_s) == 0 and 0 < float(after.full_apart) < 0.1
+    partly, _ = last_window(0.0, 0.0, upright=True)
+    assert float(partly.unseen_s) > 0
+    assert float(partly.full_apart) == 0
+
+
+def test_a_pose_that_only_parallel_lines_hold_explains_nothing_while_the_object_may_be_hidden():
+    _, told = last_window(0.1, 0.4, upright=True)
+    _, not_asked = last_window(0.1, 0.4, upright=True, all_directions=False)
+    assert float(told.quality) < 0.5 * float(not_asked.quality)
+    assert int(told.status) >= int(not_asked.status)
+    assert int(told.observation_count) >= 30
+
+
+@pytest.mark.parametrize(("unseen_s", "full_apart"), [(0.0, 0.4), (0.1, 0.0)])
+def test_it_does_where_the_object_was_just_seen_well_or_never_fires_otherwise(unseen_s, full_apart):
+    _, told = last_window(unseen_s, full_apart, upright=True)
+    _, not_asked = last_window(unseen_s, full_apart, upright=True, all_directions=False)
+    assert float(told.quality) == float(not_asked.quality) > 0
+    assert told.status.tolist() == not_asked.status.tolist()
+
+
+def test_all_of_a_box_holds_it_all_ways():
+    _, told = last_window(0.1, 0.4)
+    assert int(told.status) == Status.TRACKING
+    assert float(told.quality) > 0.7
