@@ -147,9 +147,7 @@ def random_find(tracker, prediction, dtype):
     measured[0], measured[1], measured[5], gathered[2] = 0.05, 0.3, torch.nan, torch.nan
     elsewhere = torch.arange(OBJECTS) % 3 == 0
     full_gathered, apart, asked_apart = (uniform(OBJECTS, seed=seed).to(dtype) for seed in (26, 30, 31))
-    return Found(
-        Fit(solution, contours, matches), measured, torch.ones_like(measured), count, gathered, full_gathered, apart, asked_apart, elsewhere
-    )
+    return Found(Fit(solution, contours, matches), measured, torch.ones_like(measured), count, gathered, full_gathered, apart, asked_apart, elsewhere)
 
 
 def conclusions(config, dtype, spoil=lambda found: None):
