@@ -62,7 +62,7 @@ def _paper() -> TrackerConfig:
         solver=SolverConfig(iterations=5, loss="none", damping=1e-3, prior=False),
         motion=MotionConfig(model="hold", without_events="hold"),
         learning=LearningConfig(points=0),
-        quality=QualityConfig(min_observations=6, min_on_contour=1),
+        quality=QualityConfig(min_observations=6, min_on_contour=1, all_directions=False),
     )
 
 
@@ -74,6 +74,7 @@ def _lines(loss: Literal["tukey", "none"]) -> TrackerConfig:
         matching=MatchingConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500, learned_trust="none"),
         solver=SolverConfig(iterations=3, loss=loss, damping=1e-4, prior=False),
         learning=LearningConfig(points=0),
+        quality=QualityConfig(all_directions=False),
     )
 
 
@@ -100,7 +101,7 @@ def _nns() -> TrackerConfig:
         ),
         solver=SolverConfig(iterations=2),
         learning=LearningConfig(points=0),
-        quality=QualityConfig(min_observations=10, min_on_contour=1),
+        quality=QualityConfig(min_observations=10, min_on_contour=1, all_directions=False),
     )
 
 
