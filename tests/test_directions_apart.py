@@ -22,7 +22,7 @@ def matches_of(angles_rad, **changes):
 
 def held(unseen_s=0.1, apart=0.3, full_apart=0.3, config=CONFIG):
     asked = asked_apart(torch.tensor([full_apart]), torch.tensor([unseen_s]), config)
-    return float(held_all_ways(torch.tensor([apart]), asked))
+    return 1.0 if asked is None else float(held_all_ways(torch.tensor([apart]), asked))
 
 
 # ---- how far apart

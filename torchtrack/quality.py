@@ -17,6 +17,7 @@ from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import QualitySettings
 from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SMEAR_PX, Matches, on_and_around, patch, patch_sums
+from torchtrack.readback import none_of
 
 # A patch explains its contours when this share of the observations near them are on them.
 _LEAST_SHARE = 0.5
@@ -124,24 +125,25 @@ def directions_apart(matches: Matches) -> Float[Tensor, "b"]:
     The smaller eigenvalue of the mean of ``n n^T`` over their unit normals n, by the resultant of these at twice their angles
     (Mardia and Jupp, Directional Statistics, 1.3).
     """
-    on = (matches.near & (matches.offsets.abs() < ON_CONTOUR_PX)).to(matches.offsets.dtype)
+    on = on_and_around(matches.offsets, matches.near)[:, 0]
     u, v = matches.directions.detach().unbind(-1)
     doubled = torch.stack([u * u - v * v, 2 * u * v], 1)
     count = on.sum(-1)
     return 0.5 * (count - (doubled * on[:, None]).sum(-1).norm(dim=1)) / count.clamp(min=1)
 
 
-def asked_apart(full_apart: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], config: QualityConfig) -> Float[Tensor, "b"]:
+def asked_apart(full_apart: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], config: QualityConfig) -> Float[Tensor, "b"] | None:
     """How far apart the directions of an object's contours should be, which was not seen well for a while: as far as when it was.
 
-    Less and less: an object may go on along its own edges, of which only those across its way fire then.
+    Less and less: an object may go on along its own edges, of which only those across its way fire then. None where it is certain
+    that nothing is asked of any object, as a rule.
 
     Args:
         full_apart: how far apart they are when it is seen well; zero, for nothing, where that is not known.
         unseen_s: how long ago that was (s).
     """
     asks = (unseen_s >= PARALLEL_AFTER_S) & config.all_directions
-    return torch.where(asks, full_apart * torch.exp(unseen_s / -_ASKED_S), 0)
+    return None if none_of(asks) else torch.where(asks, full_apart * torch.exp(unseen_s / -_ASKED_S), 0)
 
 
 def held_all_ways(apart: Float[Tensor, "b"], asked: Float[Tensor, "b"]) -> Float[Tensor, "b"]:

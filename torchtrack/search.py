@@ -85,9 +85,10 @@ def judge_fit(
     measured, gathered, apart = quality.shares(fit.contours, fit.matches, moving, prediction.objects.image_size, config.quality)
     # Of what does not move, events are noise.
     gathered = torch.where(measured.isnan(), torch.nan, gathered) if config.search.by_gathering else torch.full_like(measured, torch.nan)
+    if asked_apart is not None:
+        measured = measured * quality.held_all_ways(apart, asked_apart)
     nothing = torch.zeros_like(measured)
     full_gathered, asked_apart = (nothing if value is None else value for value in (full_gathered, asked_apart))
-    measured = measured * quality.held_all_ways(apart, asked_apart)
     return Found(fit, measured, at_rest, fit.matches.mask.sum(-1), gathered, full_gathered, apart, asked_apart, nothing.bool())
 
 
