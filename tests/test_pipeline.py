@@ -287,7 +287,7 @@ def test_the_papers_settings_run_on_a_recording(lbracket):
     T_start = truth.at(torch.tensor([start_us]))[0]
     short = events.slice_time(start_us, start_us + 50_000)
     results = followed(model, camera, short, T_start, config=preset("paper"), start_us=start_us)
-    assert len(results) == 5
+    assert len(results) == 17
     assert torch.isfinite(torch.cat([result.T_cam_obj for result in results])).all()
     assert any(result.corners.has_flow.any() for result in results)
     assert any(int(result.observation_count) > 0 for result in results)

@@ -54,6 +54,7 @@ class TrackerState:
         T_last_seen: pose of each object when it was last seen well (float64).
         unseen_s: how long ago that was (s).
         darker_outside: which side of each object's contours is the darker one, by the octant that they face: :mod:`torchtrack.polarity_memory`.
+        late_share: how many of the events on its moving contours come late in their bursts: :mod:`torchtrack.slow_circuits`.
         t_us: end of the last window of each stream (µs).
         last_event_us: time of the newest event of every sensor pixel (µs).
         burst_age_us: how long ago the newest burst of every sensor pixel and polarity began (µs).
@@ -76,6 +77,7 @@ class TrackerState:
     T_last_seen: Float[Tensor, "b 4 4"]
     unseen_s: Float[Tensor, "b"]
     darker_outside: Float[Tensor, "b 8"]
+    late_share: Float[Tensor, "b"]
     t_us: Int[Tensor, "s"]
     last_event_us: Int[Tensor, "s h w"]
     burst_age_us: Int[Tensor, "s 2 h w"]

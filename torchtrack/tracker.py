@@ -32,13 +32,14 @@ from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.polarity_memory import nothing_remembered
 from torchtrack.prediction import Prediction
 from torchtrack.probation import after_probation
-from torchtrack.quality import asked_apart
+from torchtrack.quality import Status, asked_apart
 from torchtrack.recovery import search_wanted
 from torchtrack.relocation import LastSeen, anywhere, is_lost, is_off_in_depth
 from torchtrack.search import explained_at_rest, judge_fit, rehearse
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.sensors import farthest_event_px
 from torchtrack.setup_check import check_start
+from torchtrack.slow_circuits import dated, late_share_after, unknown_circuits
 from torchtrack.speed_limit import largest_speed, limit_speed
 from torchtrack.state import Probation, StepResult, TrackerState, choose_rows
 from torchtrack.time_surface import empty_last_event, update_last_event
@@ -109,7 +110,11 @@ class Tracker(TrackedObjects):
         learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
         trust = ModelTrust.none(self.element_groups, velocity) if self.judges else None
         probation = Probation.none(T_cam_obj, covariance)
-        motion, shares, seen = (velocity, velocity, covariance), (nothing,) * 7, (T_cam_obj.clone(), nothing, nothing_remembered(velocity))
+        motion, shares, seen = (
+            (velocity, velocity, covariance),
+            (nothing,) * 7,
+            (T_cam_obj.clone(), nothing, nothing_remembered(velocity), unknown_circuits(nothing)),
+        )
         return TrackerState(T_cam_obj.clone(), *motion, *shares, *seen, times, last_event_us, burst_age_us, probation, learned, trust)
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
@@ -262,7 +267,7 @@ class Tracker(TrackedObjects):
         if self.weigher is not None:
             evidence = Evidence(observations, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
             observations = judged(evidence, self.weigher)
-        fit = align(recorded, contours, index, widening, observations, config)
+        fit = align(recorded, contours, index, widening, dated(observations, state.late_share, config.matching), config)
         full_gathered = gathered_when_known(doubt, state.full_gathered, config.search)
         apart = asked_apart(state.full_apart, state.unseen_s, config.quality)
         found = judge_fit(prediction, fit, config, explained_at_rest(widening), full_gathered, apart)
@@ -276,7 +281,9 @@ class Tracker(TrackedObjects):
         if config.search.probation:
             next_state, result = after_probation(state, next_state, result, prediction, widening, config)
         next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self.on_surfaces, learns), config)
-        return replace(next_state, t_us=t_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
+        sure = (result.status == int(Status.TRACKING)) & ~found.elsewhere
+        late_share = late_share_after(state.late_share, observations, contours, fit.matches, prediction, sure, config.matching)
+        return replace(next_state, late_share=late_share, t_us=t_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""

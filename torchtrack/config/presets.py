@@ -41,16 +41,19 @@ def _learned() -> TrackerConfig:
 
 
 def _paper() -> TrackerConfig:
-    """Corners alone, matched along their flow with the splatted boundary, from the last pose, without a prior."""
+    """Corners alone, matched along their flow with the splatted boundary, from the last pose, without a prior.
+
+    Where the paper is silent, as its idea works best: windows are so short that a pose is found before its edges are out of
+    reach, distances count across edges, robustly, and the boundary is extracted anew in each round of matching.
+    """
     return TrackerConfig(
-        window=WindowConfig(duration_us=10_000),
+        window=WindowConfig(duration_us=3_000),
         surface=SurfaceConfig(margin_px=16),
-        corners=CornerConfig(max_corners=200, snap=False, fresh_only=False),
+        corners=CornerConfig(max_corners=400, cell_px=5),
         flow=FlowConfig(radius_px=6, iterations=10),
-        contours=ContourConfig(source="splat", texture=False, creases=False),
+        contours=ContourConfig(source="splat", texture=False, creases=False, refresh_rounds=(0, 1, 2)),
         matching=MatchingConfig(
             along_flow=True,
-            residual="point",
             gates_px=(8.0, 8.0, 8.0),
             motion_compensation=False,
             max_events=0,
@@ -59,7 +62,7 @@ def _paper() -> TrackerConfig:
             polarity_memory_s=0.0,
             learned_trust="none",
         ),
-        solver=SolverConfig(iterations=5, loss="none", damping=1e-3, prior=False),
+        solver=SolverConfig(iterations=5, damping=1e-3, prior=False),
         motion=MotionConfig(model="hold", without_events="hold"),
         learning=LearningConfig(points=0),
         quality=QualityConfig(min_observations=6, min_on_contour=1, all_directions=False),

@@ -144,6 +144,9 @@ class MatchingConfig(Settings):
     burst_px: float = Field(
         1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow circuits fire on (px)."
     )
+    adaptive_bursts: bool = Field(
+        True, description="Less so, the less events are seen to come late: the circuits of a sensor in good light are fast."
+    )
     burst_us: int = Field(10_000, ge=0, le=30_000, description="A burst is what a pixel fires of one polarity in this time (µs); 0 for no bursts.")
     learned_trust: Literal["none", "limbs", "all"] = Field(
         "limbs", description="Which observations to trust as a small network has learned from the events around them: those of smooth limbs, or all."
@@ -335,6 +338,15 @@ class TrackerConfig(Settings):
     search: SearchConfig = SearchConfig()
     quality: QualityConfig = QualityConfig()
     smoothing: SmoothingConfig = SmoothingConfig()
+
+    @model_validator(mode="after")
+    def _observes_something(self) -> "TrackerConfig":
+        if not (self.corners.max_corners or self.matching.max_events):
+            raise ValueError(
+                "nothing would be observed: corners.max_corners and matching.max_events are both 0; "
+                "set matching.max_events, such as to 1500, or for corners alone corners.max_corners, such as to 400"
+            )
+        return self
 
     @model_validator(mode="after")
     def _smoothed_by_a_filter(self) -> "TrackerConfig":

@@ -1,0 +1,77 @@
+"""How slow the circuits of a sensor are, told by how late in their bursts the events on contours come.
+
+In good light a pixel fires while an edge passes it, which is over once the edge has moved on by its blur; in poor light circuits
+fire on for several pixels more. To date late events back is right of these alone: of those, they are as much of the edge as early
+ones are, and without them it seems to lie before where it is. It is the sensor's, and the light's, so that it is remembered.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.linalg import vecdot
+
+from torchtrack.config.tracker import MatchingConfig
+from torchtrack.contours import Contours
+from torchtrack.matching import SMEAR_PX, Matches
+from torchtrack.observations import Observations
+from torchtrack.prediction import Prediction
+
+# An event is late once its edge has moved on by this much since the first of its burst (px). Of an edge that hardly comes farther
+# while a burst lasts, nothing is told.
+_LATE_PX, _FAR_ENOUGH_PX = 2.0, 2.5
+# Shares of events that are late up to which circuits are fast, and from which they are slow: measured, 0.01 to 0.1, and 0.1 to 0.35.
+_FAST, _SLOW = 0.07, 0.12
+# Events that are remembered: some twenty windows of them.
+_REMEMBERED = 20_000.0
+
+
+def unknown_circuits(like: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
+    """Share of late events before any were seen: as of slow circuits, whose late events do more harm."""
+    return torch.full_like(like, _SLOW)
+
+
+def slowness(late_share: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
+    """From 0, of circuits that are fast, to 1, of slow ones."""
+    return ((late_share - _FAST) / (_SLOW - _FAST)).clamp(0, 1)
+
+
+def dated(observations: Observations, late_share: Float[Tensor, "b"], config: MatchingConfig) -> Observations:
+    """The observations as late in their bursts as counts: less so, and then not dated back so far, the faster circuits are."""
+    if not _tells(config):
+        return observations
+    return replace(observations, into_burst_s=observations.into_burst_s * slowness(late_share)[:, None])
+
+
+@torch.no_grad()
+def late_share_after(
+    late_share: Float[Tensor, "b"],
+    observations: Observations,
+    contours: Contours,
+    matches: Matches,
+    prediction: Prediction,
+    known: Bool[Tensor, "b"],
+    config: MatchingConfig,
+) -> Float[Tensor, "b"]:
+    """Share of the events on moving contours that are late, with a window more.
+
+    Args:
+        late_share: before the window.
+        observations: as they were, before :func:`dated`.
+        contours: that were matched, at the predicted pose and moving with it.
+        known: objects whose pose is sure: of the others nothing is told.
+    """
+    if not _tells(config):
+        return late_share
+    speed_px_s = vecdot(contours.normals, prediction.contour_velocity(contours)).abs().gather(1, matches.contour)
+    around = matches.near & (matches.offsets.abs() < SMEAR_PX) & (observations.polarity != 0)
+    tells = around & known[:, None] & (speed_px_s > _FAR_ENOUGH_PX / (1e-6 * config.burst_us))
+    is_late = tells & (observations.into_burst_s * speed_px_s > _LATE_PX)
+    late, count = (which.sum(1, dtype=late_share.dtype) for which in (is_late, tells))
+    return torch.lerp(late_share, late / count.clamp(min=1), count / (count + _REMEMBERED))
+
+
+def _tells(config: MatchingConfig) -> bool:
+    """Whether there is anything to tell."""
+    return config.adaptive_bursts and config.burst_us > 0 and config.max_events > 0
