@@ -13,6 +13,7 @@ from torchtrack.slow_circuits import dated, late_share_after, slowness, unknown_
 
 # Bursts so long that what moves as the boxes of these tests do comes far enough.
 LONG = MatchingConfig(burst_us=30_000)
+SEEN = torch.zeros(1)
 OFF = [LONG.model_copy(update=change) for change in ({"adaptive_bursts": False}, {"burst_us": 0}, {"max_events": 0})]
 
 
@@ -71,16 +72,23 @@ def test_from_fast_circuits_to_slow_ones():
 def test_of_fast_circuits_no_event_is_late():
     _, _, observations, _ = observed()
     observations = replace(observations, into_burst_s=torch.rand(observations.age_s.shape, generator=torch.Generator().manual_seed(0)))
-    assert not dated(observations, torch.zeros(1), LONG).into_burst_s.any()
-    assert torch.equal(dated(observations, torch.ones(1), LONG).into_burst_s, observations.into_burst_s)
+    assert not dated(observations, torch.zeros(1), SEEN, LONG).into_burst_s.any()
+    assert torch.equal(dated(observations, torch.ones(1), SEEN, LONG).into_burst_s, observations.into_burst_s)
     for config in OFF:
-        assert dated(observations, torch.zeros(1), config) is observations
+        assert dated(observations, torch.zeros(1), SEEN, config) is observations
+
+
+def test_of_what_is_not_seen_well_all_are_late():
+    _, _, observations, _ = observed()
+    observations = replace(observations, into_burst_s=torch.ones_like(observations.age_s))
+    shares = [float(dated(observations, torch.zeros(1), torch.full((1,), unseen_s), LONG).into_burst_s.mean()) for unseen_s in (0.0, 0.005, 1.0)]
+    assert shares[0] == 0 and 0 < shares[1] < 1 and shares[2] == 1
 
 
 def test_each_object_has_its_own():
     _, _, observations, _ = observed()
     two = replace(observations, into_burst_s=torch.ones(2, observations.age_s.shape[1]))
-    assert dated(two, torch.tensor([0.0, 1.0]), LONG).into_burst_s.sum(1).tolist() == [0.0, observations.age_s.shape[1]]
+    assert dated(two, torch.tensor([0.0, 1.0]), torch.zeros(2), LONG).into_burst_s.sum(1).tolist() == [0.0, observations.age_s.shape[1]]
 
 
 # ---- in the tracker
@@ -100,6 +108,6 @@ def test_with_fast_circuits_poses_are_as_without_bursts():
         again = replace(events, t_us=events.t_us + 300)
         both = replace(events, **{name: torch.cat([value, getattr(again, name)]) for name, value in vars(events).items() if torch.is_tensor(value)})
         both = both[both.t_us.sort(stable=True).indices].slice_time(end_us - 5_000, end_us)
-        _, result = tracker.step(replace(state, late_share=torch.zeros(1), T_cam_obj=started()[1].T_cam_obj), both, end_us)
+        _, result = tracker.step(replace(state, late_share=torch.zeros(1), unseen_s=torch.zeros(1), T_cam_obj=started()[1].T_cam_obj), both, end_us)
         found.append(poses_of([result]))
     torch.testing.assert_close(*found, atol=2e-5, rtol=0)

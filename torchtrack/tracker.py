@@ -267,7 +267,8 @@ class Tracker(TrackedObjects):
         if self.weigher is not None:
             evidence = Evidence(observations, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
             observations = judged(evidence, self.weigher)
-        fit = align(recorded, contours, index, widening, dated(observations, state.late_share, config.matching), config)
+        as_late = dated(observations, state.late_share, state.unseen_s, config.matching)
+        fit = align(recorded, contours, index, widening, as_late, config)
         full_gathered = gathered_when_known(doubt, state.full_gathered, config.search)
         apart = asked_apart(state.full_apart, state.unseen_s, config.quality)
         found = judge_fit(prediction, fit, config, explained_at_rest(widening), full_gathered, apart)
