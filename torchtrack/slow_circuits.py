@@ -1,8 +1,9 @@
 """How slow the circuits of a sensor are, told by how late in their bursts the events on contours come.
 
 In good light a pixel fires while an edge passes it, which is over once the edge has moved on by its blur; in poor light circuits
-fire on for several pixels more. To date late events back is right of these alone: of those, they are as much of the edge as early
-ones are, and without them it seems to lie before where it is. It is the sensor's, and the light's, so that it is remembered.
+fire on for several pixels more. To date late events back is right of slow circuits alone: of fast ones they are as much of the edge
+as early ones are, and without them it seems to lie before where it is. How slow they are is the sensor's, and the light's: it is
+remembered.
 """
 
 from dataclasses import replace
