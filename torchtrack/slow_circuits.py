@@ -24,8 +24,6 @@ from torchtrack.prediction import Prediction
 _LATE_PX, _FAR_ENOUGH_PX = 2.0, 2.5
 # Shares of events that are late up to which circuits are fast, and from which they are slow: measured, 0.01 to 0.1, and 0.1 to 0.35.
 _FAST, _SLOW = 0.07, 0.12
-# So much of the time counts where circuits are fast. With less, poses are a little more exact, but they err more when a bar passes.
-_LEAST = 0.5
 # What was not seen well for so long (s) is dated back in full.
 _UNSEEN_S = 0.02
 # Events that are remembered: some twenty windows of them.
@@ -43,7 +41,7 @@ def slowness(late_share: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
 
 
 def dated(observations: Observations, late_share: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], config: MatchingConfig) -> Observations:
-    """The observations as late in their bursts as counts: down to half of it, and then not dated back so far, the faster circuits are.
+    """The observations as late in their bursts as counts: less so, and then not dated back so far, the faster circuits are.
 
     Of what is not seen well all are dated back: less exact, but events of what moves otherwise gather less.
 
@@ -52,8 +50,7 @@ def dated(observations: Observations, late_share: Float[Tensor, "b"], unseen_s: 
     """
     if not _tells(config):
         return observations
-    fully = torch.maximum(slowness(late_share), (unseen_s / _UNSEEN_S).clamp(max=1))
-    counts = _LEAST + (1 - _LEAST) * fully
+    counts = torch.maximum(slowness(late_share), (unseen_s / _UNSEEN_S).clamp(max=1))
     return replace(observations, into_burst_s=observations.into_burst_s * counts[:, None])
 
 
