@@ -145,7 +145,7 @@ class MatchingConfig(Settings):
         1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow circuits fire on (px)."
     )
     adaptive_bursts: bool = Field(
-        False, description="Less so, the less events are seen to come late: the circuits of a sensor in good light are fast."
+        False, description="Date them back less far, the fewer are seen to come late: in good light the circuits of a sensor are fast."
     )
     burst_us: int = Field(10_000, ge=0, le=30_000, description="A burst is what a pixel fires of one polarity in this time (µs); 0 for no bursts.")
     learned_trust: Literal["none", "limbs", "all"] = Field(
