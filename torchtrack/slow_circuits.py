@@ -15,7 +15,7 @@ from torch.linalg import vecdot
 
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.contours import Contours
-from torchtrack.matching import SMEAR_PX, Matches
+from torchtrack.matching import Matches, on_and_around
 from torchtrack.observations import Observations
 from torchtrack.prediction import Prediction
 
@@ -75,7 +75,7 @@ def late_share_after(
     if not _tells(config):
         return late_share
     speed_px_s = vecdot(contours.normals, prediction.contour_velocity(contours)).abs().gather(1, matches.contour)
-    around = matches.near & (matches.offsets.abs() < SMEAR_PX) & (observations.polarity != 0)
+    around = (on_and_around(matches.offsets, matches.near)[:, 1] > 0) & (observations.polarity != 0)
     tells = around & known[:, None] & (speed_px_s > _FAR_ENOUGH_PX / (1e-6 * config.burst_us))
     is_late = tells & (observations.into_burst_s * speed_px_s > _LATE_PX)
     late, count = (which.sum(1, dtype=late_share.dtype) for which in (is_late, tells))

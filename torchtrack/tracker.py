@@ -282,9 +282,11 @@ class Tracker(TrackedObjects):
         if config.search.probation:
             next_state, result = after_probation(state, next_state, result, prediction, widening, config)
         next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self.on_surfaces, learns), config)
-        sure = (result.status == int(Status.TRACKING)) & ~found.elsewhere
-        late_share = late_share_after(state.late_share, observations, contours, fit.matches, prediction, sure, config.matching)
-        return replace(next_state, late_share=late_share, t_us=t_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
+        if config.matching.adaptive_bursts:
+            sure = (result.status == int(Status.TRACKING)) & ~found.elsewhere
+            late_share = late_share_after(state.late_share, observations, contours, fit.matches, prediction, sure, config.matching)
+            next_state = replace(next_state, late_share=late_share)
+        return replace(next_state, t_us=t_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""
