@@ -15,7 +15,8 @@ from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, wind
 
 from torchtrack import Tracker, compiled, readback
 from torchtrack.config.run import RunConfig
-from torchtrack.config.tracker import LearningConfig, ModelTrustConfig, SearchConfig, TrackerConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import LearningConfig, ModelTrustConfig, TrackerConfig
 from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch, concatenate
 from torchtrack.runner import run

@@ -10,7 +10,8 @@ from tracked_boxes import SCENES, follow
 
 from torchtrack import Tracker, readback
 from torchtrack.compiled import CompiledStep
-from torchtrack.config.tracker import LearningConfig, SearchConfig, TrackerConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import LearningConfig, TrackerConfig
 from torchtrack.quality import Status
 
 COUNT = 8

@@ -7,7 +7,8 @@ import torch
 from test_quality import matches_at
 from tracked_boxes import started
 
-from torchtrack.config.tracker import QualityConfig, TrackerConfig
+from torchtrack.config.search import QualityConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.quality import PARALLEL_AFTER_S, Status, asked_apart, directions_apart, held_all_ways
 
 CONFIG = QualityConfig()

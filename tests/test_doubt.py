@@ -8,7 +8,8 @@ from helpers import SMALL_CAMERA, box_model, pose, pose_errors
 from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, windows
 
 from torchtrack import Tracker
-from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig, SearchConfig, TrackerConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig, TrackerConfig
 from torchtrack.doubt import Doubt, drifted, gathered_when_known, has_strayed, in_doubt, is_adrift, is_due, is_wanted, less_certain
 from torchtrack.events import concatenate
 from torchtrack.lie import retract_about

@@ -5,7 +5,8 @@ import torch
 from helpers import SMALL_CAMERA, generator, pose_errors
 from tracked_boxes import in_motion
 
-from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.event_image import event_density
 from torchtrack.hypotheses import draw_offsets, mark, promising
 from torchtrack.views import outlines_at, thinned

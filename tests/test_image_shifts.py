@@ -6,7 +6,8 @@ from both_ways import both_ways
 from helpers import generator
 from tracked_boxes import in_motion
 
-from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.image_shifts import _peaks, shifted
 from torchtrack.views import outlines_at
 

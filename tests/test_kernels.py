@@ -12,7 +12,8 @@ from test_visibility import ball, l_prism
 
 from torchtrack.bursts import LONG_AGO_US, update_bursts
 from torchtrack.camera import undistortion_table
-from torchtrack.config.tracker import ContourConfig, QualityConfig
+from torchtrack.config.search import QualityConfig
+from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contour_model import ContourKind, group_by_model
 from torchtrack.contours import assemble, mesh_contours, reproject

@@ -9,7 +9,8 @@ from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, windows
 
 from torchtrack import Tracker
 from torchtrack.camera import project
-from torchtrack.config.tracker import CornerConfig, SearchConfig, TrackerConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.lie import difference_about, retract_about, rotation_angle_deg, transform_points
 from torchtrack.motion import Acceleration
 from torchtrack.object_model.symmetry import symmetry_planes

@@ -8,7 +8,8 @@ import torch
 from helpers import pose
 from tracked_boxes import assert_same, started, tracker_of
 
-from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.events import EventBatch
 from torchtrack.probation import after_probation
 from torchtrack.quality import Status

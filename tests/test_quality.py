@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchtrack.config.tracker import QualityConfig
+from torchtrack.config.search import QualityConfig
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours
 from torchtrack.matching import Matches

@@ -8,7 +8,8 @@ from helpers import IMAGE_SIZE, box_model, contours_at, generator, random_events
 from tracked_boxes import SCENES, assert_same, follow, started
 
 from torchtrack import Tracker, readback, window_parts
-from torchtrack.config.tracker import CornerConfig, SearchConfig, SurfaceConfig, TrackerConfig, WindowConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig, WindowConfig
 from torchtrack.constants import constant
 from torchtrack.contour_index import index_contours
 from torchtrack.corners import detect_corners

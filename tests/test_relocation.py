@@ -8,7 +8,8 @@ from helpers import SMALL_CAMERA, box_model, pose
 from tracked_boxes import follow, in_motion, moving_box, started, windows
 
 from torchtrack import Tracker
-from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
 from torchtrack.recovery import _least

@@ -9,7 +9,8 @@ from helpers import SMALL_CAMERA, box_model, pose, pose_errors, random_events
 from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, poses_of, started, tensors_of, windows
 
 from torchtrack import Tracker
-from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.events import concatenate
 from torchtrack.kernels.switch import numba_is_installed
 from torchtrack.lie import retract_about

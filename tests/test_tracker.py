@@ -20,12 +20,11 @@ from tracked_boxes import (
 
 from torchtrack import Tracker, preset
 from torchtrack.camera import project
+from torchtrack.config.search import QualityConfig, SearchConfig
 from torchtrack.config.tracker import (
     CornerConfig,
     FlowConfig,
     MotionConfig,
-    QualityConfig,
-    SearchConfig,
     TrackerConfig,
 )
 from torchtrack.errors import ModelError, PoseError

@@ -9,12 +9,12 @@ from pydantic import ValidationError
 from tracked_boxes import HOLD, SAME_POSE, WINDOW_US, assert_same, follow, moving_box, poses_of, started, tracker_of, windows
 
 from torchtrack import Tracker, preset
+from torchtrack.config.search import QualityConfig
 from torchtrack.config.tracker import (
     ContourConfig,
     CornerConfig,
     MatchingConfig,
     MotionConfig,
-    QualityConfig,
     SolverConfig,
     SurfaceConfig,
     TrackerConfig,

@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.tracker import SearchConfig, TrackerConfig
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.motion import rim_and_centre
 from torchtrack.prediction import Prediction
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.tracker import QualityConfig
+from torchtrack.config.search import QualityConfig
 from torchtrack.constants import constant
 from torchtrack.contours import Contours
 from torchtrack.image_motion import MovingObjects, pixel_velocity

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Literal, get_args
 
+from torchtrack.config.search import QualityConfig, SearchConfig
 from torchtrack.config.tracker import (
     ContourConfig,
     CornerConfig,
@@ -10,8 +11,6 @@ from torchtrack.config.tracker import (
     LearningConfig,
     MatchingConfig,
     MotionConfig,
-    QualityConfig,
-    SearchConfig,
     SmoothingConfig,
     SolverConfig,
     SurfaceConfig,

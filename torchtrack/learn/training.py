@@ -13,8 +13,9 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.utils.data import DataLoader
 
 from torchtrack.config.presets import preset
+from torchtrack.config.search import SearchConfig
 from torchtrack.config.settings import Settings
-from torchtrack.config.tracker import SearchConfig, TrackerConfig, WindowConfig
+from torchtrack.config.tracker import TrackerConfig, WindowConfig
 from torchtrack.evidence import Evidence
 from torchtrack.learn.augmentation import AugmentationConfig
 from torchtrack.learn.dataset import ClipConfig, SequenceBatches, WindowDataset
