@@ -26,10 +26,8 @@ SEARCHED = TrackerConfig(
 )
 NEVER_ADRIFT = TrackerConfig(corners=CornerConfig(max_corners=32), matching=FORGETFUL, motion=TURNING, search=SearchConfig(doubt_us=0, slipped_to=0))
 # Nothing is ever in doubt, and looks farther away are for what was not seen well for long, or for nothing.
-STRAYING, NEVER_STRAYED = (
-    SEARCHED.model_copy(update={"search": SearchConfig(doubt_us=10_000, drift_diameters_s=4, doubted_below=0, slipped_to=0, strayed_to=share)})
-    for share in (0.85, 0.0)
-)
+UNDOUBTED = {"doubt_us": 10_000, "drift_diameters_s": 4, "doubted_below": 0, "slipped_to": 0, "anew_below": 0}
+STRAYING, NEVER_STRAYED = (SEARCHED.model_copy(update={"search": SearchConfig(strayed_to=share, **UNDOUBTED)}) for share in (0.85, 0.0))
 # Twenty degrees, onto other edges: farther than a pose that is sure of itself is looked for.
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
@@ -48,9 +46,10 @@ def doubt(
     unseen_s=1.0,
     strayed=False,
     off_in_depth=False,
+    little=False,
 ):
     sigma_px = torch.as_tensor(sigma_px)
-    values = score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric, unseen_s, strayed, off_in_depth
+    values = score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric, unseen_s, strayed, off_in_depth, little
     return Doubt(sigma_px, *(torch.as_tensor(value).expand_as(sigma_px) for value in values))
 
 

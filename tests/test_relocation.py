@@ -13,7 +13,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
 from torchtrack.recovery import _least
-from torchtrack.relocation import LastSeen, anywhere, is_lost, is_off_in_depth
+from torchtrack.relocation import LastSeen, anywhere, explains_little, is_lost, is_off_in_depth
 from torchtrack.search import _by_events
 from torchtrack.state import joined
 
@@ -65,6 +65,20 @@ def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(m
     assert not is_off_in_depth(replace(away, covariance=uncertain(away)), tracker.objects, due, CONFIG)
 
 
+@pytest.mark.parametrize(("score", "little"), [(0.4, False), (0.5, True), (0.55, False)])
+def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_for_there(score, little):
+    tracker, state, *_ = started()
+    full = 0.9 if little else 0.6
+    low = unseen(state, score=torch.full((1,), score), full_share=torch.full((1,), full))
+    due = state.t_us + 1_000_000
+    assert explains_little(low, tracker.objects, due, CONFIG).tolist() == [little]
+    assert not explains_little(low, tracker.objects, state.t_us, CONFIG)
+    assert not explains_little(unseen(low, 0.05), tracker.objects, due, CONFIG)
+    assert not explains_little(replace(low, covariance=uncertain(low)), tracker.objects, due, CONFIG)
+    for never in ({"anew_below": 0}, {"anew_us": 0}, {"hypotheses": 0}):
+        assert not explains_little(low, tracker.objects, due, TrackerConfig(search=SearchConfig(**never)))
+
+
 # ---- where
 
 
@@ -109,15 +123,28 @@ def test_small_poses_that_few_events_explain_are_worth_less():
     assert _by_events(torch.zeros(3), count).tolist() == [0.0, 0.0, 0.0]
 
 
-def test_what_is_off_in_depth_gives_way_to_far_more_events():
+def asked_anew(off_in_depth, little):
+    """What is asked of a find around where the object was last seen well, what it explained then, and by how many events it does now."""
     tracker, state, *_ = started()
-    t_us = state.t_us + 50_000
-    tracked = tracker._doubt(state, t_us, torch.ones(1), torch.tensor([False]), torch.tensor([True]))
+    why = torch.tensor([off_in_depth]), torch.tensor([little])
+    tracked = tracker._doubt(state, state.t_us + 50_000, torch.ones(1), torch.tensor([False]), why)
     found = in_motion()[3]
-    margin, needed, gathered, count = _least(tracked, found, tracker.config)[2, :, 0].tolist()
+    return _least(tracked, found, tracker.config)[2, :, 0].tolist(), float(state.full_share), int(found.count)
+
+
+@pytest.mark.parametrize("little", [False, True])
+def test_what_is_off_in_depth_gives_way_to_far_more_events(little):
+    (margin, needed, gathered, count), full, matched = asked_anew(True, little)
     assert margin == -torch.inf and gathered == 0
-    assert needed == pytest.approx(0.75 * float(state.full_share))
-    assert count == 2 * int(found.count)
+    assert needed == pytest.approx(0.75 * full)
+    assert count == 2 * matched
+
+
+def test_what_explains_little_gives_way_to_nearly_all_by_no_fewer_events():
+    (margin, needed, gathered, count), full, matched = asked_anew(False, True)
+    assert margin == pytest.approx(0.15) and gathered == 0
+    assert needed == pytest.approx(0.9 * full)
+    assert count == matched
 
 
 def test_an_object_seen_by_few_events_is_not_remembered_as_seen_well(way):
@@ -159,3 +186,20 @@ def test_an_object_that_ran_off_is_found_again_where_it_was_seen_well(name):
     found_m, status = after(100_000)
     assert found_m < 5e-3 and status == Status.TRACKING
     assert after(0)[0] > 0.05
+
+
+def test_an_object_that_holds_on_to_other_edges_is_found_again_where_it_was_seen_well():
+    """Sure of a pose forty degrees off, as near as it was: nowhere else is it looked for so far away."""
+    trajectory, events = moving_box(pose(), 30)
+
+    def after(anew_below):
+        search = SearchConfig(anew_below=anew_below, strayed_to=0, unseen_us=0, doubted_below=0, slipped_to=0, mirrored_to=0, dropped_to=0)
+        tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=search))
+        state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 8))
+        turned = retract_about(state.T_cam_obj, torch.tensor([[0.0, 0.3, 0.6, 0.0, 0.0, 0.0]], dtype=torch.float64), tracker.centre_obj.double())
+        state, results = follow(tracker, unseen(state, T_cam_obj=turned), windows(events, 30)[8:])
+        true = trajectory.at(torch.tensor([150_000]))[0]
+        return float((results[-1].T_cam_obj[0] - true)[:3, :3].norm())
+
+    assert after(0.6) < 0.02
+    assert after(0.0) > 0.2

@@ -42,7 +42,7 @@ class Doubt:
         has_symmetry: objects with a plane of symmetry.
         unseen_s: how long ago each was last seen well (s).
         strayed: which of those adrift merely explain less than when seen well.
-        off_in_depth: which are to be looked for where they were last seen well: :func:`torchtrack.relocation.is_off_in_depth`.
+        off_in_depth, little: which are to be looked for all around where they were last seen well, and why: :mod:`torchtrack.relocation`.
     """
 
     sigma_px: Float[Tensor, "b"]
@@ -58,6 +58,7 @@ class Doubt:
     unseen_s: Float[Tensor, "b"]
     strayed: Bool[Tensor, "b"]
     off_in_depth: Bool[Tensor, "b"]
+    little: Bool[Tensor, "b"]
 
     def reasons(self, score: Float[Tensor, "b"], config: SearchConfig) -> tuple[Bool[Tensor, "b"], ...]:
         """Which objects a search is wanted for: beside the prediction, where they may have slipped to, and mirrored."""
@@ -94,6 +95,10 @@ class Doubt:
         long = (self.unseen_s >= 1e-6 * config.unseen_us) & (config.unseen_us > 0)
         return self._far_due(config) & long & (self.adrift | (self.sigma_px > config.wide_sigma_px))
 
+    def anew(self) -> Bool[Tensor, "b"]:
+        """Which objects are looked for all around where they were last seen well."""
+        return self.off_in_depth | self.little
+
     def _far_due(self, config: SearchConfig) -> Bool[Tensor, "b"]:
         return self.far_due & (config.doubt_us > 0)
 
@@ -120,7 +125,7 @@ def is_wanted(doubt: Doubt, score: Float[Tensor, "b"], config: TrackerConfig) ->
         return torch.zeros_like(doubt.starting)
     # Those that have run off are asked for already, as uncertain ones or as those in doubt.
     asks, slips, is_mirrored = doubt.reasons(score, config.search)
-    return asks | slips | is_mirrored | doubt.off_in_depth
+    return asks | slips | is_mirrored | doubt.anew()
 
 
 def in_doubt(

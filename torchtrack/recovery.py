@@ -80,11 +80,11 @@ def _search_anew(
     so_far: tuple[Found, Prediction, Float[Tensor, "b"]],
     config: TrackerConfig,
 ) -> tuple[Found, Prediction, Float[Tensor, "b"]]:
-    """:func:`search_wanted` for objects that are far off in depth: around where they were last seen well."""
+    """:func:`search_wanted` for objects that are far off in depth, or explain little: around where they were last seen well."""
     found, prediction, widening = so_far
     anywhere = gate_widening(torch.full_like(widening, torch.inf), config)
-    for number, is_off in enumerate(Answer.to(doubt.off_in_depth).numbers()):
-        if is_off:
+    for number, is_sought in enumerate(Answer.to(doubt.anew()).numbers()):
+        if is_sought:
             # A look from there is a wide one, however far this one goes.
             other, wide_px, before = last_seen.prediction(number, prediction), 2 * config.search.wide_sigma_px, found
             found, prediction = _search_from(number, other, wide_px, least[:, number], events, found, prediction, config)
@@ -106,8 +106,8 @@ def _stands(doubt: Doubt, found: Found, config: TrackerConfig) -> Bool[Tensor, "
 def _least(doubt: Doubt, found: Found, config: TrackerConfig) -> Float[Tensor, "4 4 b"]:
     """By how much other poses must explain more, how much they must explain and gather, and by how many events at least.
 
-    And the same of where an object is not predicted at all, of where it was last seen well, if it is far off in depth, and if it is
-    in doubt.
+    And the same of where an object is not predicted at all, of where it was last seen well, if it is far off in depth or explains little,
+    and if it is in doubt.
 
     While a motion is not known nothing says how far events gather when all is well, and dense print explains as much of many poses:
     one that smears the events more than the prediction's own is not better.
@@ -126,8 +126,10 @@ def _least(doubt: Doubt, found: Found, config: TrackerConfig) -> Float[Tensor, "
     needed = torch.where(new, search.new_share, needed)
     gathered = torch.where(doubt.starting | new, found.gathered.nan_to_num(0.0) - AS_MUCH, 0)
     elsewhere = none + search.slip_margin, search.slip_share * doubt.full_share, none, none
-    # A small thing that is all explained says nothing against one of which far more events are explained.
-    anew = none - torch.inf, config.quality.certain_at * doubt.full_share, none, _FAR_MORE * matched
+    # A small thing that is all explained says nothing against one of which far more events are explained. What is partly hidden does.
+    off = doubt.off_in_depth
+    needed_anew = torch.where(off, config.quality.certain_at, search.slip_share) * doubt.full_share
+    anew = torch.where(off, -torch.inf, search.slip_margin), needed_anew, none, torch.where(off, _FAR_MORE, 1) * matched
     last_seen = *elsewhere[:3], torch.where(_stands(doubt, found, config), _FAR_MORE * matched, 0)
     return torch.stack([margin, needed, gathered, count, *elsewhere, *anew, *last_seen]).unflatten(0, (4, 4))
 

@@ -34,7 +34,7 @@ from torchtrack.prediction import Prediction
 from torchtrack.probation import after_probation
 from torchtrack.quality import Status, asked_apart
 from torchtrack.recovery import search_wanted
-from torchtrack.relocation import LastSeen, anywhere, is_lost, is_off_in_depth
+from torchtrack.relocation import LastSeen, anywhere, explains_little, is_lost, is_off_in_depth
 from torchtrack.search import explained_at_rest, judge_fit, rehearse
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.sensors import farthest_event_px
@@ -188,10 +188,10 @@ class Tracker(TrackedObjects):
         dt_s = self._window_s(state, t_us)[self.stream_index]
         return None if self.tiles is None else self.tiles.near(self._predict(state, dt_s), dt_s, farthest_event_px(self.config))
 
-    def _near(self, events: NearbyEvents, prediction: Prediction, off_in_depth: Tensor, dt_s: Tensor) -> NearbyEvents:
-        """Those of the events that can have to do with the objects: with those ``off_in_depth``, any; a weigher of one's own is shown all."""
-        if not readback.none_of(off_in_depth):
-            prediction = replace(prediction, covariance=anywhere(prediction.covariance, off_in_depth))
+    def _near(self, events: NearbyEvents, prediction: Prediction, anew: Tensor, dt_s: Tensor) -> NearbyEvents:
+        """Those of the events that can have to do with the objects: with those looked for ``anew``, any; a weigher of one's own is shown all."""
+        if not readback.none_of(anew):
+            prediction = replace(prediction, covariance=anywhere(prediction.covariance, anew))
         return events if self.shows_all else self.sensors.near_objects(events, prediction, dt_s, self.config)
 
     def _window_s(self, state: TrackerState, t_us: Tensor) -> Tensor:
@@ -248,13 +248,13 @@ class Tracker(TrackedObjects):
         dt_s = window_s[self.stream_index]
         recorded = self._predict(self._expected(state, events.events, t_us, dt_s, questions), dt_s)
         prediction = recorded.detached()
-        off_in_depth = is_off_in_depth(state, self.objects, t_us, config)
-        nearby = self._near(events, prediction, off_in_depth, dt_s)
+        off_in_depth, little = (why(state, self.objects, t_us, config) for why in (is_off_in_depth, explains_little))
+        nearby = self._near(events, prediction, off_in_depth | little, dt_s)
         seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, t_us - state.t_us, config.matching.burst_us)
         contours = prediction.contours(dt_s, config.contours)
         sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(self.diameter_m)
         starting = torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
-        doubt = self._doubt(state, t_us, sigma_px, starting, off_in_depth)
+        doubt = self._doubt(state, t_us, sigma_px, starting, (off_in_depth, little))
         widening = gate_widening(sigma_px, config)
         # Asked for here: a GPU answers while corners are looked for.
         radius_px = questions.ask(index_radius(widening, config), usual_index_radius(config))
@@ -301,15 +301,15 @@ class Tracker(TrackedObjects):
         objects = objects_as_known(self.objects, state, self.element_groups, self.on_surfaces is not None, self.config)
         return forecast(state, dt_s, objects, self.revolution_axes if self.revolves else None, self.far_pose, self.config)
 
-    def _doubt(self, state: TrackerState, t_us: Tensor, sigma_px: Tensor, starting: Tensor, off_in_depth: Tensor) -> Doubt:
-        """What speaks for trying other poses in the window that ends at ``t_us``."""
+    def _doubt(self, state: TrackerState, t_us: Tensor, sigma_px: Tensor, starting: Tensor, anew: tuple[Tensor, Tensor]) -> Doubt:
+        """What speaks for trying other poses in the window that ends at ``t_us``; with why objects are looked for ``anew``."""
         config = self.config.search
         due, far_due = (is_due(state.t_us, t_us, interval_us)[self.stream_index] for interval_us in (config.interval_us, config.doubt_us))
         adrift = is_adrift(state.doubted_s, far_due, config)
         strayed = ~(adrift | starting) & has_strayed(state.score, state.full_share, state.unseen_s, sigma_px, far_due, config)
         since_s = torch.where(strayed, state.unseen_s, state.doubted_s)
         told = sigma_px, state.score, state.usual_score, starting, due, adrift | strayed, since_s, state.full_share, far_due
-        return Doubt(*told, self.has_symmetry, state.unseen_s, strayed, off_in_depth)
+        return Doubt(*told, self.has_symmetry, state.unseen_s, strayed, *anew)
 
     def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:
         """The state that a window is predicted from: of what is lost for long, where it was last seen well."""

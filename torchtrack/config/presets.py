@@ -36,7 +36,7 @@ def _learned() -> TrackerConfig:
 
     It believes less where an object is seen badly, and explains less there: that is no sign of having strayed.
     """
-    return TrackerConfig(matching=MatchingConfig(learned_trust="all"), search=SearchConfig(strayed_to=0), smoothing=_SMOOTHED)
+    return TrackerConfig(matching=MatchingConfig(learned_trust="all"), search=SearchConfig(strayed_to=0, anew_below=0), smoothing=_SMOOTHED)
 
 
 def _paper() -> TrackerConfig:
