@@ -65,11 +65,10 @@ def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(m
     assert not is_off_in_depth(replace(away, covariance=uncertain(away)), tracker.objects, due, CONFIG)
 
 
-@pytest.mark.parametrize(("score", "little"), [(0.4, False), (0.5, True), (0.55, False)])
+@pytest.mark.parametrize(("score", "little"), [(0.6, True), (0.7, False)])
 def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_for_there(score, little):
     tracker, state, *_ = started()
-    full = 0.9 if little else 0.6
-    low = unseen(state, score=torch.full((1,), score), full_share=torch.full((1,), full))
+    low = unseen(state, score=torch.full((1,), score), full_share=torch.full((1,), 0.9))
     due = state.t_us + 1_000_000
     assert explains_little(low, tracker.objects, due, CONFIG).tolist() == [little]
     assert not explains_little(low, tracker.objects, state.t_us, CONFIG)
@@ -201,5 +200,5 @@ def test_an_object_that_holds_on_to_other_edges_is_found_again_where_it_was_seen
         true = trajectory.at(torch.tensor([150_000]))[0]
         return float((results[-1].T_cam_obj[0] - true)[:3, :3].norm())
 
-    assert after(0.6) < 0.02
+    assert after(0.75) < 0.02
     assert after(0.0) > 0.2

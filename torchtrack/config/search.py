@@ -31,7 +31,7 @@ class SearchConfig(Settings):
         description="What was not seen well for so long, and is lost or far off in depth, is looked for all around where it was then (µs); 0: never.",
     )
     anew_below: float = Field(
-        0.6, ge=0, le=1, description="Share of what an object explains when seen well below which, as long, it is looked for there, too; 0 for never."
+        0.75, ge=0, le=1, description="Share of what an object explains when seen well below which, as long, it is looked for there; 0 for never."
     )
     by_events: bool = Field(
         True, description="Poses of very uncertain objects are also compared by how many events they explain: far away, a few explain all."
