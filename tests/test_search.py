@@ -28,6 +28,8 @@ DISPLACED = torch.tensor([[0.09, -0.06, 0.12, 0.008, -0.006, 0.0]], dtype=torch.
 
 # By how much another pose must explain more, how much it must explain, how much of the events around it it must gather, and how many explain.
 LEAST = torch.tensor([0.1, 0.0, 0.0, 0.0])
+# Neither far off in depth nor explaining little: no reason to be looked for around where it was last seen well.
+NOT_ANEW = torch.tensor([False]), torch.tensor([False])
 
 
 def test_rest_explains_nothing_of_what_was_looked_for_in_many_places():
@@ -132,9 +134,7 @@ def test_what_was_merely_not_seen_well_has_to_explain_nearly_all_elsewhere_and_n
     tracker, state, _, _, _ = started()
     _, _, _, found, _ = in_motion()
     state = replace(state, score=torch.full((1,), 0.5), full_share=torch.full((1,), 0.8), unseen_s=torch.full((1,), 0.2))
-    strayed, in_place = (
-        tracker._doubt(state, state.t_us + later_us, torch.ones(1), torch.tensor([False]), torch.tensor([False])) for later_us in (50_000, 0)
-    )
+    strayed, in_place = (tracker._doubt(state, state.t_us + later_us, torch.ones(1), torch.tensor([False]), NOT_ANEW) for later_us in (50_000, 0))
     assert strayed.strayed.tolist() == strayed.adrift.tolist() == [True]
     torch.testing.assert_close(strayed.doubted_s, state.unseen_s)
     assert in_place.adrift.tolist() == [False]
@@ -150,7 +150,7 @@ def in_doubt_and_sure():
     _, _, _, found, _ = in_motion()
     found = replace(found, count=torch.full_like(found.count, 200))
     state = replace(state, score=torch.full((1,), 0.3), full_share=torch.full((1,), 0.8), doubted_s=torch.full((1,), 0.2))
-    doubt = tracker._doubt(state, state.t_us + 50_000, torch.ones(1), torch.tensor([False]), torch.tensor([False]))
+    doubt = tracker._doubt(state, state.t_us + 50_000, torch.ones(1), torch.tensor([False]), NOT_ANEW)
     assert doubt.adrift.tolist() == [True] and doubt.strayed.tolist() == [False]
     return tracker, found, doubt
 
@@ -187,7 +187,7 @@ def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
     """Of any two poses, dense print explains about as much."""
     tracker, state, _, _, _ = started()
     _, _, _, found, _ = in_motion()
-    doubts = [tracker._doubt(state, state.t_us, torch.ones(1), torch.tensor([starting]), torch.tensor([False])) for starting in (True, False)]
+    doubts = [tracker._doubt(state, state.t_us, torch.ones(1), torch.tensor([starting]), NOT_ANEW) for starting in (True, False)]
     least = [_least(doubt, found, tracker.config) for doubt in doubts]
     assert 0.5 < float(least[0][0, 2]) < float(found.gathered) < float(least[0][0, 2]) + 0.05
     assert least[1][0, 2].tolist() == least[0][1, 2].tolist() == [0.0]
