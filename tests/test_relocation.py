@@ -13,7 +13,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.lie import retract_about
 from torchtrack.quality import Status
 from torchtrack.recovery import _least
-from torchtrack.relocation import LastSeen, anywhere, explains_little, is_lost, is_off_in_depth
+from torchtrack.relocation import LastSeen, anywhere, is_lost, looked_for_anew
 from torchtrack.search import _by_events
 from torchtrack.state import joined
 
@@ -58,11 +58,11 @@ def test_an_object_is_lost_once_nothing_is_known_of_it_and_it_was_not_seen_for_l
 def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(metres, off):
     tracker, state, *_ = started()
     away, due = unseen(state, T_cam_obj=moved_away(tracker, state, metres)), state.t_us + 1_000_000
-    assert is_off_in_depth(away, tracker.objects, due, CONFIG).tolist() == [off]
-    assert not is_off_in_depth(away, tracker.objects, state.t_us, CONFIG)
-    assert not is_off_in_depth(unseen(away, 0.05), tracker.objects, due, CONFIG)
+    assert looked_for_anew(away, tracker.objects, due, CONFIG)[0].tolist() == [off]
+    assert not looked_for_anew(away, tracker.objects, state.t_us, CONFIG)[0]
+    assert not looked_for_anew(unseen(away, 0.05), tracker.objects, due, CONFIG)[0]
     # What is lost is expected there as it is.
-    assert not is_off_in_depth(replace(away, covariance=uncertain(away)), tracker.objects, due, CONFIG)
+    assert not looked_for_anew(replace(away, covariance=uncertain(away)), tracker.objects, due, CONFIG)[0]
 
 
 @pytest.mark.parametrize(("score", "little"), [(0.6, True), (0.7, False)])
@@ -70,12 +70,12 @@ def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_
     tracker, state, *_ = started()
     low = unseen(state, score=torch.full((1,), score), full_share=torch.full((1,), 0.9))
     due = state.t_us + 1_000_000
-    assert explains_little(low, tracker.objects, due, CONFIG).tolist() == [little]
-    assert not explains_little(low, tracker.objects, state.t_us, CONFIG)
-    assert not explains_little(unseen(low, 0.05), tracker.objects, due, CONFIG)
-    assert not explains_little(replace(low, covariance=uncertain(low)), tracker.objects, due, CONFIG)
+    assert looked_for_anew(low, tracker.objects, due, CONFIG)[1].tolist() == [little]
+    assert not looked_for_anew(low, tracker.objects, state.t_us, CONFIG)[1]
+    assert not looked_for_anew(unseen(low, 0.05), tracker.objects, due, CONFIG)[1]
+    assert not looked_for_anew(replace(low, covariance=uncertain(low)), tracker.objects, due, CONFIG)[1]
     for never in ({"anew_below": 0}, {"anew_us": 0}, {"hypotheses": 0}):
-        assert not explains_little(low, tracker.objects, due, TrackerConfig(search=SearchConfig(**never)))
+        assert not looked_for_anew(low, tracker.objects, due, TrackerConfig(search=SearchConfig(**never)))[1]
 
 
 # ---- where

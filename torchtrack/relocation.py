@@ -1,9 +1,8 @@
 """Where an object is looked for that has not been seen well for a while: all around the pose that it had then.
 
 A prediction goes on from what was last taken for the object. One that is lost coasts away, until it is out of the image; a
-pose that slipped runs off in depth, where the few events on its small contours explain all of them; or it
-holds on to other edges, which explain some of it. Meanwhile the object is seen well again, not far from where it was, and nobody
-looks there.
+pose that slipped runs off in depth, where the few events on its small contours explain all of them; or it holds on to other
+edges, which explain some of it. Meanwhile the object is seen well again, not far from where it was, and nobody looks there.
 """
 
 from dataclasses import dataclass, replace
@@ -93,36 +92,30 @@ def is_lost(state: TrackerState, diameter_m: Float[Tensor, "b"], config: Tracker
     return unknown & unseen
 
 
-def is_off_in_depth(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """Which objects are much farther away, or nearer, than when they were last seen well, long ago, and due in the window to ``t_us``."""
-    due = _due_for_long(state, objects, t_us, config)
-    if readback.none_of(due):
-        return due
-    now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.T_last_seen))
-    return due & (torch.maximum(now_m / then_m, then_m / now_m) > _OFF_IN_DEPTH)
+def looked_for_anew(
+    state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig
+) -> tuple[Bool[Tensor, "b"], Bool[Tensor, "b"]]:
+    """Which objects, not seen well for long, are looked for all around where they were then, in the window to ``t_us``, and why.
 
+    Those that explain little are partly hidden, as a rule. But a pose may also have gone along with what hid the object, and hold on to
+    other edges. What is lost is expected there as it is.
 
-def explains_little(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """Which objects explain much less than when they were last seen well, long ago, and are due in the window to ``t_us``.
-
-    As a rule they are partly hidden. But a pose may also have gone along with what hid the object, and hold on to other edges.
+    Returns:
+        Those much farther away than then, or nearer; and those that explain much less.
     """
-    return _due_for_long(state, objects, t_us, config) & (state.score < config.search.anew_below * state.full_share)
+    unseen = _unseen_for_long(state, config)
+    if readback.none_of(unseen):
+        return unseen, unseen
+    due = unseen & is_due(state.t_us, t_us, config.search.doubt_us)[objects.stream_index] & ~is_lost(state, objects.diameter_m, config)
+    now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.T_last_seen))
+    off_in_depth = torch.maximum(now_m / then_m, then_m / now_m) > _OFF_IN_DEPTH
+    return due & off_in_depth, due & (state.score < config.search.anew_below * state.full_share)
 
 
 def anywhere(covariance: Float[Tensor, "b 12 12"], chosen: Bool[Tensor, "b"]) -> Float[Tensor, "b 12 12"]:
     """Covariances of poses and velocities, of the ``chosen`` objects so large that they may be anywhere in the image."""
     unknown = torch.eye(12, dtype=covariance.dtype, device=covariance.device)
     return torch.where(chosen[:, None, None], unknown, covariance)
-
-
-def _due_for_long(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """Which objects, not lost, were not seen well for long, and are looked for anew in the window to ``t_us``."""
-    unseen = _unseen_for_long(state, config)
-    if readback.none_of(unseen):
-        return unseen
-    due = is_due(state.t_us, t_us, config.search.doubt_us)[objects.stream_index]
-    return unseen & due & ~is_lost(state, objects.diameter_m, config)
 
 
 def _unseen_for_long(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:

@@ -34,7 +34,7 @@ from torchtrack.prediction import Prediction
 from torchtrack.probation import after_probation
 from torchtrack.quality import Status, asked_apart
 from torchtrack.recovery import search_wanted
-from torchtrack.relocation import LastSeen, anywhere, explains_little, is_lost, is_off_in_depth
+from torchtrack.relocation import LastSeen, anywhere, is_lost, looked_for_anew
 from torchtrack.search import explained_at_rest, judge_fit, rehearse
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.sensors import farthest_event_px
@@ -248,7 +248,7 @@ class Tracker(TrackedObjects):
         dt_s = window_s[self.stream_index]
         recorded = self._predict(self._expected(state, events.events, t_us, dt_s, questions), dt_s)
         prediction = recorded.detached()
-        off_in_depth, little = (why(state, self.objects, t_us, config) for why in (is_off_in_depth, explains_little))
+        off_in_depth, little = looked_for_anew(state, self.objects, t_us, config)
         nearby = self._near(events, prediction, off_in_depth | little, dt_s)
         seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, t_us - state.t_us, config.matching.burst_us)
         contours = prediction.contours(dt_s, config.contours)
