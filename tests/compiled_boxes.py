@@ -12,9 +12,23 @@ from helpers import SMALL_CAMERA, box_model, pose
 from tracked_boxes import follow, moving_box, windows
 
 from torchtrack import Tracker, compiled
-from torchtrack.config.tracker import CornerConfig, LearningConfig, TrackerConfig
+from torchtrack.config.tracker import CornerConfig, LearningConfig, MatchingConfig, TrackerConfig
 
-SMALL = TrackerConfig(learning=LearningConfig(points=0), corners=CornerConfig(max_corners=0))
+# What is compiled for each round of matching is the same: two are enough to see that they follow one another.
+SMALL = TrackerConfig(learning=LearningConfig(points=0), corners=CornerConfig(max_corners=0), matching=MatchingConfig(gates_px=(5.0, 1.5)))
+
+
+class Counting(compiled.CompiledStep):
+    """Graphs that say of each window whether they took it."""
+
+    def __init__(self, tracker, *, compiles=True):
+        super().__init__(tracker, compiles=compiles)
+        self.took = []
+
+    def __call__(self, state, events, t_us):
+        done = super().__call__(state, events, t_us)
+        self.took.append(done is not None)
+        return done
 
 
 def with_backend(backend):
@@ -35,14 +49,15 @@ def main(backend, count, device):
     plain = Tracker([box_model()], SMALL_CAMERA, config)
     with torch.inference_mode():
         _, expected = follow(plain, plain.init(pose()[None], 0), cut)
-    with with_backend(backend), torch.inference_mode():
+    with with_backend(backend), mock.patch("torchtrack.tracker.CompiledStep", Counting), torch.inference_mode():
         tracker = Tracker([box_model()], SMALL_CAMERA, config, compiled=True).to(device)
         state = tracker.init(pose()[None], 0)
         tracker.prepare(state)
         prepared = len(tracker.graphs)
         _, found = follow(tracker, state, [(window.to(device), end_us) for window, end_us in cut])
     apart = max(float((one.T_cam_obj.cpu() - other.T_cam_obj).abs().max()) for one, other in zip(found, expected, strict=True))
-    print(json.dumps({"apart": apart, "prepared": prepared, "graphs": len(tracker.graphs), "status": int(found[-1].status[0])}))
+    told = {"apart": apart, "prepared": prepared, "graphs": len(tracker.graphs), "took": sum(tracker.graphs.took), "status": int(found[-1].status[0])}
+    print(json.dumps(told))
 
 
 if __name__ == "__main__":

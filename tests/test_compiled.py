@@ -21,6 +21,7 @@ from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch, concatenate
 from torchtrack.runner import run
 from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
+from torchtrack.state import each_tensor
 
 # Something is learned from every third window.
 LEARNING = TrackerConfig(learning=LearningConfig(first_windows=0, every=3, up_to_share=1.0))
@@ -32,7 +33,7 @@ class Graphs:
     """In the place of compiled graphs: functions that read nothing, as graphs do not, and say how often they were asked."""
 
     def __init__(self, monkeypatch):
-        self.calls, self.dropped = [], 0
+        self.calls, self.dropped, self.compiled_for = [], 0, []
         monkeypatch.setattr(compiled, "_compiled", self._graph_of)
 
     def _graph_of(self, function, device):
@@ -42,6 +43,8 @@ class Graphs:
         self.calls.append(0)
 
         def graph(*args):
+            if not self.calls[number]:
+                self.compiled_for.append(args[0])
             self.calls[number] += 1
             *done, wrong = self._reading_nothing(function)(*args)
             self.dropped += bool(wrong)
@@ -90,6 +93,16 @@ def test_poses_are_those_of_a_step(graphs, streams, mode):
     assert torch.equal(compiled_state.burst_age_us, state.burst_age_us)
     assert compiled_state.learned.windows == state.learned.windows == COUNT
     assert found[-1].T_cam_obj.is_inference() == (mode is torch.inference_mode)
+
+
+def test_each_tensor_of_the_state_that_a_graph_is_compiled_for_is_one_alone(graphs):
+    """The compiler takes one tensor in two places for one in both, whatever comes later."""
+    both_ways(LEARNING)
+    for state in graphs.compiled_for:
+        tensors = []
+        each_tensor(lambda tensor: tensors.append(tensor) or tensor, state)
+        places = {tensor.data_ptr() for tensor in tensors if tensor.numel()}
+        assert len(places) == sum(tensor.numel() > 0 for tensor in tensors) > 20
 
 
 def test_poses_of_a_smooth_object_are_those_of_a_step(graphs):
@@ -257,6 +270,7 @@ def in_own_process(backend, device="cpu"):
 def test_a_compiler_takes_a_step_as_one_graph():
     told = in_own_process("eager")
     assert told["prepared"] == told["graphs"] == 1
+    assert told["took"] >= COUNT // 4
     assert told["apart"] < 1e-6
     assert told["status"] == 0
 
@@ -265,6 +279,7 @@ def test_a_compiler_takes_a_step_as_one_graph():
 def test_compiled_poses_are_those_of_a_step():
     told = in_own_process("inductor")
     assert told["graphs"] == 1
+    assert told["took"] >= COUNT // 4
     assert told["apart"] < 1e-5
     assert told["status"] == 0
 
@@ -273,5 +288,6 @@ def test_compiled_poses_are_those_of_a_step():
 def test_poses_of_cuda_graphs_are_those_of_the_cpu():
     told = in_own_process("inductor", "cuda")
     assert told["graphs"] == 1
+    assert told["took"] >= COUNT // 4
     assert told["apart"] < 1e-4
     assert told["status"] == 0

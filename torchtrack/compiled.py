@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from inspect import signature
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 import torch
 from jaxtyping import Int
@@ -160,15 +160,17 @@ def _compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
     return graph
 
 
-def _for_the_first_time(graph: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+def _for_the_first_time(graph: Callable[Concatenate[TrackerState, P], R], state: TrackerState, *args: P.args, **kwargs: P.kwargs) -> R:
     """What a graph gives that is compiled for this.
 
     Raises:
         ConfigError: if it cannot be.
     """
+    # A tensor that stands for two of the state's would be taken for both of them ever after.
+    state = each_tensor(Tensor.clone, state)
     try:
         with _as_expected():
-            return graph(*args, **kwargs)
+            return graph(state, *args, **kwargs)
     except RuntimeError as error:
         reason = str(error).partition("\n")[0]
         needed = "a C++ compiler (g++ or clang++), or on a GPU triton and a C compiler"
