@@ -15,11 +15,12 @@ from torchtrack.executor.tasks import without_errors
 from torchtrack.interrupt import Interrupt
 from torchtrack.io import EventSource
 from torchtrack.io.live import LiveSource
+from torchtrack.refined_steps import Refinement, refined_steps
 from torchtrack.run_outputs import RunOutputs
 from torchtrack.session import Session, open_session
 from torchtrack.sinks import Sink
 from torchtrack.sinks.summary import RunSummary
-from torchtrack.smoothed_steps import SmoothedObjects, smoothed_steps
+from torchtrack.smoothed_steps import SmoothedObjects
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.stepping import clipped, cut_windows, steps
 from torchtrack.streams import follow
@@ -33,9 +34,9 @@ __all__ = ["run", "run_many", "track"]
 def track(
     source: EventSource | Iterable[EventBatch], tracker: Tracker, state: TrackerState, window: WindowConfig | None = None
 ) -> Iterator[StepResult]:
-    """Track one stream from ``state`` on, one result per window, in constant memory; smoothed where the tracker's settings say so.
+    """Track one stream from ``state`` on, one result per window, in constant memory; refined where the tracker's settings say so.
 
-    Smoothed results come up to 0.1 s late by the preset ``default``: for batches from a camera of your own, take ``causal``.
+    Refined results come up to 0.6 s late by the preset ``default``: for batches from a camera of your own, take ``causal``.
     A live source is never held back.
 
     Args:
@@ -52,7 +53,8 @@ def track(
     seen, length = False, WindowLength(window or tracker.config.window)
     objects = SmoothedObjects(tracker.centre_obj.double().cpu(), tracker.diameter_m.double().cpu(), tracker.intrinsics.double().cpu())
     taken = steps(cut_windows(clipped(chunks, start_us), start_us, length), tracker, state, length)
-    for step in taken if isinstance(source, LiveSource) else smoothed_steps(taken, objects, tracker.config):
+    refinement = Refinement(objects, tracker.config, tracker.alone)
+    for step in taken if isinstance(source, LiveSource) else refined_steps(taken, refinement):
         seen = True
         yield step.result
     if not seen:

@@ -1,6 +1,6 @@
 """What a run tracks: events, camera, object models, the initial poses, and the truth where it is known."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -54,6 +54,16 @@ class Session:
     def chunks(self) -> Iterator[EventBatch]:
         """The events after the start and up to the end."""
         return clipped(self.events.chunks(), self.start_us, self.end_us)
+
+    def with_objects(self, numbers: Sequence[int]) -> "Session":
+        """The same stream, with some of the objects."""
+        return replace(
+            self,
+            labels=tuple(self.labels[number] for number in numbers),
+            models=tuple(self.models[number] for number in numbers),
+            ground_truth=tuple(self.ground_truth[number] for number in numbers),
+            T_cam_obj=self.T_cam_obj[list(numbers)],
+        )
 
     def keep_up(self, windows: Iterator[EventWindow]) -> KeepUp | None:
         """The ``windows`` of a live source, less those that come too fast; None for a file."""

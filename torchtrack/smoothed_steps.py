@@ -1,7 +1,7 @@
 """The steps of a run, held back until what came after them is known, and given on with refined poses."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,7 +15,6 @@ from torchtrack.lie import orthonormalise, transform_points
 from torchtrack.motion import left_covariance
 from torchtrack.object_model import ObjectModel
 from torchtrack.smoothing import Filtered, smoothed
-from torchtrack.state import TrackerState
 from torchtrack.stepping import Step
 
 
@@ -48,7 +47,7 @@ class Smoother:
 
     def add(self, step: Step) -> list[Step]:
         """Take one step; returns those that are due, in order."""
-        self._held.append(replace(step, state=_without_maps(step.state)))
+        self._held.append(replace(step, state=step.state.without_maps()))
         lag_us = 1e6 * self._config.smoothing.lag_s
         newest_us = step.window.t_end_us
         if newest_us - self._held[0].window.t_end_us < 2 * lag_us:
@@ -69,30 +68,11 @@ class Smoother:
         return [replace(step, seconds=step.seconds + seconds) for step in refined]
 
 
-def smoothed_steps(steps: Iterator[Step], objects: SmoothedObjects, config: TrackerConfig) -> Iterator[Step]:
-    """The same steps with refined poses, some time later; as they are where ``smoothing.lag_s`` is 0."""
-    if not config.smoothing.lag_s:
-        yield from steps
-        return
-    smoother = Smoother(objects, config)
-    for step in steps:
-        yield from smoother.add(step)
-    yield from smoother.rest()
-
-
-def _without_maps(state: TrackerState) -> TrackerState:
-    streams = len(state.t_us)
-    return replace(state, last_event_us=state.last_event_us.new_empty(streams, 0, 0), burst_age_us=state.burst_age_us.new_empty(streams, 2, 0, 0))
-
-
 def _refined(held: Sequence[Step], objects: SmoothedObjects, config: TrackerConfig, count: int) -> list[Step]:
     """The first ``count`` of the steps, smoothed by all of them."""
     if not count:
         return []
-    t_us = torch.tensor([step.window.t_end_us for step in held])
-    known = zip(*((step.state.T_cam_obj, step.state.velocity, step.state.covariance) for step in held), strict=True)
-    filtered = Filtered(t_us, *(torch.stack(values).double().cpu() for values in known))
-    after = smoothed(filtered, objects.centre_obj, objects.diameter_m, config.motion)
+    after = smoothed(Filtered.of([step.state for step in held]), objects.centre_obj, objects.diameter_m, config.motion)
     poses = zip(orthonormalise(after.T_cam_obj), after.velocity, after.covariance, strict=True)
     return [_with_pose(step, objects, *pose) for step, pose in zip(held[:count], poses, strict=False)]
 

@@ -4,15 +4,17 @@ The pose of a window stands on the events up to its end. Those of the windows af
 to, and how fast. What is refined comes later for it, so this is for recordings, and for whoever can wait.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import MotionConfig
 from torchtrack.lie import difference_about, retract_about
 from torchtrack.motion import inverse, predict_covariance
+from torchtrack.state import TrackerState
 
 # Squared distance (12 degrees of freedom) from what was to be expected above which an object was found in another place: what
 # came before is not dragged there. Of what the filter holds for possible, 2 in 100 million are farther.
@@ -35,6 +37,12 @@ class Filtered:
     velocity: Float[Tensor, "n b 6"]
     covariance: Float[Tensor, "n b 12 12"]
 
+    @classmethod
+    def of(cls, states: Sequence[TrackerState]) -> "Filtered":
+        """What the states of one stream after consecutive windows say."""
+        known = zip(*((state.T_cam_obj, state.velocity, state.covariance) for state in states), strict=True)
+        return cls(torch.cat([state.t_us for state in states]).cpu(), *(torch.stack(values).double().cpu() for values in known))
+
 
 @dataclass(frozen=True)
 class _Link:
@@ -50,6 +58,12 @@ class _Link:
     covariance: Float[Tensor, "m b 12 12"]
     information: Float[Tensor, "m b 12 12"]
     gain: Float[Tensor, "m b 12 12"]
+
+
+def goes_on(filtered: Filtered, centre_obj: Float[Tensor, "b 3"], diameter_m: Float[Tensor, "b"], config: MotionConfig) -> Bool[Tensor, "m b"]:
+    """Whether each object was found, in each window but the first, where the one before led to expect it; arguments as :func:`smoothed`."""
+    link = _link(filtered, centre_obj, diameter_m, config)
+    return _goes_on(link.off[..., None], link.information)[..., 0, 0]
 
 
 def smoothed(filtered: Filtered, centre_obj: Float[Tensor, "b 3"], diameter_m: Float[Tensor, "b"], config: MotionConfig) -> Filtered:
@@ -72,15 +86,20 @@ def smoothed(filtered: Filtered, centre_obj: Float[Tensor, "b 3"], diameter_m: F
     steps, covariances = [step], [covariance]
     for k in reversed(range(len(link.off))):
         off = (link.off[k] + step)[..., None]
-        goes_on = off.mT @ link.information[k] @ off < _FARTHEST
+        same_motion = _goes_on(off, link.information[k])
         # Chosen, not multiplied: what is not a number would stay.
-        gain, off, less = (torch.where(goes_on, values, 0) for values in (link.gain[k], off, covariance - link.covariance[k]))
+        gain, off, less = (torch.where(same_motion, values, 0) for values in (link.gain[k], off, covariance - link.covariance[k]))
         step, covariance = (gain @ off)[..., 0], filtered.covariance[k] + gain @ less @ gain.mT
         steps.append(step)
         covariances.append(covariance)
     by, faster = torch.stack(steps[::-1]).split(6, -1)
     T_cam_obj = retract_about(filtered.T_cam_obj, by, centre_obj.expand(len(steps), -1, 3))
     return Filtered(filtered.t_us, T_cam_obj, filtered.velocity + faster, torch.stack(covariances[::-1]))
+
+
+def _goes_on(off: Float[Tensor, "*m b 12 1"], information: Float[Tensor, "*m b 12 12"]) -> Bool[Tensor, "*m b 1 1"]:
+    """Whether what was found so far off what was expected may be the same motion, going on."""
+    return off.mT @ information @ off < _FARTHEST
 
 
 def _link(filtered: Filtered, centre_obj: Tensor, diameter_m: Tensor, config: MotionConfig) -> _Link:

@@ -94,6 +94,11 @@ class TrackerState:
             trust = replace(trust, windows=before.model_trust.windows + more)
         return replace(self, learned=learned, model_trust=trust)
 
+    def without_maps(self) -> "TrackerState":
+        """The state without what is known of every pixel of the sensors, which is most of it: to be looked at, not to go on from."""
+        streams = len(self.t_us)
+        return replace(self, last_event_us=self.last_event_us.new_empty(streams, 0, 0), burst_age_us=self.burst_age_us.new_empty(streams, 2, 0, 0))
+
 
 @dataclass(frozen=True)
 class StepResult:

@@ -15,8 +15,9 @@ from torchtrack.baselines import tracker_class
 from torchtrack.config.run import TrackingConfig
 from torchtrack.errors import ConfigError, TorchtrackError
 from torchtrack.events import EventWindow, concatenate
+from torchtrack.refined_steps import Refinement
 from torchtrack.session import Session
-from torchtrack.smoothed_steps import SmoothedObjects, Smoother
+from torchtrack.smoothed_steps import SmoothedObjects
 from torchtrack.state import TrackerState, joined, take_part
 from torchtrack.stepping import Step, timed_step
 from torchtrack.tracker import Tracker
@@ -67,7 +68,7 @@ def follow(
     with ExitStack() as stack:
         for number, opening in enumerate(followers):
             try:
-                opened[number] = _smoothed(stack.enter_context(closing(opening())), config)
+                opened[number] = _refined(stack.enter_context(closing(opening())), config)
             except TorchtrackError as error:
                 outcomes[number] = error
         for number, step in _steps(opened, config):
@@ -80,31 +81,36 @@ def follow(
     return [outcomes[number] for number in range(len(followers))]
 
 
-class _Smoothed(Generic[R]):
-    """A follower that is given steps once they are smoothed."""
+class _Refined(Generic[R]):
+    """A follower that is given steps once they are refined."""
 
-    def __init__(self, follower: Follower[R], smoother: Smoother) -> None:
-        self._follower, self._smoother = follower, smoother
+    def __init__(self, follower: Follower[R], refinement: Refinement) -> None:
+        self._follower, self._refinement = follower, refinement
         self.session, self.windows, self.close = follower.session, follower.windows, follower.close
 
     def add(self, step: Step) -> None:
         """Take one step, and give on those that are due."""
-        for due in self._smoother.add(step):
+        for due in self._refinement.add(step):
             self._follower.add(due)
 
     def finish(self) -> R:
         """Give on what was held back."""
-        for left in self._smoother.rest():
+        for left in self._refinement.rest():
             self._follower.add(left)
         return self._follower.finish()
 
 
-def _smoothed(follower: Follower[R], config: TrackingConfig) -> Follower[R]:
-    """The follower, of smoothed steps where the settings ask for them; poses of a live source are not held back."""
+def _refined(follower: Follower[R], config: TrackingConfig) -> Follower[R]:
+    """The follower, of refined steps where the settings ask for them; poses of a live source are not held back."""
     session = follower.session
-    if not config.tracker.smoothing.lag_s or not session.models or session.live is not None:
+    if not config.tracker.smoothing.holds_back or not session.models or session.live is not None:
         return follower
-    return _Smoothed(follower, Smoother(SmoothedObjects.of(session.models, session.camera), config.tracker))
+
+    def alone(number: int) -> Tracker:
+        # Compiling would take longer than it saves.
+        return build_tracker([session.with_objects([number])], config.model_copy(update={"compiled": False}))
+
+    return _Refined(follower, Refinement(SmoothedObjects.of(session.models, session.camera), config.tracker, alone))
 
 
 def _take(number: int, step: "Step | Ended", follower: Follower[R], outcomes: dict[int, R | TorchtrackError]) -> None:

@@ -53,6 +53,7 @@ class TrackedObjects(nn.Module):
         cameras = [camera] if isinstance(camera, Camera) else list(camera)
         self.config = config or TrackerConfig()
         self.object_names = tuple(model.name for model in objects)
+        self.object_models, self.cameras, self.has_own_weigher = tuple(objects), tuple(cameras), weigher is not None
         streams = list(stream_index) if stream_index is not None else [0] * len(objects)
         check_setup(objects, cameras, streams, self.config)
         self._shared = len(set(streams)) < len(streams)

@@ -93,6 +93,12 @@ class Tracker(TrackedObjects):
             self.graphs = copy.copy(self.graphs)
         return self
 
+    def alone(self, number: int) -> "Tracker":
+        """A tracker of one of the objects alone, in its stream, with the same settings."""
+        weigher, camera = self.weigher if self.has_own_weigher else None, self.cameras[int(self.stream_index[number])]
+        alone = Tracker([self.object_models[number]], camera, self.config, dtype=self.intrinsics.dtype, weigher=weigher, kernels=self.kernels)
+        return alone.to(self.intrinsics.device)
+
     def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
         """The state before the first window, from each object's pose at ``t_us``.
 

@@ -22,12 +22,12 @@ from torchtrack.errors import ConfigError
 PresetName = Literal["default", "causal", "learned", "paper", "line", "ls", "nns"]
 
 
-# What comes later than this tells hardly anything of a pose.
-_SMOOTHED = SmoothingConfig(lag_s=0.05)
+# What comes later than this tells hardly anything of a pose, and few objects are out of sight for longer.
+_SMOOTHED = SmoothingConfig(lag_s=0.05, retrace_s=0.5)
 
 
 def _default() -> TrackerConfig:
-    """Our best of recordings and of live cameras; of recordings, each pose is refined by the 50 ms after it."""
+    """Our best of recordings and of live cameras; of recordings, each pose is refined by what comes after it."""
     return TrackerConfig(smoothing=_SMOOTHED)
 
 

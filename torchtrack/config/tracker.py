@@ -110,7 +110,7 @@ class MatchingConfig(Settings):
     gate_sigmas: float = Field(3.0, gt=0, description="Width of an uncertain object's first gate, in standard deviations of its prediction.")
     index_cell_px: int = Field(2, ge=1, le=4, description="Cell of the index of nearest contour points (px).")
     fine_below_px: float = Field(
-        120.0, ge=0, description="Of objects smaller than this in the image (px) and not uncertain, contours are looked up finer than by cells."
+        10_000.0, ge=0, description="Of objects smaller than this in the image (px) and not uncertain, contours are looked up finer than by cells."
     )
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
@@ -146,7 +146,7 @@ class MatchingConfig(Settings):
         1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow circuits fire on (px)."
     )
     adaptive_bursts: bool = Field(
-        False, description="Date them back less far, the fewer are seen to come late: in good light the circuits of a sensor are fast."
+        True, description="Date them back less far, the fewer are seen to come late: in good light the circuits of a sensor are fast."
     )
     burst_us: int = Field(10_000, ge=0, le=30_000, description="A burst is what a pixel fires of one polarity in this time (µs); 0 for no bursts.")
     learned_trust: Literal["none", "limbs", "all"] = Field(
@@ -229,11 +229,19 @@ class ModelTrustConfig(Settings):
 
 
 class SmoothingConfig(Settings):
-    """Poses of a recording refined by what came after them, see :mod:`torchtrack.smoothing`."""
+    """Poses of a recording refined by what came after them, see :mod:`torchtrack.smoothing` and :mod:`torchtrack.retracing`."""
 
     lag_s: float = Field(
         0.0, ge=0, le=10, description="Each pose of a recording is refined by the windows of so much time after it (s); 0 for not at all."
     )
+    retrace_s: float = Field(
+        0.0, ge=0, le=10, description="Objects of a recording that are found again are followed back in time, by up to so much (s); 0 for not."
+    )
+
+    @property
+    def holds_back(self) -> bool:
+        """Whether poses wait for what comes after them."""
+        return self.lag_s > 0 or self.retrace_s > 0
 
 
 class TrackerConfig(Settings):
@@ -264,9 +272,9 @@ class TrackerConfig(Settings):
 
     @model_validator(mode="after")
     def _smoothed_by_a_filter(self) -> "TrackerConfig":
-        if self.smoothing.lag_s and not (self.solver.prior and self.motion.model == "constant_velocity"):
+        if self.smoothing.holds_back and not (self.solver.prior and self.motion.model == "constant_velocity"):
             raise ValueError(
                 "smoothing weighs poses by what the filter knows of their motion: it needs solver.prior true and motion.model constant_velocity; "
-                "otherwise set smoothing.lag_s to 0"
+                "otherwise set smoothing.lag_s and smoothing.retrace_s to 0"
             )
         return self

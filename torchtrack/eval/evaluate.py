@@ -1,7 +1,7 @@
 """Many sequences under many methods: run, measure, compare."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from torchtrack.executor import TaskFailure, Tell
 from torchtrack.executor.groups import run_in_groups
 from torchtrack.executor.tasks import without_errors
 from torchtrack.quality import Status
-from torchtrack.session import Session, open_session
+from torchtrack.session import open_session
 from torchtrack.sim.suite import Told
 from torchtrack.sinks.record import ObjectRecord, Record
 from torchtrack.stepping import Step, cut_windows
@@ -164,7 +164,7 @@ class _Measurement:
             raise EventDataError(f"'{job.path}' has no ground truth (poses, pose_t) to evaluate against. Use `torchtrack track` for it.")
         reasons = [unsuitable(job.config.preset, model) for model in session.models]
         self._left_out = [NotApplicable(session.name, label, job.method, why) for label, why in zip(session.labels, reasons, strict=True) if why]
-        self.session = _only(session, [number for number, reason in enumerate(reasons) if reason is None])
+        self.session = session.with_objects([number for number, reason in enumerate(reasons) if reason is None])
         self._record, self._job, self._limits = Record(self.session.ground_truth, self.session.models), job, limits
 
     def windows(self, length: WindowLength) -> Iterator[EventWindow]:
@@ -189,14 +189,3 @@ class _Measurement:
         median_step_ms = 1e3 * sorted(seconds)[len(seconds) // 2]
         metrics, unseen_turns = summarise(errors, *self._limits), of_object.axis is not None
         return ObjectResult(self.session.name, label, self._job.method, errors, metrics, status, median_step_ms, unseen_turns)
-
-
-def _only(session: Session, numbers: Sequence[int]) -> Session:
-    """The session with some of its objects."""
-    return replace(
-        session,
-        labels=tuple(session.labels[number] for number in numbers),
-        models=tuple(session.models[number] for number in numbers),
-        ground_truth=tuple(session.ground_truth[number] for number in numbers),
-        T_cam_obj=session.T_cam_obj[list(numbers)],
-    )

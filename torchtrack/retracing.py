@@ -1,0 +1,158 @@
+"""Objects that were found again, followed back in time to where they were lost.
+
+Forwards, an object that comes out from behind another is looked for while hardly anything of it is to be seen: it is found late, or
+in a wrong place first. Backwards nothing has to be looked for: from the window in which it is seen well again, the events of the
+windows before are played in reverse, and a tracker follows them to where the object is hidden. It comes later for it, so this is for
+recordings, and for whoever can wait.
+
+In reverse, contours move the other way and what got brighter gets darker, so that all that is known of an object still holds.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.contours import Contours, reproject
+from torchtrack.events import EventBatch, EventWindow
+from torchtrack.quality import Status
+from torchtrack.state import StepResult, TrackerState, take_part
+from torchtrack.stepping import Step
+from torchtrack.tracker import Tracker
+
+# An object that was lost for longer is hidden, and not followed any farther (s).
+_HIDDEN_S = 0.01
+# A pose that shows an object this near to where it was seen well forwards is the same (px).
+_SAME_PX = 2.0
+# By how much more a pose has to explain than one of a window in which the object was not lost yet.
+_MARGIN = 0.1
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Where an object was lost, among consecutive steps: their numbers.
+
+    Args:
+        first: the first step in which it was lost, or found in another place than was to be expected.
+        seen: the step in which it is seen well again.
+    """
+
+    first: int
+    seen: int
+
+
+def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> list[Step]:
+    """Consecutive steps, with other poses of the object ``number`` in and before a gap, as far as it can be followed back.
+
+    From where it was lost on, what leads there from where it is seen well is believed; before that, what explains clearly more.
+
+    Args:
+        steps: without maps of events.
+        number: of the object, in the steps.
+        gap: where it was lost.
+        alone: a tracker of this object alone.
+    """
+    changed, since_us = list(steps), steps[gap.seen].window.t_end_us
+    for at, state, result in _followed_back(steps[: gap.seen + 1], number, alone):
+        before = steps[at]
+        if int(result.status[0]) >= int(Status.LOST):
+            if since_us - before.window.t_end_us > 1e6 * _HIDDEN_S:
+                break
+            continue
+        since_us = before.window.t_end_us
+        if at < gap.first and not float(before.state.unseen_s[number]) and _apart_px(before, number, result, alone) < _SAME_PX:
+            break
+        if at >= gap.first or float(state.score[0]) > float(before.state.score[number]) + _MARGIN:
+            changed[at] = _with_object(before, number, state, result)
+    return changed
+
+
+def _followed_back(steps: Sequence[Step], number: int, alone: Tracker) -> Iterator[tuple[int, TrackerState, StepResult]]:
+    """The states and results of an object at the end of each step but the last, the latest first, from what comes after it."""
+    about_us = steps[-1].window.t_end_us
+    state = _turned(steps[-1].state, number, alone)
+    for at in reversed(range(len(steps) - 1)):
+        window = steps[at + 1].window
+        events = _in_reverse(window, about_us).to(state.T_cam_obj.device)
+        state, result = alone.step(state, events, 2 * about_us - window.t_start_us)
+        yield at, state, result
+
+
+def _in_reverse(window: EventWindow, about_us: int) -> EventBatch:
+    """The events of a window with time running backwards, mirrored at ``about_us``: its start is their end."""
+    events = window.events
+    x, y, t_us, polarity, stream = (values.flip(0) for values in (events.x, events.y, events.t_us, events.polarity, events.stream_index))
+    # Events at the end of a window belong to it, and those at its start do not.
+    return EventBatch(x, y, 2 * about_us + 1 - t_us, ~polarity, stream)
+
+
+def _turned(state: TrackerState, number: int, alone: Tracker) -> TrackerState:
+    """What is known of one object, as the state of a tracker of it alone for which time runs backwards."""
+    known = take_part(state, slice(number, number + 1), slice(0, 1))
+    fresh = alone.init(known.T_cam_obj, known.t_us)
+    trust = known.model_trust and known.model_trust.of_width(alone.element_groups.shape[1])
+    return replace(
+        known,
+        velocity=-known.velocity,
+        covariance=_of_reverse(known.covariance),
+        doubted_s=fresh.doubted_s,
+        T_last_seen=fresh.T_last_seen,
+        unseen_s=fresh.unseen_s,
+        last_event_us=fresh.last_event_us,
+        burst_age_us=fresh.burst_age_us,
+        probation=fresh.probation,
+        model_trust=trust,
+    )
+
+
+def _of_reverse(covariance: Float[Tensor, "b 12 12"]) -> Float[Tensor, "b 12 12"]:
+    """The covariance of pose and velocity, with the velocity the other way."""
+    sign = torch.ones_like(covariance[0, 0])
+    sign[6:] = -1
+    return covariance * sign * sign[:, None]
+
+
+def _apart_px(step: Step, number: int, result: StepResult, alone: Tracker) -> float:
+    """How far apart two poses of an object show its contours, in the mean over them (px)."""
+    contours = result.contours
+    T_cam_obj = step.result.T_cam_obj[number : number + 1].to(contours.pixels.dtype)
+    way_px = (reproject(contours, T_cam_obj, alone.intrinsics).pixels - contours.pixels).norm(dim=-1)
+    return float((way_px * contours.mask).sum() / contours.mask.sum().clamp(min=1))
+
+
+def _with_object(step: Step, number: int, state: TrackerState, result: StepResult) -> Step:
+    """The step with another state and result of one object, for which time runs backwards."""
+    before, told = step.state, step.result
+    state = replace(
+        before,
+        T_cam_obj=_row(before.T_cam_obj, number, state.T_cam_obj),
+        velocity=_row(before.velocity, number, -state.velocity),
+        covariance=_row(before.covariance, number, _of_reverse(state.covariance)),
+        score=_row(before.score, number, state.score),
+    )
+    result = replace(
+        told,
+        T_cam_obj=_row(told.T_cam_obj, number, result.T_cam_obj),
+        covariance=_row(told.covariance, number, result.covariance),
+        status=_row(told.status, number, result.status),
+        quality=_row(told.quality, number, result.quality),
+        contours=_contours(told, number, result),
+        observation_count=_row(told.observation_count, number, result.observation_count),
+    )
+    return replace(step, state=state, result=result)
+
+
+def _contours(told: StepResult, number: int, result: StepResult) -> Contours:
+    """The contours of a result, with those of one object from another."""
+    count = max(told.contours.mask.shape[1], result.contours.mask.shape[1])
+    own, other = told.contours.widened(count), result.contours.widened(count)
+    return Contours(*(_row(value, number, getattr(other, name)) for name, value in vars(own).items()))
+
+
+def _row(values: Tensor, number: int, row: Tensor) -> Tensor:
+    """The values with one row in the place of another."""
+    changed = values.clone()
+    changed[number : number + 1] = row
+    return changed
