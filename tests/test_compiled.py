@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
-from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, windows
+from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, tensors_of, windows
 
 from torchtrack import Tracker, compiled, readback
 from torchtrack.config.run import RunConfig
@@ -21,7 +21,6 @@ from torchtrack.errors import ConfigError
 from torchtrack.events import EventBatch, concatenate
 from torchtrack.runner import run
 from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
-from torchtrack.state import each_tensor
 
 # Something is learned from every third window.
 LEARNING = TrackerConfig(learning=LearningConfig(first_windows=0, every=3, up_to_share=1.0))
@@ -99,10 +98,8 @@ def test_each_tensor_of_the_state_that_a_graph_is_compiled_for_is_one_alone(grap
     """The compiler takes one tensor in two places for one in both, whatever comes later."""
     both_ways(LEARNING)
     for state in graphs.compiled_for:
-        tensors = []
-        each_tensor(lambda tensor: tensors.append(tensor) or tensor, state)
-        places = {tensor.data_ptr() for tensor in tensors if tensor.numel()}
-        assert len(places) == sum(tensor.numel() > 0 for tensor in tensors) > 20
+        places = [tensor.data_ptr() for tensor in tensors_of(state) if tensor.numel()]
+        assert len(set(places)) == len(places) > 20
 
 
 def test_poses_of_a_smooth_object_are_those_of_a_step(graphs):

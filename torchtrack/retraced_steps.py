@@ -1,5 +1,6 @@
 """The steps of a run, held back until it is known what is found after them, and given on with objects followed back in time."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -74,7 +75,7 @@ class Retracer:
     @torch.inference_mode()
     def _look(self) -> None:
         """See which objects were lost in the newest steps, and follow back those that are seen well again."""
-        newest = self._held[self._looked_at - 1 :]
+        newest, begun = self._held[self._looked_at - 1 :], time.perf_counter()
         if len(newest) > 1:
             objects, states = self._objects, [step.state for step in newest]
             found = goes_on(Filtered.of(states), objects.centre_obj, objects.diameter_m, self._config.motion)
@@ -83,6 +84,8 @@ class Retracer:
             seen = torch.stack([state.unseen_s == 0 for state in states[1:]]).cpu() & ~lost
             for at, (lost_now, seen_now) in enumerate(zip(lost.tolist(), seen.tolist(), strict=True), self._looked_at):
                 self._note(at, lost_now, seen_now)
+            seconds = (time.perf_counter() - begun) / (len(newest) - 1)
+            self._held[self._looked_at :] = [replace(step, seconds=step.seconds + seconds) for step in self._held[self._looked_at :]]
         self._looked_at = max(len(self._held), 1)
 
     def _note(self, at: int, lost: list[bool], seen: list[bool]) -> None:

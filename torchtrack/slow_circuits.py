@@ -26,8 +26,8 @@ _LATE_PX, _FAR_ENOUGH_PX = 2.0, 2.5
 _FAST, _SLOW = 0.07, 0.12
 # What was not seen well for so long (s) is dated back in full.
 _UNSEEN_S = 0.02
-# Events that are remembered: some twenty windows of them.
-_REMEMBERED = 20_000.0
+# It changes with the light, and is looked at so often (µs). Events that are remembered: those of some five such windows.
+LOOK_US, _REMEMBERED = 20_000, 5_000.0
 
 
 def unknown_circuits(like: Float[Tensor, "b"]) -> Float[Tensor, "b"]:

@@ -39,7 +39,7 @@ from torchtrack.search import explained_at_rest, judge_fit, rehearse
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.sensors import farthest_event_px
 from torchtrack.setup_check import check_start
-from torchtrack.slow_circuits import dated, late_share_after, unknown_circuits
+from torchtrack.slow_circuits import LOOK_US, dated, late_share_after, unknown_circuits
 from torchtrack.speed_limit import largest_speed, limit_speed
 from torchtrack.state import Probation, StepResult, TrackerState, choose_rows
 from torchtrack.time_surface import empty_last_event, update_last_event
@@ -288,8 +288,9 @@ class Tracker(TrackedObjects):
         if config.search.probation:
             next_state, result = after_probation(state, next_state, result, prediction, widening, config)
         next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self.on_surfaces, learns), config)
-        if config.matching.adaptive_bursts:
-            sure = (result.status == int(Status.TRACKING)) & ~found.elsewhere
+        due = is_due(state.t_us, t_us, LOOK_US)[self.stream_index]
+        if config.matching.adaptive_bursts and not readback.none_of(due):
+            sure = due & (result.status == int(Status.TRACKING)) & ~found.elsewhere
             late_share = late_share_after(state.late_share, observations, contours, fit.matches, prediction, sure, config.matching)
             next_state = replace(next_state, late_share=late_share)
         return replace(next_state, t_us=t_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
