@@ -31,9 +31,13 @@ from torchtrack.sim.trajectory import Trajectory
 DT_S = 0.005
 # Exact events, though few of them: corners are observed as well. Nothing is common to their errors.
 CORNERS, EXACT = CornerConfig(max_corners=32), SolverConfig(observation_px=0.2, common_px=0.0)
-STEADY = TrackerConfig(corners=CORNERS, motion=MotionConfig(acceleration_s=0.0), solver=EXACT.model_copy(update={"acceleration_in_window": False}))
-ALWAYS = TrackerConfig(corners=CORNERS, motion=MotionConfig(acceleration_px=0.0), solver=EXACT)
-DEFAULT = TrackerConfig(corners=CORNERS, solver=EXACT)
+# Which events count as late does not change while velocities are compared.
+DATED = MatchingConfig(adaptive_bursts=False)
+STEADY = TrackerConfig(
+    corners=CORNERS, matching=DATED, motion=MotionConfig(acceleration_s=0.0), solver=EXACT.model_copy(update={"acceleration_in_window": False})
+)
+ALWAYS = TrackerConfig(corners=CORNERS, matching=DATED, motion=MotionConfig(acceleration_px=0.0), solver=EXACT)
+DEFAULT = TrackerConfig(corners=CORNERS, matching=DATED, solver=EXACT)
 COUNT = 20
 # Windows after the start.
 SWINGING = slice(4, COUNT)
