@@ -96,7 +96,7 @@ def test_each_object_has_its_own():
 
 def test_it_is_remembered():
     # Circuits are looked at once in 20 ms: in the window that ends there.
-    tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(matching=LONG), count=7)
+    tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(matching=LONG), count=11)
     after = [float(tracker.step(replace(state, late_share=torch.full((1,), before)), events, end_us)[0].late_share) for before in (0.0, 1.0)]
     assert 0.0 < after[0] < 0.02 and 0.98 < after[1] < 1.0
 

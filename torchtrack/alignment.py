@@ -11,6 +11,7 @@ from torchtrack import fast_alignment
 from torchtrack.common_error import told_by_each
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.contour_index import ContourIndex, index_contours
+from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours, reproject
 from torchtrack.implicit_gradient import with_gradient
 from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
@@ -101,12 +102,11 @@ def align(
     begin = prediction if offset is None else prediction.moved(offset)
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
     table = _table(contours, index, objects, matching)
-    # One that may be far off would settle on the first edges that it is nearest to.
-    small = (objects.size_px(begin.T_cam_obj).detach() < matching.fine_below_px) & (widening <= 1)
+    finely = _looked_up_finely(objects, begin, contours, widening, matching)
     narrowing = tuple(_narrowing(widening, len(matching.gates_px)))
     if fast_alignment.applies(config, offset):
         solution, matches = fast_alignment.align_rounds(
-            prediction, begin.T_cam_obj, offset, information, table, observations, narrowing, small, config
+            prediction, begin.T_cam_obj, offset, information, table, observations, narrowing, finely, config
         )
         return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
     place = _first_place(begin, observations, config)
@@ -120,13 +120,24 @@ def align(
             contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
             matches = match_along_flow(observations, contours, moving, gate_px, matching)
         else:
-            matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider, small)
+            matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider, finely)
         matches = _believed(matches, observations, config)
         problem = _problem(prediction, information, matches, observations, offset, gate_px * wider, config)
         solution = solve_pose(problem, begin.T_cam_obj, config.solver, offset)
         begin, offset = prediction.at(solution.T_cam_obj, solution.from_prior), solution.from_prior
     solution = with_gradient(problem, solution, config.solver)
     return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
+
+
+def _looked_up_finely(
+    objects: ObjectBatch, begin: Prediction, contours: Contours, widening: Float[Tensor, "b"], config: MatchingConfig
+) -> Bool[Tensor, "b"]:
+    """Of which objects contours are looked up between the cells of the index: of small ones, and those whose print is seen, fine as it may be."""
+    finely = objects.size_px(begin.T_cam_obj).detach() < config.fine_below_px
+    if config.fine_print:
+        finely = finely | ((contours.kind == int(ContourKind.TEXTURE)) & contours.mask).any(1)
+    # One that may be far off would settle on the first edges that it is nearest to.
+    return finely & (widening <= 1)
 
 
 def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config: MatchingConfig) -> ContourTable:

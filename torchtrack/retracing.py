@@ -5,7 +5,8 @@ in a wrong place first. Backwards nothing has to be looked for: from the window 
 windows before are played in reverse, and a tracker follows them to where the object is hidden. It comes later for it, so this is for
 recordings, and for whoever can wait.
 
-In reverse, contours move the other way and what got brighter gets darker, so that all that is known of an object still holds.
+In reverse, contours move the other way and what got brighter gets darker, so that all that is known of an object still holds. It is
+followed alone: that another tracked object hides it is no more known than of anything else.
 """
 
 from collections.abc import Iterator, Sequence
