@@ -132,10 +132,14 @@ def align(
 def _looked_up_finely(
     objects: ObjectBatch, begin: Prediction, contours: Contours, widening: Float[Tensor, "b"], config: MatchingConfig
 ) -> Bool[Tensor, "b"]:
-    """Of which objects contours are looked up between the cells of the index: of small ones, and those whose print is seen, fine as it may be."""
+    """Of which objects contours are looked up between the cells of the index: of small ones, and those of which print or smooth limbs are seen.
+
+    Others of plain faces are not: their models may lack print, whose events then find the nearest edge all the more surely.
+    """
     finely = objects.size_px(begin.T_cam_obj).detach() < config.fine_below_px
-    if config.fine_print:
-        finely = finely | ((contours.kind == int(ContourKind.TEXTURE)) & contours.mask).any(1)
+    if config.fine_unless_plain:
+        fine = (contours.kind == int(ContourKind.TEXTURE)) | (contours.kind == int(ContourKind.LIMB))
+        finely = finely | (fine & contours.mask).any(1)
     # One that may be far off would settle on the first edges that it is nearest to.
     return finely & (widening <= 1)
 

@@ -112,7 +112,9 @@ class MatchingConfig(Settings):
     fine_below_px: float = Field(
         120.0, ge=0, description="Of objects smaller than this in the image (px) and not uncertain, contours are looked up finer than by cells."
     )
-    fine_print: bool = Field(True, description="So are those of larger objects whose print is seen: it may be as fine as cells.")
+    fine_unless_plain: bool = Field(
+        True, description="So are those of larger objects of which more is seen than plain faces: print, or smooth limbs."
+    )
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
     concentration: bool = Field(True, description="Trust observations less where those around them are smeared across the contour.")
