@@ -288,9 +288,8 @@ class Tracker(TrackedObjects):
         if config.search.probation:
             next_state, result = after_probation(state, next_state, result, prediction, widening, config)
         next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self.on_surfaces, learns), config)
-        due = is_due(state.t_us, t_us, LOOK_US)[self.stream_index]
-        if config.matching.adaptive_bursts and not readback.none_of(due):
-            sure = due & (result.status == int(Status.TRACKING)) & ~found.elsewhere
+        if config.matching.adaptive_bursts and not readback.none_of(due := is_due(state.t_us, t_us, LOOK_US)):
+            sure = due[self.stream_index] & (result.status == int(Status.TRACKING)) & ~found.elsewhere
             late_share = late_share_after(state.late_share, observations, contours, fit.matches, prediction, sure, config.matching)
             next_state = replace(next_state, late_share=late_share)
         return replace(next_state, t_us=t_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
