@@ -8,6 +8,7 @@ import trimesh
 from both_ways import assert_as_close, both_ways
 from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_events, random_pose, random_twist
 from test_common_error import two_depths
+from test_prediction import boxes
 from test_visibility import ball, l_prism
 
 from torchtrack.bursts import LONG_AGO_US, update_bursts
@@ -106,17 +107,29 @@ def test_points_at_a_pose(dtype):
 
 
 @pytest.mark.parametrize("streams", [[0, 0, 0, 0, 0, 0], [0, 1, 2, 0, 1, 1]])
+@pytest.mark.parametrize("depth_m", [(0.4, 0.8), (0.8, 3.0)], ids=["near", "far"])
 @pytest.mark.parametrize("seed", range(3))
-def test_hidden_contours_of_objects_before_one_another(streams, seed):
+def test_hidden_contours_of_objects_before_one_another(streams, depth_m, seed):
     models, streams = all_kinds(), torch.tensor(streams)
     groups = [group.double() for group in group_by_model(models, ContourConfig())]
-    T, intrinsics = random_pose(6, seed=seed), SMALL_CAMERA.intrinsics(torch.float64).expand(6, 4)
+    T, intrinsics = random_pose(6, seed=seed, depth_m=depth_m), SMALL_CAMERA.intrinsics(torch.float64).expand(6, 4)
     diameters, shape = torch.tensor([model.diameter_m for model in models]).double(), (3, SMALL_CAMERA.height, SMALL_CAMERA.width)
     contours = mesh_contours(groups, T, intrinsics, ContourConfig())
     scene = Scene(groups, T, intrinsics, streams, diameters, shape, shared=True)
     by_kernels, plain = both_ways(lambda: remove_hidden(contours, scene, ContourConfig()))
     assert torch.equal(by_kernels.mask, plain.mask)
     assert 0 < int(plain.mask.sum()) < int(contours.mask.sum())
+
+
+def test_poses_in_the_middle_of_a_window(dtype):
+    T_cam_obj, velocity = random_pose(5).to(dtype), 4.0 * random_twist(5).to(dtype)
+    # One was behind the camera then, and one is nowhere.
+    velocity[1, 5], T_cam_obj[2, 0, 0] = 1e3, torch.nan
+    prediction, dt_s = boxes(T_cam_obj, velocity=velocity, dtype=dtype), uniform(5, low=0.005, high=0.05, dtype=dtype)
+    by_kernels, plain = both_ways(lambda: prediction.in_mid_window(dt_s))
+    assert_as_close(by_kernels, plain, tolerance=TOLERANCE[dtype])
+    assert torch.equal(plain[1:3].nan_to_num(9.0), T_cam_obj[1:3].nan_to_num(9.0))
+    assert not torch.equal(plain[0], T_cam_obj[0])
 
 
 # ---- index, table and choice of events

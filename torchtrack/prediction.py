@@ -94,11 +94,21 @@ class Prediction:
         """
         if config.source == "splat" or not config.mid_window:
             return self.objects.contours(self.T_cam_obj, config)
+        seen = self.objects.contours(self.in_mid_window(dt_s), config)
+        return assemble(seen.points_obj, seen.tangents_obj, seen.kind, seen.mask, self.T_cam_obj, self.objects.intrinsics)
+
+    def in_mid_window(self, dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 4 4"]:
+        """Poses half a window of length ``dt_s`` earlier; those at its end where they would not be before the camera."""
+        if switch.apply_to(self.T_cam_obj):
+            # Not at the top: Numba is an extra.
+            from torchtrack.kernels.forecast import in_mid_window
+
+            middle = torch.empty_like(self.T_cam_obj, memory_format=torch.contiguous_format)
+            in_mid_window(*as_arrays(self.T_cam_obj, self.velocity, dt_s, self.objects.centre_obj), MIN_DEPTH_M, MAX_DEPTH_M, middle.numpy())
+            return middle
         back = self.velocity * (-0.5 * dt_s)[:, None]
         middle = step_about(self.T_cam_obj, back, self.objects.centre_obj)
-        middle, _ = before_camera(middle, self.objects.centre_obj, self.T_cam_obj)
-        seen = self.objects.contours(middle, config)
-        return assemble(seen.points_obj, seen.tangents_obj, seen.kind, seen.mask, self.T_cam_obj, self.objects.intrinsics)
+        return before_camera(middle, self.objects.centre_obj, self.T_cam_obj)[0]
 
     def moved(self, offset: Float[Tensor, "b k"]) -> "Prediction":
         """The prediction with its pose and velocity moved; the covariance stays."""

@@ -229,12 +229,12 @@ def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -
     drawn = ~exact[:, 0] | _beside_others(scene, contours, cell_px)
     if readback.none_of(drawn):
         return torch.zeros_like(contours.mask)
+    if switch.apply_to(contours.pixels):
+        return _hidden_in_buffer_by_kernel(scene, contours, drawn, exact[:, 0], config)
     _, height, width = scene.image_shape
     u, v = contours.pixels.unbind(-1)
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     grid = DepthGrid.around(scene, contours.pixels, contours.mask & inside, cell_px)
-    if switch.apply_to(contours.pixels):
-        return _hidden_in_buffer_by_kernel(scene, contours, drawn, exact[:, 0], grid, config)
     depth_m, owner = depth_buffer(scene, grid, drawn if readback.read_at_once(drawn) else None)
     sides = torch.stack([contours.pixels + side * contours.normals for side in (0, -cell_px, cell_px)], 1)
     cell = grid.cell(sides, scene.stream_index)
@@ -245,26 +245,28 @@ def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -
 
 
 def _hidden_in_buffer_by_kernel(
-    scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"], exact: Bool[Tensor, "b"], grid: DepthGrid, config: ContourConfig
+    scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"], exact: Bool[Tensor, "b"], config: ContourConfig
 ) -> Tensor:
     """:func:`_hidden_in_buffer`, sample by sample and point by point."""
     # Not at the top: Numba is an extra.
     from torchtrack.kernels import visibility as kernels
 
-    settings = GridSettings(*grid.size, float(grid.cell_px), *scene.image_shape[1:], _DEPTH_STEPS_PER_M, MIN_DEPTH_M)
-    cells = len(grid.first) * settings.rows * settings.columns
+    streams, height, width = scene.image_shape
+    hidden, margin_m, first = torch.zeros_like(contours.mask), config.depth_margin * scene.diameters_m, np.empty((streams, 2))
+    points_cam, pixels, normals, mask = as_arrays(
+        *(value.transpose(1, 2) for value in (contours.points_cam, contours.pixels, contours.normals)), contours.mask
+    )
+    T_cam_obj, intrinsics, stream_index, diameters_m = as_arrays(scene.T_cam_obj, scene.intrinsics, scene.stream_index, scene.diameters_m)
+    cell_px = float(config.depth_cell_px)
+    size = kernels.around(pixels, mask, stream_index, cell_px, height, width, first)
+    settings = GridSettings(*size, cell_px, height, width, _DEPTH_STEPS_PER_M, MIN_DEPTH_M, _SAMPLES_PER_CELL)
+    cells = streams * settings.rows * settings.columns
     depth, owner = np.full(cells, _NOTHING), np.full(cells, len(drawn))
-    T_cam_obj, intrinsics, stream_index, first = as_arrays(scene.T_cam_obj, scene.intrinsics, scene.stream_index, grid.first)
-    every = np.ones(len(drawn), np.int64)
     for model in scene.models:
-        members = model.members[drawn[model.members]]
-        if len(members) == 0:
-            continue
-        every[members.numpy()] = (1 << _halvings(model, members, scene, grid.cell_px)).numpy()
-        kernels.draw(*as_arrays(members, model.surface_points), every, T_cam_obj, intrinsics, stream_index, first, settings, depth, owner)
-    hidden, margin_m = torch.zeros_like(contours.mask), config.depth_margin * scene.diameters_m
-    points = as_arrays(*(value.transpose(1, 2) for value in (contours.points_cam, contours.pixels, contours.normals)), contours.mask, exact, margin_m)
-    kernels.hide_in_buffer(*points, stream_index, first, settings, depth, owner, hidden.numpy())
+        of_model = as_arrays(model.members, drawn, model.surface_points)
+        kernels.draw(*of_model, T_cam_obj, intrinsics, diameters_m, stream_index, first, settings, depth, owner)
+    own = as_arrays(exact, margin_m)
+    kernels.hide_in_buffer(points_cam, pixels, normals, mask, *own, stream_index, first, settings, depth, owner, hidden.numpy())
     return hidden
 
 

@@ -142,15 +142,40 @@ def _move(
     T_cam_obj: Array, centre_obj: Array, before: Array, acceleration: Array, dt: float, settings: ForecastSettings, T_prior: Array, velocity: Array
 ) -> bool:
     """Move a pose by its velocity and acceleration, which change the velocity, too; whether it is one before the camera."""
-    moved, rotation = np.empty(6), np.empty((3, 3))
+    moved = np.empty(6)
     for k in range(6):
         gained = acceleration[k] * dt
         moved[k], velocity[k] = (before[k] + 0.5 * gained) * dt, before[k] + gained
+    return _step(T_cam_obj, centre_obj, moved, settings.least_depth_m, settings.most_depth_m, T_prior)
+
+
+@kernel()
+def _step(T_cam_obj: Array, centre_obj: Array, moved: Array, least_depth_m: float, most_depth_m: float, stepped: Array) -> bool:
+    """Move a pose a little, about the object's centre; whether it is one before the camera."""
+    rotation = np.empty((3, 3))
     turn(T_cam_obj[:3, :3], moved, rotation)
     for j in range(3):
-        T_prior[j, 3] = T_cam_obj[j, 3] + moved[3 + j]
+        stepped[j, 3] = T_cam_obj[j, 3] + moved[3 + j]
         for k in range(3):
-            T_prior[j, 3] += (T_cam_obj[j, k] - rotation[j, k]) * centre_obj[k]
-            T_prior[j, k] = rotation[j, k]
-    T_prior[3] = T_cam_obj[3]
-    return is_finite(T_prior) and settings.least_depth_m < depth_of(T_prior, centre_obj) < settings.most_depth_m
+            stepped[j, 3] += (T_cam_obj[j, k] - rotation[j, k]) * centre_obj[k]
+            stepped[j, k] = rotation[j, k]
+    stepped[3] = T_cam_obj[3]
+    return is_finite(stepped) and least_depth_m < depth_of(stepped, centre_obj) < most_depth_m
+
+
+@kernel()
+def in_mid_window(
+    T_cam_obj: Array, velocity: Array, dt_s: Array, centre_obj: Array, least_depth_m: float, most_depth_m: float, middle: Array
+) -> None:
+    """Where objects were half a window earlier: :meth:`torchtrack.prediction.Prediction.in_mid_window`, object by object.
+
+    Args:
+        T_cam_obj, velocity, dt_s, centre_obj: ``[b, 4, 4]``, ``[b, 6]``, ``[b]`` and ``[b, 3]``.
+        middle: ``[b, 4, 4]``, filled.
+    """
+    moved = np.empty(6)
+    for b in range(len(T_cam_obj)):
+        for k in range(6):
+            moved[k] = -0.5 * dt_s[b] * velocity[b, k]
+        if not _step(T_cam_obj[b], centre_obj[b], moved, least_depth_m, most_depth_m, middle[b]):
+            middle[b] = T_cam_obj[b]

@@ -133,6 +133,7 @@ class GridSettings(NamedTuple):
         height, width: of the image (px).
         steps_per_m: depths are compared in so many parts of a metre.
         least_depth_m: what is nearer is not drawn.
+        samples_per_cell: so many surface samples for each cell of the square around an object are enough.
     """
 
     rows: int
@@ -142,6 +143,7 @@ class GridSettings(NamedTuple):
     width: int
     steps_per_m: float
     least_depth_m: float
+    samples_per_cell: int
 
 
 class SamplingSettings(NamedTuple):

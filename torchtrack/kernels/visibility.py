@@ -88,13 +88,53 @@ def _cell(u: float, v: float, first: Array, stream: int, grid: GridSettings) -> 
     return (int(row) + stream * grid.rows) * grid.columns + int(column)
 
 
+@kernel()
+def around(pixels: Array, mask: Array, stream_index: Array, cell_px: float, height: int, width: int, first: Array) -> tuple[int, int]:
+    """Rows and columns of depth buffers that hold what is asked for: :meth:`torchtrack.visibility.DepthGrid.around`.
+
+    Args:
+        pixels, mask: ``[b, 2, m]`` and ``[b, m]``.
+        height, width: of the image (px); pixels outside it are not asked for.
+        first: ``[s, 2]``, filled: first cell (column, row) of each stream's buffer.
+    """
+    last = np.full(first.shape, -np.inf)
+    first[:] = np.inf
+    for b in range(len(mask)):
+        low, high = first[stream_index[b]], last[stream_index[b]]
+        for i in range(mask.shape[1]):
+            u, v = pixels[b, 0, i], pixels[b, 1, i]
+            if mask[b, i] and u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1:
+                low[0], low[1], high[0], high[1] = min(low[0], u), min(low[1], v), max(high[0], u), max(high[1], v)
+    columns, rows = 0.0, 0.0
+    for s in range(len(first)):
+        if not np.isfinite(first[s, 0]):
+            first[s] = 0.0
+            continue
+        for k in range(2):
+            # Beside the pixels, and one more that takes what lies outside.
+            first[s, k], last[s, k] = np.floor(first[s, k] / cell_px) - 2.0, np.ceil(last[s, k] / cell_px) + 2.0
+        columns, rows = max(columns, last[s, 0] - first[s, 0]), max(rows, last[s, 1] - first[s, 1])
+    return int(rows) + 1, int(columns) + 1
+
+
+@kernel()
+def _every(samples: int, T_cam_obj: Array, intrinsics: Array, diameter_m: float, grid: GridSettings) -> int:
+    """The so manieth surface sample of an object that is taken, as few will do where it is small in the image."""
+    size_cells = diameter_m * intrinsics[0] / max(T_cam_obj[2, 3], grid.least_depth_m) / grid.side_px
+    spare, every = samples / max(grid.samples_per_cell * size_cells * size_cells, 1.0), 1
+    while 2 * every <= spare:
+        every *= 2
+    return every
+
+
 @kernel(fastmath=FAST)
 def draw(
     members: Array,
+    drawn: Array,
     samples: Array,
-    every: Array,
     T_cam_obj: Array,
     intrinsics: Array,
+    diameters_m: Array,
     stream_index: Array,
     first: Array,
     grid: GridSettings,
@@ -104,14 +144,16 @@ def draw(
     """Draw surface samples of objects of one model into depth buffers; of objects as near, the first stays.
 
     Args:
-        members: numbers of the objects.
-        samples: ``[n, 3]``, in the object's frame; ``every [b]`` so manieth of them is taken.
+        members: numbers of the objects, and which of all are ``drawn [b]``.
+        samples: ``[n, 3]``, in the object's frame.
         first: ``[s, 2]``, first cell of each stream's buffer.
         depth, owner: ``[p]``, depths in whole steps, and the object of each; changed.
     """
     for b in members:
+        if not drawn[b]:
+            continue
         stream, pose, (fx, fy, cx, cy) = stream_index[b], entries(T_cam_obj[b]), lens(intrinsics[b])
-        for i in range(0, len(samples), every[b]):
+        for i in range(0, len(samples), _every(len(samples), T_cam_obj[b], intrinsics[b], diameters_m[b], grid)):
             x, y, z = placed(pose, samples[i, 0], samples[i, 1], samples[i, 2])
             if not z > grid.least_depth_m:
                 continue
