@@ -45,11 +45,12 @@ def doubt(
     symmetric=False,
     unseen_s=1.0,
     strayed=False,
+    may_have_turned=False,
     off_in_depth=False,
     little=False,
 ):
     sigma_px = torch.as_tensor(sigma_px)
-    values = score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric, unseen_s, strayed, off_in_depth, little
+    values = score, usual, starting, due, adrift, doubted_s, full, far_due, symmetric, unseen_s, strayed, may_have_turned, off_in_depth, little
     return Doubt(sigma_px, *(torch.as_tensor(value).expand_as(sigma_px) for value in values))
 
 
@@ -117,6 +118,15 @@ def test_what_has_a_plane_of_symmetry_and_does_not_explain_all_may_be_mirrored_w
     assert is_wanted(state, score, TrackerConfig(search=SearchConfig(**only_mirrors))).tolist() == [True] + [False] * 5
     for never in ({"mirrored_to": 0}, {"doubt_us": 0}):
         assert not state.is_mirrored(score, SearchConfig(**never)).any()
+
+
+def test_what_may_have_turned_is_looked_at_once_it_is_seen_well_again_and_sure_of_its_place():
+    settings, score = SearchConfig(slip_share=0.9, slip_sigma_px=6.0), torch.tensor([0.82, 0.8, 0.82, 0.82, 0.82])
+    turned, starting, due = (torch.tensor([number != wrong for number in range(5)]) for wrong in (2, 3, 4))
+    state = doubt([1.0] * 5, full=0.9, may_have_turned=turned, starting=~starting, far_due=due)
+    assert state.is_turned(score, settings).tolist() == [True, False, False, False, False]
+    assert is_wanted(state, score, TrackerConfig(search=settings)).tolist()[0]
+    assert not doubt([6.1], full=0.9, may_have_turned=True, far_due=True).is_turned(score[:1], settings).any()
 
 
 def test_what_is_adrift_or_very_uncertain_is_looked_for_as_it_was_last_seen_when_it_is_time():

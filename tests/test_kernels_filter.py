@@ -145,9 +145,10 @@ def random_find(tracker, prediction, dtype):
     solution = Linearisation(T_cam_obj, offset.to(dtype), hessian.to(dtype), offset.to(dtype))
     measured, gathered = uniform(OBJECTS, low=0.3, seed=23).to(dtype), uniform(OBJECTS, seed=24).to(dtype)
     measured[0], measured[1], measured[5], gathered[2] = 0.05, 0.3, torch.nan, torch.nan
-    elsewhere = torch.arange(OBJECTS) % 3 == 0
+    elsewhere, turn_unclear = torch.arange(OBJECTS) % 3 == 0, torch.arange(OBJECTS) % 4 == 2
     full_gathered, apart, asked_apart = (uniform(OBJECTS, seed=seed).to(dtype) for seed in (26, 30, 31))
-    return Found(Fit(solution, contours, matches), measured, torch.ones_like(measured), count, gathered, full_gathered, apart, asked_apart, elsewhere)
+    told = measured, torch.ones_like(measured), count, gathered, full_gathered, apart, asked_apart
+    return Found(Fit(solution, contours, matches), *told, elsewhere, turn_unclear)
 
 
 def conclusions(config, dtype, spoil=lambda found: None):

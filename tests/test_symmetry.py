@@ -9,7 +9,7 @@ from torchtrack.eval.metrics import pose_errors
 from torchtrack.io import Trajectory
 from torchtrack.lie import se3_exp, so3_exp
 from torchtrack.object_model import ObjectModel
-from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axes, revolution_axis, symmetry_planes
+from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axes, revolution_axis, symmetry_planes, turning_axis
 from torchtrack.sim.curved import vase
 
 SEEN_AXIS = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -101,6 +101,64 @@ def test_axes_of_many_objects_are_those_of_each():
     assert torch.equal(axes[0], revolution_axis(can).direction_obj)
     assert torch.equal(axes[0], axes[2])
     assert torch.equal(axes[1], torch.zeros(3, dtype=torch.float64))
+
+
+# ---- axes that most of an object can be turned about
+
+
+def handle(extents_m, x_m, z_m=0.0):
+    """A box beside the axis z."""
+    box = trimesh.creation.box(extents_m)
+    box.apply_translation((x_m, 0, z_m))
+    return box
+
+
+def printed_can():
+    can = trimesh.creation.cylinder(0.03, 0.1, sections=32)
+    colours = [[255, 255, 255, 255] if x > 0 else [20, 20, 20, 255] for x in can.triangles_center[:, 0]]
+    can.visual = trimesh.visual.ColorVisuals(can, face_colors=colours)
+    return can
+
+
+HANDLED_SHAPES = {
+    "can": [trimesh.creation.cylinder(0.03, 0.1, sections=32), handle((0.03, 0.012, 0.06), 0.042, 0.01)],
+    "ring": [trimesh.creation.torus(0.05, 0.014), handle((0.03, 0.012, 0.02), 0.07)],
+    "cone": [trimesh.creation.cone(0.04, 0.12), handle((0.02, 0.02, 0.02), 0.035, 0.02)],
+    "printed can": [printed_can()],
+}
+
+
+@pytest.mark.parametrize("name", HANDLED_SHAPES)
+def test_the_axis_of_most_of_a_shape_wherever_it_lies(name):
+    parts = HANDLED_SHAPES[name]
+    mesh = trimesh.util.concatenate(parts) if len(parts) > 1 else parts[0].copy()
+    T = se3_exp(torch.tensor([0.4, -0.9, 0.3, 0.2, -0.1, 0.3], dtype=torch.float64))
+    mesh.apply_transform(T.numpy())
+    axis, direction = turning_axis(ObjectModel.from_mesh(mesh)), T[:3, :3] @ SEEN_AXIS
+    assert axis is not None
+    assert abs(float(axis.direction_obj @ direction)) == pytest.approx(1, abs=2e-5)
+    # To a third of a millimetre, although the handle shifts the middle by several.
+    assert float(torch.linalg.cross(axis.point_obj - T[:3, 3], direction).norm()) < 3e-4
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        TURNED_SHAPES["cylinder"],
+        trimesh.creation.box((0.1, 0.1, 0.02)),
+        trimesh.creation.box((0.2, 0.2, 0.002)),
+        trimesh.util.concatenate([trimesh.creation.icosphere(subdivisions=3, radius=0.05), handle((0.02, 0.01, 0.01), 0.055)]),
+        trimesh.util.concatenate([handle((0.03, 0.08, 0.03 * (step + 1)), 0.03 * step, -0.015 * (step + 1)) for step in range(4)]),
+        trimesh.util.concatenate([trimesh.creation.cylinder(0.01, 0.05, sections=32), handle((0.1, 0.1, 0.05), 0.07)]),
+    ],
+    ids=["cylinder", "box", "plate", "ball with a handle", "stairs", "box with a knob"],
+)
+def test_all_other_shapes_cannot_be_turned_nearly_unseen(mesh):
+    assert turning_axis(ObjectModel.from_mesh(mesh)) is None
+
+
+def test_lines_have_no_axis_either():
+    assert turning_axis(ObjectModel.from_polylines([[[0.0, 0, 0], [0.1, 0, 0]]])) is None
 
 
 # ---- planes

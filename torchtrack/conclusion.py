@@ -80,7 +80,8 @@ def _judged(
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
     trusted = torch.where(failed, 0, torch.maximum(hidden, quality.trust(share, config.quality, state.full_share, widening)))
     doubted = ~failed & in_doubt(found.score, state.full_share, found.gathered, found.full_gathered, config.search)
-    status = torch.where(doubted, status.clamp(min=int(quality.Status.UNCERTAIN)), status)
+    unsure = doubted | (~failed & found.turn_unclear)
+    status = torch.where(unsure, status.clamp(min=int(quality.Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
     # Of an object that is partly hidden too little is seen to tell.
     seen_well = ~failed & (share >= config.quality.certain_at * state.full_share)
@@ -130,7 +131,7 @@ def _judged_by_kernel(
     kernels.conclude(
         *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance, prediction.information),
         *as_arrays(expected.expected, expected.variance, solution.T_cam_obj, solution.from_prior, solution.hessian),
-        *as_arrays(found.elsewhere, found.count, told, dt_s, objects.centre_obj, objects.diameter_m),
+        *as_arrays(found.elsewhere, found.turn_unclear, found.count, told, dt_s, objects.centre_obj, objects.diameter_m),
         _settings(config),
         *as_arrays(remembered, T_last_seen, T_cam_obj, velocity, acceleration, covariance, left, status),
     )

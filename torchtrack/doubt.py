@@ -42,6 +42,7 @@ class Doubt:
         has_symmetry: objects with a plane of symmetry.
         unseen_s: how long ago each was last seen well (s).
         strayed: which of those adrift merely explain less than when seen well.
+        may_have_turned: which may be turned about an axis unseen: :mod:`torchtrack.turns`.
         off_in_depth, little: which are to be looked for all around where they were last seen well, and why: :mod:`torchtrack.relocation`.
     """
 
@@ -57,12 +58,13 @@ class Doubt:
     has_symmetry: Bool[Tensor, "b"]
     unseen_s: Float[Tensor, "b"]
     strayed: Bool[Tensor, "b"]
+    may_have_turned: Bool[Tensor, "b"]
     off_in_depth: Bool[Tensor, "b"]
     little: Bool[Tensor, "b"]
 
     def reasons(self, score: Float[Tensor, "b"], config: SearchConfig) -> tuple[Bool[Tensor, "b"], ...]:
-        """Which objects a search is wanted for: beside the prediction, where they may have slipped to, and mirrored."""
-        return self.asks(score, config), self.slips(score, config), self.is_mirrored(score, config)
+        """Which objects a search is wanted for: beside the prediction, where they may have slipped to, mirrored, and turned about an axis."""
+        return self.asks(score, config), self.slips(score, config), self.is_mirrored(score, config), self.is_turned(score, config)
 
     def asks(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects are to be searched for: uncertain and new ones, those whose score stays below the usual, and those long in doubt."""
@@ -89,6 +91,11 @@ class Doubt:
         sure = ~self.starting & (self.sigma_px < config.slip_sigma_px)
         low = torch.maximum(score, self.last_score) < config.mirrored_to * self.full_share
         return sure & low & self._far_due(config) & self.has_symmetry
+
+    def is_turned(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+        """Which objects may be turned about their axis: those that are sure of their place, and explain as much as when seen well again."""
+        sure = self.may_have_turned & ~self.starting & (self.sigma_px < config.slip_sigma_px)
+        return sure & (score >= config.slip_share * self.full_share) & self._far_due(config)
 
     def has_run_off(self, config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects are also looked for as they were last seen well."""
@@ -119,13 +126,18 @@ def mirrors(config: TrackerConfig) -> bool:
     return searches(config) and config.search.mirrored_to > 0
 
 
+def turns(config: TrackerConfig) -> bool:
+    """Whether they are turned ones, too."""
+    return searches(config) and config.search.turned and config.search.doubt_us > 0
+
+
 def is_wanted(doubt: Doubt, score: Float[Tensor, "b"], config: TrackerConfig) -> Bool[Tensor, "b"]:
     """Which objects a search is wanted for, as ``score`` tells once the window is aligned."""
     if not searches(config):
         return torch.zeros_like(doubt.starting)
     # Those that have run off are asked for already, as uncertain ones or as those in doubt.
-    asks, slips, is_mirrored = doubt.reasons(score, config.search)
-    return asks | slips | is_mirrored | doubt.anew()
+    asks, slips, is_mirrored, is_turned = doubt.reasons(score, config.search)
+    return asks | slips | is_mirrored | is_turned | doubt.anew()
 
 
 def in_doubt(

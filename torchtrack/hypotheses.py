@@ -24,7 +24,7 @@ from torchtrack.prediction import Prediction
 from torchtrack.views import outlines_at, thinned
 
 # Events beside a contour are counted this far from it (px), and more than this many of them in one place say no more.
-_BESIDE_PX, _ENOUGH_EVENTS = 4.0, 3.0
+_BESIDE_PX, ENOUGH_EVENTS = 4.0, 3.0
 
 
 def promising(
@@ -45,7 +45,7 @@ def promising(
         places: pixels of the events at the window's end, and which of them exist.
     """
     settings = config.search
-    enough = event_density(*places, prediction.objects.image_size).clamp(max=_ENOUGH_EVENTS)
+    enough = event_density(*places, prediction.objects.image_size).clamp(max=ENOUGH_EVENTS)
     if sigma_px > settings.wide_sigma_px:
         poses = _near_events(prediction, covariance, places, enough, config)
         offsets = difference_about(prediction.T_cam_obj.expand(len(poses), 4, 4), poses, prediction.objects.centre_obj.expand(len(poses), 3))

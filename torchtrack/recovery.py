@@ -16,6 +16,7 @@ from torchtrack.quality import are_many
 from torchtrack.readback import Answer
 from torchtrack.relocation import LastSeen
 from torchtrack.search import AS_MUCH, Found, is_taken, search, search_around
+from torchtrack.turns import TurningAxes, turns_compared
 
 # A pose explains no fewer events than another where it explains this share of theirs.
 _AS_MANY = 0.8
@@ -32,12 +33,14 @@ def search_wanted(
     config: TrackerConfig,
     last_seen: LastSeen,
     planes: SymmetryPlanes,
+    axes: TurningAxes,
 ) -> tuple[Found, Prediction, Float[Tensor, "b"]]:
     """Try other poses for the objects that need it, one object after the other: beside the prediction, where it may have slipped to, and so on.
 
     Args:
         last_seen: where the objects were seen well for the last time.
         planes: of symmetry.
+        axes: that most of an object can be turned about unseen.
 
     Returns:
         What was found, the prediction that it is to be weighed against, and the widening of the first gates: of an object that had
@@ -53,7 +56,7 @@ def search_wanted(
     sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
     answers = (Answer.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px, doubt.sigma_px))
     for number, told in enumerate(zip(*answers, strict=True)):
-        it_stands, is_tried, may_have_slipped, is_mirrored, has_run_off, own_sigma_px, predicted_px = told
+        it_stands, is_tried, may_have_slipped, is_mirrored, is_turned, has_run_off, own_sigma_px, predicted_px = told
         if it_stands:
             found = _search_slipped(number, uncertain, own_sigma_px, least_near[:, number], events, found, config)
         elif is_tried:
@@ -66,6 +69,8 @@ def search_wanted(
         for plane in planes.of(number) if is_mirrored else ():
             other = less_certain(mirrored(_as_found(number, prediction, found), *plane), 0, predicted_px, config.search.slip_sigma_px)
             found, prediction = _search_from(number, other, config.search.slip_sigma_px, least_far[:, number], events, found, prediction, config)
+        if is_turned:
+            found, prediction = turns_compared(number, _as_found(number, prediction, found), axes, events, found, prediction, config)
     was_adrift = doubt.adrift & found.elsewhere
     prediction = replace(prediction, covariance=torch.where(was_adrift[:, None, None], uncertain.covariance, prediction.covariance))
     widening = torch.where(was_adrift, gate_widening(sigma_px, config), widening)

@@ -43,6 +43,7 @@ class Found:
         apart: how far apart the directions of the contours are that events lie on.
         asked_apart: how far apart they have to be to count in full; zero for nothing asked.
         elsewhere: which objects a search found in another place than the prediction led to.
+        turn_unclear: which may be turned otherwise about their axis (:mod:`torchtrack.turns`).
     """
 
     fit: Fit
@@ -54,6 +55,7 @@ class Found:
     apart: Float[Tensor, "b"]
     asked_apart: Float[Tensor, "b"]
     elsewhere: Bool[Tensor, "b"]
+    turn_unclear: Bool[Tensor, "b"]
 
     @once
     def share(self) -> Float[Tensor, "b"]:
@@ -89,7 +91,7 @@ def judge_fit(
         measured = measured * quality.held_all_ways(apart, asked_apart)
     nothing = torch.zeros_like(measured)
     full_gathered, asked_apart = (nothing if value is None else value for value in (full_gathered, asked_apart))
-    return Found(fit, measured, at_rest, fit.matches.mask.sum(-1), gathered, full_gathered, apart, asked_apart, nothing.bool())
+    return Found(fit, measured, at_rest, fit.matches.mask.sum(-1), gathered, full_gathered, apart, asked_apart, nothing.bool(), nothing.bool())
 
 
 def explained_at_rest(widening: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
@@ -130,7 +132,7 @@ def search_around(
     covariance, seen = less_certain(one, 0, sigma_px, widened_px).covariance[0], events.of(number)
     places = one.carried(seen.pixels, seen.age_s), seen.mask
     offsets = promising(one, outline, covariance, widened_px, places, config)
-    tried = _align_all(one.copies(0, len(offsets)), offsets, seen, config, found.full_gathered[number], found.asked_apart[number])
+    tried = align_all(one.copies(0, len(offsets)), offsets, seen, config, found.full_gathered[number], found.asked_apart[number])
     offset = tried.fit.solution.from_prior
     margin, needed, gathered, count = least.unbind()
     # Written so that what does not tell how far it gathers counts.
@@ -143,7 +145,7 @@ def search_around(
     by_events = config.search.by_events and wide
     best = _likeliest(_by_events(score, tried.count) if by_events else score, offset, one.covariance[0])
     better = score.index_select(0, best) > asked
-    return found if readback.none_of(better) else _replaced(found, number, tried, best, better)
+    return found if readback.none_of(better) else replaced(found, number, tried, best, better)
 
 
 def is_taken(number: int, other: Found, found: Found) -> Bool[Tensor, ""]:
@@ -195,7 +197,7 @@ def _likeliest(score: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], cova
     return torch.where(score >= score.max() - AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]
 
 
-def _align_all(
+def align_all(
     copies: Prediction, offsets: Tensor, seen: WindowEvents, config: TrackerConfig, full_gathered: Float[Tensor, ""], asked_apart: Float[Tensor, ""]
 ) -> Found:
     """Align copies of one object, each from its own offset, on the events of the object."""
@@ -210,7 +212,7 @@ def _align_all(
     return replace(found, elsewhere=torch.ones_like(found.elsewhere))
 
 
-def _replaced(found: Found, number: int, other: Found, row: Int[Tensor, "1"], better: Bool[Tensor, "1"]) -> Found:
+def replaced(found: Found, number: int, other: Found, row: Int[Tensor, "1"], better: Bool[Tensor, "1"]) -> Found:
     """``found`` with one object's poses, contours and quality from a row of another, where that is better."""
 
     def put(mine: Tensor, theirs: Tensor) -> Tensor:
@@ -223,5 +225,7 @@ def _replaced(found: Found, number: int, other: Found, row: Int[Tensor, "1"], be
     count = max(mine.contours.mask.shape[1], theirs.contours.mask.shape[1])
     own, others = mine.contours.widened(count), theirs.contours.widened(count)
     contours = Contours(*(put(value, getattr(others, name)) for name, value in vars(own).items()))
-    names = [field.name for field in fields(Found) if field.name != "fit"]
-    return Found(Fit(solution, contours, mine.matches), *(put(getattr(found, name), getattr(other, name)) for name in names))
+    names = [field.name for field in fields(Found) if field.name not in ("fit", "turn_unclear")]
+    told = (put(getattr(found, name), getattr(other, name)) for name in names)
+    # Another pose says nothing of whether it is the only one.
+    return Found(Fit(solution, contours, mine.matches), *told, turn_unclear=found.turn_unclear)

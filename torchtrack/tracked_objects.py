@@ -9,17 +9,18 @@ from torch.nn.functional import pad
 from torchtrack.camera import Camera
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_model import ContourModel, group_by_model
-from torchtrack.doubt import mirrors
+from torchtrack.doubt import mirrors, turns
 from torchtrack.model_trust import element_groups
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
-from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, symmetry_planes
+from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, stacked, symmetry_planes, turning_axis
 from torchtrack.other_places import SymmetryPlanes
 from torchtrack.prediction import far_pose
 from torchtrack.sensor_tiles import SensorTiles
 from torchtrack.sensors import Sensors, sensor_tables
 from torchtrack.setup_check import check_setup
 from torchtrack.trust import LimbTrust, TrustNetwork, shipped_weigher
+from torchtrack.turns import TurningAxes
 
 
 class TrackedObjects(nn.Module):
@@ -37,6 +38,9 @@ class TrackedObjects(nn.Module):
     symmetry_points: Tensor
     symmetry_normals: Tensor
     has_symmetry: Tensor
+    turning_points: Tensor
+    turning_directions: Tensor
+    has_turning_axis: Tensor
     with_surface: Tensor
     far_pose: Tensor
 
@@ -77,6 +81,11 @@ class TrackedObjects(nn.Module):
         self.register_buffer("symmetry_points", torch.stack(points))
         self.register_buffer("symmetry_normals", torch.stack([pad(each, (0, 0, 0, 3 - len(each))) for each in normals]))
         self.register_buffer("has_symmetry", torch.tensor(self.symmetry_counts) > 0)
+        on_axes, directions = stacked(of_each(objects, turning_axis) if turns(self.config) else [None] * len(objects))
+        self.register_buffer("turning_points", on_axes)
+        self.register_buffer("turning_directions", directions)
+        self.register_buffer("has_turning_axis", directions.any(1))
+        self.turns = bool(directions.any())
         self.register_buffer("far_pose", far_pose(self.centre_obj))
         self.weigher = shipped_weigher(self.models, self.config.matching) if weigher is None else weigher
         # On dense meshes no line of sight is followed.
@@ -103,6 +112,11 @@ class TrackedObjects(nn.Module):
     def planes(self) -> SymmetryPlanes:
         """The planes of symmetry of the objects."""
         return SymmetryPlanes(self.symmetry_points, self.symmetry_normals, self.symmetry_counts)
+
+    @property
+    def axes(self) -> TurningAxes:
+        """The axes that most of an object can be turned about unseen."""
+        return TurningAxes(self.turning_points, self.turning_directions)
 
     @property
     def sensors(self) -> Sensors:

@@ -44,6 +44,7 @@ from torchtrack.speed_limit import largest_speed, limit_speed
 from torchtrack.state import Probation, StepResult, TrackerState, choose_rows
 from torchtrack.time_surface import empty_last_event, update_last_event
 from torchtrack.tracked_objects import TrackedObjects
+from torchtrack.turns import may_have_turned
 from torchtrack.window_parts import of_unknown_motion, to_be_parted
 
 _QUESTIONS = readback.Questions()
@@ -278,11 +279,13 @@ class Tracker(TrackedObjects):
         full_gathered = gathered_when_known(doubt, state.full_gathered, config.search)
         apart = asked_apart(state.full_apart, state.unseen_s, config.quality)
         found = judge_fit(prediction, fit, config, explained_at_rest(widening), full_gathered, apart)
+        if self.turns:
+            found = replace(found, turn_unclear=doubt.may_have_turned)
         # A GPU is waited for: a pose that begins to slip is farther off a window later.
         wanted = questions.ask(is_wanted(doubt, found.score, config), False)
         if wanted.any():
             last_seen = LastSeen.of(state, self.objects, t_us, config)
-            found, recorded, widening = search_wanted(recorded, doubt, seen, found, widening, config, last_seen, self.planes)
+            found, recorded, widening = search_wanted(recorded, doubt, seen, found, widening, config, last_seen, self.planes, self.axes)
             prediction = recorded.detached()
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
         if config.search.probation:
@@ -315,7 +318,8 @@ class Tracker(TrackedObjects):
         strayed = ~(adrift | starting) & has_strayed(state.score, state.full_share, state.unseen_s, sigma_px, far_due, config)
         since_s = torch.where(strayed, state.unseen_s, state.doubted_s)
         told = sigma_px, state.score, state.usual_score, starting, due, adrift | strayed, since_s, state.full_share, far_due
-        return Doubt(*told, self.has_symmetry, state.unseen_s, strayed, *anew)
+        turned = may_have_turned(self.has_turning_axis, state.unseen_s, config)
+        return Doubt(*told, self.has_symmetry, state.unseen_s, strayed, turned, *anew)
 
     def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:
         """The state that a window is predicted from: of what is lost for long, where it was last seen well."""

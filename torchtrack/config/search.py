@@ -22,6 +22,9 @@ class SearchConfig(Settings):
     mirrored_to: float = Field(
         0.8, ge=0, le=1, description="Share of what an object explains when seen well below which it may be mirrored in depth; 0 for never."
     )
+    turned: bool = Field(
+        True, description="What can be turned about an axis nearly unseen is not taken to be seen well again until events tell how it is turned."
+    )
     unseen_us: int = Field(
         200_000, ge=0, description="What may be far away and was not seen well for so long is also looked for as it was then (µs); 0 for never."
     )

@@ -34,6 +34,7 @@ def conclude(
     offset: Array,
     hessian: Array,
     elsewhere: Array,
+    turn_unclear: Array,
     matched: Array,
     found: Array,
     dt_s: Array,
@@ -55,7 +56,7 @@ def conclude(
         T_before: poses before the window, ``[b, 4, 4]``.
         T_prior, usable, velocity, covariance, information, expected, variance: of the prediction, and its acceleration.
         T_found, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 13]``, ``[b, 13, 13]``.
-        elsewhere: ``[b]``, of finds; ``matched [b]``, how many observations they have.
+        elsewhere, turn_unclear: ``[b]``, of finds; ``matched [b]``, how many observations they have.
         found: ``[FOUND, b]``, what else is told of them.
         remembered, T_last_seen: ``[REMEMBERED, b]`` and ``[b, 4, 4]`` before the window; changed to those after it.
         T_cam_obj, new_velocity, acceleration, posterior, left, status: after the window, ``left`` being the covariance of poses; filled.
@@ -71,7 +72,7 @@ def conclude(
             T_cam_obj[b] = T_before[b]
         trusted = 0.0 if failed else max(hidden, _trust(share, full_share, found[WIDENING, b], settings))
         doubted = not failed and _in_doubt(b, found, full_share, settings)
-        if doubted:
+        if doubted or (turn_unclear[b] and not failed):
             status[b] = max(status[b], UNCERTAIN)
         inverse(hessian[b], inverses)
         _update(trusted, failed, dt, velocity[b], covariance[b], offset[b], inverses, settings, new_velocity[b], posterior[b])

@@ -1,4 +1,4 @@
-"""Surfaces of revolution, such as bottles and bowls, which turned about their axis look the same; and planes of symmetry."""
+"""Surfaces of revolution, such as bottles and bowls, which turned about their axis look the same, or nearly so; and planes of symmetry."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +17,13 @@ from torchtrack.object_model.model import ObjectModel
 _SLIP, _KEEPING = 0.14, 0.995
 # A ball, which can be turned about every axis, has none: any other turn moves a surface of unit diameter by this much more (squared).
 _DISTINCT = 1e-4
+# Of what can be turned about an axis nearly unseen, such as a can with a handle, this share of what faces away from the axis keeps to
+# it, and that is at least so much of the surface. What does not counts less and less, in so many rounds.
+_NEARLY_KEEPING, _FACING_AWAY, _ROUNDS = 0.7, 0.2, 15
+# And other turns move it by so much more (squared, of unit diameter): what is nearly a ball turns about every axis.
+_CLEARLY_DISTINCT = 2e-3
+# Triangles of meshes with fewer are looked at within, too.
+_FEW_TRIANGLES = 5000
 # A surface is its own mirror image when samples of the image lie this near to it, in the mean (diameters).
 _MIRRORED = 0.02
 
@@ -68,6 +75,43 @@ def revolution_axis(model: ObjectModel) -> RevolutionAxis | None:
     return RevolutionAxis(middle, direction)
 
 
+def turning_axis(model: ObjectModel) -> RevolutionAxis | None:
+    """The axis that most of an object can be turned about unseen, and not all: of a can with a handle, or with print; None for any other shape.
+
+    As :func:`revolution_axis` finds it, but of any axis, not through the middle alone, and robustly: the handle counts for nothing.
+    """
+    if len(model.triangles) == 0 or revolution_axis(model) is not None:
+        return None
+    triangles = model.triangles.double()
+    corners, normals, area = _corners(_quartered(triangles) if len(triangles) < _FEW_TRIANGLES else triangles)
+    middle = area @ corners
+    points = (corners - middle) / model.diameter_m
+    turns, weights = torch.linalg.cross(points, normals), area
+    for _ in range(_ROUNDS):
+        values, direction, shift = _least_slip(turns, normals, weights)
+        arm = torch.linalg.cross(direction.expand_as(points), points).add(shift).norm(dim=-1)
+        slip = (turns @ direction + normals @ shift).abs() / (_SLIP * arm + 1e-3)
+        weights = area / (1 + slip.square()).square()
+    # Flat ends keep to every axis across them.
+    away = area * (1 - (normals @ direction).square())
+    keeps = away.sum() >= _FACING_AWAY and (away * (slip <= 1)).sum() >= _NEARLY_KEEPING * away.sum()
+    if not keeps or values[1] < values[0] + _CLEARLY_DISTINCT:
+        return None
+    return RevolutionAxis(middle + model.diameter_m * torch.linalg.cross(direction, shift), direction)
+
+
+def _least_slip(
+    turns: Float[Tensor, "p 3"], normals: Float[Tensor, "p 3"], weights: Float[Tensor, "p"]
+) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """How far turns move points along their normals, ``a · (p × n) + b · n``; the one that does so least, and the shift that goes with it."""
+    weighted = weights[:, None] * normals
+    of_shifts, of_both = weighted.mT @ normals + 1e-9 * torch.eye(3, dtype=normals.dtype), turns.mT @ weighted
+    values, axes = torch.linalg.eigh((weights[:, None] * turns).mT @ turns - of_both @ torch.linalg.solve(of_shifts, of_both.mT))
+    direction = axes[:, 0]
+    shift = -torch.linalg.solve(of_shifts, of_both.mT @ direction)
+    return values, direction, shift - (shift @ direction) * direction
+
+
 def symmetry_planes(model: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tensor, "k 3"]]:
     """The middle of the surface, and unit normals of the planes through it that mirror the surface onto itself, or nearly so (float64).
 
@@ -91,14 +135,27 @@ def no_planes(_: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tensor, "0 3"]]
 
 def revolution_axes(models: Sequence[ObjectModel]) -> Float[Tensor, "b 3"]:
     """Direction of the :func:`revolution_axis` of each object (float64); zero where there is none."""
-    axes = of_each(models, revolution_axis)
-    return torch.stack([torch.zeros(3, dtype=torch.float64) if axis is None else axis.direction_obj for axis in axes])
+    return stacked(of_each(models, revolution_axis))[1]
+
+
+def stacked(axes: Sequence[RevolutionAxis | None]) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3"]]:
+    """A point on each axis, and its direction (float64); zeros where there is none."""
+    nothing = torch.zeros(3, dtype=torch.float64)
+    points, directions = zip(*((nothing, nothing) if axis is None else (axis.point_obj, axis.direction_obj) for axis in axes), strict=True)
+    return torch.stack(points), torch.stack(directions)
 
 
 def of_each(models: Sequence[ObjectModel], look: Callable[[ObjectModel], T]) -> list[T]:
     """What is found of each model; one that several objects have is looked at once."""
     found = {number: look(model) for number, model in {id(model): model for model in models}.items()}
     return [found[id(model)] for model in models]
+
+
+def _quartered(triangles: Float[Tensor, "f 3 3"]) -> Float[Tensor, "q 3 3"]:
+    """Triangles divided at the middles of their sides."""
+    middles = 0.5 * (triangles + triangles.roll(-1, 1))
+    at_corners = torch.stack([triangles, middles, middles.roll(1, 1)], 2)
+    return torch.cat([at_corners.flatten(0, 1), middles])
 
 
 def _corners(triangles: Float[Tensor, "f 3 3"]) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"], Float[Tensor, "p"]]:
