@@ -16,6 +16,7 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.motion import rim_and_centre
 from torchtrack.prediction import Prediction
+from torchtrack.readback import none_of
 
 # An object is not looked for farther away than it can have drifted in this time (s), nor turned farther than in this.
 _LONGEST_S, _LONGEST_TURN_S = 0.4, 1.0
@@ -94,6 +95,8 @@ class Doubt:
 
     def is_turned(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects may be turned about their axis: those that are sure of their place, and explain as much as when seen well again."""
+        if none_of(self.may_have_turned):
+            return self.may_have_turned
         sure = self.may_have_turned & ~self.starting & (self.sigma_px < config.slip_sigma_px)
         return sure & (score >= config.slip_share * self.full_share) & self._far_due(config)
 

@@ -226,6 +226,6 @@ def replaced(found: Found, number: int, other: Found, row: Int[Tensor, "1"], bet
     own, others = mine.contours.widened(count), theirs.contours.widened(count)
     contours = Contours(*(put(value, getattr(others, name)) for name, value in vars(own).items()))
     names = [field.name for field in fields(Found) if field.name not in ("fit", "turn_unclear")]
-    told = (put(getattr(found, name), getattr(other, name)) for name in names)
+    told = {name: put(getattr(found, name), getattr(other, name)) for name in names}
     # Another pose says nothing of whether it is the only one.
-    return Found(Fit(solution, contours, mine.matches), *told, turn_unclear=found.turn_unclear)
+    return Found(fit=Fit(solution, contours, mine.matches), turn_unclear=found.turn_unclear, **told)

@@ -318,7 +318,7 @@ class Tracker(TrackedObjects):
         strayed = ~(adrift | starting) & has_strayed(state.score, state.full_share, state.unseen_s, sigma_px, far_due, config)
         since_s = torch.where(strayed, state.unseen_s, state.doubted_s)
         told = sigma_px, state.score, state.usual_score, starting, due, adrift | strayed, since_s, state.full_share, far_due
-        turned = may_have_turned(self.has_turning_axis, state.unseen_s, config)
+        turned = may_have_turned(self.has_turning_axis, state.unseen_s, config) if self.turns else self.has_turning_axis
         return Doubt(*told, self.has_symmetry, state.unseen_s, strayed, turned, *anew)
 
     def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:

@@ -92,20 +92,31 @@ def turns_compared(
     chosen, exists = _peaks(totals)
     rows = axes.turned(number, one, angles[chosen])
     tried = align_all(rows, one.velocity.new_zeros(len(chosen), 13), seen, config, found.full_gathered[number], found.asked_apart[number])
-    length, totals = tried.fit.contours.mask.sum(-1), totals[chosen]
-    explained = length * (2 * tried.score - 1) / length[0].clamp(min=1)
-    strength = torch.where(exists, explained + totals / totals.max().clamp(min=1e-6), -torch.inf)
-    first, second = strength.topk(2).values
-    best = strength.argmax()[None]
-    clear = (first - second >= _CLEARLY) & (tried.count[best] >= config.quality.min_observations)
-    larger = (tried.score[best] >= tried.score[0] + _LARGER_SHARE) | (totals[best] >= _MORE_EVENTS * totals[0])
-    turned = clear & (best > 0) & (explained[best] >= explained[0] + _CLEARLY) & larger
+    best, clear, turned = _compared(tried, totals[chosen], exists, config.quality.min_observations)
     unclear = found.turn_unclear.clone()
     # What was turned has to be confirmed by the next look.
     unclear[number] &= ~(clear & (best == 0))[0]
     other = axes.turned(number, one, angles[chosen[best]])
     found = replace(replaced(found, number, tried, best, turned), turn_unclear=unclear)
     return found, prediction.exchanged(number, other, turned[0])
+
+
+def _compared(
+    tried: Found, totals: Float[Tensor, "k"], exists: Bool[Tensor, "k"], min_observations: int
+) -> tuple[Int[Tensor, "1"], Bool[Tensor, "1"], Bool[Tensor, "1"]]:
+    """Which of some turned poses is the best, whether it clearly is, and whether to turn to it; the first is the pose as it is.
+
+    Args:
+        totals: how many more events lie on the contours of each than beside them; ``exists`` tells which there are.
+    """
+    length = tried.fit.contours.mask.sum(-1)
+    explained = length * (2 * tried.score - 1) / length[0].clamp(min=1)
+    strength = torch.where(exists, explained + totals / totals.max().clamp(min=1e-6), -torch.inf)
+    first, second = strength.topk(2).values
+    best = strength.argmax()[None]
+    clear = (first - second >= _CLEARLY) & (tried.count[best] >= min_observations)
+    larger = (tried.score[best] >= tried.score[0] + _LARGER_SHARE) | (totals[best] >= _MORE_EVENTS * totals[0])
+    return best, clear, clear & (best > 0) & (explained[best] >= explained[0] + _CLEARLY) & larger
 
 
 def _events_on_contours(turned: Prediction, one: Prediction, seen: WindowEvents, config: TrackerConfig) -> Float[Tensor, "n"]:

@@ -258,10 +258,9 @@ def _hidden_in_buffer_by_kernel(
     )
     T_cam_obj, intrinsics, stream_index, diameters_m = as_arrays(scene.T_cam_obj, scene.intrinsics, scene.stream_index, scene.diameters_m)
     cell_px = float(config.depth_cell_px)
-    size = kernels.around(pixels, mask, stream_index, cell_px, height, width, first)
-    settings = GridSettings(*size, cell_px, height, width, _DEPTH_STEPS_PER_M, MIN_DEPTH_M, _SAMPLES_PER_CELL)
-    cells = streams * settings.rows * settings.columns
-    depth, owner = np.full(cells, _NOTHING), np.full(cells, len(drawn))
+    rows, columns = kernels.around(pixels, mask, stream_index, cell_px, height, width, first)
+    settings = GridSettings(rows, columns, cell_px, height, width, _DEPTH_STEPS_PER_M, MIN_DEPTH_M, _SAMPLES_PER_CELL)
+    depth, owner = (np.full(streams * rows * columns, value) for value in (_NOTHING, len(drawn)))
     for model in scene.models:
         of_model = as_arrays(model.members, drawn, model.surface_points)
         kernels.draw(*of_model, T_cam_obj, intrinsics, diameters_m, stream_index, first, settings, depth, owner)
