@@ -62,7 +62,7 @@ def test_sharp_edges_are_believed_in_full(dtype):
 
 def test_limbs_are_judged_as_the_network_judges_them(dtype):
     evidence, weigher = evidence_of(dtype=dtype)
-    trust, of_all, (_, is_limb) = weigher(evidence), weigher.network(evidence), limb_features(evidence)
+    trust, of_all, (_, is_limb, _) = weigher(evidence), weigher.network(evidence), limb_features(evidence)
     assert torch.equal(trust[is_limb], of_all[is_limb]) and (trust[~is_limb] == 1).all() and is_limb.any()
 
 
@@ -73,10 +73,14 @@ def test_limbs_are_described_the_same_by_a_kernel(dtype):
     pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
     evidence, _ = evidence_of((SMOOTH, BOX, SMOOTH), dtype)
     with torch.no_grad():
-        features, is_limb = limb_features(evidence)
+        features, is_limb, objects = limb_features(evidence)
         with kernels(wanted=False):
-            expected, wanted = limb_features(evidence)
-    assert torch.equal(is_limb, wanted) and is_limb.sum() > 200 and (features[~is_limb] == 0).all()
+            expected, wanted, every = limb_features(evidence)
+    # Of the box there is nothing to describe.
+    assert objects.tolist() == [0, 2] and every.tolist() == [0, 1, 2]
+    assert torch.equal(is_limb, wanted) and not is_limb[1].any()
+    expected, is_limb = expected[objects], is_limb[objects]
+    assert is_limb.sum() > 200 and (features[~is_limb] == 0).all()
     # What lies halfway between two pixels is counted at one or the other.
     assert ((features - expected)[is_limb].abs() < 1e-4).all(-1).double().mean() > 0.99
 
@@ -85,8 +89,8 @@ def test_where_there_is_no_limb_there_is_nothing_to_describe():
     pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
     evidence, weigher = evidence_of((BOX,))
     with torch.no_grad():
-        features, is_limb = limb_features(evidence)
-        assert not features.any() and not is_limb.any() and (weigher(evidence) == 1).all()
+        features, is_limb, objects = limb_features(evidence)
+        assert not len(objects) and not features.any() and not is_limb.any() and (weigher(evidence) == 1).all()
 
 
 # ---- in the tracker

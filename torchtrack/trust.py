@@ -75,8 +75,11 @@ class LimbTrust(nn.Module):
 
     def forward(self, evidence: Evidence) -> Float[Tensor, "b n"]:
         """How far each observation is to be believed, 0 to 1."""
-        features, is_limb = limb_features(evidence)
-        return torch.where(is_limb, torch.sigmoid(self.network.logits(features)), 1.0)
+        features, is_limb, objects = limb_features(evidence)
+        trust = torch.sigmoid(self.network.logits(features))
+        if len(objects) < len(is_limb):
+            trust = trust.new_ones(is_limb.shape).index_copy(0, objects, trust)
+        return torch.where(is_limb, trust, 1.0)
 
 
 def shipped_weigher(models: Sequence[ContourModel], config: MatchingConfig) -> nn.Module | None:

@@ -87,16 +87,19 @@ def trust_features(evidence: Evidence) -> Float[Tensor, "b n f"]:
     return torch.cat([_counts(evidence, frame), _ages(evidence, frame), kinds, torch.stack(single, -1)], -1)
 
 
-def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "b n f"], Bool[Tensor, "b n"]]:
-    """:func:`trust_features`, and which observations are nearest to the limb of a smooth surface; of others they need not be told."""
+def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
+    """:func:`trust_features`, which observations are nearest to the limb of a smooth surface, and of which objects there may be any.
+
+    Of other observations and other objects they need not be told.
+    """
     if switch.apply_to(evidence.observations.age_s):
         return _limb_features_by_kernel(evidence)
     features = trust_features(evidence)
     of_limb = features[..., _OF_KIND + int(ContourKind.LIMB)] * features[..., -1] > 0
-    return features, of_limb & evidence.observations.mask
+    return features, of_limb & evidence.observations.mask, torch.arange(len(features), device=features.device)
 
 
-def _limb_features_by_kernel(evidence: Evidence) -> tuple[Float[Tensor, "b n f"], Bool[Tensor, "b n"]]:
+def _limb_features_by_kernel(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
     """:func:`limb_features`, observation by observation."""
     # Not at the top: Numba is an extra.
     from torchtrack.kernels.trust import describe
@@ -104,10 +107,12 @@ def _limb_features_by_kernel(evidence: Evidence) -> tuple[Float[Tensor, "b n f"]
     observations, contours, index, history = evidence.observations, evidence.contours, evidence.index, evidence.history
     moving, (events, own, counts) = evidence.prediction.moving(compensated=True), laid_out(evidence.seen)
     told = torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.polarity, _age_share(observations)], 1)
+    has_limb = ((contours.kind == int(ContourKind.LIMB)) & contours.mask).any(1)
+    objects, is_limb = has_limb.nonzero()[:, 0], torch.zeros_like(observations.mask)
     # As many for all: how many a neighbour has would show in roundings.
-    features, is_limb = told.new_zeros(*observations.mask.shape, FEATURES), torch.empty_like(observations.mask)
+    features = told.new_zeros(len(objects), observations.mask.shape[1], FEATURES)
     describe(
-        *as_arrays(*events.pixels.unbind(-1), events.age_s, events.polarity, events.mask, own, counts, told, observations.mask),
+        *as_arrays(objects, *events.pixels.unbind(-1), events.age_s, events.polarity, events.mask, own, counts, told, observations.mask),
         *as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.kind, index.nearest, index.first),
         index.cells,
         *as_arrays(moving.velocity, moving.centre_cam, moving.intrinsics),
@@ -115,7 +120,7 @@ def _limb_features_by_kernel(evidence: Evidence) -> tuple[Float[Tensor, "b n f"]
         PatchSettings(_ACROSS_PX, _ALONG_PX, _SIDE, BORDER_PX, int(ContourKind.LIMB), _OF_KIND, _SLOW_PX_S, _SPEED_UNIT_PX_S, _OLDEST_PX),
         *as_arrays(features, is_limb),
     )
-    return features, is_limb
+    return features, is_limb, objects
 
 
 def _frame(evidence: Evidence) -> _Frame:

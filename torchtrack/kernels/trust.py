@@ -15,6 +15,7 @@ _SPEED, _POLARITY, _SIDE, _KNOWN, _AGE, _EXISTS = range(-6, 0)
 
 @kernel(fastmath=FAST)
 def describe(
+    objects: Array,
     u: Array,
     v: Array,
     age_s: Array,
@@ -41,9 +42,10 @@ def describe(
     features: Array,
     is_limb: Array,
 ) -> None:
-    """Describe the observations whose nearest contour is a limb.
+    """Describe the observations of some objects whose nearest contour is a limb.
 
     Args:
+        objects: ``[r]``, which these are.
         u, v, age_s, polarity, mask: ``[e, n]``: events of each object, or one row for all.
         own, counts: as :func:`torchtrack.kernels.selection.select` takes them.
         told: ``[b, 5, n]`` of the observations, and which of them ``exists [b, n]``.
@@ -51,11 +53,12 @@ def describe(
             ``first [b, 2]`` are their index.
         velocity, centre_cam, intrinsics: of each object.
         sensor_pixels, stream_index, last_event_us, t_us: of a :class:`torchtrack.history.History`.
-        features: ``[b, n, f]`` of zeros, filled for these.
-        is_limb: ``[b, n]``, filled: which these are.
+        features: ``[r, n, f]`` of zeros, filled for these.
+        is_limb: ``[b, n]``, false so far: which these are.
     """
     counted = np.zeros((settings.side * settings.side, 2), features.dtype)
-    for b in range(len(told)):
+    for row in range(len(objects)):
+        b = objects[row]
         e = b if len(mask) > 1 else 0
         looked_at = counts[b] if len(own) else mask.shape[1]
         motion, depth_m, of_lens = drift(velocity[b], centre_cam[b]), centre_cam[b, 2], lens(intrinsics[b])
@@ -71,7 +74,7 @@ def describe(
                 s = stream_index[b]
                 _describe_one(
                     i, found, told[b], points_cam[b], normals[b], motion, of_lens, counted, sensor_pixels[s], last_event_us[s], t_us[s],
-                    settings, features[b, i],
+                    settings, features[row, i],
                 )  # fmt: skip
 
 
