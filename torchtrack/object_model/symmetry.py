@@ -22,8 +22,8 @@ _DISTINCT = 1e-4
 _NEARLY_KEEPING, _FACING_AWAY, _ROUNDS = 0.7, 0.2, 15
 # And other turns move it by so much more (squared, of unit diameter): what is nearly a ball turns about every axis.
 _CLEARLY_DISTINCT = 2e-3
-# Triangles of meshes with fewer are looked at within, too.
-_FEW_TRIANGLES = 5000
+# Of meshes with fewer triangles, these are looked at within, too; of those with more, as many are looked at.
+_TRIANGLES = 5000
 # A surface is its own mirror image when samples of the image lie this near to it, in the mean (diameters).
 _MIRRORED = 0.02
 
@@ -82,8 +82,8 @@ def turning_axis(model: ObjectModel) -> RevolutionAxis | None:
     """
     if len(model.triangles) == 0 or revolution_axis(model) is not None:
         return None
-    triangles = model.triangles.double()
-    corners, normals, area = _corners(_quartered(triangles) if len(triangles) < _FEW_TRIANGLES else triangles)
+    triangles = model.triangles[:: len(model.triangles) // _TRIANGLES + 1].double()
+    corners, normals, area = _corners(_quartered(triangles) if len(model.triangles) < _TRIANGLES else triangles)
     middle = area @ corners
     points = (corners - middle) / model.diameter_m
     turns, weights = torch.linalg.cross(points, normals), area
