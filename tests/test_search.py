@@ -178,7 +178,7 @@ def test_what_stands_is_looked_for_as_if_it_had_slipped_and_gives_way_to_far_mor
         monkeypatch.setattr("torchtrack.recovery.search", lambda *args, stands=stands: looked.setdefault(stands, args[2]) and args[5])
         last_seen = LastSeen(prediction.T_cam_obj.double(), prediction.covariance)
         told = replace(doubt, unseen_s=torch.zeros(1), has_symmetry=torch.tensor([False]))
-        search_wanted(prediction, told, seen, found, torch.ones(1), tracker.config, last_seen, tracker.planes)
+        search_wanted(prediction, told, seen, found, torch.ones(1), tracker.config, last_seen, tracker.planes, tracker.axes)
     assert looked[True] == tracker.config.search.slip_sigma_px
     assert looked[False] > 2 * looked[True]
 
