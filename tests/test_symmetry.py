@@ -40,10 +40,18 @@ def test_axis_of_a_turned_shape_wherever_it_lies(name):
     assert float(torch.linalg.cross(axis.point_obj - T[:3, 3], direction).norm()) < 1e-5
 
 
-def with_handle():
-    body, handle = trimesh.creation.cylinder(0.03, 0.1, sections=48), trimesh.creation.box((0.02, 0.005, 0.03))
-    handle.apply_translation((0.038, 0, 0))
-    return trimesh.util.concatenate([body, handle])
+def handle(extents_m, x_m, z_m=0.0):
+    """A box beside the axis z."""
+    box = trimesh.creation.box(extents_m)
+    box.apply_translation((x_m, 0, z_m))
+    return box
+
+
+def printed_can():
+    can = trimesh.creation.cylinder(0.03, 0.1, sections=32)
+    colours = [[255, 255, 255, 255] if x > 0 else [20, 20, 20, 255] for x in can.triangles_center[:, 0]]
+    can.visual = trimesh.visual.ColorVisuals(can, face_colors=colours)
+    return can
 
 
 @pytest.mark.parametrize(
@@ -52,7 +60,7 @@ def with_handle():
         trimesh.creation.box((0.1, 0.1, 0.02)),
         trimesh.creation.cylinder(0.03, 0.1, sections=6),
         trimesh.creation.icosphere(subdivisions=3, radius=0.05),
-        with_handle(),
+        trimesh.util.concatenate([trimesh.creation.cylinder(0.03, 0.1, sections=48), handle((0.02, 0.005, 0.03), 0.038)]),
     ],
     ids=["box", "hexagonal prism", "ball", "with a handle"],
 )
@@ -61,10 +69,7 @@ def test_other_shapes_have_none(mesh):
 
 
 def test_print_shows_turns():
-    can = trimesh.creation.cylinder(0.03, 0.1, sections=32)
-    colours = [[255, 255, 255, 255] if x > 0 else [20, 20, 20, 255] for x in can.triangles_center[:, 0]]
-    can.visual = trimesh.visual.ColorVisuals(can, face_colors=colours)
-    assert axis_of(can) is None
+    assert axis_of(printed_can()) is None
 
 
 def test_polylines_have_none():
@@ -104,20 +109,6 @@ def test_axes_of_many_objects_are_those_of_each():
 
 
 # ---- axes that most of an object can be turned about
-
-
-def handle(extents_m, x_m, z_m=0.0):
-    """A box beside the axis z."""
-    box = trimesh.creation.box(extents_m)
-    box.apply_translation((x_m, 0, z_m))
-    return box
-
-
-def printed_can():
-    can = trimesh.creation.cylinder(0.03, 0.1, sections=32)
-    colours = [[255, 255, 255, 255] if x > 0 else [20, 20, 20, 255] for x in can.triangles_center[:, 0]]
-    can.visual = trimesh.visual.ColorVisuals(can, face_colors=colours)
-    return can
 
 
 HANDLED_SHAPES = {

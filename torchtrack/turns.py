@@ -18,7 +18,7 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.event_image import event_density
 from torchtrack.hypotheses import ENOUGH_EVENTS, mark
-from torchtrack.lie import so3_exp
+from torchtrack.lie import retract_about
 from torchtrack.observations import ObjectEvents, WindowEvents
 from torchtrack.prediction import Prediction
 from torchtrack.search import Found, align_all, replaced
@@ -53,16 +53,13 @@ class TurningAxes:
         What is on the axis goes on as it did.
         """
         count, point, direction = len(angles), self.points_obj[number], self.directions_obj[number]
-        turns = torch.eye(4, dtype=point.dtype, device=point.device).repeat(count, 1, 1)
-        turns[:, :3, :3] = so3_exp(angles[:, None] * direction)
-        turns[:, :3, 3] = point - turns[:, :3, :3] @ point
-        copies = one.copies(0, count)
-        moved = replace(copies, T_cam_obj=copies.T_cam_obj @ turns)
+        copies, along = one.copies(0, count), one.T_cam_obj[0, :3, :3] @ direction
+        turns = pad(angles[:, None] * along, (0, 3))
+        moved = replace(copies, T_cam_obj=retract_about(copies.T_cam_obj, turns, point.expand(count, 3)))
         gained = torch.linalg.cross(copies.velocity[:, :3], moved.centre_cam - copies.centre_cam, dim=-1)
-        along = (one.T_cam_obj[0, :3, :3] @ direction).to(one.covariance.dtype)
-        unknown = torch.zeros_like(one.covariance)
+        unknown, spread = torch.zeros_like(one.covariance), torch.outer(along, along).to(one.covariance.dtype)
         for first, sigma in ((0, _TURN_RAD), (6, _SPIN_RAD_S)):
-            unknown[:, first : first + 3, first : first + 3] = sigma**2 * torch.outer(along, along)
+            unknown[:, first : first + 3, first : first + 3] = sigma**2 * spread
         velocity = torch.cat([copies.velocity[:, :3], copies.velocity[:, 3:] + gained], 1)
         return replace(moved, velocity=velocity, covariance=copies.covariance + unknown)
 

@@ -119,7 +119,7 @@ def around(pixels: Array, mask: Array, stream_index: Array, cell_px: float, heig
 
 @kernel()
 def _every(samples: int, T_cam_obj: Array, intrinsics: Array, diameter_m: float, grid: GridSettings) -> int:
-    """The so manieth surface sample of an object that is taken, as few will do where it is small in the image."""
+    """The so manieth surface sample of an object that is taken, a power of two: :func:`torchtrack.visibility.depth_buffer` halves them so."""
     size_cells = diameter_m * intrinsics[0] / max(T_cam_obj[2, 3], grid.least_depth_m) / grid.side_px
     spare, every = samples / max(grid.samples_per_cell * size_cells * size_cells, 1.0), 1
     while 2 * every <= spare:
