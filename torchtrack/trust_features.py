@@ -106,13 +106,13 @@ def _limb_features_by_kernel(evidence: Evidence) -> tuple[Float[Tensor, "r n f"]
 
     observations, contours, index, history = evidence.observations, evidence.contours, evidence.index, evidence.history
     moving, (events, own, counts) = evidence.prediction.moving(compensated=True), laid_out(evidence.seen)
-    told = torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.polarity, _age_share(observations)], 1)
     has_limb = ((contours.kind == int(ContourKind.LIMB)) & contours.mask).any(1)
     objects, is_limb = has_limb.nonzero()[:, 0], torch.zeros_like(observations.mask)
     # As many for all: how many a neighbour has would show in roundings.
-    features = told.new_zeros(len(objects), observations.mask.shape[1], FEATURES)
+    features = observations.age_s.new_empty(len(objects), observations.mask.shape[1], FEATURES)
     describe(
-        *as_arrays(objects, *events.pixels.unbind(-1), events.age_s, events.polarity, events.mask, own, counts, told, observations.mask),
+        *as_arrays(objects, *events.pixels.unbind(-1), events.age_s, events.polarity, events.mask, own, counts),
+        *as_arrays(observations.pixels.transpose(1, 2), observations.age_s, observations.polarity, observations.mask),
         *as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.kind, index.nearest, index.first),
         index.cells,
         *as_arrays(moving.velocity, moving.centre_cam, moving.intrinsics),

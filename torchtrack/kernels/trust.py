@@ -7,8 +7,10 @@ from torchtrack.kernels.look_up import nearest
 from torchtrack.kernels.motion import Numbers, across, at_depth, drift, inverse_depth, lens
 from torchtrack.kernels.settings import Cells, PatchSettings
 
-# Rows of what is told of an observation.
-U, V, AGE, POLARITY, AGE_SHARE = range(5)
+# Places are worked out so many at once: what is left over would be, one at a time.
+_AT_ONCE = 32
+# Events of a polarity that are counted at a place, at most; those of the other one lie in the bits beside them.
+_MOST, _BITS = 255, 8
 # The last numbers of a description.
 _SPEED, _POLARITY, _SIDE, _KNOWN, _AGE, _EXISTS = range(-6, 0)
 
@@ -23,7 +25,9 @@ def describe(
     mask: Array,
     own: Array,
     counts: Array,
-    told: Array,
+    pixels: Array,
+    ages_s: Array,
+    polarities: Array,
     exists: Array,
     points_cam: Array,
     normals: Array,
@@ -48,34 +52,70 @@ def describe(
         objects: ``[r]``, which these are.
         u, v, age_s, polarity, mask: ``[e, n]``: events of each object, or one row for all.
         own, counts: as :func:`torchtrack.kernels.selection.select` takes them.
-        told: ``[b, 5, n]`` of the observations, and which of them ``exists [b, n]``.
+        pixels, ages_s, polarities, exists: ``[b, 2, n]`` and ``[b, n]`` of the observations.
         points_cam, normals, kind: ``[b, 3, m]``, ``[b, 2, m]`` and ``[b, m]`` of contour points; ``nearest_of_cell [b, p]`` and
             ``first [b, 2]`` are their index.
         velocity, centre_cam, intrinsics: of each object.
         sensor_pixels, stream_index, last_event_us, t_us: of a :class:`torchtrack.history.History`.
-        features: ``[r, n, f]`` of zeros, filled for these.
+        features: ``[r, n, f]``, filled; with zeros where there is nothing to describe.
         is_limb: ``[b, n]``, false so far: which these are.
     """
-    counted = np.zeros((settings.side * settings.side, 2), features.dtype)
+    counted, softened = np.zeros(settings.side * settings.side, np.uint16), _softened(features)
+    across_px, along_px, aside_px = _patch(settings, features)
+    places, table_width = np.zeros(len(across_px), np.int32), sensor_pixels.shape[2]
     for row in range(len(objects)):
         b = objects[row]
-        e = b if len(mask) > 1 else 0
+        e, s = b if len(mask) > 1 else 0, stream_index[b]
         looked_at = counts[b] if len(own) else mask.shape[1]
         motion, depth_m, of_lens = drift(velocity[b], centre_cam[b]), centre_cam[b, 2], lens(intrinsics[b])
-        of_object = own[b] if len(own) else own.ravel()
-        counted[:] = 0.0
-        _count(u[e], v[e], age_s[e], polarity[e], mask[e], of_object, looked_at, motion, depth_m, of_lens, settings, counted)
-        for i in range(told.shape[2]):
-            speed_u, speed_v = at_depth(motion, depth_m, told[b, U, i], told[b, V, i], of_lens)
-            age = told[b, AGE, i]
-            found = nearest(nearest_of_cell[b], first[b], told[b, U, i] + speed_u * age, told[b, V, i] + speed_v * age, cells)
+        of_object, oldest_s = own[b] if len(own) else own.ravel(), _oldest(ages_s[b], exists[b])
+        counted[:] = 0
+        _count(u[e], v[e], age_s[e], polarity[e], mask[e], of_object, looked_at, motion, depth_m, of_lens, settings.side, counted)
+        # Not in the loop: to point at a part of an array takes as long as to read several numbers.
+        cells_of_object, first_of_object, points, lines = nearest_of_cell[b], first[b], points_cam[b], normals[b]
+        of_sensor, newest_us, described = sensor_pixels[s].reshape(-1, 2), last_event_us[s], features[row]
+        for i in range(exists.shape[1]):
+            x, y, age = pixels[b, 0, i], pixels[b, 1, i], ages_s[b, i]
+            speed_u, speed_v = at_depth(motion, depth_m, x, y, of_lens)
+            found = nearest(cells_of_object, first_of_object, x + speed_u * age, y + speed_v * age, cells)
             is_limb[b, i] = exists[b, i] and found >= 0 and kind[b, max(found, 0)] == settings.limb
-            if is_limb[b, i]:
-                s = stream_index[b]
-                _describe_one(
-                    i, found, told[b], points_cam[b], normals[b], motion, of_lens, counted, sensor_pixels[s], last_event_us[s], t_us[s],
-                    settings, features[row, i],
-                )  # fmt: skip
+            if not is_limb[b, i]:
+                described[i] = 0.0
+                continue
+            point = points[0, found], points[1, found], points[2, found], lines[0, found], lines[1, found]
+            _describe_one(
+                (x, y, age, polarities[b, i], age / oldest_s), point, motion, of_lens, counted, softened, across_px, along_px, aside_px,
+                places, of_sensor, table_width, newest_us, t_us[s], settings, described[i],
+            )  # fmt: skip
+
+
+@kernel()
+def _softened(features: Array) -> Array:
+    """What is told of so many events: of n, n / (1 + n)."""
+    events = np.arange(_MOST + 1)
+    return (events / (events + 1)).astype(features.dtype)
+
+
+@kernel()
+def _patch(settings: PatchSettings, features: Array) -> tuple[Array, Array, Array]:
+    """Across the contour and along it (px), where events are counted, and across it where their ages are looked at; zeros after that."""
+    along, across = len(settings.along_px), len(settings.across_px)
+    room = -(-along * across // _AT_ONCE) * _AT_ONCE
+    across_px, along_px, aside_px = np.zeros(room, features.dtype), np.zeros(room, features.dtype), np.zeros(room, features.dtype)
+    for i in range(across):
+        aside_px[i] = settings.across_px[i]
+        for k in range(along):
+            across_px[i * along + k], along_px[i * along + k] = settings.across_px[i], settings.along_px[k]
+    return across_px, along_px, aside_px
+
+
+@kernel()
+def _oldest(age_s: Array, exists: Array) -> float:
+    """Age of the oldest observation (s)."""
+    oldest_s = 1e-6
+    for i in range(len(age_s)):
+        oldest_s = max(oldest_s, age_s[i] if exists[i] else 0.0)
+    return oldest_s
 
 
 @kernel(fastmath=FAST)
@@ -96,65 +136,83 @@ def _count(
     motion: Numbers,
     depth_m: float,
     intrinsics: Numbers,
-    settings: PatchSettings,
+    side: int,
     counted: Array,
 ) -> None:
     """Count an object's events, moved to the window's end at its depth, by place and polarity."""
     for j in range(looked_at):
         i = np.uint64(own[j]) if len(own) else np.uint64(j)
         speed_u, speed_v = at_depth(motion, depth_m, u[i], v[i], intrinsics)
-        place = _place(u[i] + speed_u * age_s[i], v[i] + speed_v * age_s[i], settings.side)
+        place = _place(u[i] + speed_u * age_s[i], v[i] + speed_v * age_s[i], side)
         if mask[i]:
-            # Of n events, n / (1 + n) is kept: with one more, that is one over two less it.
-            sign = 1 if polarity[i] > 0 else 0
-            counted[place, sign] = 1.0 / (2.0 - counted[place, sign])
+            bits = _BITS if polarity[i] > 0 else 0
+            if (counted[place] >> bits) & _MOST < _MOST:
+                counted[place] += 1 << bits
 
 
 @kernel(fastmath=FAST)
-def _newest_us(u: float, v: float, sensor_pixels: Array, last_event_us: Array, border_px: int) -> int:
-    """When anything last happened at an ideal pixel: as :meth:`torchtrack.history.History.age_s` looks it up."""
-    column = int(np.rint(min(max(u + border_px, 0.0), sensor_pixels.shape[1] - 1.0)))
-    row = int(np.rint(min(max(v + border_px, 0.0), sensor_pixels.shape[0] - 1.0)))
-    placed = sensor_pixels[row, column]
-    x = int(min(max(np.rint(placed[0]), 0.0), last_event_us.shape[1] - 1.0))
-    y = int(min(max(np.rint(placed[1]), 0.0), last_event_us.shape[0] - 1.0))
-    return last_event_us[y, x]
+def _find_places(u: float, v: float, nu: float, nv: float, across_px: Array, along_px: Array, side: int, places: Array) -> None:
+    """The places that a patch around a pixel is counted at, several at once."""
+    # In the type of the patch, and 32 bits: of others, a processor takes half as many at once.
+    kind, most = across_px.dtype.type, np.int32(side - 1)
+    u, v, nu, nv = kind(u), kind(v), kind(nu), kind(nv)
+    for k in range(len(places)):
+        column = np.int32(np.rint(u + across_px[k] * nu - along_px[k] * nv)) & most
+        row = np.int32(np.rint(v + across_px[k] * nv + along_px[k] * nu)) & most
+        places[k] = row * np.int32(side) + column
+
+
+@kernel(fastmath=FAST)
+def _find_pixels(u: float, v: float, nu: float, nv: float, across_px: Array, height: int, width: int, places: Array) -> None:
+    """Rows of a table of sensor pixels for places across the contour, several at once: as :func:`torchtrack.history.on_sensor` finds them."""
+    kind = across_px.dtype.type
+    u, v, nu, nv, right, bottom = kind(u), kind(v), kind(nu), kind(nv), kind(width - 1), kind(height - 1)
+    for k in range(len(places)):
+        column, row = u + across_px[k] * nu, v + across_px[k] * nv
+        # Written so that what is not a number finds a place, too.
+        column, row = min(column if column > 0 else kind(0), right), min(row if row > 0 else kind(0), bottom)
+        places[k] = np.int32(np.rint(row)) * np.int32(width) + np.int32(np.rint(column))
 
 
 @kernel(fastmath=FAST)
 def _describe_one(
-    i: int,
-    found: int,
-    told: Array,
-    points_cam: Array,
-    normals: Array,
+    told: Numbers,
+    point: Numbers,
     motion: Numbers,
     intrinsics: Numbers,
     counted: Array,
+    softened: Array,
+    across_px: Array,
+    along_px: Array,
+    aside_px: Array,
+    places: Array,
     sensor_pixels: Array,
+    table_width: int,
     last_event_us: Array,
     t_us: int,
     settings: PatchSettings,
     row: Array,
 ) -> None:
     """Fill the description of one observation, whose nearest contour point was found."""
-    x, y, z = points_cam[0, found], points_cam[1, found], points_cam[2, found]
+    u, v, age, polarity, age_share = told
+    x, y, z, nu, nv = point
     speed_u, speed_v = across(motion, x, y, z, inverse_depth(z), intrinsics)
-    speed = normals[0, found] * speed_u + normals[1, found] * speed_v
-    outward = -1.0 if speed < 0 else 1.0
-    nu, nv, polarity = outward * normals[0, found], outward * normals[1, found], told[POLARITY, i]
-    u, v, age = told[U, i], told[V, i], told[AGE, i]
-    moved_u, moved_v, speed = u + speed_u * age, v + speed_v * age, max(abs(speed), settings.slow_px_s)
-    own, k, places = 1 if polarity >= 0 else 0, 0, len(settings.across_px) * len(settings.along_px)
-    for a, aside in enumerate(settings.across_px):
-        for along in settings.along_px:
-            place = _place(moved_u + aside * nu - along * nv, moved_v + aside * nv + along * nu, settings.side)
-            row[k], row[places + k] = counted[place, own], counted[place, 1 - own]
-            k += 1
-        newest_us = _newest_us(u + aside * nu, v + aside * nv, sensor_pixels, last_event_us, settings.border_px)
-        behind_px = ((t_us - newest_us) * 1e-6 - age) * speed
-        row[2 * places + a] = min(max(behind_px / settings.oldest_px, -1.0), 1.0)
-    row[settings.of_kind :] = 0.0
+    outward = -1.0 if nu * speed_u + nv * speed_v < 0 else 1.0
+    speed = max(abs(nu * speed_u + nv * speed_v), settings.slow_px_s)
+    nu, nv, count = outward * nu, outward * nv, len(settings.across_px) * len(settings.along_px)
+    _find_places(u + speed_u * age, v + speed_v * age, nu, nv, across_px, along_px, settings.side, places)
+    own = _BITS if polarity >= 0 else 0
+    for k in range(count):
+        both = counted[np.uint64(places[k])]
+        row[k], row[count + k] = softened[(both >> own) & _MOST], softened[(both >> (_BITS - own)) & _MOST]
+    _find_pixels(u + settings.border_px, v + settings.border_px, nu, nv, aside_px, len(sensor_pixels) // table_width, table_width, places)
+    right, bottom = last_event_us.shape[1] - 1.0, last_event_us.shape[0] - 1.0
+    for k in range(len(settings.across_px)):
+        column, line = sensor_pixels[places[k], 0], sensor_pixels[places[k], 1]
+        newest_us = last_event_us[int(np.rint(min(max(line, 0.0), bottom))), int(np.rint(min(max(column, 0.0), right)))]
+        row[2 * count + k] = min(max(((t_us - newest_us) * 1e-6 - age) * speed / settings.oldest_px, -1.0), 1.0)
+    for k in range(settings.of_kind, len(row)):
+        row[k] = 0.0
     row[settings.of_kind + settings.limb] = row[_EXISTS] = 1.0
-    row[_SPEED], row[_AGE] = np.log1p(speed / settings.unit_px_s), told[AGE_SHARE, i]
+    row[_SPEED], row[_AGE] = np.log1p(speed / settings.unit_px_s), age_share
     row[_POLARITY], row[_SIDE], row[_KNOWN] = polarity, polarity * outward, abs(polarity)
