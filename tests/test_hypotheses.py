@@ -72,6 +72,10 @@ def test_events_outside_the_image_or_nowhere_are_not_counted():
     assert int(density[151, 201]) == 1
 
 
+def marks_at(prediction, outlines, offsets, image):
+    return mark(outlines, prediction.poses_at(offsets[:, :6]), prediction.objects.intrinsics, image)
+
+
 def test_the_true_pose_is_marked_best(dtype):
     _, prediction, seen, found, _ = in_motion(dtype=dtype)
     density = event_density(seen.pixels + prediction.plane_velocity(seen.pixels) * seen.age_s[..., None], seen.mask, IMAGE_SIZE)
@@ -80,7 +84,7 @@ def test_the_true_pose_is_marked_best(dtype):
         away[2 * axis + 1, axis], away[2 * axis + 2, axis] = (0.15, -0.15) if axis < 3 else (0.015, -0.015)
     # Depth moves contours least.
     away[11:] *= 4
-    marks = mark(prediction, thinned(found.fit.contours), away, density.clamp(max=3))
+    marks = marks_at(prediction, thinned(found.fit.contours), away, density.clamp(max=3))
     assert int(marks.argmax()) == 0
     assert float(marks[0]) > 1.5 * float(marks[1:].max())
 
@@ -90,8 +94,8 @@ def test_marks_of_poses_behind_the_camera_are_numbers():
     offsets = torch.zeros(2, 13)
     offsets[1, 5] = -2.0
     density = event_density(seen.pixels, seen.mask, IMAGE_SIZE)
-    assert torch.isfinite(mark(prediction, thinned(found.fit.contours), offsets, density)).all()
-    assert torch.isfinite(mark(prediction, outlines_at(prediction, prediction.poses_at(offsets[:, :6]), TrackerConfig()), offsets, density)).all()
+    for outlines in (thinned(found.fit.contours), outlines_at(prediction, prediction.poses_at(offsets[:, :6]), TrackerConfig())):
+        assert torch.isfinite(marks_at(prediction, outlines, offsets, density)).all()
 
 
 # ---- what is promising
@@ -124,7 +128,12 @@ def test_a_pose_near_the_true_one_is_among_the_promising(rotation_rad, dtype):
 def test_as_many_are_promising_as_are_to_be_tried_or_kept():
     _, prediction, seen, found, _ = in_motion()
     covariance = 1e-2 * torch.eye(12, dtype=torch.float64)
-    for few, count in ((SearchConfig(hypotheses=5, turns=40), 5), (SearchConfig(kept=3, turns=2), 4), (SearchConfig(hypotheses=1), 1)):
+    for few, count in (
+        (SearchConfig(hypotheses=5, turns=40), 5),
+        (SearchConfig(kept=3, turns=2), 4),
+        (SearchConfig(pulled=3), 4),
+        (SearchConfig(hypotheses=1), 1),
+    ):
         config = TrackerConfig(search=few)
         assert len(promising(prediction, found.fit.contours, covariance, 30.0, places_of(prediction, seen), config)) == count
 

@@ -9,18 +9,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.config.tracker import SolverConfig, TrackerConfig
+from torchtrack.config.tracker import SolverConfig
 from torchtrack.contours import Contours, reproject
-from torchtrack.event_image import look_up
+from torchtrack.event_image import BORDER_PX, look_up
+from torchtrack.kernels import switch
+from torchtrack.kernels.arrays import as_arrays
 from torchtrack.lie import difference_about
 from torchtrack.motion import inverse
 from torchtrack.pose_problem import PoseProblem
 from torchtrack.pose_solver import solve_pose
 from torchtrack.prediction import Prediction
-from torchtrack.views import outlines_at
 
-# How far contour points look (px), a step of the solver each; outlines are taken anew for every row.
-_REACHES_PX = ((12.0, 8.4, 5.9), (7.2, 5.0, 3.5))
+# How far contour points look (px), a step of the solver each: of poses far off, and of those that were pulled nearer.
+FAR_PX, NEAR_PX = (12.0, 8.4, 5.9), (7.2, 5.0, 3.5)
 # Places that each looks at, on both sides.
 _LOOKS = 17
 # Standard deviation of what a contour point with one event finds (px), with its share of what all have in common.
@@ -31,36 +32,50 @@ _SOLVER = SolverConfig(iterations=1, loss="huber")
 def pulled(
     prediction: Prediction,
     T_cam_obj: Float[Tensor, "k 4 4"],
+    outlines: Contours,
     image: Float[Tensor, "h w"],
     covariance: Float[Tensor, "6 6"],
-    config: TrackerConfig,
+    reaches_px: tuple[float, ...],
 ) -> Float[Tensor, "k 4 4"]:
     """Poses of one object, each moved to where its contours lie on events.
 
     Args:
         prediction: of the object, with the ``covariance`` of its pose.
         T_cam_obj: where each begins.
+        outlines: contours of each there, or at a pose that is not far off.
         image: how many events there are at every pixel, as :mod:`torchtrack.event_image` has it.
+        reaches_px: how far contour points look, a step of the solver each.
     """
     information = (_FIND_PX**2 * inverse(covariance[None])).to(T_cam_obj.dtype)
-    for reaches_px in _REACHES_PX:
-        outlines = outlines_at(prediction, T_cam_obj, config)
-        for reach_px in reaches_px:
-            outlines = reproject(outlines, T_cam_obj, prediction.objects.intrinsics.expand(len(T_cam_obj), 4))
-            targets, weights = _found(outlines, image, reach_px)
-            problem = _problem(prediction, outlines, targets, weights, reach_px, information)
-            offset = difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
-            T_cam_obj = solve_pose(problem, T_cam_obj, _SOLVER, offset).T_cam_obj
+    for reach_px in reaches_px:
+        outlines = reproject(outlines, T_cam_obj, prediction.objects.intrinsics.expand(len(T_cam_obj), 4))
+        targets, weights = found(outlines, image, reach_px)
+        problem = _problem(prediction, outlines, targets, weights, reach_px, information)
+        offset = difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
+        T_cam_obj = solve_pose(problem, T_cam_obj, _SOLVER, offset).T_cam_obj
     return T_cam_obj
 
 
-def _found(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
+def found(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
     """Where each contour point finds most events along its normal, rather near by, and how much that counts."""
+    if switch.apply_to(image):
+        return _found_by_kernel(outlines, image, reach_px)
     steps_px = torch.linspace(-reach_px, reach_px, _LOOKS, dtype=image.dtype, device=image.device)
     looked_at = outlines.pixels[:, :, None] + steps_px[:, None] * outlines.normals[:, :, None]
     there = look_up(image, looked_at) * (1 - steps_px.abs() / (reach_px + 1))
     most, place = there.max(-1)
     return torch.addcmul(outlines.pixels, outlines.normals, steps_px[place][..., None]), most * outlines.mask
+
+
+def _found_by_kernel(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
+    """:func:`found`, point by point."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.event_pull import find
+
+    targets, weights = image.new_empty(*outlines.mask.shape, 2), image.new_empty(outlines.mask.shape)
+    points = as_arrays(outlines.pixels.transpose(1, 2), outlines.normals.transpose(1, 2), outlines.mask)
+    find(*points, *as_arrays(image), BORDER_PX, reach_px, _LOOKS, *as_arrays(targets, weights))
+    return targets, weights
 
 
 def _problem(

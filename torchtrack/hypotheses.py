@@ -15,7 +15,7 @@ from torch.nn.functional import avg_pool2d, pad
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours, assemble, sampling_settings
 from torchtrack.event_image import BORDER_PX, event_density, look_up
-from torchtrack.event_pull import pulled
+from torchtrack.event_pull import FAR_PX, NEAR_PX, pulled
 from torchtrack.image_shifts import shifted
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
@@ -47,25 +47,32 @@ def promising(
     settings = config.search
     enough = event_density(*places, prediction.objects.image_size).clamp(max=ENOUGH_EVENTS)
     if sigma_px > settings.wide_sigma_px:
-        poses = _near_events(prediction, covariance, places, enough, config)
+        poses, outlines = _near_events(prediction, covariance, places, enough, config)
         offsets = difference_about(prediction.T_cam_obj.expand(len(poses), 4, 4), poses, prediction.objects.centre_obj.expand(len(poses), 3))
-        offsets, outlines = _with_velocity(offsets, covariance), outlines_at(prediction, poses, config)
+        offsets = _with_velocity(offsets, covariance)
     else:
         offsets, outlines = draw_offsets(covariance, settings.drawn).to(prediction.velocity.dtype), thinned(outline)
-    marks = mark(prediction, outlines, offsets, enough)
+        poses = prediction.poses_at(offsets[:, :6])
+    marks = mark(outlines, poses, prediction.objects.intrinsics, enough)
     chosen = marks.topk(min(settings.hypotheses - 1, len(marks))).indices
     return torch.cat([torch.zeros_like(offsets[:1]), offsets[chosen]])
 
 
 def _near_events(
     prediction: Prediction, covariance: Tensor, places: tuple[Tensor, Tensor], enough: Float[Tensor, "h w"], config: TrackerConfig
-) -> Float[Tensor, "k 4 4"]:
-    """Poses of a very uncertain object whose contours lie on events: turned as drawn, shifted to where most are, and pulled onto them."""
+) -> tuple[Float[Tensor, "k 4 4"], Contours]:
+    """Poses of a very uncertain object whose contours lie on events, and these: turned as drawn, shifted to where most are, and pulled onto them."""
     steps = draw_offsets(covariance, config.search.turns)[:, :6].to(prediction.velocity.dtype)
     sigma_m = covariance.diagonal()[3:5].mean().sqrt().to(steps.dtype)
-    steps = shifted(prediction, steps, sigma_m, places, config)
+    steps, outlines = shifted(prediction, steps, sigma_m, places, config)
     around = avg_pool2d(enough[None], 3, 1, 1)[0]
-    return pulled(prediction, prediction.poses_at(steps), around, covariance[:6, :6], config)
+    onto = (around, covariance[:6, :6])
+    poses = pulled(prediction, prediction.poses_at(steps), outlines, *onto, FAR_PX)
+    best = mark(outlines, poses, prediction.objects.intrinsics, enough).topk(min(config.search.pulled, len(poses))).indices
+    poses = poses[best]
+    # What was seen from near there does not do any more.
+    poses = pulled(prediction, poses, outlines_at(prediction, poses, config), *onto, NEAR_PX)
+    return poses, outlines_at(prediction, poses, config)
 
 
 def draw_offsets(covariance: Float[Tensor, "12 12"], count: int) -> Float[Tensor, "n 13"]:
@@ -96,21 +103,21 @@ def _normal(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tenso
         return normal
 
 
-def mark(prediction: Prediction, outlines: Contours, offsets: Float[Tensor, "n 13"], image: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
-    """How much denser events are on the contours of each pose than beside them.
+def mark(outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"], image: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
+    """How much denser events are on the contours of one object at each of some poses than beside them.
 
     Args:
-        prediction: of the one object.
-        outlines: the contours of each pose; or one for all, which are moved: over a few degrees they stay contours, even on a smooth surface.
+        outlines: its contours at each pose; or one for all, which are moved: over a few degrees they stay contours, even on a smooth surface.
+        T_cam_obj: the poses.
         image: how many events there are at every pixel, as :mod:`torchtrack.event_image` has it.
     """
-    count, objects = len(offsets), prediction.objects
+    count = len(T_cam_obj)
     if switch.apply_to(image):
-        return _marked_by_kernel(outlines, prediction.poses_at(offsets[:, :6]), objects.intrinsics, image)
+        return _marked_by_kernel(outlines, T_cam_obj, intrinsics, image)
     points, tangents, kind, mask = (
         values.expand(count, *values.shape[1:]) for values in (outlines.points_obj, outlines.tangents_obj, outlines.kind, outlines.mask)
     )
-    moved = assemble(points, tangents, kind, mask, prediction.poses_at(offsets[:, :6]), objects.intrinsics.expand(count, 4))
+    moved = assemble(points, tangents, kind, mask, T_cam_obj, intrinsics.expand(count, 4))
     total = image.new_zeros(count)
     for side_px, weight in ((0.0, 1.0), (_BESIDE_PX, -0.5), (-_BESIDE_PX, -0.5)):
         total = total + weight * (look_up(image, moved.pixels + side_px * moved.normals) * moved.mask).sum(-1)

@@ -14,6 +14,7 @@ from torch.fft import irfft2, rfft2
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.contours import Contours
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.prediction import Prediction
@@ -56,8 +57,8 @@ class _Square:
 
 def shifted(
     prediction: Prediction, steps: Float[Tensor, "n 6"], sigma_m: Float[Tensor, ""], places: tuple[Tensor, Tensor], config: TrackerConfig
-) -> Float[Tensor, "k 6"]:
-    """Offsets of one object's pose at which its contours lie on most events: ``search.kept`` of them, the best first.
+) -> tuple[Float[Tensor, "k 6"], Contours]:
+    """Offsets of one object's pose at which its contours lie on most events, ``search.kept`` of them, the best first, and its outlines there.
 
     Args:
         prediction: of the object.
@@ -72,43 +73,48 @@ def shifted(
     square = _Square(ray[:2] * focal + objects.intrinsics[0, 2:], cell_px)
     steps = torch.cat([steps[:, :3], steps[:, 5:] * ray], 1)
     outlines = outlines_by_view(prediction, prediction.poses_at(steps), config)
-    fit = _correlation(square.counts(*places)[0] / cell_px, square.counts(outlines.pixels, outlines.mask))
-    number, shift = _best(fit, sigma_px / cell_px, config.search.kept)
+    number, shift = _best(square, places, outlines, sigma_px / cell_px, config.search.kept)
     moved_m = shift * cell_px * ((centre[2] + steps[number, 5:]) / focal)
-    return torch.cat([steps[number, :3], steps[number, 3:5] + moved_m, steps[number, 5:]], 1)
+    return torch.cat([steps[number, :3], steps[number, 3:5] + moved_m, steps[number, 5:]], 1), outlines.rows(number)
 
 
-def _correlation(events: Float[Tensor, "h w"], outlines: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
+def _best(
+    square: _Square, places: tuple[Tensor, Tensor], outlines: Contours, sigma_cells: Float[Tensor, ""], count: int
+) -> tuple[Int[Tensor, "k"], Float[Tensor, "k 2"]]:
+    """Numbers of the outlines that fit best, and their shifts (cells)."""
+    step = torch.arange(_SIDE, dtype=sigma_cells.dtype, device=sigma_cells.device) - _SIDE // 2
+    allowed = step[:, None].square() + step.square() <= (_SIGMAS * sigma_cells).square()
+    spectrum = _spectrum(square.counts(*places)[0] / square.cell_px)
+    split = zip(outlines.pixels.split(_TOGETHER), outlines.mask.split(_TOGETHER), strict=True)
+    peaks = (_peaks(_correlation(spectrum, square.counts(*some)), allowed) for some in split)
+    best, place = (torch.cat(values).flatten() for values in zip(*peaks, strict=True))
+    chosen = best.topk(min(count, best.numel())).indices
+    place = place[chosen]
+    return chosen // _SHIFTS, torch.stack([step[place % _SIDE], step[place // _SIDE]], -1)
+
+
+def _spectrum(events: Float[Tensor, "h w"]) -> Tensor:
+    """The spectrum of how much denser events are than around them, of which one for each pixel of a contour through the cell is enough."""
+    enough = events.clamp(max=1)
+    denser = _blurred(enough, _BLUR) - _blurred(enough, _BESIDE)
+    return rfft2(denser.roll((_SIDE // 2, _SIDE // 2), (0, 1)))
+
+
+def _correlation(spectrum: Tensor, outlines: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
     """How much more events there are on each outline than around it, for every shift; none at all is in the middle.
 
     Args:
-        events: their number, of which one for each pixel of a contour through the cell is enough.
+        spectrum: of the events.
         outlines: the number of contour points.
     """
-    enough = events.clamp(max=1)
-    denser = _blurred(enough, _BLUR) - _blurred(enough, _BESIDE)
-    spectrum = rfft2(denser.roll((_SIDE // 2, _SIDE // 2), (0, 1)))
-    fits = []
-    for some in outlines.split(_TOGETHER):
-        fit = irfft2(rfft2(some).conj() * spectrum, s=(_SIDE, _SIDE))
-        fits.append(fit.div_(some.sum((1, 2), keepdim=True).clamp(min=1)))
-    return torch.cat(fits)
+    fit = irfft2(rfft2(outlines).conj() * spectrum, s=(_SIDE, _SIDE))
+    return fit.div_(outlines.sum((1, 2), keepdim=True).clamp(min=1))
 
 
 def _blurred(cells: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
     """The mean over so many cells to each side, one way after the other."""
     side = 2 * radius + 1
     return avg_pool2d(avg_pool2d(cells[None], (side, 1), 1, (radius, 0)), (1, side), 1, (0, radius))[0]
-
-
-def _best(fit: Float[Tensor, "n h w"], sigma_cells: Float[Tensor, ""], count: int) -> tuple[Tensor, Float[Tensor, "k 2"]]:
-    """Numbers of the outlines that fit best, and their shifts (cells)."""
-    step = torch.arange(_SIDE, dtype=fit.dtype, device=fit.device) - _SIDE // 2
-    allowed = step[:, None].square() + step.square() <= (_SIGMAS * sigma_cells).square()
-    best, place = _peaks(fit, allowed)
-    chosen = best.flatten().topk(min(count, best.numel())).indices
-    place = place.flatten()[chosen]
-    return chosen // _SHIFTS, torch.stack([step[place % _SIDE], step[place // _SIDE]], -1)
 
 
 def _peaks(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:

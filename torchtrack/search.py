@@ -25,6 +25,8 @@ from torchtrack.prediction import Prediction
 AS_MUCH = 0.02
 # The 99th percentile of the squared distance of a pose, of six dimensions, in standard deviations (chi-square).
 _LIKELY = 16.8
+# So many of the poses of a very uncertain object, those that explain most, are aligned again.
+_ALIGNED_AGAIN = 8
 # From this share of how far they do when an object is seen well, events gather in full.
 _AS_GATHERED = 0.9
 
@@ -132,12 +134,17 @@ def search_around(
     covariance, seen = less_certain(one, 0, sigma_px, widened_px).covariance[0], events.of(number)
     places = one.carried(seen.pixels, seen.age_s), seen.mask
     offsets = promising(one, outline, covariance, widened_px, places, config)
-    tried = align_all(one.copies(0, len(offsets)), offsets, seen, config, found.full_gathered[number], found.asked_apart[number])
+    on, wide = (seen, config, found.full_gathered[number], found.asked_apart[number]), sigma_px > config.search.wide_sigma_px
+    tried = align_all(one.copies(0, len(offsets)), offsets, *on)
+    for _ in range(config.search.realigned if wide else 0):
+        # From some way off, a pose comes near the right one before its contours are those that are seen there.
+        best = tried.score.topk(min(_ALIGNED_AGAIN, len(tried.score))).indices
+        tried = align_all(one.copies(0, len(best)), tried.fit.solution.from_prior[best], *on)
     offset = tried.fit.solution.from_prior
     margin, needed, gathered, count = least.unbind()
     # Written so that what does not tell how far it gathers counts.
     counts = (tried.count >= count.clamp(min=config.quality.min_observations)) & _is_likely(offset, covariance) & ~(tried.gathered < gathered)
-    score, wide = torch.where(counts, tried.score, 0), sigma_px > config.search.wide_sigma_px
+    score = torch.where(counts, tried.score, 0)
     mine = torch.where(found.count[number] >= config.quality.min_observations, found.score[number], 0.0)
     asked = torch.maximum(mine + margin, needed)
     if config.search.line_ends and wide:

@@ -120,7 +120,7 @@ def _events_on_contours(turned: Prediction, one: Prediction, seen: WindowEvents,
     """How many more events lie on the contours of each prediction than beside them: in all, not for each of their points."""
     image = event_density(one.carried(seen.pixels, seen.age_s), seen.mask, one.objects.image_size).clamp(max=ENOUGH_EVENTS)
     contours = turned.objects.contours(turned.T_cam_obj, config.contours)
-    return mark(turned, thinned(contours), turned.velocity.new_zeros(len(turned.velocity), 13), image) * contours.mask.sum(-1)
+    return mark(thinned(contours), turned.T_cam_obj, one.objects.intrinsics, image) * contours.mask.sum(-1)
 
 
 def _peaks(totals: Float[Tensor, "n"]) -> tuple[Int[Tensor, "k"], Bool[Tensor, "k"]]:

@@ -11,9 +11,13 @@ class SearchConfig(Settings):
     hypotheses: int = Field(24, ge=0, le=1000, description="Poses aligned at once; 0 switches the search off.")
     drawn: int = Field(2000, ge=1, le=100_000, description="Poses drawn from the prediction, of which the most promising are aligned.")
     turns: int = Field(
-        500, ge=1, le=10_000, description="Turns and depths drawn where a prediction is very uncertain, tried in all places of the image."
+        1000, ge=1, le=10_000, description="Turns and depths drawn where a prediction is very uncertain, tried in all places of the image."
     )
-    kept: int = Field(64, ge=1, le=1000, description="The best of these, which are pulled onto the events around them.")
+    kept: int = Field(512, ge=1, le=10_000, description="The best of these, which are pulled onto the events around them.")
+    pulled: int = Field(64, ge=1, le=1000, description="Those of them that are pulled once more, from nearer.")
+    realigned: int = Field(
+        2, ge=0, le=20, description="How many times the best poses of a very uncertain object are aligned again, each from where it came to."
+    )
     wide_sigma_px: float = Field(10.0, gt=0, description="Standard deviation of the prediction in the image from which that is so (px).")
     interval_us: int = Field(10_000, ge=0, description="A very uncertain object is searched for once in this time (µs); 0 for in every window.")
     from_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which others are tried (px).")

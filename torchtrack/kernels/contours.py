@@ -262,15 +262,15 @@ def mark(
             nu, nv, length = normal_of(ax - x * inverse * az, ay - y * inverse * az, inverse, of_lens)
             if mask[row, i] and length > settings.least_px_per_m and z > settings.least_depth_m:
                 u, v = x * inverse * of_lens[0] + of_lens[2], y * inverse * of_lens[1] + of_lens[3]
-                outer = _at(flat, width, height, u + beside_px * nu, v + beside_px * nv, border_px)
-                inner = _at(flat, width, height, u - beside_px * nu, v - beside_px * nv, border_px)
-                total += _at(flat, width, height, u, v, border_px) - 0.5 * (outer + inner)
+                outer = at(flat, width, height, u + beside_px * nu, v + beside_px * nv, border_px)
+                inner = at(flat, width, height, u - beside_px * nu, v - beside_px * nv, border_px)
+                total += at(flat, width, height, u, v, border_px) - 0.5 * (outer + inner)
                 count += 1
         marks[n] = total / max(count, 1)
 
 
 @kernel(fastmath=FAST)
-def _at(image: Array, width: float, height: float, u: float, v: float, border_px: int) -> float:
+def at(image: Array, width: float, height: float, u: float, v: float, border_px: int) -> float:
     """What an image with its border, row by row, has at a pixel: :func:`torchtrack.event_image.look_up`."""
     column, row = np.rint(u) + border_px, np.rint(v) + border_px
     # What is not a number is looked up at the first pixel. No branch, of which a processor would guess many wrong.
