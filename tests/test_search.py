@@ -17,7 +17,7 @@ from torchtrack.lie import retract_about
 from torchtrack.quality import Status
 from torchtrack.recovery import _least, _search_slipped, _stands, search_wanted
 from torchtrack.relocation import LastSeen
-from torchtrack.search import _is_likely, _likeliest, explained_at_rest, rehearse, search
+from torchtrack.search import _is_likely, _likeliest, align_all, explained_at_rest, rehearse, search
 
 SEARCHED = TrackerConfig()
 UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
@@ -75,6 +75,35 @@ def test_a_box_is_found_again_where_hardly_anything_is_known_of_it(velocity_know
     degrees, millimetres = pose_errors(better.fit.solution.T_cam_obj.double(), T_true)
     assert float(degrees) < 2.0
     assert float(millimetres) < 5.0
+
+
+@pytest.mark.parametrize("axis", [(0.5, -0.8, 0.3), (-0.6, 0.2, 0.8), (0.9, 0.4, 0.1), (-0.1, -0.7, -0.7)])
+def test_a_box_is_found_again_half_a_quarter_turn_off_about_any_axis(axis):
+    turn = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0) * 0.8
+    displaced = torch.cat([turn, torch.tensor([0.03, -0.02, 0.03], dtype=torch.float64)])[None]
+    tracker, prediction, seen, found, T_true = in_motion(displaced=displaced)
+    sigma = torch.tensor([0.7] * 3 + [0.06, 0.06, 0.05] + [2.0] * 3 + [0.3] * 3, dtype=torch.float64)
+    prediction = replace(prediction, covariance=torch.diag_embed(sigma.square())[None])
+    better = search(0, prediction, 40.0, LEAST, seen, found, tracker.config)
+    degrees, millimetres = pose_errors(better.fit.solution.T_cam_obj.double(), T_true)
+    assert float(degrees) < 1.0 and float(millimetres) < 3.0
+
+
+def test_the_best_poses_are_aligned_again_where_hardly_anything_is_known_and_nowhere_else(monkeypatch):
+    counts = []
+    monkeypatch.setattr("torchtrack.search.align_all", lambda copies, *told: counts.append(len(told[0])) or align_all(copies, *told))
+    tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
+    for sigma_px in (8.0, 30.0):
+        search(0, prediction, sigma_px, LEAST, seen, found, tracker.config)
+    once = replace_settings(tracker.config, realigned=0)
+    search(0, prediction, 30.0, LEAST, seen, found, once)
+    few = replace_settings(tracker.config, hypotheses=3, realigned=1)
+    search(0, prediction, 30.0, LEAST, seen, found, few)
+    assert counts == [24, 24, 8, 8, 24, 3, 3]
+
+
+def replace_settings(config, **search_settings):
+    return config.model_copy(update={"search": config.search.model_copy(update=search_settings)})
 
 
 def test_of_poses_that_explain_as_much_the_most_expected_is_taken():

@@ -1,13 +1,16 @@
 """How fast an object can be that has not been found yet: few events before it, and it cannot have moved far."""
 
+from dataclasses import replace
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.camera import project
 from torchtrack.lie import transform_points
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import WindowEvents
+from torchtrack.state import TrackerState
 
 # A shorter way need not show at all: a pixel fires only once an edge has passed far enough over it (px).
 _LEAST_WAY_PX = 0.6
@@ -43,3 +46,13 @@ def largest_speed(objects: ObjectBatch, T_cam_obj: Float[Tensor, "b 4 4"], event
     before_it = events.mask & (x * x + y * y < (0.5 * diameter_px[:, None]).square())
     way_px = (before_it.sum(-1) / (2 * diameter_px)).clamp(min=_LEAST_WAY_PX)
     return way_px / diameter_px * objects.diameter_m / window_s
+
+
+@torch.no_grad()
+def held_back(
+    state: TrackerState, unfound: Bool[Tensor, "b"], objects: ObjectBatch, events: WindowEvents, window_s: Float[Tensor, "b"]
+) -> TrackerState:
+    """The state, with the speed of objects that are ``unfound`` yet limited by a window's events before them."""
+    T_cam_obj = state.T_cam_obj.detach().to(objects.intrinsics.dtype)
+    limit_m_s = torch.where(unfound, largest_speed(objects, T_cam_obj, events, window_s), torch.inf)
+    return replace(state, covariance=limit_speed(state.covariance, limit_m_s, objects.diameter_m, objects.depth_m(T_cam_obj)))

@@ -13,23 +13,23 @@ from torch import Tensor, nn
 
 from torchtrack import readback
 from torchtrack.alignment import align, gate_widening, index_for, index_radius, usual_index_radius
-from torchtrack.bursts import no_bursts
 from torchtrack.camera import Camera
 from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.contour_index import ContourIndex
+from torchtrack.contours import Contours
+from torchtrack.corners import Corners
 from torchtrack.doubt import Doubt, gathered_when_known, has_strayed, is_adrift, is_due, is_wanted, searches
 from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
+from torchtrack.first_state import first_state
 from torchtrack.forecast import forecast
+from torchtrack.history import History
 from torchtrack.kernels import switch
-from torchtrack.learned_contours import LearnedContours
-from torchtrack.model_trust import ModelTrust
-from torchtrack.motion import initial_covariance
 from torchtrack.object_model import ObjectModel
-from torchtrack.observations import corner_observations, join, select_events
+from torchtrack.observations import ObjectEvents, Observations, corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
-from torchtrack.polarity_memory import nothing_remembered
 from torchtrack.prediction import Prediction
 from torchtrack.probation import after_probation
 from torchtrack.quality import Status, asked_apart
@@ -39,10 +39,10 @@ from torchtrack.search import explained_at_rest, judge_fit, rehearse
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.sensors import farthest_event_px
 from torchtrack.setup_check import check_start
-from torchtrack.slow_circuits import LOOK_US, dated, late_share_after, unknown_circuits
-from torchtrack.speed_limit import largest_speed, limit_speed
-from torchtrack.state import Probation, StepResult, TrackerState, choose_rows
-from torchtrack.time_surface import empty_last_event, update_last_event
+from torchtrack.slow_circuits import LOOK_US, dated, late_share_after
+from torchtrack.speed_limit import held_back
+from torchtrack.state import StepResult, TrackerState, choose_rows
+from torchtrack.time_surface import update_last_event
 from torchtrack.tracked_objects import TrackedObjects
 from torchtrack.turns import may_have_turned
 from torchtrack.window_parts import of_unknown_motion, to_be_parted
@@ -108,21 +108,7 @@ class Tracker(TrackedObjects):
         """
         T_cam_obj = torch.as_tensor(T_cam_obj, dtype=torch.float64, device=self.intrinsics.device)
         check_start(T_cam_obj, self.centre_obj, self.object_names)
-        times = torch.as_tensor(t_us, dtype=torch.int64, device=T_cam_obj.device).expand(self.streams).clone()
-        velocity = torch.zeros(len(T_cam_obj), 6, dtype=self.intrinsics.dtype, device=T_cam_obj.device)
-        covariance = initial_covariance(self.diameter_m, self.config.motion)
-        nothing = torch.zeros_like(self.diameter_m)
-        last_event_us, burst_age_us = (empty(self.streams, *self.image_size, T_cam_obj.device) for empty in (empty_last_event, no_bursts))
-        learning = self.config.learning
-        learned = LearnedContours.none(len(velocity), learning, velocity) if learning.points and self.config.contours.source == "mesh" else None
-        trust = ModelTrust.none(self.element_groups, velocity) if self.judges else None
-        probation = Probation.none(T_cam_obj, covariance)
-        motion, shares, seen = (
-            (velocity, velocity, covariance),
-            (nothing,) * 7,
-            (T_cam_obj.clone(), nothing, nothing_remembered(velocity), unknown_circuits(nothing)),
-        )
-        return TrackerState(T_cam_obj.clone(), *motion, *shares, *seen, times, last_event_us, burst_age_us, probation, learned, trust)
+        return first_state(self, T_cam_obj, torch.as_tensor(t_us, dtype=torch.int64, device=T_cam_obj.device).expand(self.streams).clone())
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """:meth:`step`, as a layer of a network: what comes in first."""
@@ -267,13 +253,7 @@ class Tracker(TrackedObjects):
         radius_px = questions.ask(index_radius(widening, config), usual_index_radius(config))
         corners = sensors.corners(contours, last_event_us, t_us, window_s, config)
         index = index_for(contours, self.image_size, config, widening, radius_px)
-        observations = corner_observations(corners)
-        if config.matching.max_events:
-            near = select_events(seen, index, prediction.moving(compensated=True), config.matching.max_events)
-            observations = join(observations, near)
-        if self.weigher is not None:
-            evidence = Evidence(observations, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
-            observations = judged(evidence, self.weigher)
+        observations = self._observed(corners, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
         as_late = dated(observations, state.late_share, state.unseen_s, config.matching)
         fit = align(recorded, contours, index, widening, as_late, config)
         full_gathered = gathered_when_known(doubt, state.full_gathered, config.search)
@@ -296,6 +276,17 @@ class Tracker(TrackedObjects):
             late_share = late_share_after(state.late_share, observations, contours, fit.matches, prediction, sure, config.matching)
             next_state = replace(next_state, late_share=late_share)
         return replace(next_state, t_us=t_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
+
+    def _observed(
+        self, corners: Corners, seen: ObjectEvents, prediction: Prediction, contours: Contours, index: ContourIndex, history: History
+    ) -> Observations:
+        """What is matched with the contours: corners, and recent events near them, each with how far it is to be believed."""
+        observations, most = corner_observations(corners), self.config.matching.max_events
+        if most:
+            observations = join(observations, select_events(seen, index, prediction.moving(compensated=True), most))
+        if self.weigher is None:
+            return observations
+        return judged(Evidence(observations, seen, prediction, contours, index, history), self.weigher)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""
@@ -324,20 +315,11 @@ class Tracker(TrackedObjects):
     def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:
         """The state that a window is predicted from: of what is lost for long, where it was last seen well."""
         lost = is_lost(state, self.diameter_m, self.config)
-        state = self._held_back(state, events, t_us, dt_s, questions)
-        return state if questions.none_of(lost) else LastSeen.of(state, self.objects, t_us, self.config).in_place_of(state, lost)
-
-    @torch.no_grad()
-    def _held_back(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:
-        """The state, with the speed of objects that were never found yet limited by the events before them."""
         # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.
-        found = state.usual_score > 0
-        if not self.config.motion.speed_from_events or questions.none_of(~found):
-            return state
-        T_cam_obj = state.T_cam_obj.detach().to(self.intrinsics.dtype)
-        limit_m_s = largest_speed(self.objects, T_cam_obj, self.sensors.seen(pad_streams(events, self.streams, t_us)), dt_s)
-        limit_m_s = torch.where(found, torch.inf, limit_m_s)
-        return replace(state, covariance=limit_speed(state.covariance, limit_m_s, self.diameter_m, self.objects.depth_m(T_cam_obj)))
+        unfound = ~(state.usual_score > 0)
+        if self.config.motion.speed_from_events and not questions.none_of(unfound):
+            state = held_back(state, unfound, self.objects, self.sensors.seen(pad_streams(events, self.streams, t_us)), dt_s)
+        return state if questions.none_of(lost) else LastSeen.of(state, self.objects, t_us, self.config).in_place_of(state, lost)
 
 
 def _counted(done: tuple[TrackerState, StepResult]) -> tuple[TrackerState, StepResult]:
