@@ -163,7 +163,7 @@ def test_an_object_seen_by_few_events_is_not_remembered_as_seen_well(way):
 # ---- all together
 
 
-LOST = {"lost": {"turn_rad": 0.45, "metres": 0.3, "sideways_m": 0.4}, "small, far behind": {"turn_rad": 0.01, "metres": 0.35, "sideways_m": 0.0}}
+LOST = {"lost": {"turn_rad": 0.45, "metres": 0.3, "sideways_m": 2.0}, "small, far behind": {"turn_rad": 0.01, "metres": 0.35, "sideways_m": 0.0}}
 
 
 @pytest.mark.parametrize("name", LOST)
