@@ -167,8 +167,9 @@ def test_what_was_merely_not_seen_well_has_to_explain_nearly_all_elsewhere_and_n
     assert strayed.strayed.tolist() == strayed.adrift.tolist() == [True]
     torch.testing.assert_close(strayed.doubted_s, state.unseen_s)
     assert in_place.adrift.tolist() == [False]
-    near, elsewhere = _least(strayed, found, tracker.config)[:2, :, 0]
-    torch.testing.assert_close(near, torch.tensor([0.15, 0.72, 0.0, 0.8 * float(found.count)]))
+    near, elsewhere, _, as_last_seen = _least(strayed, found, tracker.config)[:, :, 0]
+    for least in (near, as_last_seen):
+        torch.testing.assert_close(least, torch.tensor([0.15, 0.72, 0.0, float(found.count)]))
     torch.testing.assert_close(elsewhere, torch.tensor([0.15, 0.72, 0.0, 0.0]))
     torch.testing.assert_close(_least(in_place, found, tracker.config)[0, :, 0], torch.tensor([0.1, 0.0, 0.0, 0.0]))
 

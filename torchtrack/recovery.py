@@ -18,8 +18,6 @@ from torchtrack.relocation import LastSeen
 from torchtrack.search import AS_MUCH, Found, is_taken, search, search_around
 from torchtrack.turns import TurningAxes, turns_compared
 
-# A pose explains no fewer events than another where it explains this share of theirs.
-_AS_MANY = 0.8
 # What explains so many times as many events as a pose far off in depth is no smaller thing that chance explains.
 _FAR_MORE = 2.0
 
@@ -121,11 +119,12 @@ def _least(doubt: Doubt, found: Found, config: TrackerConfig) -> Float[Tensor, "
     margin = torch.where(doubt.starting, search.start_margin, search.margin)
     # What is far away has to explain about as much as usual; so has what is found step by step, while a motion is lost, ever farther away.
     needed = torch.where(doubt.adrift | doubt.starting, search.adrift_share * doubt.full_share, 0)
-    # What is partly hidden explains less, too: nothing but the whole object, seen elsewhere, speaks against that. A part of its edges does not.
+    # What is partly hidden explains less, too: nothing but the whole object, seen elsewhere by no fewer events, speaks against that.
+    # A part of its edges does not.
     margin = torch.where(doubt.strayed, search.slip_margin, margin)
     needed = torch.where(doubt.strayed, search.slip_share * doubt.full_share, needed)
     matched = found.count.to(margin.dtype)
-    count = torch.where(doubt.strayed, _AS_MANY * matched, 0)
+    count = torch.where(doubt.strayed, matched, 0)
     # Of a new object, only what explains nearly all is surely better: edges of what hides it explain half.
     new = doubt.is_new(found.score, search)
     needed = torch.where(new, search.new_share, needed)
@@ -135,7 +134,7 @@ def _least(doubt: Doubt, found: Found, config: TrackerConfig) -> Float[Tensor, "
     off = doubt.off_in_depth
     needed_anew = torch.where(off, config.quality.certain_at, search.slip_share) * doubt.full_share
     anew = torch.where(off, -torch.inf, search.slip_margin), needed_anew, none, torch.where(off, _FAR_MORE, 1) * matched
-    last_seen = *elsewhere[:3], torch.where(_stands(doubt, found, config), _FAR_MORE * matched, 0)
+    last_seen = *elsewhere[:3], torch.where(_stands(doubt, found, config), _FAR_MORE * matched, count)
     return torch.stack([margin, needed, gathered, count, *elsewhere, *anew, *last_seen]).unflatten(0, (4, 4))
 
 
