@@ -85,6 +85,14 @@ def test_a_can_that_turned_unseen_is_turned_back_once_it_is_seen_again(wrong, ke
     assert Status(int(results[0].status)) == Status.UNCERTAIN and Status(int(results[-1].status)) == Status.TRACKING
 
 
+def test_it_does_not_turn_farther_than_it_can_have_spun_unseen():
+    """Half round within a tenth of a second it cannot; in twice as long nearly."""
+    state, _, T_true = after_a_while(wrong=2.2, unseen_s=0.06, first=18)
+    assert float(pose_errors(state.T_cam_obj, T_true)[0]) > 60
+    state, _, T_true = after_a_while(wrong=2.2, first=18)
+    assert float(pose_errors(state.T_cam_obj, T_true)[0]) < 20
+
+
 def test_without_it_the_can_stays_turned_and_is_sure_of_that():
     state, results, T_true = after_a_while(TrackerConfig(search=SearchConfig(turned=False)), wrong=2.2)
     assert float(pose_errors(state.T_cam_obj, T_true)[0]) > 60
@@ -166,10 +174,17 @@ def test_what_is_turned_keeps_its_axis_where_it_is_and_goes(dtype):
 def test_the_best_turns_that_are_not_beside_better_ones():
     totals = torch.zeros(120)
     totals[[0, 3, 30, 33, 60, 118]] = torch.tensor([5.0, 9.0, 7.0, 6.0, 8.0, 9.0])
-    chosen, exists = _peaks(totals)
+    chosen, exists = _peaks(totals, torch.ones(120, dtype=torch.bool))
     # The pose itself, whatever it is worth; what is beside it is the same.
     assert chosen[:3].tolist() == [0, 60, 30]
     assert exists[:3].all() and 33 not in chosen[exists].tolist()
+
+
+def test_turns_out_of_reach_are_left_out():
+    totals = torch.zeros(120)
+    totals[[30, 60, 90]] = torch.tensor([7.0, 8.0, 6.0])
+    chosen, exists = _peaks(totals, torch.arange(120) < 50)
+    assert chosen[0] == 0 and {30} <= set(chosen[exists].tolist()) and not {60, 90} & set(chosen[exists].tolist())
 
 
 def test_what_was_not_seen_for_a_while_may_have_turned():

@@ -68,7 +68,8 @@ def search_wanted(
             other = less_certain(mirrored(_as_found(number, prediction, found), *plane), 0, predicted_px, config.search.slip_sigma_px)
             found, prediction = _search_from(number, other, config.search.slip_sigma_px, least_far[:, number], events, found, prediction, config)
         if is_turned:
-            found, prediction = turns_compared(number, _as_found(number, prediction, found), axes, events, found, prediction, config)
+            one, unseen_s = _as_found(number, prediction, found), doubt.unseen_s[number]
+            found, prediction = turns_compared(number, one, axes, unseen_s, events, found, prediction, config)
     was_adrift = doubt.adrift & found.elsewhere
     prediction = replace(prediction, covariance=torch.where(was_adrift[:, None, None], uncertain.covariance, prediction.covariance))
     widening = torch.where(was_adrift, gate_widening(sigma_px, config), widening)

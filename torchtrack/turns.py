@@ -31,8 +31,8 @@ _ALIGNED = 6
 # How much better, in both comparisons taken together, one has to be than all others. To be turned to, it has to explain so much more,
 # and a larger share of its contours, or to lie on so many times as many events: longer contours lie on more of the background's.
 _CLEARLY, _LARGER_SHARE, _MORE_EVENTS = 0.1, 0.05, 1.15
-# How certain a turn is (rad), and a spin (rad/s), that was not seen.
-_TURN_RAD, _SPIN_RAD_S = 0.1, 4.0
+# How certain a turn is (rad), and a spin (rad/s), that was not seen; and the fastest spin that is believed (rad/s).
+_TURN_RAD, _SPIN_RAD_S, _FASTEST_RAD_S = 0.1, 4.0, 12.0
 
 
 @dataclass(frozen=True)
@@ -75,18 +75,27 @@ def may_have_turned(has_axis: Bool[Tensor, "b"], unseen_s: Float[Tensor, "b"], c
 
 
 def turns_compared(
-    number: int, one: Prediction, axes: TurningAxes, events: ObjectEvents, found: Found, prediction: Prediction, config: TrackerConfig
+    number: int,
+    one: Prediction,
+    axes: TurningAxes,
+    unseen_s: Float[Tensor, ""],
+    events: ObjectEvents,
+    found: Found,
+    prediction: Prediction,
+    config: TrackerConfig,
 ) -> tuple[Found, Prediction]:
     """The object ``number`` turned as its events say, where these do so clearly, and the prediction that it is to be weighed against.
 
     Args:
         one: the object alone, as it was found.
+        unseen_s: how long ago it was seen well (s): it cannot have turned farther than it can spin in this time.
         events: of all objects.
     """
     seen = events.of(number)
     angles = torch.arange(_TURNS, dtype=one.T_cam_obj.dtype, device=one.T_cam_obj.device) * (2 * math.pi / _TURNS)
     totals = _events_on_contours(axes.turned(number, one, angles), one, seen, config)
-    chosen, exists = _peaks(totals)
+    within = torch.minimum(angles, 2 * math.pi - angles) <= _FASTEST_RAD_S * unseen_s
+    chosen, exists = _peaks(totals, within)
     rows = axes.turned(number, one, angles[chosen])
     tried = align_all(rows, one.velocity.new_zeros(len(chosen), 13), seen, config, found.full_gathered[number], found.asked_apart[number])
     best, clear, turned = _compared(tried, totals[chosen], exists, config.quality.min_observations)
@@ -123,10 +132,10 @@ def _events_on_contours(turned: Prediction, one: Prediction, seen: WindowEvents,
     return mark(thinned(contours), turned.T_cam_obj, one.objects.intrinsics, image) * contours.mask.sum(-1)
 
 
-def _peaks(totals: Float[Tensor, "n"]) -> tuple[Int[Tensor, "k"], Bool[Tensor, "k"]]:
-    """The pose itself, and the turns that are better than those beside them, the best first; and which of these there are."""
+def _peaks(totals: Float[Tensor, "n"], within: Bool[Tensor, "n"]) -> tuple[Int[Tensor, "k"], Bool[Tensor, "k"]]:
+    """The pose itself, and the turns ``within`` reach that are better than those beside them, the best first; and which of these there are."""
     around = pad(totals[None, None], (_SAME, _SAME), mode="circular")
-    peaks = torch.where(totals == max_pool1d(around, 2 * _SAME + 1, 1)[0, 0], totals, -torch.inf)
+    peaks = torch.where(within & (totals == max_pool1d(around, 2 * _SAME + 1, 1)[0, 0]), totals, -torch.inf)
     peaks[: _SAME + 1], peaks[-_SAME:] = -torch.inf, -torch.inf
     best = peaks.topk(_ALIGNED)
     chosen, exists = (pad(values, (1, 0), value=first) for values, first in ((best.indices, 0), (best.values > -torch.inf, True)))
