@@ -140,10 +140,12 @@ def test_what_is_adrift_or_very_uncertain_is_looked_for_as_it_was_last_seen_when
 
 def test_it_is_time_once_in_every_interval_whatever_the_windows():
     ends_us = torch.arange(0, 100_001, 5000)
-    due = is_due(ends_us[:-1], ends_us[1:], 20_000)
+    due = is_due(ends_us[:-1], ends_us[1:], 20_000)[0]
     assert due.nonzero().flatten().tolist() == [3, 7, 11, 15, 19]
     assert is_due(ends_us[:-1], ends_us[1:], 0).all()
     assert is_due(torch.tensor([1000]), torch.tensor([61_000]), 20_000).all()
+    of_each = is_due(ends_us[:-1], ends_us[1:], 20_000, 0)
+    assert torch.equal(of_each[0], due) and of_each[1].all()
 
 
 @pytest.mark.parametrize(("doubt_us", "expected"), [(50_000, [False, True, False]), (20_000, [True, True, False]), (0, [False] * 3)])

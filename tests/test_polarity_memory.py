@@ -17,7 +17,7 @@ from torchtrack.contour_model import ContourKind
 from torchtrack.matching import ContourTable, match_nearest
 from torchtrack.object_model import ObjectModel
 from torchtrack.online_learning import objects_as_known
-from torchtrack.polarity_memory import expected_polarity, is_seen_well, nothing_remembered, octant, remembered
+from torchtrack.polarity_memory import expected_polarity, is_asked, is_seen_well, nothing_remembered, octant, remembered
 from torchtrack.quality import Status, explained_share
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import simulate
@@ -84,6 +84,7 @@ def test_nothing_is_expected_of_what_is_seen_well_and_all_of_what_is_hardly_seen
     sides = torch.tensor([[1.0, -1.0, 0.5, -0.5, 0.1, 0.0, 0.9, -0.9]], dtype=dtype).expand(4, 8)
     score, full = torch.tensor([0.75, 0.6, 0.4, 0.0], dtype=dtype), torch.full((4,), 0.8, dtype=dtype)
     expected = expected_polarity(sides, score, full)
+    assert is_asked(score, full).tolist() == [False, True, True, True]
     assert (expected[0] == 0).all()
     torch.testing.assert_close(expected[2:], (sides * sides.abs())[2:])
     torch.testing.assert_close(expected[1], 0.5 * (sides * sides.abs())[1])

@@ -1,6 +1,5 @@
 """One window's alignment: rounds of matching and solving with ever tighter gates."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor
 from torchtrack import fast_alignment
 from torchtrack.common_error import told_by_each
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
+from torchtrack.constants import constant
 from torchtrack.contour_index import ContourIndex, index_contours
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours, reproject
@@ -103,7 +103,7 @@ def align(
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
     table = _table(contours, index, objects, matching)
     finely = _looked_up_finely(objects, begin, contours, widening, matching)
-    narrowing = tuple(_narrowing(widening, len(matching.gates_px)))
+    narrowing = _narrowing(widening, len(matching.gates_px))
     if fast_alignment.applies(config, offset):
         solution, matches = fast_alignment.align_rounds(
             prediction, begin.T_cam_obj, offset, information, table, observations, narrowing, finely, config
@@ -149,10 +149,10 @@ def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config
     return ContourTable.of(contours, index, objects.polarity, of_print=config.print_polarity, close_px=config.close_edges_px)
 
 
-def _narrowing(widening: Float[Tensor, "b"], rounds: int) -> Iterable[Float[Tensor, "b"]]:
+def _narrowing(widening: Float[Tensor, "b"], rounds: int) -> Float[Tensor, "r b"]:
     """How many times wider than configured the gate of every round is: as given at first, not at all at last."""
-    left = torch.linspace(1, 0, rounds, dtype=widening.dtype, device=widening.device)
-    return (widening ** left[:, None]).unbind(0)
+    left = tuple((1 - number / max(rounds - 1, 1),) for number in range(rounds))
+    return widening ** constant(left, widening.dtype, widening.device)
 
 
 def _first_place(begin: Prediction, observations: Observations, config: TrackerConfig) -> Float[Tensor, "b n 2"]:

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import lie, quality
-from torchtrack.alignment import ANYWHERE, may_be_anywhere
+from torchtrack import lie, quality, readback
+from torchtrack.alignment import ANYWHERE, Fit, may_be_anywhere
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contours import reproject
+from torchtrack.contours import Contours, reproject
 from torchtrack.corners import Corners
 from torchtrack.doubt import SMEARED, in_doubt
 from torchtrack.kernels import switch
@@ -52,10 +52,18 @@ def conclude(
         after, covariance, status = _judged_by_kernel(state, prediction, expected, widening, found, dt_s, config)
     else:
         after, covariance, status = _judged(state, prediction, widening, found, dt_s, config)
-    contours = reproject(found.fit.contours, after.T_cam_obj.to(dt_s.dtype), prediction.objects.intrinsics)
+    contours = _where_they_are(found.fit, after.T_cam_obj, status >= int(quality.Status.LOST), prediction.objects.intrinsics)
     result = StepResult(state.t_us, after.T_cam_obj, covariance, status, found.share, contours, corners, found.count)
     sides = _darker_outside(state, found, status, dt_s, config)
     return replace(after, score=found.score, darker_outside=sides, full_apart=_full_apart(state, after, found)), result
+
+
+def _where_they_are(fit: Fit, T_cam_obj: Float[Tensor, "b 4 4"], failed: Bool[Tensor, "b"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
+    """The contours of a fit, of objects that ``failed`` at the poses that they go on from instead."""
+    if readback.none_of(failed):
+        return fit.contours
+    fitted = fit.solution.T_cam_obj
+    return reproject(fit.contours, torch.where(failed[:, None, None], T_cam_obj.to(fitted.dtype), fitted), intrinsics)
 
 
 # The state with what is known of poses and motions after a window, covariances of the poses' left perturbation, and statuses.

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.constants import constant
 from torchtrack.motion import rim_and_centre
 from torchtrack.prediction import Prediction
 from torchtrack.readback import none_of
@@ -113,10 +114,10 @@ class Doubt:
         return self.far_due & (config.doubt_us > 0)
 
 
-def is_due(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], interval_us: int) -> Bool[Tensor, "s"]:
-    """Streams in which it is time for what is done once in an interval: by the clock, whatever the windows."""
-    interval_us = max(interval_us, 1)
-    return t_us // interval_us > since_us // interval_us
+def is_due(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], *intervals_us: int) -> Bool[Tensor, "k s"]:
+    """Streams in which it is time for what is done once in each of some intervals: by the clock, whatever the windows."""
+    each_us = constant(tuple((max(interval_us, 1),) for interval_us in intervals_us), t_us.dtype, t_us.device)
+    return t_us // each_us > since_us // each_us
 
 
 def searches(config: TrackerConfig) -> bool:

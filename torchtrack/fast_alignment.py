@@ -1,12 +1,11 @@
 """The rounds of an alignment by a kernel, under the settings that it knows: those of the preset ``default``, and most beside them."""
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.constants import constant
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import MatchingSettings, RoundSettings
@@ -32,7 +31,7 @@ def align_rounds(
     information: Float[Tensor, "b 13 13"],
     table: ContourTable,
     observations: Observations,
-    wider: Sequence[Float[Tensor, "b"]],
+    wider: Float[Tensor, "r b"],
     finely: Bool[Tensor, "b"],
     config: TrackerConfig,
 ) -> tuple[Linearisation, Matches]:
@@ -61,7 +60,7 @@ def align_rounds(
         *as_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
         table.index.cells,
         *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, objects.intrinsics, objects.centre_obj),
-        *as_arrays(torch.tensor(config.matching.gates_px, dtype=offset.dtype), torch.stack(list(wider)), finely),
+        *as_arrays(constant(config.matching.gates_px, offset.dtype, offset.device), wider, finely),
         _matching_settings(config),
         RoundSettings(config.matching.motion_compensation, config.solver.velocity_in_window),
         damping_settings(config.solver, information),

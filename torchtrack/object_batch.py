@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.linalg import vecdot
 from torch.nn.functional import pad
 
 from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourKind, ContourModel
 from torchtrack.contours import Contours, assemble, joined, mesh_contours, mesh_elements
-from torchtrack.lie import transform_points
 from torchtrack.splat import splat_contours
 from torchtrack.visibility import Scene, remove_hidden
 
@@ -75,7 +75,8 @@ class ObjectBatch:
 
     def depth_m(self, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b"]:
         """Depth of each object's centre, at least what the camera can see (m)."""
-        return transform_points(T_cam_obj, self.centre_obj[:, None])[:, 0, 2].clamp(min=MIN_DEPTH_M)
+        # Of the rotation, only the row that tells the depth: this is asked for in every window.
+        return (vecdot(T_cam_obj[:, 2, :3], self.centre_obj) + T_cam_obj[:, 2, 3]).clamp(min=MIN_DEPTH_M)
 
     def px_per_m(self, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b"]:
         """How far each object moves in the image when it moves by a metre across it (px)."""

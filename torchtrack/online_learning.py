@@ -10,7 +10,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.model_trust import judge_elements
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import ObjectEvents
-from torchtrack.polarity_memory import expected_polarity
+from torchtrack.polarity_memory import expected_polarity, is_asked
 from torchtrack.prediction import Prediction
 from torchtrack.quality import Status
 from torchtrack.search import Found
@@ -38,10 +38,9 @@ def objects_as_known(
         if not readback.read_at_once(shown) or not bool(shown.all()):
             objects = replace(objects, shown=shown)
     if config.matching.polarity_memory_s:
-        expected = expected_polarity(state.darker_outside, state.score.detach(), state.full_share.detach())
-        # Of objects that are seen well nothing is asked.
-        if not readback.none_of(expected != 0):
-            objects = replace(objects, polarity=expected)
+        explained = state.score.detach(), state.full_share.detach()
+        if not readback.none_of(is_asked(*explained)):
+            objects = replace(objects, polarity=expected_polarity(state.darker_outside, *explained))
     return objects
 
 

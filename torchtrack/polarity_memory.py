@@ -48,6 +48,11 @@ def expected_polarity(darker_outside: Float[Tensor, "b 8"], score: Float[Tensor,
     return counts[:, None] * darker_outside * darker_outside.abs()
 
 
+def is_asked(score: Float[Tensor, "b"], full_share: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
+    """Of which objects anything is expected at all: those that explain less than when they are seen well."""
+    return score < _SEEN * full_share.clamp(min=_LEAST_FULL)
+
+
 def is_seen_well(share: Float[Tensor, "b"], full_share: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
     """Which objects explain enough for their contours' sides to be remembered."""
     return share >= _SEEN_WELL * full_share.clamp(min=_LEAST_FULL)

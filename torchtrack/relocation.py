@@ -106,7 +106,7 @@ def looked_for_anew(
     unseen = _unseen_for_long(state, config)
     if readback.none_of(unseen):
         return unseen, unseen
-    due = unseen & is_due(state.t_us, t_us, config.search.doubt_us)[objects.stream_index] & ~is_lost(state, objects.diameter_m, config)
+    due = unseen & is_due(state.t_us, t_us, config.search.doubt_us)[0, objects.stream_index] & ~is_lost(state, objects.diameter_m, config)
     now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.T_last_seen))
     off_in_depth = torch.maximum(now_m / then_m, then_m / now_m) > _OFF_IN_DEPTH
     return due & off_in_depth, due & (state.score < config.search.anew_below * state.full_share)

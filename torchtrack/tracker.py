@@ -272,7 +272,7 @@ class Tracker(TrackedObjects):
             next_state, result = after_probation(state, next_state, result, prediction, widening, config)
         next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self.on_surfaces, learns), config)
         if config.matching.adaptive_bursts and not readback.none_of(due := is_due(state.t_us, t_us, LOOK_US)):
-            sure = due[self.stream_index] & (result.status == int(Status.TRACKING)) & ~found.elsewhere
+            sure = due[0, self.stream_index] & (result.status == int(Status.TRACKING)) & ~found.elsewhere
             late_share = late_share_after(state.late_share, observations, contours, fit.matches, prediction, sure, config.matching)
             next_state = replace(next_state, late_share=late_share)
         return replace(next_state, t_us=t_us, burst_age_us=burst_age_us), replace(result, t_us=t_us)
@@ -304,7 +304,7 @@ class Tracker(TrackedObjects):
     def _doubt(self, state: TrackerState, t_us: Tensor, sigma_px: Tensor, starting: Tensor, anew: tuple[Tensor, Tensor]) -> Doubt:
         """What speaks for trying other poses in the window that ends at ``t_us``; with why objects are looked for ``anew``."""
         config = self.config.search
-        due, far_due = (is_due(state.t_us, t_us, interval_us)[self.stream_index] for interval_us in (config.interval_us, config.doubt_us))
+        due, far_due = is_due(state.t_us, t_us, config.interval_us, config.doubt_us)[:, self.stream_index]
         adrift = is_adrift(state.doubted_s, far_due, config)
         strayed = ~(adrift | starting) & has_strayed(state.score, state.full_share, state.unseen_s, sigma_px, far_due, config)
         since_s = torch.where(strayed, state.unseen_s, state.doubted_s)
