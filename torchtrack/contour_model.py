@@ -69,8 +69,9 @@ class ContourModel(nn.Module):
         is_segment = torch.zeros(len(points), dtype=torch.bool)
         is_segment[len(model.edge_points) :] = True
         self.register_buffer("edge_ends", points.clone())
-        self.register_buffer("face_normals", normals)
-        self.register_buffer("face_offsets", (normals * points[:, :1]).sum(-1))
+        # In memory, coordinates are rows, each of all edges: so they are looked at several at once.
+        self.register_buffer("face_normals", normals.permute(1, 2, 0).contiguous().permute(2, 0, 1))
+        self.register_buffer("face_offsets", (normals * points[:, :1]).sum(-1).T.contiguous().T)
         self.register_buffer("is_segment", is_segment)
         self.register_buffer("is_crease", torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)]) & config.creases)
         texture_count = min(len(model.texture_points), config.max_texture_points) if config.texture else 0
@@ -91,7 +92,7 @@ class ContourModel(nn.Module):
         self.register_buffer("texture_element", of_print)
         # Of the kind of each; the first, which stands for all the rest of the model, has a group of its own.
         self.register_buffer("element_group", pad(elements[:, -1].long() + 1, (1, 0)))
-        self.register_buffer("surface_points", model.surface_points.clone())
+        self.register_buffer("surface_points", model.surface_points.T.contiguous().T)
         exact = len(model.triangles) <= config.exact_faces
         triangles = model.triangles if exact else model.triangles[:0]
         self.register_buffer("triangles", triangles.clone())

@@ -11,11 +11,8 @@ from torchtrack.contour_model import ContourModel
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import SamplingSettings
 
-# What of a model its contour points are sampled from.
-_SAMPLED_FROM = (
-    *("edge_ends", "face_normals", "face_offsets", "is_crease", "is_segment", "edges"),
-    *("texture_points", "texture_tangents", "texture_normals"),
-)
+# What of a model its contour points are sampled from, beside the faces.
+_SAMPLED_FROM = ("is_crease", "is_segment", "edges", "texture_points", "texture_tangents", "texture_normals")
 
 
 def mesh_points(
@@ -30,7 +27,8 @@ def mesh_points(
     kind, counts = np.empty((batch, room), np.int64), np.zeros(batch, np.int64)
     seen = as_arrays(T_cam_obj, intrinsics)
     for model in models:
-        of_model = as_arrays(model.members, *(getattr(model, name) for name in _SAMPLED_FROM))
+        of_edges = model.edge_ends, model.face_normals.permute(1, 2, 0), model.face_offsets.T
+        of_model = as_arrays(model.members, *of_edges, *(getattr(model, name) for name in _SAMPLED_FROM))
         kernels.sample(*of_model, model.texture_spacing_m, *seen, settings, sampled, kind, counts)
     # One place at least: what selects from contours needs one to point at.
     width = max(int(counts.max()), 1)

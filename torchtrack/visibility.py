@@ -262,7 +262,7 @@ def _hidden_in_buffer_by_kernel(
     settings = GridSettings(rows, columns, cell_px, height, width, _DEPTH_STEPS_PER_M, MIN_DEPTH_M, _SAMPLES_PER_CELL)
     depth, owner = (np.full(streams * rows * columns, value) for value in (_NOTHING, len(drawn)))
     for model in scene.models:
-        of_model = as_arrays(model.members, drawn, model.surface_points)
+        of_model = as_arrays(model.members, drawn, model.surface_points.T)
         kernels.draw(*of_model, T_cam_obj, intrinsics, diameters_m, stream_index, first, settings, depth, owner)
     own = as_arrays(exact, margin_m)
     kernels.hide_in_buffer(points_cam, pixels, normals, mask, *own, stream_index, first, settings, depth, owner, hidden.numpy())

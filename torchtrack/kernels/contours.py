@@ -38,7 +38,7 @@ def sample(
     Args:
         members: numbers of the objects.
         edge_ends, face_normals, face_offsets, is_crease, is_segment, edges: of the model's edges, as :class:`torchtrack.contour_model.ContourModel`
-            has them; so are those of texture.
+            has them, but for those of faces, ``[2, 3, e]`` and ``[2, e]``; so are those of texture.
         sampled, kind: ``[b, SAMPLED, n]`` and ``[b, n]``, with room enough; filled as far as ``counts [b]`` says.
     """
     active, length, depths = np.empty(len(edge_ends), np.int64), np.empty(len(edge_ends)), np.empty((len(edge_ends), 2))
@@ -60,13 +60,20 @@ def _active_edges(
     camera_obj: Array, face_normals: Array, face_offsets: Array, is_crease: Array, is_segment: Array, settings: SamplingSettings, active: Array
 ) -> int:
     """Which edges are contours, first in ``active``: how many; of too many, some, spread evenly."""
-    used = 0
+    front, back = np.empty(len(active), np.bool_), np.empty(len(active), np.bool_)
+    _facing(face_normals[0], face_offsets[0], camera_obj, front)
+    _facing(face_normals[1], face_offsets[1], camera_obj, back)
+    # Of eight edges at a time, mostly none is one.
+    shows, used = np.zeros(-(-len(active) // 8) * 8, np.bool_), 0
     for e in range(len(active)):
-        front = _faces(face_normals[e, 0], face_offsets[e, 0], camera_obj)
-        back = _faces(face_normals[e, 1], face_offsets[e, 1], camera_obj)
-        if is_segment[e] or (is_crease[e] and (front or back)) or (settings.occluding and front != back):
-            active[used] = e
-            used += 1
+        shows[e] = is_segment[e] | (is_crease[e] & (front[e] | back[e])) | (settings.occluding & (front[e] != back[e]))
+    eight = shows.view(np.uint64)
+    for k in range(len(eight)):
+        if eight[k]:
+            for e in range(8 * k, 8 * k + 8):
+                if shows[e]:
+                    active[used] = e
+                    used += 1
     if used <= settings.most_edges:
         return used
     for j in range(settings.most_edges):
@@ -75,9 +82,12 @@ def _active_edges(
 
 
 @kernel(fastmath=FAST)
-def _faces(normal: Array, offset: float, camera_obj: Array) -> bool:
-    """Whether a face looks at the camera."""
-    return normal[0] * camera_obj[0] + normal[1] * camera_obj[1] + normal[2] * camera_obj[2] > offset
+def _facing(normals: Array, offsets: Array, camera_obj: Array, facing: Array) -> None:
+    """Which faces look at the camera: those on one side of the edges, several at once."""
+    x, y, z = camera_obj[0], camera_obj[1], camera_obj[2]
+    normal_x, normal_y, normal_z = normals[0], normals[1], normals[2]
+    for e in range(len(facing)):
+        facing[e] = normal_x[e] * x + normal_y[e] * y + normal_z[e] * z > offsets[e]
 
 
 @kernel(fastmath=FAST)

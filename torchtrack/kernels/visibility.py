@@ -3,9 +3,11 @@
 import numpy as np
 
 from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.motion import Numbers, entries, lens, placed, turned
+from torchtrack.kernels.motion import Numbers, entries, inverse_depth, lens, placed, turned
 from torchtrack.kernels.settings import GridSettings
 
+# Deeper than what there is nothing at.
+_DEEPEST = np.iinfo(np.int64).max
 # Dot products of a face with a point: within its three edges, and behind its plane.
 _TESTS = 4
 
@@ -145,22 +147,46 @@ def draw(
 
     Args:
         members: numbers of the objects, and which of all are ``drawn [b]``.
-        samples: ``[n, 3]``, in the object's frame.
+        samples: ``[3, n]``, in the object's frame.
         first: ``[s, 2]``, first cell of each stream's buffer.
         depth, owner: ``[p]``, depths in whole steps, and the object of each; changed.
     """
+    cells, steps = np.empty(samples.shape[1], np.int32), np.empty(samples.shape[1], np.int64)
     for b in members:
         if not drawn[b]:
             continue
-        stream, pose, (fx, fy, cx, cy) = stream_index[b], entries(T_cam_obj[b]), lens(intrinsics[b])
-        for i in range(0, len(samples), _every(len(samples), T_cam_obj[b], intrinsics[b], diameters_m[b], grid)):
-            x, y, z = placed(pose, samples[i, 0], samples[i, 1], samples[i, 2])
-            if not z > grid.least_depth_m:
-                continue
-            u, v = x / z * fx + cx, y / z * fy + cy
-            cell, steps = _cell(u, v, first, stream, grid), int(z * grid.steps_per_m)
-            if steps < depth[cell] or (steps == depth[cell] and b < owner[cell]):
-                depth[cell], owner[cell] = steps, b
+        every = _every(samples.shape[1], T_cam_obj[b], intrinsics[b], diameters_m[b], grid)
+        taken, stream = samples if every == 1 else samples[:, ::every].copy(), stream_index[b]
+        _place(taken, entries(T_cam_obj[b]), lens(intrinsics[b]), first[stream], stream * grid.rows, grid, cells, steps)
+        for i in range(taken.shape[1]):
+            cell = np.uint64(cells[i])
+            if steps[i] < depth[cell] or (steps[i] == depth[cell] and b < owner[cell]):
+                depth[cell], owner[cell] = steps[i], b
+
+
+@kernel(fastmath=FAST)
+def _place(
+    samples: Array,
+    pose: Numbers,
+    intrinsics: Numbers,
+    first: Array,
+    rows_before: int,
+    grid: GridSettings,
+    cells: Array,
+    steps: Array,
+) -> None:
+    """Cells of surface samples, and their depths in whole steps, several at once; deeper than all else what is not before the camera."""
+    cells_px, right, bottom, first_column, first_row = 1.0 / grid.side_px, grid.columns - 1.0, grid.rows - 1.0, first[0], first[1]
+    points_x, points_y, points_z = samples[0], samples[1], samples[2]
+    for i in range(samples.shape[1]):
+        x, y, z = placed(pose, points_x[i], points_y[i], points_z[i])
+        scale, is_before = cells_px * inverse_depth(z), z > grid.least_depth_m
+        column = np.rint(x * scale * intrinsics[0] + cells_px * intrinsics[2]) - first_column
+        row = np.rint(y * scale * intrinsics[1] + cells_px * intrinsics[3]) - first_row
+        # Written so that what is not a number finds a cell, too.
+        column, row = min(column if column > 0 else 0.0, right), min(row if row > 0 else 0.0, bottom)
+        cells[i] = np.int32((row + rows_before) * grid.columns + column)
+        steps[i] = np.int64(z * grid.steps_per_m) if is_before else _DEEPEST
 
 
 @kernel(fastmath=FAST)
