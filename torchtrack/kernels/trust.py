@@ -174,7 +174,8 @@ def _find_pixels(u: float, v: float, nu: float, nv: float, across_px: Array, hei
         places[k] = np.int32(np.rint(row)) * np.int32(width) + np.int32(np.rint(column))
 
 
-@kernel(fastmath=FAST)
+# Called for each observation, with so many numbers, it takes a quarter longer.
+@kernel(fastmath=FAST, forceinline=True)
 def _describe_one(
     told: Numbers,
     point: Numbers,
