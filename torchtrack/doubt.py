@@ -66,7 +66,10 @@ class Doubt:
 
     def reasons(self, score: Float[Tensor, "b"], config: SearchConfig) -> tuple[Bool[Tensor, "b"], ...]:
         """Which objects a search is wanted for: beside the prediction, where they may have slipped to, mirrored, and turned about an axis."""
-        return self.asks(score, config), self.slips(score, config), self.is_mirrored(score, config), self.is_turned(score, config)
+        none = self.far_due
+        # As a rule it is not time for what is looked for far away.
+        far = (none, none) if none_of(none) else (self.is_mirrored(score, config), self.is_turned(score, config))
+        return self.asks(score, config), self.slips(score, config), *far
 
     def asks(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects are to be searched for: uncertain and new ones, those whose score stays below the usual, and those long in doubt."""
@@ -80,6 +83,8 @@ class Doubt:
 
         Once in a while only: one that begins half hidden is new for long.
         """
+        if none_of(self.due):
+            return self.due
         best = torch.maximum(score, self.last_score)
         return ~self.starting & self.due & (self.full_share < _NEW * best) & (best < config.new_share)
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchtrack import readback
+from torchtrack.constants import constant
 from torchtrack.errors import EventDataError
 
 
@@ -277,7 +278,7 @@ def of_streams(events: EventBatch, streams: int) -> EventBatch:
 
 def stream_bounds(events: EventBatch, streams: int) -> Int[Tensor, "_"]:
     """Where each of the ``streams`` begins among the events, and where the last one ends."""
-    return torch.searchsorted(events.stream_index, torch.arange(streams + 1, device=events.stream_index.device))
+    return torch.searchsorted(events.stream_index, constant(tuple(range(streams + 1)), torch.int64, events.stream_index.device))
 
 
 def pad_streams(events: EventBatch, streams: int, t_end_us: Int[Tensor, "s"]) -> PaddedEvents:
