@@ -49,12 +49,14 @@ class Sensors:
     Args:
         ideal_pixels: ideal pixel (u, v) of every sensor pixel.
         sensor_pixels: sensor pixel of every ideal pixel, with a border; both from :func:`sensor_tables`.
+        sensor_numbers: numbers of these, from :func:`torchtrack.history.pixel_numbers`.
         stream_index: the stream that each object is seen in.
         tiles: of the sensor, where there is one stream alone.
     """
 
     ideal_pixels: Float[Tensor, "s h w 2"]
     sensor_pixels: Float[Tensor, "s bh bw 2"]
+    sensor_numbers: Int[Tensor, "s bh bw"]
     stream_index: Int[Tensor, "b"]
     tiles: SensorTiles | None
 
@@ -168,7 +170,7 @@ class Sensors:
 
     def history(self, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"]) -> History:
         """How long ago anything happened at a pixel."""
-        return History(self.sensor_pixels, self.stream_index, last_event_us, t_us)
+        return History(self.sensor_numbers, self.stream_index, last_event_us, t_us)
 
 
 def _of_rows(seen: Float[Tensor, "5 b e"], exists: Bool[Tensor, "b e"]) -> WindowEvents:

@@ -26,9 +26,12 @@ _GRID_PX = 4
 
 def at_pixels(maps: Shaped[Tensor, "s h w *c"], stream: Int[Tensor, "*#p"], u: Int[Tensor, "*#p"], v: Int[Tensor, "*#p"]) -> Shaped[Tensor, "..."]:
     """``maps[stream, v, u]``, as one selection of rows: several times faster than indexing with three tensors."""
-    row = torch.add(u, v, alpha=maps.shape[2])
-    if len(maps) > 1:
-        row = row + stream * (maps.shape[1] * maps.shape[2])
+    return by_number(maps, stream, torch.add(u, v, alpha=maps.shape[2]))
+
+
+def by_number(maps: Shaped[Tensor, "s h w *c"], stream: Int[Tensor, "*#p"], number: Int[Tensor, "*#p"]) -> Shaped[Tensor, "..."]:
+    """:func:`at_pixels` that are numbered row by row."""
+    row = number + stream * (maps.shape[1] * maps.shape[2]) if len(maps) > 1 else number
     return maps.flatten(0, 2).index_select(0, row.flatten()).view(*row.shape, *maps.shape[3:])
 
 

@@ -10,6 +10,7 @@ from torchtrack.camera import Camera
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_model import ContourModel, group_by_model
 from torchtrack.doubt import mirrors, turns
+from torchtrack.history import pixel_numbers
 from torchtrack.model_trust import element_groups
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
@@ -29,6 +30,7 @@ class TrackedObjects(nn.Module):
     intrinsics: Tensor
     ideal_pixels: Tensor
     sensor_pixels: Tensor
+    sensor_numbers: Tensor
     stream_index: Tensor
     element_groups: Tensor
     centre_obj: Tensor
@@ -69,6 +71,7 @@ class TrackedObjects(nn.Module):
         ideal_pixels, sensor_pixels = sensor_tables(cameras)
         self.register_buffer("ideal_pixels", ideal_pixels)
         self.register_buffer("sensor_pixels", sensor_pixels)
+        self.register_buffer("sensor_numbers", pixel_numbers(sensor_pixels, self.image_size))
         self.tiles = SensorTiles(self.ideal_pixels[0]) if len(cameras) == 1 else None
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
         self.register_buffer("half_extent", torch.stack([model.half_extent for model in objects]))
@@ -121,7 +124,7 @@ class TrackedObjects(nn.Module):
     @property
     def sensors(self) -> Sensors:
         """The sensors that the objects are seen by."""
-        return Sensors(self.ideal_pixels, self.sensor_pixels, self.stream_index, self.tiles)
+        return Sensors(self.ideal_pixels, self.sensor_pixels, self.sensor_numbers, self.stream_index, self.tiles)
 
     @property
     def on_surfaces(self) -> Tensor | None:

@@ -116,7 +116,7 @@ def _limb_features_by_kernel(evidence: Evidence) -> tuple[Float[Tensor, "r n f"]
         *as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.kind, index.nearest, index.first),
         index.cells,
         *as_arrays(moving.velocity, moving.centre_cam, moving.intrinsics),
-        *as_arrays(history.sensor_pixels, history.stream_index, history.last_event_us, history.t_us),
+        *as_arrays(history.sensor_numbers, history.stream_index, history.last_event_us, history.t_us),
         PatchSettings(_ACROSS_PX, _ALONG_PX, _SIDE, BORDER_PX, int(ContourKind.LIMB), _OF_KIND, _SLOW_PX_S, _SPEED_UNIT_PX_S, _OLDEST_PX),
         *as_arrays(features, is_limb),
     )

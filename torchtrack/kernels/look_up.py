@@ -26,7 +26,8 @@ def nearest(nearest_of_cell: Array, first: Array, u: float, v: float, cells: Cel
     return nearest_of_cell[np.uint64(row) * np.uint64(cells.columns) + np.uint64(column)]
 
 
-@kernel(fastmath=FAST)
+# Called for each observation: a twentieth of all rounds' time.
+@kernel(fastmath=FAST, forceinline=True)
 def nearest_of_four(nearest_of_cell: Array, first: Array, pixels: Array, u: float, v: float, cells: Cells) -> int:
     """Of the contour points that the four cells around a place know, the one nearest to it; -1 for none.
 

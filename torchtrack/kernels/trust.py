@@ -38,7 +38,7 @@ def describe(
     velocity: Array,
     centre_cam: Array,
     intrinsics: Array,
-    sensor_pixels: Array,
+    sensor_numbers: Array,
     stream_index: Array,
     last_event_us: Array,
     t_us: Array,
@@ -56,13 +56,13 @@ def describe(
         points_cam, normals, kind: ``[b, 3, m]``, ``[b, 2, m]`` and ``[b, m]`` of contour points; ``nearest_of_cell [b, p]`` and
             ``first [b, 2]`` are their index.
         velocity, centre_cam, intrinsics: of each object.
-        sensor_pixels, stream_index, last_event_us, t_us: of a :class:`torchtrack.history.History`.
+        sensor_numbers, stream_index, last_event_us, t_us: of a :class:`torchtrack.history.History`.
         features: ``[r, n, f]``, filled; with zeros where there is nothing to describe.
         is_limb: ``[b, n]``, false so far: which these are.
     """
     counted, softened = np.zeros(settings.side * settings.side, np.uint16), _softened(features)
     across_px, along_px, aside_px = _patch(settings, features)
-    places, table_width = np.zeros(len(across_px), np.int32), sensor_pixels.shape[2]
+    places, table_width = np.zeros(len(across_px), np.int32), sensor_numbers.shape[2]
     for row in range(len(objects)):
         b = objects[row]
         e, s = b if len(mask) > 1 else 0, stream_index[b]
@@ -73,7 +73,7 @@ def describe(
         _count(u[e], v[e], age_s[e], polarity[e], mask[e], of_object, looked_at, motion, depth_m, of_lens, settings.side, counted)
         # Not in the loop: to point at a part of an array takes as long as to read several numbers.
         cells_of_object, first_of_object, points, lines = nearest_of_cell[b], first[b], points_cam[b], normals[b]
-        of_sensor, newest_us, described = sensor_pixels[s].reshape(-1, 2), last_event_us[s], features[row]
+        of_sensor, newest_us, described = sensor_numbers[s].reshape(-1), last_event_us[s].reshape(-1), features[row]
         for i in range(exists.shape[1]):
             x, y, age = pixels[b, 0, i], pixels[b, 1, i], ages_s[b, i]
             speed_u, speed_v = at_depth(motion, depth_m, x, y, of_lens)
@@ -187,7 +187,7 @@ def _describe_one(
     along_px: Array,
     aside_px: Array,
     places: Array,
-    sensor_pixels: Array,
+    sensor_numbers: Array,
     table_width: int,
     last_event_us: Array,
     t_us: int,
@@ -206,11 +206,9 @@ def _describe_one(
     for k in range(count):
         both = counted[np.uint64(places[k])]
         row[k], row[count + k] = softened[(both >> own) & _MOST], softened[(both >> (_BITS - own)) & _MOST]
-    _find_pixels(u + settings.border_px, v + settings.border_px, nu, nv, aside_px, len(sensor_pixels) // table_width, table_width, places)
-    right, bottom = last_event_us.shape[1] - 1.0, last_event_us.shape[0] - 1.0
+    _find_pixels(u + settings.border_px, v + settings.border_px, nu, nv, aside_px, len(sensor_numbers) // table_width, table_width, places)
     for k in range(len(settings.across_px)):
-        column, line = sensor_pixels[places[k], 0], sensor_pixels[places[k], 1]
-        newest_us = last_event_us[int(np.rint(min(max(line, 0.0), bottom))), int(np.rint(min(max(column, 0.0), right)))]
+        newest_us = last_event_us[np.uint64(sensor_numbers[np.uint64(places[k])])]
         row[2 * count + k] = min(max(((t_us - newest_us) * 1e-6 - age) * speed / settings.oldest_px, -1.0), 1.0)
     for k in range(settings.of_kind, len(row)):
         row[k] = 0.0
