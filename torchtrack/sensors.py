@@ -18,7 +18,7 @@ from torchtrack.contours import Contours
 from torchtrack.corners import Corners, detect_corners, no_corners
 from torchtrack.events import EventBatch, PaddedEvents, check_on_sensor, of_streams, pad_streams
 from torchtrack.flow import estimate_flow
-from torchtrack.history import BORDER_PX, History, on_sensor
+from torchtrack.history import BORDER_PX, History, on_sensor, pixel_numbers
 from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.observations import ObjectEvents, SharedEvents, WindowEvents
@@ -30,11 +30,12 @@ from torchtrack.time_surface import at_pixels, object_regions, time_surface
 _DRAWN_SIGMAS = 4.0
 
 
-def sensor_tables(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "s h w 2"], Float[Tensor, "s bh bw 2"]]:
-    """The tables that :class:`Sensors` looks up: ideal pixels of the sensor's, and sensor pixels of ideal ones."""
+def sensor_tables(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "s h w 2"], Float[Tensor, "s bh bw 2"], Int[Tensor, "s bh bw"]]:
+    """The tables that :class:`Sensors` looks up: ideal pixels of the sensor's, sensor pixels of ideal ones, and their numbers."""
     ideal_pixels = stack_tables([undistortion_table(c) for c in cameras])
     # What lies beyond a smaller sensor lies outside it on the sensor too.
-    return ideal_pixels, stack_tables([distortion_table(c, BORDER_PX) for c in cameras], beyond_px=-BORDER_PX)
+    sensor_pixels = stack_tables([distortion_table(c, BORDER_PX) for c in cameras], beyond_px=-BORDER_PX)
+    return ideal_pixels, sensor_pixels, pixel_numbers(sensor_pixels, (ideal_pixels.shape[1], ideal_pixels.shape[2]))
 
 
 def farthest_event_px(config: TrackerConfig) -> float:
@@ -48,8 +49,8 @@ class Sensors:
 
     Args:
         ideal_pixels: ideal pixel (u, v) of every sensor pixel.
-        sensor_pixels: sensor pixel of every ideal pixel, with a border; both from :func:`sensor_tables`.
-        sensor_numbers: numbers of these, from :func:`torchtrack.history.pixel_numbers`.
+        sensor_pixels: sensor pixel of every ideal pixel, with a border.
+        sensor_numbers: numbers of these; all three from :func:`sensor_tables`.
         stream_index: the stream that each object is seen in.
         tiles: of the sensor, where there is one stream alone.
     """

@@ -10,7 +10,6 @@ from torchtrack.camera import Camera
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_model import ContourModel, group_by_model
 from torchtrack.doubt import mirrors, turns
-from torchtrack.history import pixel_numbers
 from torchtrack.model_trust import element_groups
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
@@ -68,10 +67,8 @@ class TrackedObjects(nn.Module):
         self.register_buffer("stream_index", torch.tensor(streams))
         self.register_buffer("element_groups", element_groups(self.models, len(objects)))
         self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
-        ideal_pixels, sensor_pixels = sensor_tables(cameras)
-        self.register_buffer("ideal_pixels", ideal_pixels)
-        self.register_buffer("sensor_pixels", sensor_pixels)
-        self.register_buffer("sensor_numbers", pixel_numbers(sensor_pixels, self.image_size))
+        for name, table in zip(("ideal_pixels", "sensor_pixels", "sensor_numbers"), sensor_tables(cameras), strict=True):
+            self.register_buffer(name, table)
         self.tiles = SensorTiles(self.ideal_pixels[0]) if len(cameras) == 1 else None
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
         self.register_buffer("half_extent", torch.stack([model.half_extent for model in objects]))
