@@ -38,6 +38,18 @@ def test_an_answer_gives_the_values():
     assert not readback.Answer.to(torch.zeros(0, dtype=torch.bool)).any()
 
 
+@pytest.mark.parametrize("shape", [(), (0,), (4,), (2, 3)])
+def test_it_is_certain_that_none_is_true_where_none_is(shape, nothing_is_read):
+    nothing = torch.zeros(shape, dtype=torch.bool)
+    assert readback.none_of(nothing)
+    if nothing.numel():
+        something = nothing.clone()
+        something.view(-1)[-1] = True
+        assert not readback.none_of(something)
+    nothing_is_read()
+    assert not readback.none_of(nothing)
+
+
 def test_an_answer_is_a_constant():
     assert not readback.Answer.to(torch.ones(2, requires_grad=True)).on_device.requires_grad
 

@@ -57,6 +57,25 @@ def test_pixels_far_off_are_somewhere_outside(sensors):
     assert not ((place >= 0) & (place < torch.tensor([width, height]))).all(-1).any()
 
 
+def test_numbers_are_those_of_the_sensor_pixels_nearest_to_ideal_ones(sensors):
+    height, width = sensors.image_size
+    nearest = sensors.sensor_pixels.round()
+    column, row = nearest[..., 0].clamp(0, width - 1).long(), nearest[..., 1].clamp(0, height - 1).long()
+    assert sensors.sensor_numbers.shape == sensors.sensor_pixels.shape[:3]
+    assert torch.equal(sensors.sensor_numbers.long(), row * width + column)
+
+
+def test_the_history_looks_where_the_lens_puts_an_ideal_pixel(sensors):
+    height, width = sensors.image_size
+    # An age for every sensor pixel, of no other: what is looked up tells where it was.
+    last_event_us = -torch.arange(2 * height * width).view(2, height, width)
+    pixels = torch.tensor([[[20.0, 30.0], [150.0, 5.0], [80.4, 99.6]]], dtype=torch.float64).expand(3, 3, 2)
+    u, v = sensors.on_sensor(pixels).round().unbind(-1)
+    number = (v.clamp(0, height - 1) * width + u.clamp(0, width - 1)).long() + sensors.stream_index[:, None] * height * width
+    age_s = sensors.history(last_event_us, torch.tensor([0, 0])).age_s(pixels)
+    torch.testing.assert_close(age_s, 1e-6 * number.double())
+
+
 def test_the_history_tells_the_age_of_the_newest_event(sensors, events):
     last_event_us = update_last_event(empty_last_event(2, *sensors.image_size), events)
     age_s = sensors.history(last_event_us, NOW_US).age_s
