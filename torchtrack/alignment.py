@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchtrack import fast_alignment
 from torchtrack.common_error import told_by_each
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.constants import constant
 from torchtrack.contour_index import ContourIndex, index_contours
-from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours, reproject
 from torchtrack.implicit_gradient import with_gradient
 from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
@@ -102,7 +102,7 @@ def align(
     begin = prediction if offset is None else prediction.moved(offset)
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
     table = _table(contours, index, objects, matching)
-    finely = _looked_up_finely(objects, begin, contours, widening, matching)
+    finely = _looked_up_finely(objects, begin, table, widening, matching)
     narrowing = _narrowing(widening, len(matching.gates_px))
     if fast_alignment.applies(config, offset):
         solution, matches = fast_alignment.align_rounds(
@@ -130,7 +130,7 @@ def align(
 
 
 def _looked_up_finely(
-    objects: ObjectBatch, begin: Prediction, contours: Contours, widening: Float[Tensor, "b"], config: MatchingConfig
+    objects: ObjectBatch, begin: Prediction, table: ContourTable, widening: Float[Tensor, "b"], config: MatchingConfig
 ) -> Bool[Tensor, "b"]:
     """Of which objects contours are looked up between the cells of the index: of small ones, and those of which print or smooth limbs are seen.
 
@@ -138,8 +138,7 @@ def _looked_up_finely(
     """
     finely = objects.size_px(begin.T_cam_obj).detach() < config.fine_below_px
     if config.fine_unless_plain:
-        fine = (contours.kind == int(ContourKind.TEXTURE)) | (contours.kind == int(ContourKind.LIMB))
-        finely = finely | (fine & contours.mask).any(1)
+        finely = finely | table.not_plain
     # One that may be far off would settle on the first edges that it is nearest to.
     return finely & (widening <= 1)
 
@@ -167,10 +166,9 @@ def _information(prediction: Prediction, config: TrackerConfig) -> Tensor:
     if not config.solver.prior:
         return prediction.velocity.new_zeros(len(prediction.velocity), 6, 6)
     swelling_px = config.solver.swelling_px or _NO_SWELLING_PX
-    information = prediction.covariance.new_zeros(len(prediction.covariance), 13, 13)
-    information[:, :12, :12] = prediction.information
-    information[:, 12, 12] = swelling_px**-2
-    return (config.solver.observation_px**2 * information).to(prediction.velocity.dtype)
+    information = pad((config.solver.observation_px**2 * prediction.information).to(prediction.velocity.dtype), (0, 1, 0, 1))
+    information[:, 12, 12] = config.solver.observation_px**2 * swelling_px**-2
+    return information
 
 
 def _believed(matches: Matches, observations: Observations, config: TrackerConfig) -> Matches:

@@ -173,6 +173,8 @@ def gathered_when_known(doubt: Doubt, full_gathered: Float[Tensor, "b"], config:
 
 def is_adrift(doubted_s: Float[Tensor, "b"], due: Bool[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
     """Which objects have been in doubt for so long that they are looked for farther away, where that is ``due``."""
+    if none_of(due):
+        return due
     return due & (doubted_s >= 1e-6 * config.doubt_us) if config.doubt_us else torch.zeros_like(due)
 
 
@@ -188,6 +190,8 @@ def has_strayed(
 
     What is usual follows a slip that grows slowly, and the covariance forgets the direction that it went in.
     """
+    if none_of(due):
+        return due
     if not (config.doubt_us and config.strayed_to):
         return torch.zeros_like(due)
     low = last_score < config.strayed_to * full_share

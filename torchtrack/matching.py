@@ -79,10 +79,12 @@ class ContourTable:
     Args:
         rows: the values of all contour points, laid out so that one selection takes them for all observations.
         index: the contour point nearest to each place in the image.
+        not_plain: objects of which print or smooth limbs are seen.
     """
 
     rows: Float[Tensor, "b k m"]
     index: ContourIndex
+    not_plain: Bool[Tensor, "b"]
 
     @classmethod
     def of(
@@ -98,7 +100,7 @@ class ContourTable:
             close_px: distance from which parallel edges are told apart; 0 for always.
         """
         if switch.apply_to(contours.pixels):
-            return cls(_rows_by_kernel(contours, index, polarity, of_print=of_print, close_px=close_px), index)
+            return _table_by_kernel(contours, index, polarity, of_print=of_print, close_px=close_px)
         limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
         oriented, expected = limb | crease, (texture & of_print).to(contours.pixels.dtype)
         if polarity is not None:
@@ -106,7 +108,7 @@ class ContourTable:
         mistaken = mistaken_px2(contours, index, oriented, crease, close_px) if close_px else torch.zeros_like(expected)
         marks = torch.stack([limb.to(expected.dtype), oriented.to(expected.dtype), expected, mistaken], -1)
         values = (contours.points_obj, contours.normals, index.pixels, marks)
-        return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index)
+        return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index, ((limb | texture) & contours.mask).any(1))
 
     def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, ...]:
         """Of contour points: places on the object, normals, pixels when indexed; limb or not, oriented or not, darker side expected, mistaken."""
@@ -115,20 +117,20 @@ class ContourTable:
         return points_obj, normals, indexed, *marks.unbind(-1)
 
 
-def _rows_by_kernel(contours: Contours, index: ContourIndex, polarity: Tensor | None, *, of_print: bool, close_px: float) -> Float[Tensor, "b k m"]:
-    """Rows of a :class:`ContourTable`, point by point."""
+def _table_by_kernel(contours: Contours, index: ContourIndex, polarity: Tensor | None, *, of_print: bool, close_px: float) -> ContourTable:
+    """:meth:`ContourTable.of`, point by point."""
     # Not at the top: Numba is an extra.
     from torchtrack.kernels import table as kernels
 
     limb, crease, texture = (int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
     close = ASIDE_PX, PARALLEL, APART_PX, TOUCHING_PX, DEPTH_SHARE, SORTED_PX2
     settings = TableSettings(limb, crease, texture, of_print, close_px, *close)
-    table = contours.points_obj.new_empty(*contours.mask.shape, kernels.COLUMNS)
+    table, not_plain = contours.points_obj.new_empty(*contours.mask.shape, kernels.COLUMNS), torch.empty_like(contours.mask[:, 0])
     points, pixels, normals, indexed = (value.transpose(1, 2) for value in (contours.points_obj, contours.pixels, contours.normals, index.pixels))
     expected = pixels.new_empty(len(table), 0) if polarity is None else polarity
     given = as_arrays(points, contours.points_cam[..., 2], pixels, normals, contours.kind, contours.mask, indexed, index.nearest, index.first)
-    kernels.fill(*given, index.cells, *as_arrays(expected), settings, table.numpy())
-    return table.transpose(1, 2)
+    kernels.fill(*given, index.cells, *as_arrays(expected), settings, table.numpy(), not_plain.numpy())
+    return ContourTable(table.transpose(1, 2), index, not_plain)
 
 
 def match_nearest(

@@ -26,8 +26,9 @@ def fill(
     polarity: Array,
     settings: TableSettings,
     table: Array,
+    not_plain: Array,
 ) -> None:
-    """Fill ``table [b, m, COLUMNS]``, with zeros for points that do not count.
+    """Fill ``table [b, m, COLUMNS]``, with zeros for points that do not count, and ``not_plain [b]``: which objects show print or limbs.
 
     Args:
         points_obj, depth_m, pixels, normals, kind, mask: of contours; ``pixels`` and ``normals`` as ``[b, 2, m]``, ``points_obj`` as ``[b, 3, m]``.
@@ -37,7 +38,7 @@ def fill(
     table[:] = 0.0
     for b in range(len(table)):
         expected = polarity[b] if polarity.shape[1] else polarity.ravel()
-        _fill_one(points_obj[b], pixels[b], normals[b], kind[b], mask[b], indexed[b], expected, settings, table[b])
+        not_plain[b] = _fill_one(points_obj[b], normals[b], kind[b], mask[b], indexed[b], expected, settings, table[b])
         if settings.close_px:
             _add_mistaken(depth_m[b], pixels[b], normals[b], kind[b], mask[b], nearest_of_cell[b], first[b], cells, settings, table[b])
 
@@ -45,7 +46,6 @@ def fill(
 @kernel()
 def _fill_one(
     points_obj: Array,
-    pixels: Array,
     normals: Array,
     kind: Array,
     mask: Array,
@@ -53,8 +53,9 @@ def _fill_one(
     polarity: Array,
     settings: TableSettings,
     table: Array,
-) -> None:
-    """Fill the table of one object, but for how far off what is seen may be."""
+) -> bool:
+    """Fill the table of one object, but for how far off what is seen may be; whether it shows print or limbs."""
+    not_plain = False
     for i in range(len(mask)):
         if not mask[i]:
             continue
@@ -64,9 +65,11 @@ def _fill_one(
         is_limb = kind[i] == settings.limb
         is_oriented = is_limb or kind[i] == settings.crease
         table[i, LIMB], table[i, ORIENTED] = is_limb, is_oriented
+        not_plain = not_plain or is_limb or kind[i] == settings.texture
         table[i, EXPECTED] = settings.of_print and kind[i] == settings.texture
         if is_oriented and len(polarity):
             table[i, EXPECTED] = polarity[octant(normals[0, i], normals[1, i])]
+    return not_plain
 
 
 @kernel()
