@@ -4,7 +4,7 @@ Its velocity is learned in short steps first, where there are events enough for 
 """
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -48,22 +48,23 @@ def of_unknown_motion(state: TrackerState, t_us: Int[Tensor, "s"], objects: Obje
     window = config.window
     if window.parts == 1 or not config.solver.prior:
         return torch.zeros_like(objects.stream_index, dtype=torch.bool)
-    unknown_px, sigma_px = _uncertain_px(state, ((t_us - state.t_us) * 1e-6)[objects.stream_index], objects)
-    # What is not known to be anywhere is looked for by all events of a window, and with the motion that leads to each place.
-    return (unknown_px > window.max_unknown_px) & (sigma_px <= config.search.wide_sigma_px)
-
-
-def _uncertain_px(state: TrackerState, window_s: Float[Tensor, "b"], objects: ObjectBatch) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"]]:
-    """How far objects may move in a window beside what is known, and standard deviations of where they are (px)."""
-    if switch.apply_to(window_s):
-        # Not at the top: Numba is an extra.
-        from torchtrack.kernels.filtering import unknown_motion
-
-        unknown_px, sigma_px = objects.diameter_m.new_empty(2, len(window_s))
-        own = as_arrays(objects.centre_obj, objects.intrinsics[:, 0], objects.diameter_m, window_s)
-        unknown_motion(*as_arrays(state.covariance, state.T_cam_obj), *own, unknown_px.numpy(), sigma_px.numpy())
-        return unknown_px, sigma_px
+    if switch.apply_to(state.covariance):
+        return _of_unknown_motion_by_kernel(state, t_us, objects, config)
+    window_s = ((t_us - state.t_us) * 1e-6)[objects.stream_index]
     unknown_m_s = unknown_speed(state.covariance, objects.diameter_m).to(objects.intrinsics.dtype)
     px_per_m = objects.px_per_m(state.T_cam_obj.to(unknown_m_s.dtype))
     sigma_m = state.covariance.diagonal(dim1=1, dim2=2)[:, 3:5].mean(1).sqrt().to(px_per_m.dtype)
-    return unknown_m_s * window_s * px_per_m, px_per_m * sigma_m
+    # What is not known to be anywhere is looked for by all events of a window, and with the motion that leads to each place.
+    return (unknown_m_s * window_s * px_per_m > window.max_unknown_px) & (px_per_m * sigma_m <= config.search.wide_sigma_px)
+
+
+def _of_unknown_motion_by_kernel(state: TrackerState, t_us: Int[Tensor, "s"], objects: ObjectBatch, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """:func:`of_unknown_motion`, object by object."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.filtering import find_unknown_motion
+
+    is_unknown = torch.empty_like(objects.stream_index, dtype=torch.bool)
+    own = as_arrays(objects.centre_obj, objects.intrinsics[:, 0], objects.diameter_m, objects.stream_index, t_us - state.t_us)
+    limits = config.window.max_unknown_px, config.search.wide_sigma_px
+    find_unknown_motion(*as_arrays(state.covariance, state.T_cam_obj), *own, *limits, is_unknown.numpy())
+    return is_unknown

@@ -38,15 +38,25 @@ def inverse(matrix: Array, into: Array) -> None:
 
 
 @kernel()
-def unknown_motion(
-    covariance: Array, T_cam_obj: Array, centre_obj: Array, focal_px: Array, diameter_m: Array, window_s: Array, unknown_px: Array, sigma_px: Array
+def find_unknown_motion(
+    covariance: Array,
+    T_cam_obj: Array,
+    centre_obj: Array,
+    focal_px: Array,
+    diameter_m: Array,
+    stream_index: Array,
+    elapsed_us: Array,
+    max_unknown_px: float,
+    most_sigma_px: float,
+    is_unknown: Array,
 ) -> None:
-    """How far objects may move in a window beside what is known, and where they may be: of :mod:`torchtrack.window_parts` and ``speed_limit``.
+    """Objects that may move far in a window beside what is known: :func:`torchtrack.window_parts.of_unknown_motion`.
 
     Args:
-        covariance: ``[b, 12, 12]``.
-        focal_px, diameter_m, window_s: ``[b]``.
-        unknown_px, sigma_px: ``[b]``, filled.
+        covariance, T_cam_obj, centre_obj, focal_px, diameter_m, stream_index: of each object.
+        elapsed_us: ``[s]``, the window's length.
+        max_unknown_px, most_sigma_px: farther than that, and of those that are not known to be anywhere.
+        is_unknown: ``[b]``, filled.
     """
     for b in range(len(covariance)):
         turning = moving = 0.0
@@ -55,5 +65,5 @@ def unknown_motion(
             moving += covariance[b, 9 + k, 9 + k] / 3.0
         place = 0.5 * (covariance[b, 3, 3] + covariance[b, 4, 4])
         px_per_m = focal_px[b] * inverse_depth(depth_of(T_cam_obj[b], centre_obj[b]))
-        unknown_px[b] = np.sqrt(moving + turning * (0.5 * diameter_m[b]) ** 2) * window_s[b] * px_per_m
-        sigma_px[b] = np.sqrt(place) * px_per_m
+        unknown_px = np.sqrt(moving + turning * (0.5 * diameter_m[b]) ** 2) * elapsed_us[stream_index[b]] * 1e-6 * px_per_m
+        is_unknown[b] = unknown_px > max_unknown_px and np.sqrt(place) * px_per_m <= most_sigma_px
