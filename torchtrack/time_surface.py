@@ -68,10 +68,8 @@ def _update_by_kernel(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -
     from torchtrack.kernels.events import newest
 
     updated = last_event_us.clone(memory_format=torch.contiguous_format)
-    ends = stream_bounds(events, len(updated)).tolist()
-    for times_us, begin, end in zip(updated, ends, ends[1:], strict=False):
-        if not newest(*as_arrays(events.x[begin:end], events.y[begin:end], events.t_us[begin:end], times_us)):
-            check_on_sensor(events, width=last_event_us.shape[2], height=last_event_us.shape[1])
+    if not newest(*as_arrays(events.x, events.y, events.t_us, stream_bounds(events, len(updated)), updated)):
+        check_on_sensor(events, width=last_event_us.shape[2], height=last_event_us.shape[1])
     return updated
 
 

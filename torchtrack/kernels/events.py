@@ -75,19 +75,25 @@ def _around(
 
 
 @kernel()
-def newest(x: Array, y: Array, t_us: Array, times_us: Array) -> bool:
-    """Bring a map of newest times ``[h, w]`` up, if all events are on the sensor, and tell whether they are."""
-    height, width, right, bottom = np.uint32(times_us.shape[0]), np.uint32(times_us.shape[1]), np.uint32(0), np.uint32(0)
+def newest(x: Array, y: Array, t_us: Array, bounds: Array, times_us: Array) -> bool:
+    """Bring maps of newest times ``[s, h, w]`` up, if all events are on the sensor, and tell whether they are.
+
+    Args:
+        x, y, t_us: ``[e]``, one stream after the other; ``bounds [s + 1]``, where each begins, and where the last one ends.
+    """
+    right, bottom, end = np.uint32(0), np.uint32(0), bounds[len(times_us)]
     # Looked at before: several events at once, and none of the writes waits for it.
-    for i in range(len(x)):
+    for i in range(end):
         # Unsigned, a negative number is a large one.
         right, bottom = max(right, np.uint32(x[i])), max(bottom, np.uint32(y[i]))
-    if len(x) > 0 and not (right < width and bottom < height):
+    if end > 0 and not (right < times_us.shape[2] and bottom < times_us.shape[1]):
         return False
-    times = times_us.ravel()
-    for i in range(len(x)):
-        place = np.uint64(np.uint32(y[i]) * width + np.uint32(x[i]))
-        times[place] = max(times[place], t_us[i])
+    width = np.uint32(times_us.shape[2])
+    for s in range(len(times_us)):
+        times = times_us[s].ravel()
+        for i in range(np.uint64(bounds[s]), np.uint64(bounds[s + 1])):
+            place = np.uint64(np.uint32(y[i]) * width + np.uint32(x[i]))
+            times[place] = max(times[place], t_us[i])
     return True
 
 
