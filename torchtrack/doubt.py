@@ -66,10 +66,11 @@ class Doubt:
 
     def reasons(self, score: Float[Tensor, "b"], config: SearchConfig) -> tuple[Bool[Tensor, "b"], ...]:
         """Which objects a search is wanted for: beside the prediction, where they may have slipped to, mirrored, and turned about an axis."""
-        none = self.far_due
-        # As a rule it is not time for what is looked for far away.
-        far = (none, none) if none_of(none) else (self.is_mirrored(score, config), self.is_turned(score, config))
-        return self.asks(score, config), self.slips(score, config), *far
+        is_mirrored = is_turned = self.far_due
+        # As a rule it is not time for these.
+        if not none_of(self.far_due):
+            is_mirrored, is_turned = self.is_mirrored(score, config), self.is_turned(score, config)
+        return self.asks(score, config), self.slips(score, config), is_mirrored, is_turned
 
     def asks(self, score: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
         """Which objects are to be searched for: uncertain and new ones, those whose score stays below the usual, and those long in doubt."""
