@@ -69,9 +69,8 @@ class ContourModel(nn.Module):
         is_segment = torch.zeros(len(points), dtype=torch.bool)
         is_segment[len(model.edge_points) :] = True
         self.register_buffer("edge_ends", points.clone())
-        # In memory, coordinates are rows, each of all edges: so they are looked at several at once.
-        self.register_buffer("face_normals", normals.permute(1, 2, 0).contiguous().permute(2, 0, 1))
-        self.register_buffer("face_offsets", (normals * points[:, :1]).sum(-1).T.contiguous().T)
+        self.register_buffer("face_normals", _in_rows(normals))
+        self.register_buffer("face_offsets", _in_rows((normals * points[:, :1]).sum(-1)))
         self.register_buffer("is_segment", is_segment)
         self.register_buffer("is_crease", torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)]) & config.creases)
         texture_count = min(len(model.texture_points), config.max_texture_points) if config.texture else 0
@@ -92,7 +91,7 @@ class ContourModel(nn.Module):
         self.register_buffer("texture_element", of_print)
         # Of the kind of each; the first, which stands for all the rest of the model, has a group of its own.
         self.register_buffer("element_group", pad(elements[:, -1].long() + 1, (1, 0)))
-        self.register_buffer("surface_points", model.surface_points.T.contiguous().T)
+        self.register_buffer("surface_points", _in_rows(model.surface_points))
         exact = len(model.triangles) <= config.exact_faces
         triangles = model.triangles if exact else model.triangles[:0]
         self.register_buffer("triangles", triangles.clone())
@@ -109,6 +108,11 @@ class ContourModel(nn.Module):
     def elements_of_edges(self, limb: Bool[Tensor, "b e"]) -> Int[Tensor, "b e"]:
         """The element of each edge; 0 on the limb of what may be smooth: it shows, whether or not its facets do."""
         return self.edge_element * ~(limb & self.is_bent)
+
+
+def _in_rows(values: Float[Tensor, "n *c"]) -> Float[Tensor, "n *c"]:
+    """A copy that has each coordinate of all of them in one row in memory: so a processor looks at several at once."""
+    return values.movedim(0, -1).clone(memory_format=torch.contiguous_format).movedim(-1, 0)
 
 
 def _most_facing(normals: Float[Tensor, "n 3"]) -> int:

@@ -174,8 +174,6 @@ def gathered_when_known(doubt: Doubt, full_gathered: Float[Tensor, "b"], config:
 
 def is_adrift(doubted_s: Float[Tensor, "b"], due: Bool[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
     """Which objects have been in doubt for so long that they are looked for farther away, where that is ``due``."""
-    if none_of(due):
-        return due
     return due & (doubted_s >= 1e-6 * config.doubt_us) if config.doubt_us else torch.zeros_like(due)
 
 

@@ -27,7 +27,7 @@ def mesh_points(
     kind, counts = np.empty((batch, room), np.int64), np.zeros(batch, np.int64)
     seen = as_arrays(T_cam_obj, intrinsics)
     for model in models:
-        of_edges = model.edge_ends, model.face_normals.permute(1, 2, 0), model.face_offsets.T
+        of_edges = model.edge_ends, model.face_normals.movedim(0, -1), model.face_offsets.T
         of_model = as_arrays(model.members, *of_edges, *(getattr(model, name) for name in _SAMPLED_FROM))
         kernels.sample(*of_model, model.texture_spacing_m, *seen, settings, sampled, kind, counts)
     # One place at least: what selects from contours needs one to point at.

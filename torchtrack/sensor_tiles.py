@@ -132,8 +132,7 @@ class SensorTiles(nn.Module):
         from torchtrack.kernels.events import keep
 
         kept = np.empty(len(events) + 1, np.int64)
-        near_any = near[0] if len(near) == 1 else near.any(0)
-        count = int(keep(*as_arrays(events.x, events.y, near_any), TILE_BITS, self.columns, self.width, self.height, kept))
+        count = int(keep(*as_arrays(events.x, events.y, near.any(0)), TILE_BITS, self.columns, self.width, self.height, kept))
         if count < 0:
             check_on_sensor(events, self.width, self.height)
         return kept, count

@@ -82,12 +82,12 @@ def _deepen(tests: Array, x: Array, y: Array, z: Array, deepest: Array) -> None:
 
 
 @kernel(fastmath=FAST)
-def _cell(u: float, v: float, first: Array, stream: int, grid: GridSettings) -> int:
+def _cell(u: float, v: float, first: Numbers, rows_before: int, grid: GridSettings) -> int:
     """The cell of a depth buffer that a pixel falls into; what lies outside falls into the outermost, what is not a number into the first."""
-    column, row = np.rint(u / grid.side_px) - first[stream, 0], np.rint(v / grid.side_px) - first[stream, 1]
-    column = min(max(column, 0.0), grid.columns - 1.0) if column == column else 0.0
-    row = min(max(row, 0.0), grid.rows - 1.0) if row == row else 0.0
-    return (int(row) + stream * grid.rows) * grid.columns + int(column)
+    column, row = np.rint(u / grid.side_px) - first[0], np.rint(v / grid.side_px) - first[1]
+    # Written so that what is not a number finds a cell, too.
+    column, row = min(column if column > 0 else 0.0, grid.columns - 1.0), min(row if row > 0 else 0.0, grid.rows - 1.0)
+    return int((row + rows_before) * grid.columns + column)
 
 
 @kernel()
@@ -157,7 +157,7 @@ def draw(
             continue
         every = _every(samples.shape[1], T_cam_obj[b], intrinsics[b], diameters_m[b], grid)
         taken, stream = samples if every == 1 else samples[:, ::every].copy(), stream_index[b]
-        _place(taken, entries(T_cam_obj[b]), lens(intrinsics[b]), first[stream], stream * grid.rows, grid, cells, steps)
+        _place(taken, entries(T_cam_obj[b]), lens(intrinsics[b]), (first[stream, 0], first[stream, 1]), stream * grid.rows, grid, cells, steps)
         for i in range(taken.shape[1]):
             cell = np.uint64(cells[i])
             if steps[i] < depth[cell] or (steps[i] == depth[cell] and b < owner[cell]):
@@ -169,24 +169,19 @@ def _place(
     samples: Array,
     pose: Numbers,
     intrinsics: Numbers,
-    first: Array,
+    first: Numbers,
     rows_before: int,
     grid: GridSettings,
     cells: Array,
     steps: Array,
 ) -> None:
     """Cells of surface samples, and their depths in whole steps, several at once; deeper than all else what is not before the camera."""
-    cells_px, right, bottom, first_column, first_row = 1.0 / grid.side_px, grid.columns - 1.0, grid.rows - 1.0, first[0], first[1]
     points_x, points_y, points_z = samples[0], samples[1], samples[2]
     for i in range(samples.shape[1]):
         x, y, z = placed(pose, points_x[i], points_y[i], points_z[i])
-        scale, is_before = cells_px * inverse_depth(z), z > grid.least_depth_m
-        column = np.rint(x * scale * intrinsics[0] + cells_px * intrinsics[2]) - first_column
-        row = np.rint(y * scale * intrinsics[1] + cells_px * intrinsics[3]) - first_row
-        # Written so that what is not a number finds a cell, too.
-        column, row = min(column if column > 0 else 0.0, right), min(row if row > 0 else 0.0, bottom)
-        cells[i] = np.int32((row + rows_before) * grid.columns + column)
-        steps[i] = np.int64(z * grid.steps_per_m) if is_before else _DEEPEST
+        inverse = inverse_depth(z)
+        cells[i] = _cell(x * inverse * intrinsics[0] + intrinsics[2], y * inverse * intrinsics[1] + intrinsics[3], first, rows_before, grid)
+        steps[i] = np.int64(z * grid.steps_per_m) if z > grid.least_depth_m else _DEEPEST
 
 
 @kernel(fastmath=FAST)
@@ -213,13 +208,15 @@ def hide_in_buffer(
         hidden: ``[b, m]``, changed.
     """
     for b in range(len(mask)):
+        stream = stream_index[b]
+        own_first, rows_before = (first[stream, 0], first[stream, 1]), stream * grid.rows
         for i in range(mask.shape[1]):
             u, v = pixels[b, 0, i], pixels[b, 1, i]
             if not mask[b, i] or not (u >= 0 and v >= 0 and u <= grid.width - 1 and v <= grid.height - 1):
                 continue
             behind, farthest_m = True, points_cam[b, 2, i] - margin_m[b]
             for side in (0.0, -grid.side_px, grid.side_px):
-                cell = _cell(u + side * normals[b, 0, i], v + side * normals[b, 1, i], first, stream_index[b], grid)
+                cell = _cell(u + side * normals[b, 0, i], v + side * normals[b, 1, i], own_first, rows_before, grid)
                 counts = not exact[b] or owner[cell] != b
                 behind = behind and counts and farthest_m > depth[cell] / grid.steps_per_m
             hidden[b, i] = hidden[b, i] or behind
