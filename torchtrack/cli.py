@@ -15,10 +15,11 @@ from tyro.conf import Positional, arg, subcommand
 
 from torchtrack.cli_io import Bench, Convert, Info, refuse_settings
 from torchtrack.config.executor import ExecutorName
-from torchtrack.config.load import typed
+from torchtrack.config.load import load, typed
 from torchtrack.config.settings import CommandLineText
 from torchtrack.errors import ConfigError, TorchtrackError
 from torchtrack.exit_codes import ExitCode
+from torchtrack.limits import Limits, limits
 
 
 def _option(metavar: str, *aliases: str) -> Any:
@@ -251,7 +252,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options, overrides = split_overrides(sys.argv[1:] if arguments is None else arguments)
         command = tyro.cli(_Command, prog="torchtrack", description="6DoF object pose tracking with an event camera.", args=options)
-        code: int = command.run(overrides)
+        with limits(_limits(overrides)):
+            code: int = command.run(overrides)
     except ConfigError as error:
         return _report(error, ExitCode.WRONG_SETTINGS)
     except TorchtrackError as error:
@@ -282,6 +284,12 @@ def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]
             value = following
         overrides[name.replace("-", "_")] = typed(value)
     return options, overrides
+
+
+def _limits(overrides: dict[str, Any]) -> Limits:
+    """The limits of files that are given by dotted key; every command takes them."""
+    given = {key.removeprefix("limits."): value for key, value in overrides.items() if key.startswith("limits.")}
+    return load(Limits, None, given)
 
 
 def _given(command: Any, without: tuple[str, ...]) -> dict[str, Any]:

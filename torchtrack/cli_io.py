@@ -99,6 +99,6 @@ class Bench:
 
 
 def refuse_settings(overrides: dict[str, Any]) -> None:
-    """Raise :class:`ConfigError` where settings are given to a command that has none."""
-    if overrides:
-        raise ConfigError(f"command line: this command takes no settings, got --{', --'.join(overrides)}.")
+    """Raise :class:`ConfigError` where settings other than limits are given to a command that has none."""
+    if others := [key for key in overrides if not key.startswith("limits.")]:
+        raise ConfigError(f"command line: this command takes no settings but --limits.NAME, got --{', --'.join(others)}.")

@@ -10,6 +10,7 @@
     ├── CalibrationError      (ValueError)         intrinsics or distortion that make no sense
     ├── ModelError            (ValueError)         an object model that cannot be tracked
     ├── PoseError             (ValueError)         a matrix that is not a pose, or an object that cannot be seen
+    ├── LimitError            (ValueError)         a file that asks for more than a stated limit
     └── MissingExtraError     (ImportError)        an optional library is not installed
 
     TorchtrackWarning         (UserWarning)        work goes on, but something should be looked at
@@ -48,6 +49,10 @@ class ModelError(TorchtrackError, ValueError):
 
 class PoseError(TorchtrackError, ValueError):
     """A matrix that is not a pose, or an object that cannot be seen."""
+
+
+class LimitError(TorchtrackError, ValueError):
+    """A file that asks for more than a stated limit; see :mod:`torchtrack.limits`."""
 
 
 class MissingExtraError(TorchtrackError, ImportError):

@@ -15,6 +15,7 @@ from torchtrack.executor.tasks import without_errors
 from torchtrack.interrupt import Interrupt
 from torchtrack.io import EventSource
 from torchtrack.io.live import LiveSource
+from torchtrack.limits import limits
 from torchtrack.refined_steps import Refinement, refined_steps
 from torchtrack.run_outputs import RunOutputs
 from torchtrack.session import Session, open_session
@@ -75,7 +76,7 @@ def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None =
         TorchtrackError: of the kind that fits, if anything that the run needs is missing or wrong.
     """
     session = session or open_session(config)
-    with threads(config.threads), Interrupt() as interrupt:
+    with threads(config.threads), limits(config.limits), Interrupt() as interrupt:
         (outcome,) = follow([lambda: RunOutputs(config, interrupt, sinks, session)], config, lambda: interrupt.requested)
     if isinstance(outcome, TorchtrackError):
         raise outcome
@@ -114,6 +115,6 @@ def run_many(
 
 def _run_group(configs: Sequence[RunConfig], tell: Tell) -> list[RunSummary | TaskFailure]:
     """Runs that have their tracking settings in common, as one batch."""
-    with threads(configs[0].threads), Interrupt() as interrupt:
+    with threads(configs[0].threads), limits(configs[0].limits), Interrupt() as interrupt:
         outputs = [partial(RunOutputs, config, interrupt) for config in configs]
         return without_errors(follow(outputs, configs[0], lambda: interrupt.requested))

@@ -19,6 +19,7 @@ from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, 
 from torchtrack.io.keep_up import KeepUp
 from torchtrack.io.live import LiveSource, open_live
 from torchtrack.lie import check_pose, rotation_from_quaternion
+from torchtrack.limits import check_limit, limits
 from torchtrack.object_model import ObjectModel
 from torchtrack.stepping import clipped
 
@@ -112,6 +113,11 @@ def open_session(config: RunConfig) -> Session:
         TorchtrackError: of the kind that fits, if a file, model, camera or pose is missing or wrong.
         EventDataError: if the stream has no events in the time asked for.
     """
+    with limits(config.limits):
+        return _opened(config)
+
+
+def _opened(config: RunConfig) -> Session:
     name, source, camera, of_sequence = _open_source(config)
     events, camera = prepared(source, camera, config.events)
     if config.sensor_latency_us:
@@ -183,6 +189,7 @@ def _open_live(source: str, config: CameraConfig | None) -> tuple[str, EventSour
 def _camera(config: CameraConfig) -> Camera:
     if config.calibration is not None:
         return read_calibration(config.calibration, config.width, config.height)
+    check_limit("sensor_pixels", (config.width or 0) * (config.height or 0), "camera")
     return Camera(**config.model_dump(exclude={"calibration"}))
 
 

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from torchtrack.config.run import Models, OverlayConfig, TrackingConfig
 from torchtrack.config.settings import ConfigPath
+from torchtrack.limits import Limits, current_limits
 
 
 class DemoConfig(TrackingConfig):
@@ -18,3 +19,4 @@ class DemoConfig(TrackingConfig):
     models: Models = Field("textured", description="Track textured models where the scene has them, or geometry alone.")
     threads: int = Field(1, ge=1, le=256, description="Threads of the tracker on the CPU.")
     overlay: OverlayConfig = OverlayConfig()
+    limits: Limits = Field(default_factory=current_limits, description="How large files may be.")

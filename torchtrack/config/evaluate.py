@@ -8,6 +8,7 @@ from pydantic import Field, StringConstraints, model_validator
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.run import Models, TrackingConfig
 from torchtrack.config.settings import ConfigPath, Settings
+from torchtrack.limits import Limits, current_limits
 
 Label = Annotated[str, StringConstraints(pattern=r"^[\w-]+$")]
 CellName = Annotated[str, StringConstraints(pattern=r"^\d\d( [a-z]+)?$")]
@@ -56,6 +57,7 @@ class EvaluateConfig(Settings):
         default_factory=lambda: Path.cwd() / "outputs" / "evaluate", description="Folder for the results; by default in the working folder."
     )
     resume: bool = Field(False, description="Take up an evaluation that was broken off: what is measured already is not measured again.")
+    limits: Limits = Field(default_factory=current_limits, description="How large files may be.")
     lost_rotation_deg: float = Field(10.0, gt=0, le=180, description="A window with a larger rotation error counts as lost (°).")
     lost_translation_cm: float = Field(5.0, gt=0, description="A window with a larger translation error counts as lost (cm).")
 

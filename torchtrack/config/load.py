@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from torchtrack.config.explain import explained
 from torchtrack.config.merge import merged, nested
 from torchtrack.config.settings import CommandLineText, Settings
 from torchtrack.errors import ConfigError, MissingFileError
 
-S = TypeVar("S", bound=Settings)
+S = TypeVar("S", bound=BaseModel)
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):

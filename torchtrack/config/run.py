@@ -11,6 +11,7 @@ from torchtrack.config.merge import merged
 from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.limits import Limits, current_limits
 
 Models = Literal["textured", "geometry"]
 Row = tuple[float, float, float, float]
@@ -56,8 +57,8 @@ class CameraConfig(Settings):
     fy: float | None = Field(None, gt=0, description="Focal length (px).")
     cx: float | None = Field(None, description="Principal point (px).")
     cy: float | None = Field(None, description="Principal point (px).")
-    width: int | None = Field(None, ge=1, le=8192, description="Sensor width (px), where the calibration does not say it.")
-    height: int | None = Field(None, ge=1, le=8192, description="Sensor height (px), where the calibration does not say it.")
+    width: int | None = Field(None, ge=1, le=65_536, description="Sensor width (px), where the calibration does not say it.")
+    height: int | None = Field(None, ge=1, le=65_536, description="Sensor height (px), where the calibration does not say it.")
     distortion_model: DistortionModel = Field("none", description="Lens model, as in OpenCV.")
     distortion: tuple[float, ...] = Field((), description="Its coefficients.")
 
@@ -121,6 +122,7 @@ class RunConfig(TrackingConfig):
         default_factory=lambda: Path.cwd() / "outputs" / "track", description="Folder for the results; by default in the working folder."
     )
     overlay: OverlayConfig = OverlayConfig()
+    limits: Limits = Field(default_factory=current_limits, description="How large files may be.")
     alignment: bool = Field(False, description="Measure how far events lie from the contours, at the tracked and at the initial pose.")
     reference_angular_velocity: ConfigPath | None = Field(
         None, description="Text file of three numbers, for the summary (a camera turns the other way)."

@@ -20,6 +20,7 @@ from torchtrack.events import EventWindow
 from torchtrack.executor import TaskFailure, Tell
 from torchtrack.executor.groups import run_in_groups
 from torchtrack.executor.tasks import without_errors
+from torchtrack.limits import limits as file_limits
 from torchtrack.quality import Status
 from torchtrack.session import open_session
 from torchtrack.sim.suite import Told
@@ -133,7 +134,7 @@ def report_of(evaluation: Evaluation, config: EvaluateConfig, planned: Plan) -> 
 
 
 def _run_config(path: Path, method: MethodConfig, config: EvaluateConfig) -> RunConfig:
-    return RunConfig(source=path, models=config.models, **{name: getattr(method, name) for name in MethodConfig.model_fields})
+    return RunConfig(source=path, models=config.models, limits=config.limits, **{name: getattr(method, name) for name in MethodConfig.model_fields})
 
 
 def _outcomes(jobs: Sequence[Job], config: EvaluateConfig) -> Iterator[tuple[int, Outcome]]:
@@ -147,7 +148,7 @@ def _outcomes(jobs: Sequence[Job], config: EvaluateConfig) -> Iterator[tuple[int
 
 def measure(jobs: Sequence[Job], tell: Tell, limits: tuple[float, float]) -> list[list[ObjectResult | NotApplicable] | TaskFailure]:
     """Track sequences with one method, as one batch, from their first true poses on, and compare every window with the truth."""
-    with threads(jobs[0].config.threads):
+    with threads(jobs[0].config.threads), file_limits(jobs[0].config.limits):
         return without_errors(follow([partial(_Measurement, job, limits) for job in jobs], jobs[0].config))
 
 

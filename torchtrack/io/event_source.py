@@ -5,6 +5,7 @@ from typing import Protocol, runtime_checkable
 
 from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch
+from torchtrack.limits import check_limit
 
 DEFAULT_CHUNK_EVENTS = 500_000
 # Readers that may choose read about so many events at a time: what is made of them stays in the processor's cache.
@@ -46,6 +47,7 @@ def check_max_events(max_events: int) -> None:
 
 
 def check_sensor_size(width: int, height: int, source: str) -> None:
-    """Raise :class:`EventDataError` unless the sensor has at least one pixel."""
+    """Raise :class:`EventDataError` unless the sensor has at least one pixel, and :class:`LimitError` where it has too many."""
     if width < 1 or height < 1:
         raise EventDataError(f"{source}: the sensor size must be positive, got {width}x{height}.")
+    check_limit("sensor_pixels", width * height, source)

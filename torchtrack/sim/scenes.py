@@ -10,6 +10,7 @@ from torchtrack.camera import Camera, DistortionModel
 from torchtrack.config.merge import merged
 from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.io.calibration import read_calibration
+from torchtrack.limits import Limits, current_limits
 from torchtrack.object_model.loading import checked_scale, load_parts
 from torchtrack.sim.background import BackgroundConfig
 from torchtrack.sim.meshes import make_mesh
@@ -117,6 +118,8 @@ class SceneConfig(Settings):
     light: LightConfig = Field(default_factory=LightConfig, description="How the light changes.")
     render: RenderConfig = Field(default_factory=RenderConfig, description="Light and sampling.")
     seed: int = Field(0, ge=0, le=2**31, description="Of motions, thresholds and noise.")
+    # A scene is the same whatever its files were allowed to be: left out of what is compared and written.
+    limits: Limits = Field(default_factory=current_limits, exclude=True, description="How large files may be.")
     max_motion_px: float = Field(0.5, gt=0.01, le=2, description="Furthest way of any vertex between two frames, pixels.")
     variants: dict[str, dict[str, Any]] = Field({}, description="By name: settings that differ; each variant is a scene NAME_VARIANT.")
     variant: str | None = Field(None, description="The variant to take; by default what is given outside of all.")

@@ -22,6 +22,7 @@ from torchtrack.config.settings import Settings
 from torchtrack.errors import ConfigError, MissingFileError, TorchtrackError
 from torchtrack.executor import TaskFailure, Tell, run_tasks
 from torchtrack.io.sequence import read_sequence
+from torchtrack.limits import limits
 from torchtrack.sim.output import check_output, write
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import Progress, simulate
@@ -111,7 +112,8 @@ def simulate_to_file(scene: SceneConfig, path: Path, progress: Progress | None =
         TorchtrackError: as :func:`torchtrack.sim.simulation.simulate`.
     """
     check_output(path)
-    sequence = simulate(scene, progress)
+    with limits(scene.limits):
+        sequence = simulate(scene, progress)
     if preview:
         # What draws pictures loads the whole tracker; those who want none need not wait for it.
         from torchtrack.sim.preview import write_preview
