@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -24,7 +24,22 @@ def _file_or_live(value: Any, info: Any) -> Any:
 EventSourcePath = Annotated[Path | str, BeforeValidator(_file_or_live)]
 
 
-class EventsConfig(Settings):
+TimeUnit = Literal["s", "ms", "us", "ns"]
+
+
+class ReadingConfig(Settings):
+    """How a file of events is read where it leaves a choice."""
+
+    time_unit: TimeUnit | None = Field(
+        None, description="Unit of the times, where a file does not say it: s, ms, us or ns; by default its format's custom."
+    )
+    polarity: Literal["auto", "inverted"] | int = Field(
+        "auto", description="Which events got brighter: auto takes 0/1 and -1/1; inverted, the others; a number, those that have it."
+    )
+    topic: str | None = Field(None, description="Of a file with several streams of events: topic, stream, camera or group to read.")
+
+
+class EventsConfig(ReadingConfig):
     """What is done with events before they are tracked; the camera follows by itself."""
 
     strict: bool = Field(False, description="What is wrong in a file is an error; otherwise it is left out, counted and reported.")
