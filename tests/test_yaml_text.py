@@ -3,7 +3,8 @@
 import pytest
 import yaml
 
-from torchtrack.yaml_text import MAX_CHARACTERS, MAX_DEPTH, MAX_VALUES, load_document, load_documents
+from torchtrack.limits import Limits
+from torchtrack.yaml_text import load_document, load_documents
 
 MULTIPLYING = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 9))
 MERGING = "a0: &a0 {k: 1}\n" + "".join(f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 10)}]}}\n" for n in range(1, 9))
@@ -43,12 +44,12 @@ def test_documents():
         ('a: "\\0"', "zero character"),
         ('a: "\\UFFFFFFFF"', "chr|too large|range"),
         ("a: !!python/object:os.system x", "could not determine a constructor"),
-        ("[" * (MAX_DEPTH + 1), "nested more than"),
+        ("[" * (Limits().text_depth + 1), "nested more than"),
         ("[" * 100_000, "nested more than"),
         ("".join(" " * n + "a:\n" for n in range(200)), "nested more than"),
-        (MULTIPLYING, "more than 200000 values, with aliases written out"),
-        (MERGING, "more than 200000 values, with aliases written out"),
-        ("x" * (MAX_CHARACTERS + 1), "characters are more than"),
+        (MULTIPLYING, "more than 100000 values, with aliases written out"),
+        (MERGING, "more than 100000 values, with aliases written out"),
+        ("x" * (Limits().text_bytes + 1), "characters are more than"),
         ("a: [", "expected"),
         ("\x00", "special characters"),
         ("{!!set {a, b}: 1}", "unhashable"),
@@ -64,4 +65,4 @@ def test_every_fault_is_an_error_of_yaml(text, message):
 
 def test_many_values_are_read_up_to_the_limit():
     assert len(load_document("[" + "1," * 5000 + "]")) == 5000
-    assert MAX_VALUES >= 100_000
+    assert Limits().text_nodes >= 100_000

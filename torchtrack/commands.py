@@ -215,7 +215,9 @@ def outline(image: str, calibration: str, output: str, distance_m: float, width:
 
 def _method_overrides(config_file: Path | None, overrides: Mapping[str, Any], chosen: Sequence[str] | None) -> dict[str, Any]:
     """Overrides with what names no method laid over every one; a chosen method that the file does not know is a preset."""
-    of_file = (read_yaml(config_file) if config_file else {}).get("methods") or {}
+    given = (read_yaml(config_file) if config_file else {}).get("methods")
+    # Anything else is told when the settings are checked.
+    of_file = given if isinstance(given, dict) else {}
     labels = list(chosen or of_file or ["default"])
     result = {f"methods.{label}.preset": CommandLineText(label) for label in labels if label not in of_file}
     for key, value in overrides.items():

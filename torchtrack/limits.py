@@ -28,11 +28,12 @@ class Limits(BaseModel):
     vertices: int = Field(4_000_000, ge=1, description="Vertices of a model, or points of its lines.")
     scene_nodes: int = Field(10_000, ge=1, description="Nodes of a model's scene, such as the parts of a CAD assembly.")
     texture_pixels: int = Field(8192 * 8192, ge=1, description="Pixels of a texture, or of all textures of a model.")
-    text_bytes: int = Field(8 * _MEGABYTE, ge=1, description="Bytes of a config or a calibration file.")
+    text_bytes: int = Field(2 * _MEGABYTE, ge=1, description="Bytes of a config or a calibration file.")
     text_nodes: int = Field(100_000, ge=1, description="Values in such a file, those that aliases (*name) repeat counted each time.")
     text_depth: int = Field(50, ge=1, le=200, description="Levels of lists and mappings within one another in such a file.")
     pose_file_bytes: int = Field(512 * _MEGABYTE, ge=1, description="Bytes of a file of poses.")
     array_bytes: int = Field(512 * _MEGABYTE, ge=1, description="Bytes of an array that is read whole, such as poses.")
+    expansion: int = Field(2000, ge=1, description="How many times larger than its file what a file holds may be; zlib reaches 1000.")
     block_bytes: int = Field(
         256 * _MEGABYTE, ge=1, description="Bytes of a part of a recording that is read at once (packet, message, chunk), once decompressed."
     )

@@ -13,6 +13,7 @@ from torchtrack.config.events import EventsConfig
 from torchtrack.config.run import CameraConfig, ObjectConfig, PoseConfig, RunConfig
 from torchtrack.errors import ConfigError, EventDataError
 from torchtrack.events import EventBatch, EventWindow
+from torchtrack.files import naming
 from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence, read_trajectory
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS
 from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, Region, downscaled_camera, find_hot_pixels, region_camera
@@ -119,7 +120,8 @@ def open_session(config: RunConfig) -> Session:
 
 def _opened(config: RunConfig) -> Session:
     name, source, camera, of_sequence = _open_source(config)
-    events, camera = prepared(source, camera, config.events)
+    with naming(Path(config.source)):
+        events, camera = prepared(source, camera, config.events)
     if config.sensor_latency_us:
         events = EarlierEvents(events, config.sensor_latency_us)
     chosen = config.objects or tuple(ObjectConfig(label=label) for label in of_sequence)

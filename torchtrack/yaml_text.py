@@ -1,8 +1,8 @@
 """YAML of people and tools, read so that no text costs more than it should, and every fault is a ``yaml.YAMLError``.
 
 Beyond what ``yaml.SafeLoader`` checks, this refuses: a key that is given twice, a value that holds itself, more nesting or more
-values than :data:`MAX_DEPTH` and :data:`MAX_VALUES` allow (an alias counts as what it stands for, so that aliases of aliases
-cannot multiply), and texts that cannot be encoded. A scalar that looks like a date or a number, but is none, is told with its place.
+values than :mod:`torchtrack.limits` allow (an alias counts as what it stands for, so that aliases of aliases cannot multiply), and
+texts that cannot be encoded. A scalar that looks like a date or a number, but is none, is told with its place.
 """
 
 from collections.abc import Hashable
@@ -10,10 +10,7 @@ from typing import Any
 
 import yaml
 
-# The longest config of the package has some 500 values in 7 levels; OpenCV's calibrations with all corners of 100 boards some 50,000 in 3.
-MAX_DEPTH = 50
-MAX_VALUES = 200_000
-MAX_CHARACTERS = 4_000_000
+from torchtrack.limits import current_limits
 
 # What the constructors of the library raise for scalars that their patterns let through, such as 2001-99-99.
 _BAD_SCALAR = (ValueError, OverflowError, KeyError, AttributeError, TypeError)
@@ -24,7 +21,7 @@ class LimitedLoader(yaml.SafeLoader):
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
-        self._depth, self._values = 0, 0
+        self._depth, self._values, self._limits = 0, 0, current_limits()
         # What a node and all below it amount to, aliases expanded. Nodes are held, so that no number of one is used again.
         self._weights: dict[yaml.Node, int] = {}
 
@@ -41,8 +38,9 @@ class LimitedLoader(yaml.SafeLoader):
         before = self._values
         self._count(1, event)
         self._depth += 1
-        if self._depth > MAX_DEPTH:
-            raise yaml.composer.ComposerError(None, None, f"nested more than {MAX_DEPTH} levels deep", event.start_mark)
+        if self._depth > self._limits.text_depth:
+            told = f"nested more than {self._limits.text_depth} levels deep; the setting limits.text_depth raises this"
+            raise yaml.composer.ComposerError(None, None, told, event.start_mark)
         node = super().compose_node(parent, index)
         self._depth -= 1
         if node is not None:
@@ -51,8 +49,9 @@ class LimitedLoader(yaml.SafeLoader):
 
     def _count(self, values: int, event: Any) -> None:
         self._values += values
-        if self._values > MAX_VALUES:
-            raise yaml.composer.ComposerError(None, None, f"more than {MAX_VALUES} values, with aliases written out", event.start_mark)
+        if self._values > self._limits.text_nodes:
+            told = f"more than {self._limits.text_nodes} values, with aliases written out; the setting limits.text_nodes raises this"
+            raise yaml.composer.ComposerError(None, None, told, event.start_mark)
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """What a node stands for.
@@ -100,8 +99,9 @@ def load_documents(text: str, loader: type[LimitedLoader] = LimitedLoader) -> li
     Raises:
         yaml.YAMLError: if it is no YAML, or beyond the limits.
     """
-    if len(text) > MAX_CHARACTERS:
-        raise yaml.YAMLError(f"{len(text)} characters are more than the {MAX_CHARACTERS} that are read")
+    most = current_limits().text_bytes
+    if len(text) > most:
+        raise yaml.YAMLError(f"{len(text)} characters are more than the {most} that are read; the setting limits.text_bytes raises this")
     try:
         return list(yaml.load_all(text, Loader=loader))
     except (ValueError, OverflowError) as error:

@@ -29,9 +29,8 @@ def hostile_inputs(seeds: list[Seed], folder: Path) -> list[Input]:
     """All of them."""
     made = [*_no_files(), *_large_sensors(), *text_inputs(), *array_inputs(), *time_inputs(), *model_inputs()]
     inputs = [Input(name, partial(_prepared, make, file, folder), TARGETS[kind], (file,)) for name, kind, file, make in made]
-    for seed in seeds:
-        if seed.kind == "events":
-            inputs.append(Input(f"shrinks_{seed.name}", partial(_copied, seed), partial(_read_while_it_shrinks, seed.mutated), (seed.mutated, "bag")))
+    shrinking = (seed for seed in seeds if seed.kind == "events")
+    inputs += [Input(f"shrinks_{s.name}", partial(_copied, s), partial(_read_while_it_shrinks, s.mutated), (s.mutated, "bag")) for s in shrinking]
     return inputs
 
 
@@ -97,6 +96,9 @@ def _large_sensors() -> Iterator[tuple[str, str, str, Make]]:
     yield "sensor_calibration", "calibration", "x.yaml", lambda path: path.write_text("fx: 9\nfy: 9\ncx: 9\ncy: 9\nwidth: 65536\nheight: 65536\n")
     text = "fx: 9000\nfy: 9000\ncx: 4000\ncy: 4000\nwidth: 8192\nheight: 8192\ndistortion_model: plumb_bob\ndistortion: [-0.1, 0.01, 0, 0, 0]\n"
     yield "sensor_distorted", "calibration", "x.yaml", lambda path: path.write_text(text)
-    yield "sensor_scene", "simulate", "x.yaml", lambda path: path.write_text("objects: [{label: a, shape: cube}]\ncamera: {width: 4096, height: 4096}\n")
-
-
+    yield (
+        "sensor_scene",
+        "simulate",
+        "x.yaml",
+        lambda path: path.write_text("objects: [{label: a, shape: cube}]\ncamera: {width: 4096, height: 4096}\n"),
+    )

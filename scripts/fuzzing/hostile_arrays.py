@@ -33,7 +33,12 @@ def array_inputs() -> Iterator[tuple[str, str, str, Make]]:
     yield "mcap_zstd", "events", "x.mcap", partial(_mcap_chunk, kind="zstd", make=_zstd_bomb)
     yield "mcap_zstd_size", "events", "x.mcap", partial(_mcap_chunk, kind="zstd", make=_zstd_size)
     yield "mcap_lz4", "events", "x.mcap", partial(_mcap_chunk, kind="lz4", make=_lz4_bomb)
-    yield "mcap_length", "events", "x.mcap", lambda path: path.write_bytes(b"\x89MCAP0\r\n" + b"\x01" + struct.pack("<Q", 1 << 62) + bytes(99) + b"\x89MCAP0\r\n")
+    yield (
+        "mcap_length",
+        "events",
+        "x.mcap",
+        lambda path: path.write_bytes(b"\x89MCAP0\r\n" + b"\x01" + struct.pack("<Q", 1 << 62) + bytes(99) + b"\x89MCAP0\r\n"),
+    )
     yield "bag1_length", "events", "x.bag", lambda path: path.write_bytes(b"#ROSBAG V2.0\n" + struct.pack("<I", 0xFFFFFFF0) + bytes(99))
     yield "bag2_zstd_message", "events", "bag", partial(_bag2_message, make=_zstd_bomb)
     yield "bag2_zstd_size", "events", "bag", partial(_bag2_message, make=_zstd_size)
@@ -224,9 +229,13 @@ def _hdf5_inputs() -> Iterator[tuple[str, str, str, Make]]:
     yield given("attributes_nan", lambda file: (_events_group(file), file.attrs.update({"width": np.nan, "height": np.inf}))[0])
     yield given("attributes_large", lambda file: (_events_group(file), file.attrs.update({"width": 65536, "height": 65536}))[0])
     yield given("geometry", lambda file: (_events_group(file), file.attrs.__delitem__("width"), file.attrs.update({"geometry": b"9x" * 9000}))[0])
-    yield given("resolution", lambda file: (_events_group(file, calib=None), file.attrs.clear(), file.update({"resolution": np.array([np.nan, 1])}))[0])
+    yield given(
+        "resolution", lambda file: (_events_group(file, calib=None), file.attrs.clear(), file.update({"resolution": np.array([np.nan, 1])}))[0]
+    )
     yield given("resolution_large", _large_resolution)
-    yield given("other_records", lambda file: file.update({"CD/events": np.zeros(5, np.dtype([("x", "S3"), ("y", "<u2"), ("p", "<i2"), ("t", "<f4", (2,))]))}))
+    yield given(
+        "other_records", lambda file: file.update({"CD/events": np.zeros(5, np.dtype([("x", "S3"), ("y", "<u2"), ("p", "<i2"), ("t", "<f4", (2,))]))})
+    )
     for name, changes in (
         ("version", {"version": "one"}),
         ("meta", {"meta": "[" * 100_000}),
@@ -352,7 +361,14 @@ def _mcap_chunk(path: Path, kind: str, make: Callable[[], bytes]) -> None:
     data_end = record(15, bytes(4))
     index_at = start + len(head)
     summary = record(3, schema) + record(4, channel)
-    indices = record(8, struct.pack("<QQQQ", 0, 10, index_at, len(body)) + struct.pack("<I", 0) + struct.pack("<Q", 0) + text(kind) + struct.pack("<QQ", len(packed), 1000))
+    indices = record(
+        8,
+        struct.pack("<QQQQ", 0, 10, index_at, len(body))
+        + struct.pack("<I", 0)
+        + struct.pack("<Q", 0)
+        + text(kind)
+        + struct.pack("<QQ", len(packed), 1000),
+    )
     statistics = record(11, struct.pack("<QHIIIIQQ", 4, 1, 1, 0, 0, 1, 0, 10) + struct.pack("<I", 10) + struct.pack("<HQ", 0, 4))
     summary_at = index_at + len(body) + len(data_end)
     footer = record(2, struct.pack("<QQI", summary_at, 0, 0))
@@ -372,5 +388,3 @@ def _bag2_message(path: Path, make: Callable[[], bytes]) -> None:
     if marked == text:
         marked = text.replace('compression_format: ""', "compression_format: zstd").replace('compression_mode: ""', "compression_mode: message")
     metadata.write_text(marked)
-
-

@@ -46,7 +46,12 @@ def model_inputs() -> Iterator[tuple[str, str, str, Make]]:
     yield "glb_nodes", "mesh", "x.glb", partial(_glb, content={"nodes": [{"mesh": 0}] * 200_000, "scenes": [{"nodes": list(range(200_000))}]})
     chain = [{"children": [n + 1]} for n in range(5000)] + [{"mesh": 0}]
     yield "glb_chain", "mesh", "x.glb", partial(_glb, content={"nodes": chain, "scenes": [{"nodes": [0]}]})
-    yield "glb_cycle", "mesh", "x.glb", partial(_glb, content={"nodes": [{"children": [1], "mesh": 0}, {"children": [0]}], "scenes": [{"nodes": [0]}]})
+    yield (
+        "glb_cycle",
+        "mesh",
+        "x.glb",
+        partial(_glb, content={"nodes": [{"children": [1], "mesh": 0}, {"children": [0]}], "scenes": [{"nodes": [0]}]}),
+    )
     doubling = [{"children": [n + 1] * 4} for n in range(14)] + [{"mesh": 0}]
     yield "glb_doubling", "mesh", "x.glb", partial(_glb, content={"nodes": doubling, "scenes": [{"nodes": [0]}]})
     yield "glb_length", "mesh", "x.glb", lambda path: path.write_bytes(b"glTF" + struct.pack("<IIII", 2, 100, 0xFFFFFFF0, 0x4E4F534A) + bytes(80))
@@ -92,7 +97,9 @@ def _glb_bytes(text: bytes, buffer: bytes) -> bytes:
 
 
 def _textured(path: Path) -> None:
-    path.write_text("mtllib x.mtl\n" + _CORNERS + "vt 0 0\nvt 1 0\nvt 0 1\nusemtl a\n" + "f 1/1 2/2 3/3\nf 1/1 2/2 4/3\nf 2/1 3/2 4/3\nf 3/1 1/2 4/3\n")
+    path.write_text(
+        "mtllib x.mtl\n" + _CORNERS + "vt 0 0\nvt 1 0\nvt 0 1\nusemtl a\n" + "f 1/1 2/2 3/3\nf 1/1 2/2 4/3\nf 2/1 3/2 4/3\nf 3/1 1/2 4/3\n"
+    )
     path.with_name("x.mtl").write_text("newmtl a\nmap_Kd x.png\n")
 
 
@@ -102,7 +109,6 @@ def _large_texture(path: Path) -> None:
 
 
 def _texture_fifo(path: Path) -> None:
-
 
     _textured(path)
     os.mkfifo(path.with_name("x.png"))

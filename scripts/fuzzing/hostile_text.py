@@ -88,7 +88,12 @@ def text_inputs() -> Iterator[tuple[str, str, str, Make]]:
     yield "poses_bop_many", "poses", "x.json", _bop
     yield "poses_long_line", "poses", "x.txt", partial(_write, text="0 " * 5_000_000)
     yield "poses_quotes", "poses", "x.csv", partial(_write, text='t,tx,ty,tz,qx,qy,qz,qw\n"' + "a" * 200_000 + "\n")
-    yield "poses_times", "poses", "x.csv", partial(_write, text="t_us,tx,ty,tz,qx,qy,qz,qw\n-9223372036854775808,0,0,1,0,0,0,1\n9223372036854775807,0,0,1,0,0,0,1\n")
+    yield (
+        "poses_times",
+        "poses",
+        "x.csv",
+        partial(_write, text="t_us,tx,ty,tz,qx,qy,qz,qw\n-9223372036854775808,0,0,1,0,0,0,1\n9223372036854775807,0,0,1,0,0,0,1\n"),
+    )
     yield "poses_long_time", "poses", "x.csv", partial(_write, text="t_us,tx,ty,tz,qx,qy,qz,qw\n" + "9" * 5000 + ",0,0,1,0,0,0,1\n")
     yield "poses_nan", "poses", "x.csv", partial(_write, text="t_us,tx,ty,tz,qx,qy,qz,qw\n1,nan,0,1,0,0,0,1\n2,inf,0,1,0,0,0,nan\n")
     yield "poses_huge", "poses", "x.txt", partial(_write, text="1 1e308 1e308 1e308 0 0 0 1\n2 -1e308 1e308 1e308 0 0 0 1\n")
@@ -102,7 +107,12 @@ def text_inputs() -> Iterator[tuple[str, str, str, Make]]:
         yield f"wide_blanks_{kind}", "events", f"x.{kind}", partial(_write, text="# width" + " " * 60_000 + "=x\n" + _FIRST[kind])
         yield f"long_numbers_{kind}", "events", f"x.{kind}", partial(_write, text=_FIRST[kind] + _FIRST[kind].replace("1", "1" * 5000))
         yield f"exponents_{kind}", "events", f"x.{kind}", partial(_write, text=_FIRST[kind] + _FIRST[kind].replace("0.002", "1e999999999"))
-        yield f"infinite_{kind}", "events", f"x.{kind}", partial(_write, text=_FIRST[kind] + _FIRST[kind].replace("0.002", "inf").replace("1000", "nan"))
+        yield (
+            f"infinite_{kind}",
+            "events",
+            f"x.{kind}",
+            partial(_write, text=_FIRST[kind] + _FIRST[kind].replace("0.002", "inf").replace("1000", "nan")),
+        )
         yield f"odd_lines_{kind}", "events", f"x.{kind}", partial(_write, text=_FIRST[kind] + "a b c d\n" * 200_000)
 
 

@@ -76,6 +76,8 @@ def _aedat4(path: Path, t_us: np.ndarray) -> None:
     x, y, p = _columns(t_us)
     records = np.zeros(len(t_us), np.dtype([("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("on", "u1"), ("pad", "V3")]))
     records["t"], records["x"], records["y"], records["on"] = t_us, x, y, p
-    content = struct.pack("<I", 12) + struct.pack("<HHH", 6, 8, 4) + b"\0\0" + struct.pack("<iI", 8, 4) + struct.pack("<I", len(t_us)) + records.tobytes()
+    content = (
+        struct.pack("<I", 12) + struct.pack("<HHH", 6, 8, 4) + b"\0\0" + struct.pack("<iI", 8, 4) + struct.pack("<I", len(t_us)) + records.tobytes()
+    )
     packet = struct.pack("<I", len(content)) + content
     path.write_bytes(aedat4(0, 0) + struct.pack("<ii", 0, len(packet)) + packet)

@@ -57,7 +57,11 @@ def _number_field(content: bytes, other: bytes, random: np.random.Generator) -> 
     size = int(random.choice([1, 2, 4, 8]))
     at = _place(content, random) // size * size if random.random() < 0.5 else _place(content, random)
     order = "little" if random.random() < 0.8 else "big"
-    value = int.from_bytes(content[at : at + size], order) + int(random.integers(-2, 3)) if random.random() < 0.3 else _ODD[int(random.integers(len(_ODD)))]
+    value = (
+        int.from_bytes(content[at : at + size], order) + int(random.integers(-2, 3))
+        if random.random() < 0.3
+        else _ODD[int(random.integers(len(_ODD)))]
+    )
     return content[:at] + (value % (1 << 8 * size)).to_bytes(size, order) + content[at + size :]
 
 
@@ -141,7 +145,7 @@ def _zip_member(content: bytes, other: bytes, random: np.random.Generator) -> by
     if random.random() < 0.15:
         members[chosen] = (members[int(random.integers(len(members)))][0] if random.random() < 0.5 else name[:-1], inner)
     else:
-        ways = _BINARY + (_text_number, _text_word)
+        ways = (*_BINARY, _text_number, _text_word)
         members[chosen] = (name, ways[int(random.integers(len(ways)))](inner, members[0][1], random))
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:

@@ -163,8 +163,6 @@ def _outcome(item: Input, path: Path) -> tuple[str, str]:
     try:
         item.read(path)
     except TorchtrackError as error:
-        if _lacks_memory(error):
-            return "memory", _trace(error)
         is_named = any(name in str(error) for name in item.names)
         return ("clear error" if is_named else "unnamed"), f"{type(error).__name__}: {error}"
     except MemoryError as error:

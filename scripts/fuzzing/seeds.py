@@ -206,7 +206,9 @@ def _container(folder: Path) -> Made:
 def ros_packet(ros2: bool, encoding: str = "mono") -> bytes:
     """A message ``event_camera_msgs/EventPacket``."""
     batch = events(40)
-    words = (batch.t_us.numpy() * 1000).astype("<u8") | batch.x.numpy().astype("<u8") << np.uint64(32) | batch.y.numpy().astype("<u8") << np.uint64(48)
+    words = (
+        (batch.t_us.numpy() * 1000).astype("<u8") | batch.x.numpy().astype("<u8") << np.uint64(32) | batch.y.numpy().astype("<u8") << np.uint64(48)
+    )
     frame, name = (text + b"\0" * ros2 for text in (b"cam", encoding.encode()))
     start = b"\0\1\0\0" if ros2 else (7).to_bytes(4, "little")
     data = _padded(start + np.array([1, 2, len(frame)], "<u4").tobytes() + frame, ros2, 4) + np.array([HEIGHT, WIDTH], "<u4").tobytes()
@@ -330,7 +332,9 @@ _CALIBRATIONS = {
     "distortion_model: plumb_bob\ndistortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.02, 0, 0, 0]}\n",
     "kalibr.yaml": "cam0:\n  camera_model: pinhole\n  intrinsics: [80.0, 80.0, 31.5, 23.5]\n  distortion_model: equidistant\n"
     "  distortion_coeffs: [0.01, -0.02, 0.001, 0.0]\n  resolution: [64, 48]\n",
-    "metavision.json": json.dumps({"camera_matrix": [[80, 0, 31.5], [0, 80, 23.5], [0, 0, 1]], "distortion_coefficients": [0.0] * 5, "image_size": [64, 48]}),
+    "metavision.json": json.dumps(
+        {"camera_matrix": [[80, 0, 31.5], [0, 80, 23.5], [0, 0, 1]], "distortion_coefficients": [0.0] * 5, "image_size": [64, 48]}
+    ),
 }
 
 

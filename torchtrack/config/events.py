@@ -18,6 +18,8 @@ def is_live(source: Path | str) -> bool:
 
 def _file_or_live(value: Any, info: Any) -> Any:
     """A live source as it is, or an absolute path; ``info`` is pydantic's ValidationInfo."""
+    if not isinstance(value, str | Path):
+        raise ValueError("expected the path of a file, or a live source")
     return str(value) if is_live(value) else absolute_path(value, info)
 
 

@@ -3,7 +3,7 @@
 What counts, from weakest to strongest: defaults, preset, file, command line.
 """
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,21 +14,10 @@ from torchtrack.config.explain import explained
 from torchtrack.config.merge import merged, nested
 from torchtrack.config.settings import CommandLineText, Settings
 from torchtrack.errors import ConfigError, MissingFileError
+from torchtrack.files import is_file, read_bytes
+from torchtrack.yaml_text import load_document
 
 S = TypeVar("S", bound=BaseModel)
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML where a key that is given twice is an error, not a silent replacement."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, Hashable) and key in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"the key '{key}' is given twice", key_node.start_mark)
-            seen.add(key)
-        return super().construct_mapping(node, deep)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -38,22 +27,23 @@ def read_yaml(path: Path) -> dict[str, Any]:
         MissingFileError: if the file is not there.
         ConfigError: if it is not YAML, holds something other than a mapping, or a key twice.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise MissingFileError(f"no config file at {path}. Check the path; examples are in the folder configs/.")
     try:
-        # The loader is a SafeLoader: it builds plain values only.
-        values = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
+        values = load_document(read_bytes(path, "config file", "text_bytes").decode("utf-8-sig"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
     if values is not None and not isinstance(values, dict):
         raise ConfigError(f"{path}: expected settings as 'name: value' lines, got a {type(values).__name__}.")
+    if strange := [key for key in values or {} if not isinstance(key, str)]:
+        raise ConfigError(f"{path}: the names of settings are text, got {strange[0]!r}. Put it in quotes, or correct it.")
     return values or {}
 
 
 def typed(text: str) -> Any:
     """A value typed on the command line, read as YAML: ``3`` is a number, ``[1, 2]`` a list, ``null`` nothing."""
     try:
-        value = yaml.safe_load(text)
+        value = load_document(text)
     except yaml.YAMLError:
         value = text
     return _from_command_line(value)

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 
+_LONGEST_NAME = 255
+
 
 class Settings(BaseModel):
     """Frozen, and a name that is not known is an error."""
@@ -31,6 +33,8 @@ def absolute_path(value: Any, info: Any) -> Any:
     if missing := re.findall(r"\$\{?(\w+)", expanded):
         raise ValueError(f"the environment variable {missing[0]} is not set")
     folder = (info.context or {}).get("folder")
+    if "\0" in expanded or max((len(os.fsencode(part)) for part in Path(expanded).parts), default=0) > _LONGEST_NAME:
+        raise ValueError(f"no file can have this name (a part of more than {_LONGEST_NAME} bytes, or a zero character)")
     base = Path.cwd() if folder is None or isinstance(value, CommandLineText) else folder
     return Path(os.path.normpath(base / expanded))
 

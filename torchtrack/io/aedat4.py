@@ -21,13 +21,16 @@ from torchtrack.io.event_file import EventFile
 from torchtrack.io.extras import optional
 from torchtrack.io.flatbuffer import field_offset, root_table, vector, whole
 from torchtrack.io.problems import Problem
+from torchtrack.limits import current_limits
 
 AEDAT4_MAGIC = b"#!AER-DAT4.0\r\n"
 _EVENT = np.dtype({"names": ["t", "x", "y", "on"], "formats": ["<i8", "<i2", "<i2", "u1"], "offsets": [0, 8, 10, 12], "itemsize": 16})
-_LARGEST_HEADER, _LARGEST_PACKET, _LARGEST_CONTENT = 1 << 24, 1 << 27, 1 << 28
+_LARGEST_HEADER, _LARGEST_PACKET = 1 << 24, 1 << 27
+# What Zstandard itself takes for granted.
+_LARGEST_WINDOW = 1 << 27
 # Small packets are decoded together.
 _FEWEST_BYTES = 1 << 20
-_NODE = re.compile(r'<node name="(\d+)" path="[^"]*/outInfo/\1/">(.*?)(?=<node name="\d+" path="[^"]*/outInfo/\d+/">|\Z)', re.DOTALL)
+_NODE = re.compile(r'<node name="(\d{1,9})" path="[^"<]*/outInfo/\d{1,9}/">')
 _NONE, _LZ4, _ZSTD = (0,), (1, 2), (3, 4)
 
 
@@ -116,12 +119,24 @@ def _events(parts: list[bytes]) -> Columns:
 
 def _event_stream(description: str) -> tuple[int, int | None, int | None] | None:
     """Number, width and height of the first stream of events."""
-    for number, content in _NODE.findall(description):
+    starts = list(_NODE.finditer(description))
+    ends = [match.start() for match in starts[1:]] + [len(description)]
+    # Of no node there is still an end.
+    for match, end in zip(starts, ends, strict=False):
+        number, content = match[1], description[match.end() : end]
         if re.search(r'key="typeIdentifier" type="string">EVTS<', content):
             sizes = [re.search(rf'key="size{axis}" type="int">(\d{{1,5}})<', content) for axis in "XY"]
             width, height = (int(size[1]) if size else None for size in sizes)
             return int(number), width, height
     return None
+
+
+def _whole(content: bytes) -> bytes:
+    """What a packet holds, if that is no more than the limit."""
+    most = current_limits().block_bytes
+    if len(content) > most:
+        raise EventDataError(f"it holds more than {most:,} bytes; the setting limits.block_bytes raises this")
+    return content
 
 
 def _decompressor(compression: int, path: Path) -> Any:
@@ -134,7 +149,7 @@ def _decompressor(compression: int, path: Path) -> Any:
 
         def unpack(packet: bytes) -> bytes:
             try:
-                return lz4.LZ4FrameDecompressor().decompress(packet, max_length=_LARGEST_CONTENT)
+                return _whole(lz4.LZ4FrameDecompressor().decompress(packet, max_length=current_limits().block_bytes + 1))
             except (RuntimeError, ValueError, EOFError, MemoryError) as error:
                 raise EventDataError(f"LZ4: {error}") from error
 
@@ -144,7 +159,9 @@ def _decompressor(compression: int, path: Path) -> Any:
 
         def unpack_zstd(packet: bytes) -> bytes:
             try:
-                return zstd.ZstdDecompressor().decompressobj().decompress(packet)
+                # A stream gives no more than it is asked for, whatever the frame says.
+                with zstd.ZstdDecompressor(max_window_size=_LARGEST_WINDOW).stream_reader(packet) as stream:
+                    return _whole(stream.read(current_limits().block_bytes + 1))
             except (zstd.ZstdError, MemoryError) as error:
                 raise EventDataError(f"Zstandard: {error}") from error
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch
 
 
@@ -47,6 +48,20 @@ class Columns:
             EventDataError: if they are not integers, or do not fit.
         """
         return EventBatch.from_numpy(self.x, self.y, self.t_us, self.polarity)
+
+
+def shifted(t_us: np.ndarray, by_us: int) -> np.ndarray:
+    """Times moved by ``by_us``.
+
+    Raises:
+        EventDataError: if some would not fit 64 bits.
+    """
+    if by_us == 0 or len(t_us) == 0:
+        return t_us
+    limits = np.iinfo(np.int64)
+    if int(t_us.min()) + by_us < limits.min or int(t_us.max()) + by_us > limits.max:
+        raise EventDataError(f"times that are counted from {by_us} µs on do not fit 64 bits. The file is damaged, or says the wrong offset.")
+    return t_us + by_us
 
 
 def join(parts: Iterable[Columns]) -> Columns:

@@ -30,17 +30,20 @@ import torch
 
 from torchtrack.camera import Camera
 from torchtrack.errors import CalibrationError, EventDataError, PoseError
+from torchtrack.files import is_file
 from torchtrack.io.hdf5 import HDF5_MAGIC, Hdf5Events, open_hdf5
+from torchtrack.io.hdf5_storage import check_link, check_whole
 from torchtrack.io.sequence_types import Sequence, SequenceObject
 from torchtrack.io.trajectory import Trajectory
 from torchtrack.io.writers.hdf5 import Hdf5Writer, append
 
 _FORMAT, _VERSION = "torchtrack-sequence", 1
+_PARTS = {"camera", "objects", "extra"}
 
 
 def is_container(path: Path) -> bool:
     """Whether a file is a sequence in HDF5."""
-    if not path.is_file():
+    if not is_file(path):
         return False
     with path.open("rb") as stream:
         if stream.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
@@ -65,6 +68,7 @@ def read_container(path: Path) -> Sequence:
             raise EventDataError(
                 f"'{path}' is a sequence of version {file.attrs.get('version')}, but version {_VERSION} is known. Update torchtrack."
             )
+        _check_arrays(file, path)
         try:
             camera = _read_camera(file, events)
             groups = sorted(file["objects"].items(), key=lambda item: int(item[1].attrs["index"]))
@@ -74,6 +78,22 @@ def read_container(path: Path) -> Sequence:
         except (CalibrationError, PoseError) as error:
             raise type(error)(f"'{path}': {error}") from error
     return Sequence(path.stem, events, camera, objects, meta if isinstance(meta, dict) else {"meta": meta}, extra)
+
+
+def _check_arrays(file: h5py.File, path: Path) -> None:
+    """Refuse arrays beside the events that are in other files, or too large to be read whole."""
+    for part in _PARTS & set(file):
+        check_link(file, part, path)
+        found = [file[part]]
+        while found:
+            place = found.pop()
+            if isinstance(place, h5py.Dataset):
+                check_whole(place, path)
+                continue
+            for name in place:
+                check_link(place, name, path)
+                if not isinstance(place.get(name, getlink=True), h5py.SoftLink):
+                    found.append(place[name])
 
 
 def _extra(array: h5py.Dataset) -> np.ndarray:

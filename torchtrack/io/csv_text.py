@@ -27,7 +27,7 @@ _NAMES = {
     "p": ("p", "ps", "pol", "polarity", "on"),
 }
 _NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
-_SIZE = re.compile(r"#.*width\s*=\s*(\d{1,5}).*height\s*=\s*(\d{1,5})")
+_WIDTH, _HEIGHT = (re.compile(rf"{name}[ \t]{{0,20}}=[ \t]{{0,20}}(\d{{1,5}})") for name in ("width", "height"))
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,7 @@ class CsvFile(EventFile):
         if order is None:
             raise EventDataError(f"'{self.path}': expected lines 't,x,y,p' or 'x,y,p,t' of numbers, or a first line that names t, x, y and p.")
         object.__setattr__(self, "order", order)
-        size = _SIZE.search(head[:_HEAD_BYTES].decode("ascii", errors="replace"))
-        self._settle_size(*((int(size[1]), int(size[2])) if size else (None, None)))
+        self._settle_size(*_size(head.decode("ascii", errors="replace")))
 
     def _read(self, max_events: int) -> Iterator[Columns]:
         rest, line_number = b"", 1
@@ -89,6 +88,16 @@ class CsvFile(EventFile):
         table = np.array(rows, dtype=np.int64).reshape(-1, 4)
         # The rows are in the order t, x, y, p; the caller expects that of the file.
         return list(table[:, np.argsort(self.order)].T)
+
+
+def _size(head: str) -> tuple[int | None, int | None]:
+    """Sensor size, from the first comment that says both."""
+    for line in head.splitlines():
+        comment = line.partition("#")[2]
+        width, height = _WIDTH.search(comment), _HEIGHT.search(comment)
+        if width and height:
+            return int(width[1]), int(height[1])
+    return None, None
 
 
 def column_order(head: bytes) -> tuple[int, ...] | None:

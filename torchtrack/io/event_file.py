@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from torchtrack.errors import EventDataError, MissingFileError
+from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch
+from torchtrack.files import check_is_file, naming
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
 from torchtrack.io.event_stream import EventStream
@@ -39,10 +40,11 @@ class EventFile(EventStream):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
-        if not self.path.exists():
-            raise MissingFileError(f"event file '{self.path}' does not exist.")
+        if not self.path.is_dir():
+            check_is_file(self.path, "event file")
         object.__setattr__(self, "problems", Problems(str(self.path), self.strict))
-        self._open()
+        with naming(self.path):
+            self._open()
         check_sensor_size(self.width, self.height, str(self.path))
 
     def chunks(self, max_events: int = DEFAULT_CHUNK_EVENTS) -> Iterator[EventBatch]:
@@ -87,7 +89,8 @@ class EventFile(EventStream):
     def _readable(self, max_events: int) -> Iterator[Columns]:
         """What can be read: where it breaks off, the rest counts as damaged."""
         try:
-            yield from self._read(max_events)
+            with naming(self.path):
+                yield from self._read(max_events)
         except EventDataError as error:
             if self.strict:
                 raise

@@ -4,7 +4,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from torchtrack.errors import MissingFileError, UnknownFormatError
+from torchtrack.errors import UnknownFormatError
+from torchtrack.files import check_is_file, is_file
 from torchtrack.io.aedat4 import AEDAT4_MAGIC, Aedat4File
 from torchtrack.io.csv_text import CsvFile, column_order
 from torchtrack.io.dat import DatFile
@@ -72,8 +73,8 @@ def reader_of(path: Path) -> Callable[..., EventFile]:
         MissingFileError: if there is no such file.
         UnknownFormatError: if no reader knows its format.
     """
-    if not path.exists():
-        raise MissingFileError(f"event file '{path}' does not exist.")
+    if not path.is_dir() and not is_file(path):
+        check_is_file(path, "event file")
     if is_bag_folder(path):
         return RosBag
     if not path.is_file():

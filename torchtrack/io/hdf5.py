@@ -21,15 +21,20 @@ from typing import Any
 import h5py
 import numpy as np
 
-from torchtrack.errors import EventDataError, MissingExtraError, UnknownFormatError
-from torchtrack.io.columns import Columns
+from torchtrack.errors import EventDataError, TorchtrackError, UnknownFormatError
+from torchtrack.files import check_is_file
+from torchtrack.io.columns import Columns, shifted
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.event_source import PART_EVENTS
 from torchtrack.io.extras import optional
+from torchtrack.io.hdf5_storage import check_array, check_link
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _LAYOUTS = (("x", "y", "t", "p"), ("xs", "ys", "ts", "ps"))
+_GROUPS = ("events", "prophesee/left", "davis/left/events", "/")
+_PLACES = ("CD/events", *_GROUPS[:-1], "t_offset", "ms_to_idx", "resolution")
 _ECF_FILTER = 0x8ECF
+_MOST_ITEM_BYTES = 256
 _DSEC_SIZE, _PROPHESEE_SIZE = (640, 480), (1280, 720)
 # Per array; events are read in order, and no part of a file twice.
 _CACHE_BYTES = 1 << 20
@@ -45,9 +50,10 @@ _ECF_HELP = (
 def open_hdf5(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading; what h5py raises over damage becomes an :class:`EventDataError`."""
     try:
+        check_is_file(path, "HDF5 file")
         with h5py.File(path, "r", rdcc_nbytes=_CACHE_BYTES) as file:
             yield file
-    except (EventDataError, UnknownFormatError, MissingExtraError):
+    except TorchtrackError:
         raise
     except _DAMAGED as error:
         raise EventDataError(f"'{path}' is truncated or damaged ({error}). Copy or make it again.") from error
@@ -73,6 +79,8 @@ class Hdf5Events(EventFile):
 
     def _open(self) -> None:
         with open_hdf5(self.path) as file:
+            for name in _PLACES:
+                check_link(file, name, self.path)
             group = find_events(file)
             if group is None:
                 raise UnknownFormatError(
@@ -84,6 +92,8 @@ class Hdf5Events(EventFile):
             if len(lengths) != 1 or len(next(iter(lengths))) != 1:
                 raise EventDataError(f"'{self.path}': x, y, t and p must be flat and of one length, got {[array.shape for array in arrays]}.")
             for array in arrays:
+                _check_numbers(array, self.path)
+                check_array(array, self.path)
                 _check_filters(array, self.path)
             object.__setattr__(self, "group", group)
             object.__setattr__(self, "count", arrays[0].shape[0])
@@ -105,10 +115,7 @@ class Hdf5Events(EventFile):
             t, x, y, p = (records[name] for name in ("t", "x", "y", "p"))
         else:
             x, y, t, p = (array[part] for array in arrays)
-        for name, values, kinds in (("t", t, "iuf"), ("x", x, "iuf"), ("y", y, "iuf"), ("p", p, "iufb")):
-            if values.dtype.kind not in kinds:
-                raise EventDataError(f"'{self.path}': '{name}' must hold numbers, got {values.dtype}.")
-        return Columns(_microseconds(t) + offset_us, _whole(x), _whole(y), p > 0)
+        return Columns(shifted(_microseconds(t), offset_us), _whole(x), _whole(y), p > 0)
 
     def _first(self, file: h5py.File, offset_us: int) -> int:
         """Index of an event not after ``start_us``, by the table of milliseconds where there is one."""
@@ -124,7 +131,7 @@ def find_events(file: h5py.File) -> str | None:
     records = file.get("CD/events")
     if isinstance(records, h5py.Dataset):
         return "CD/events" if records.dtype.names and {"x", "y", "p", "t"} <= set(records.dtype.names) else None
-    for name in ("events", "prophesee/left", "davis/left/events", "/"):
+    for name in _GROUPS:
         if _names(file, name) is not None:
             return name
     return None
@@ -135,6 +142,8 @@ def _names(file: h5py.File, group: str) -> tuple[str, ...] | None:
     found = file.get(group)
     if not isinstance(found, h5py.Group):
         return None
+    for name in {name for names in _LAYOUTS for name in names} & set(found):
+        check_link(found, name, Path(file.filename))
     return next((names for names in _LAYOUTS if all(isinstance(found.get(name), h5py.Dataset) for name in names)), None)
 
 
@@ -142,6 +151,16 @@ def _arrays(file: h5py.File, group: str) -> list[h5py.Dataset]:
     """The one array of records, or those of x, y, t and p."""
     names = _names(file, group)
     return [file[group]] if names is None else [file[group][name] for name in names]
+
+
+def _check_numbers(array: h5py.Dataset, path: Path) -> None:
+    """Refuse an array of anything but numbers; of records, those of which t, x, y or p is none."""
+    fields = {name: array.dtype[name] for name in _LAYOUTS[0]} if array.dtype.names else {str(array.name).rpartition("/")[2]: array.dtype}
+    for name, dtype in fields.items():
+        if dtype.kind not in ("iufb" if name.startswith("p") else "iuf"):
+            raise EventDataError(f"'{path}': '{name}' must hold numbers, got {dtype}.")
+    if array.dtype.itemsize > _MOST_ITEM_BYTES:
+        raise EventDataError(f"'{path}': '{array.name}' has {array.dtype.itemsize} bytes an event, which is no form of events that is known.")
 
 
 def _check_filters(array: h5py.Dataset, path: Path) -> None:
@@ -197,6 +216,8 @@ def _length(value: Any) -> int | None:
 
 def _microseconds(t: np.ndarray) -> np.ndarray:
     """Whole µs; other numbers are seconds, rounded to the nearest µs."""
+    if t.dtype == np.uint64 and t.max(initial=0) > np.iinfo(np.int64).max:
+        raise EventDataError(f"times reach {t.max()}, which is beyond 64 bits with a sign. Check the unit.")
     if t.dtype.kind != "f":
         return t.astype(np.int64)
     if not np.isfinite(t).all() or (np.abs(t) > 9e12).any():

@@ -19,12 +19,13 @@ from torchtrack.io.columns import Columns
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.event_source import PART_EVENTS
 from torchtrack.io.zip_archive import ZIP_MAGIC, damage_reported, open_archive
+from torchtrack.limits import check_limit
 
 __all__ = ["ZIP_MAGIC", "NpzEvents", "keys_of", "open_archive", "read_array"]
 
 _EVENT_KEYS = ("t", "x", "y", "p")
 # What numpy is known to raise over headers: it parses them as Python literals.
-_BAD_HEADER = (ValueError, KeyError, TypeError, SyntaxError, tokenize.TokenError)
+_BAD_HEADER = (ValueError, KeyError, TypeError, SyntaxError, OverflowError, MemoryError, RecursionError, IndexError, tokenize.TokenError)
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -73,6 +74,9 @@ def _open_member(archive: zipfile.ZipFile, key: str, path: Path) -> _Member:
     if dtype.hasobject:
         stream.close()
         raise EventDataError(f"'{path}': the array '{key}' holds Python objects, which are not loaded. Save it as plain numbers.")
+    if dtype.itemsize == 0 or min(shape, default=0) < 0:
+        stream.close()
+        raise EventDataError(f"'{path}': the array '{key}' has the shape {shape} of {dtype}, which holds nothing. Make it again.")
     data_bytes = archive.getinfo(f"{key}.npy").file_size - stream.tell()
     if data_bytes != int(np.prod(shape, dtype=object)) * dtype.itemsize:
         stream.close()
@@ -87,6 +91,7 @@ def read_array(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray:
         EventDataError: if it is not there, damaged, or holds objects; ``path`` is for the message.
     """
     member = _open_member(archive, key, path)
+    check_limit("array_bytes", int(np.prod(member.shape, dtype=object)) * member.dtype.itemsize, f"{path}: {key}")
     with member.stream:
         flat = member.read(int(np.prod(member.shape)))
         member.finish()

@@ -9,7 +9,7 @@ from typing import BinaryIO
 import numpy as np
 
 from torchtrack.errors import UnknownFormatError
-from torchtrack.io.columns import Columns
+from torchtrack.io.columns import Columns, shifted
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.evt2 import Evt2Decoder
 from torchtrack.io.evt3 import Evt3Decoder
@@ -79,7 +79,7 @@ class RawFile(EventFile):
                 decoder = _skip_to(stream, decoder, self.start_us - self.base_us)
             for words in words_of(stream, decoder.dtype, self.problems):
                 events = decoder.feed(words)
-                yield replace(events, t_us=events.t_us + self.base_us) if self.base_us else events
+                yield replace(events, t_us=shifted(events.t_us, self.base_us))
 
 
 def make_decoder(encoding: str, problems: Problems, legacy: bool = False) -> WordDecoder:

@@ -8,12 +8,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchtrack.errors import EventDataError, UnknownFormatError
+import yaml
+
+from torchtrack.errors import EventDataError, TorchtrackError, UnknownFormatError
+from torchtrack.files import check_is_file, read_bytes
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.extras import optional
 from torchtrack.io.problems import Problems
+from torchtrack.io.ros_compression import bounded_decompression, take_over_messages
 from torchtrack.io.ros_messages import ARRAYS, PACKETS, MessageDecoder
+from torchtrack.yaml_text import load_document
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
 _KINDS = {
@@ -34,6 +39,7 @@ _DAMAGED = (
     TypeError,
     ValueError,
     AssertionError,
+    MemoryError,
     struct.error,
     sqlite3.Error,
 )
@@ -83,9 +89,13 @@ class RosBag(EventFile):
     def _messages(self) -> Iterator[tuple[Any, Iterator[bytes]]]:
         """The connection with the events, and its messages; what the library raises becomes an :class:`EventDataError`."""
         purpose = f"reading '{self.path}'"
+        if self.path.is_dir():
+            _check_folder(self.path)
         module = optional("rosbags.rosbag1" if _is_ros1(self.path) else "rosbags.rosbag2", "rosbags", "ros", purpose)
+        damaged = (module.ReaderError, *bounded_decompression(), *_DAMAGED)
         try:
             with module.Reader(self.path) as reader:
+                unpack = take_over_messages(reader)
                 known = [connection for connection in reader.connections if connection.msgtype in _KINDS]
                 chosen = [connection for connection in known if self.topic in ("", connection.topic)]
                 if not chosen:
@@ -93,11 +103,22 @@ class RosBag(EventFile):
                     wanted = f"topic '{self.topic}' of events" if self.topic else "topic of events"
                     raise UnknownFormatError(f"'{self.path}' has no {wanted} (event_camera_msgs or dvs_msgs). Its topics: {topics}.")
                 same = [connection for connection in chosen if connection.topic == chosen[0].topic]
-                yield chosen[0], (bytes(data) for _, _, data in reader.messages(connections=same))
-        except (EventDataError, UnknownFormatError):
+                yield chosen[0], (unpack(data) for _, _, data in reader.messages(connections=same))
+        except TorchtrackError:
             raise
-        except (module.ReaderError, *_DAMAGED) as error:
+        except damaged as error:
             raise EventDataError(f"'{self.path}' is truncated or damaged ({type(error).__name__}: {error}). Copy it again.") from error
+
+
+def _check_folder(path: Path) -> None:
+    """Refuse a recording whose list of files costs too much to read, or which has a pipe or a device in the place of a file."""
+    try:
+        load_document(read_bytes(path / "metadata.yaml", "list of files", "text_bytes").decode("utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise EventDataError(f"'{path / 'metadata.yaml'}' is damaged: {' '.join(str(error).split())}. Copy it again.") from error
+    for file in path.iterdir():
+        if not file.is_dir():
+            check_is_file(file, "part of a recording")
 
 
 def _is_ros1(path: Path) -> bool:

@@ -18,6 +18,8 @@ from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.time_high import unwrap
 
 PACKETS, ARRAYS = "EventPacket", "EventArray"
+# After the year 2100; all that is added to it fits 64 bits.
+_LATEST_NS = 1 << 62
 _ROS1_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
 # In ROS 2 the second and later events start two bytes after a multiple of four.
 _FIRST_ROS2_BYTES = 14
@@ -114,6 +116,8 @@ class MessageDecoder:
         cursor.number(8)
         base_ns, encoding, big_endian = cursor.number(8), cursor.text(), cursor.number(1)
         data = bytes(cursor.take(cursor.number(4)))
+        if base_ns >= _LATEST_NS:
+            raise EventDataError(f"its time is {base_ns} ns, which no clock shows")
         if big_endian:
             raise EventDataError("its numbers are big-endian, which is not known of any camera")
         if encoding == "evt3":

@@ -28,6 +28,7 @@ import torch
 
 from torchtrack.camera import Camera
 from torchtrack.errors import CalibrationError, EventDataError, MissingFileError, PoseError
+from torchtrack.files import is_file, naming
 from torchtrack.io.container import is_container, read_container
 from torchtrack.io.npz import NpzEvents, keys_of, open_archive, read_array
 from torchtrack.io.sequence_types import Sequence, SequenceObject
@@ -37,6 +38,7 @@ from torchtrack.io.zip_archive import is_zip
 if TYPE_CHECKING:
     from torchtrack.io.sequence_writer import write_sequence as write_sequence
 
+_LONGEST_LABEL = 200
 _EXTRA = ("velocity", "occluder_poses", "occluder_labels")
 
 
@@ -51,8 +53,11 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
         PoseError: if the ground truth is not rigid, or its times do not increase.
     """
     path = Path(path)
-    if is_container(path):
-        return read_container(path)
+    with naming(path):
+        return read_container(path) if is_container(path) else _read_archive(path)
+
+
+def _read_archive(path: Path) -> Sequence:
     events = NpzEvents(path)
     with open_archive(path) as archive:
         camera = _read_camera(archive, events, path)
@@ -69,7 +74,7 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
 def is_sequence(path: str | os.PathLike[str]) -> bool:
     """Whether a file holds a sequence: events with a camera, in either form."""
     path = Path(path)
-    if not path.is_file():
+    if not is_file(path):
         return False
     if not is_zip(path):
         return is_container(path)
@@ -123,17 +128,19 @@ def _read_meta(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         return {}
     try:
         meta = json.loads(str(read_array(archive, "meta", path)))
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise EventDataError(f"'{path}': 'meta' is not JSON ({error}).") from error
     return meta if isinstance(meta, dict) else {"meta": meta}
 
 
 def _sequence_object(path: Path, label: str, mesh_file: str, ground_truth: Trajectory | None) -> SequenceObject:
+    if not label.isprintable() or "/" in label or len(label) > _LONGEST_LABEL:
+        raise EventDataError(f"'{path}' has an object called {label[:_LONGEST_LABEL]!r}, which is no label: it is part of the names of files.")
     mesh_path = path.parent / mesh_file
-    if not mesh_path.is_file():
+    if not is_file(mesh_path):
         raise MissingFileError(
-            f"'{path}' names the mesh '{mesh_file}' for its object '{label}' (key 'mesh_files'), "
-            f"but '{mesh_path}' does not exist. Put it beside the sequence."
+            f"'{path}' names the mesh {mesh_file[:_LONGEST_LABEL]!r} for its object '{label}' (key 'mesh_files'), "
+            f"but there is no such file in '{path.parent}'. Put it beside the sequence."
         )
     textured = path.with_name(f"{path.stem}_{label}_textured.glb")
     return SequenceObject(label, mesh_path, textured if textured.is_file() else None, ground_truth)

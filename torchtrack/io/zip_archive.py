@@ -1,17 +1,34 @@
 """Zip archives, opened with every kind of damage told in one way."""
 
+import lzma
 import os
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
+from torchtrack.errors import EventDataError, TorchtrackError, UnknownFormatError
+from torchtrack.files import check_is_file
 
 ZIP_MAGIC = b"PK\x03\x04"
 # What zipfile is known to raise over damaged bytes.
-_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, UnicodeDecodeError, OSError, ValueError, KeyError)
+_DAMAGED = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    RuntimeError,
+    NotImplementedError,
+    UnicodeDecodeError,
+    OSError,
+    ValueError,
+    KeyError,
+    struct.error,
+    OverflowError,
+    MemoryError,
+)
 
 
 def is_zip(path: Path) -> bool:
@@ -25,7 +42,7 @@ def damage_reported(path: Path) -> Iterator[None]:
     """Turn what :mod:`zipfile` raises over damaged bytes into an :class:`EventDataError`."""
     try:
         yield
-    except EventDataError:
+    except TorchtrackError:
         raise
     except _DAMAGED as error:
         raise EventDataError(f"'{path}' is truncated or damaged ({error}). Copy or make it again.") from error
@@ -40,8 +57,7 @@ def open_archive(path: str | os.PathLike[str]) -> zipfile.ZipFile:
         EventDataError: if it is one, but truncated or damaged.
     """
     path = Path(path)
-    if not path.is_file():
-        raise MissingFileError(f"file '{path}' does not exist.")
+    check_is_file(path, "file")
     with path.open("rb") as stream:
         magic = stream.read(len(ZIP_MAGIC))
     if magic != ZIP_MAGIC:

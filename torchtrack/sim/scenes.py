@@ -133,8 +133,8 @@ class SceneConfig(Settings):
         name, rest = values.get("variant"), {key: value for key, value in values.items() if key not in ("variant", "variants")}
         if name is None:
             return rest
-        if not isinstance(variants.get(name), dict):
-            raise ValueError(f"variant: there is none called '{name}' ({', '.join(variants) or 'the scene has none'})")
+        if not isinstance(name, str) or not isinstance(variants.get(name), dict):
+            raise ValueError(f"variant: there is none called '{name}' ({', '.join(map(str, variants)) or 'the scene has none'})")
         return {**merged(rest, variants[name]), "name": f"{rest.get('name', 'scene')}_{name}"}
 
     @model_validator(mode="after")

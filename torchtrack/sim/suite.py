@@ -90,7 +90,10 @@ def _expanded(path: Path, overrides: Mapping[str, Any], within: tuple[Path, ...]
 
 def _matching(folder: Path, pattern: str) -> list[Path]:
     """Files that a pattern names, relative to a folder."""
-    found = sorted(folder.glob(pattern)) if not Path(pattern).is_absolute() else [Path(pattern)]
+    try:
+        found = sorted(folder.glob(pattern)) if not Path(pattern).is_absolute() else [Path(pattern)]
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"{folder}: scenes: '{pattern}' is no pattern of file names ({error}). Correct it.") from error
     if not found:
         raise MissingFileError(f"scenes: nothing at {folder / pattern}. Check the path.")
     return found
