@@ -42,7 +42,7 @@ start_times = st.one_of(st.none(), st.integers(-50, 450))
 @pytest.mark.parametrize("integer", [np.uint8, np.uint16, np.int32, np.int64, np.uint64, ">i4"])
 def test_from_numpy_takes_any_integer_type(integer):
     x = np.array([1, 2, 3], dtype=integer)
-    events = EventBatch.from_numpy(x, x, x, np.array([-1, 0, 1]), stream=4)
+    events = EventBatch.from_numpy(x, x, x, np.array([-1, -1, 1]), stream=4)
     assert events.x.dtype == events.y.dtype == torch.int32
     assert events.t_us.dtype == events.stream_index.dtype == torch.int64
     assert events.t_us.tolist() == [1, 2, 3]
@@ -52,7 +52,17 @@ def test_from_numpy_takes_any_integer_type(integer):
 
 def test_from_numpy_takes_read_only_arrays():
     x = np.frombuffer(np.arange(3, dtype=np.int32).tobytes(), np.int32)
-    assert EventBatch.from_numpy(x, x, x, x).x.tolist() == [0, 1, 2]
+    on = np.frombuffer(bytes([0, 1, 1]), bool)
+    events = EventBatch.from_numpy(x, x, x, on)
+    assert events.x.tolist() == [0, 1, 2]
+    assert events.polarity.tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize("values", [[-1, 0, 1], [1, 2, 1], [1, 255, 1], [0.0, 0.5, 1.0], [0, float("nan"), 1]])
+def test_from_numpy_takes_no_other_codes_of_polarity(values):
+    x = np.arange(3)
+    with pytest.raises(EventDataError, match="polarity holds .*; expected 0 and 1, or -1 and 1"):
+        EventBatch.from_numpy(x, x, x, np.array(values))
 
 
 @pytest.mark.parametrize(

@@ -114,7 +114,7 @@ def test_events_outside_the_sensor_are_found(tmp_path, kind):
         source = open_events(save_text(tmp_path / "e.txt", "0.1 10 10 1\n0.2 240 10 0\n"), strict=True)
     else:
         x, y = np.array([10, 240]), np.array([10, 10])
-        path = save_npz(tmp_path / "e.npz", EventBatch.from_numpy(x, y, x, y), width=None, height=None)
+        path = save_npz(tmp_path / "e.npz", EventBatch.from_numpy(x, y, x, x > 99), width=None, height=None)
         source = open_events(path, width=240, height=180, strict=True)
     with pytest.raises(EventDataError, match=r"event 1 is at \(240, 10\), outside the sensor of 240x180"):
         list(source.chunks())

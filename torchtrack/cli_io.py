@@ -7,9 +7,13 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from torchtrack.bench.parts import Part
+from torchtrack.config.events import ReadingConfig, TimeUnit
 from torchtrack.config.formats import OutputFormat
 from torchtrack.errors import ConfigError
 
+_TimeUnit = Annotated[TimeUnit | None, arg(metavar="UNIT", help_behavior_hint="")]
+_Text = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
+_Polarity = Annotated[str, arg(metavar="CODE")]
 _Size = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
 
 
@@ -25,6 +29,12 @@ class Info:
     """Sensor height (px), where the file does not say it."""
     max_events: _Size = None
     """Read so many events and no more."""
+    time_unit: _TimeUnit = None
+    """Unit of the times, where the file does not say it: s, ms, us or ns."""
+    polarity: _Polarity = "auto"
+    """Which events got brighter: auto (0/1, -1/1), inverted, or the value that means brighter."""
+    topic: _Text = None
+    """Of a file with several streams of events, the one to read."""
     strict: bool = False
     """What is wrong is an error."""
     json: bool = False
@@ -32,10 +42,11 @@ class Info:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands_io import info
+        from torchtrack.commands_io import Input, info
 
         refuse_settings(overrides)
-        return info(self.file, self.width, self.height, self.max_events, strict=self.strict, as_json=self.json)
+        choices = _choices(self.time_unit, self.polarity, self.topic)
+        return info(Input(Path(self.file), self.width, self.height, self.strict, choices), self.max_events, as_json=self.json)
 
 
 @dataclass(frozen=True)
@@ -52,15 +63,22 @@ class Convert:
     """Sensor width (px), where the file does not say it."""
     height: _Size = None
     """Sensor height (px), where the file does not say it."""
+    time_unit: _TimeUnit = None
+    """Unit of the times, where the file does not say it: s, ms, us or ns."""
+    polarity: _Polarity = "auto"
+    """Which events got brighter: auto (0/1, -1/1), inverted, or the value that means brighter."""
+    topic: _Text = None
+    """Of a file with several streams of events, the one to read."""
     strict: bool = False
     """What is wrong is an error."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands_io import convert_file
+        from torchtrack.commands_io import Input, convert_file
 
         refuse_settings(overrides)
-        return convert_file(self.source, self.target, self.format, self.width, self.height, strict=self.strict)
+        choices = _choices(self.time_unit, self.polarity, self.topic)
+        return convert_file(Input(Path(self.source), self.width, self.height, self.strict, choices), self.target, self.format)
 
 
 @dataclass(frozen=True)
@@ -96,6 +114,17 @@ class Bench:
         sequence, compare = (Path(text) if text is not None else None for text in (self.sequence, self.compare))
         setup = Setup(self.repeats, bench_device(self.device), self.threads, self.events, sequence, self.compiled)
         return bench(self.part, Path(self.output), compare, setup)
+
+
+def _choices(time_unit: TimeUnit | None, polarity: str, topic: str | None) -> ReadingConfig:
+    """What the options say of how a file is read."""
+    try:
+        code: Any = int(polarity)
+    except ValueError:
+        code = polarity
+    if code not in ("auto", "inverted") and not isinstance(code, int):
+        raise ConfigError(f"command line: --polarity is auto, inverted or a whole number, got '{polarity}'.")
+    return ReadingConfig(time_unit=time_unit, polarity=code, topic=topic)
 
 
 def refuse_settings(overrides: dict[str, Any]) -> None:

@@ -2,25 +2,40 @@
 
 import json
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
 from torchtrack.commands import output_console
+from torchtrack.config.events import ReadingConfig
 from torchtrack.config.formats import OutputFormat
 from torchtrack.errors import TorchtrackWarning
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io.convert import convert
-from torchtrack.io.event_file import EventFile
+from torchtrack.io.event_file import DEFAULT_CHOICES, EventFile
 from torchtrack.io.formats import FORMAT_NAMES, open_events
 from torchtrack.io.info import EventInfo, as_plain
 from torchtrack.io.raw_file import RawFile
 
+_ONE_POLARITY = " (all alike: polarity may be coded in another way, --polarity)"
 
-def info(file: str, width: int | None, height: int | None, max_events: int | None, *, strict: bool, as_json: bool) -> int:
+
+@dataclass(frozen=True)
+class Input:
+    """A file of events, and how it is read; see :func:`torchtrack.io.open_events`."""
+
+    path: Path
+    width: int | None = None
+    height: int | None = None
+    strict: bool = False
+    choices: ReadingConfig = DEFAULT_CHOICES
+
+
+def info(file: Input, max_events: int | None, *, as_json: bool) -> int:
     """Show facts about a file of events; returns the exit code."""
-    source = open_events(Path(file), width, height, strict)
+    source = open_events(file.path, file.width, file.height, file.strict, file.choices)
     with warnings.catch_warnings():
         # What is wrong is part of the facts.
         warnings.simplefilter("ignore", TorchtrackWarning)
@@ -44,6 +59,8 @@ def format_name(source: EventFile) -> str:
 
 def _rows(source: EventFile, facts: EventInfo) -> list[tuple[str, str]]:
     rows = [("format", format_name(source)), ("sensor", f"{facts.width}x{facts.height}")]
+    if len(source.streams) > 1:
+        rows.append(("streams", f"{', '.join(source.streams)} (--topic chooses)"))
     count = "unknown" if facts.count is None else f"{facts.count:,}"
     rows.append(("events", count if facts.complete else f"about {count} (not all were read)"))
     if facts.first_us is None or facts.last_us is None:
@@ -54,7 +71,7 @@ def _rows(source: EventFile, facts: EventInfo) -> list[tuple[str, str]]:
         ("time", f"{facts.first_us:,} … {facts.last_us:,} µs"),
         ("duration", f"{1e-6 * facts.duration_us:.6f} s"),
         ("rate", f"{1e-6 * facts.mean_rate:.3f} Mev/s mean, {1e-6 * facts.peak_rate:.3f} Mev/s in the busiest 10 ms"),
-        ("brighter", f"{100 * facts.brighter_share:.1f} %"),
+        ("brighter", f"{100 * facts.brighter_share:.1f} %{_ONE_POLARITY if facts.brighter_share in (0, 1) else ''}"),
         ("gaps over 10 ms", f"{facts.gap_count}; longest: {longest}" if facts.gap_count else "none"),
         *_faults(facts),
     ]
@@ -64,11 +81,12 @@ def _faults(facts: EventInfo) -> list[tuple[str, str]]:
     return [("left out", f"{count:,} {problem}") for problem, count in facts.problems.items()] or [("left out", "nothing")]
 
 
-def convert_file(source: str, target: str, format: OutputFormat | None, width: int | None, height: int | None, *, strict: bool) -> int:
+def convert_file(source: Input, target: str, format: OutputFormat | None) -> int:
     """Write the events of one file into another, say how many; returns the exit code."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TorchtrackWarning)
-        done = convert(source, target, format, width, height, strict)
+        # Said below, with the counts.
+        warnings.filterwarnings("ignore", ".*some of it was left out", TorchtrackWarning)
+        done = convert(source.path, target, format, source.width, source.height, source.strict, source.choices)
     console = output_console()
     console.print(f"{done.count:,} events are in {target} ({done.format})")
     if done.problems is not None and done.problems.counts:

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchtrack import readback
 from torchtrack.constants import constant
 from torchtrack.errors import EventDataError
+from torchtrack.polarity import brighter
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,10 @@ class EventBatch:
 
     @classmethod
     def from_numpy(cls, x: np.ndarray, y: np.ndarray, t_us: np.ndarray, polarity: np.ndarray, stream: int = 0) -> "EventBatch":
-        """A batch of one stream from arrays of any integer type; polarity counts as positive where it is > 0.
+        """A batch of one stream from arrays of any integer type; polarity is boolean, 0 or 1, or -1 or 1.
 
         Raises:
-            EventDataError: if lengths differ, an array is not of integers, or a number does not fit.
+            EventDataError: if lengths differ, an array is not of integers, a number does not fit, or polarity is coded in another way.
         """
         lengths = {len(x), len(y), len(t_us), len(polarity)}
         if len(lengths) != 1:
@@ -51,7 +52,7 @@ class EventBatch:
             _integer_tensor(x, np.int32, "x"),
             _integer_tensor(y, np.int32, "y"),
             _integer_tensor(t_us, np.int64, "t"),
-            torch.from_numpy(np.asarray(polarity) > 0),
+            torch.from_numpy(np.require(brighter(np.asarray(polarity)), requirements="W")),
             torch.full((len(x),), stream, dtype=torch.int64),
         )
 

@@ -19,6 +19,7 @@ from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS
 from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, Region, downscaled_camera, find_hot_pixels, region_camera
 from torchtrack.io.keep_up import KeepUp
 from torchtrack.io.live import LiveSource, open_live
+from torchtrack.io.polarity_code import told_if_alike
 from torchtrack.lie import check_pose, rotation_from_quaternion
 from torchtrack.limits import check_limit, limits
 from torchtrack.object_model import ObjectModel
@@ -55,7 +56,7 @@ class Session:
 
     def chunks(self) -> Iterator[EventBatch]:
         """The events after the start and up to the end."""
-        return clipped(self.events.chunks(), self.start_us, self.end_us)
+        return told_if_alike(clipped(self.events.chunks(), self.start_us, self.end_us), f"'{self.name}'")
 
     def with_objects(self, numbers: Sequence[int]) -> "Session":
         """The same stream, with some of the objects."""
@@ -166,15 +167,15 @@ def _open_source(config: RunConfig) -> tuple[str, EventSource, Camera, dict[str,
     if isinstance(config.source, str):
         return _open_live(config.source, config.camera)
     if is_sequence(config.source):
-        sequence = read_sequence(config.source)
+        sequence = read_sequence(config.source, choices=config.events)
         camera = _camera(config.camera) if config.camera else sequence.camera
         return sequence.name, sequence.events, camera, {obj.label: obj for obj in sequence.objects}
     if config.camera is None:
         # Opened first, so that a file that is not there or is not one of events is told as such.
-        open_events(config.source)
+        open_events(config.source, choices=config.events)
         raise ConfigError(f"camera: '{config.source}' holds events alone. Give a calibration file, or fx, fy, cx, cy, width and height.")
     camera = _camera(config.camera)
-    return config.source.stem, open_events(config.source, camera.width, camera.height, config.events.strict), camera, {}
+    return config.source.stem, open_events(config.source, camera.width, camera.height, config.events.strict, config.events), camera, {}
 
 
 def _open_live(source: str, config: CameraConfig | None) -> tuple[str, EventSource, Camera, dict[str, SequenceObject]]:

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from torchtrack.io.columns import Columns
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.extras import optional
 from torchtrack.io.flatbuffer import field_offset, root_table, vector, whole
+from torchtrack.io.one_of_several import chosen_stream
 from torchtrack.io.problems import Problem
 from torchtrack.limits import current_limits
 
@@ -36,12 +37,14 @@ _NONE, _LZ4, _ZSTD = (0,), (1, 2), (3, 4)
 
 @dataclass(frozen=True)
 class Aedat4File(EventFile):
-    """Events of an AEDAT 4 file, of its first stream of events; see :class:`torchtrack.io.event_file.EventFile`.
+    """Events of an AEDAT 4 file, of one of its streams of events; see :class:`torchtrack.io.event_file.EventFile`.
 
     Raises:
         UnknownFormatError: if it is no AEDAT 4 file, or has no events.
         MissingExtraError: if what its compression needs is not installed.
     """
+
+    has_streams: ClassVar[bool] = True
 
     stream_id: int = field(init=False, default=0)
     compression: int = field(init=False, default=0)
@@ -58,13 +61,14 @@ class Aedat4File(EventFile):
         if len(header) != size:
             raise EventDataError(f"'{self.path}' is truncated or damaged: its header should have {size} bytes. Copy it again.")
         compression, end, description = self._parse_header(header)
-        found = _event_stream(description)
-        if found is None:
+        streams = _event_streams(description)
+        if not streams:
             raise UnknownFormatError(f"'{self.path}' holds no stream of events.")
-        values = {"stream_id": found[0], "compression": compression, "offset": len(AEDAT4_MAGIC) + 4 + size, "end": end}
+        chosen = streams[chosen_stream(tuple(streams), self.choices.topic, f"'{self.path}'")]
+        values = {"stream_id": chosen[0], "compression": compression, "offset": len(AEDAT4_MAGIC) + 4 + size, "end": end, "streams": tuple(streams)}
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        self._settle_size(found[1], found[2])
+        self._settle_size(chosen[1], chosen[2])
         # Told at once, not at the first packet.
         _decompressor(self.compression, self.path)
 
@@ -114,11 +118,12 @@ class Aedat4File(EventFile):
 
 def _events(parts: list[bytes]) -> Columns:
     table = np.frombuffer(b"".join(parts), _EVENT)
-    return Columns(table["t"].astype(np.int64), table["x"].astype(np.int32), table["y"].astype(np.int32), table["on"] > 0)
+    return Columns(table["t"].astype(np.int64), table["x"].astype(np.int32), table["y"].astype(np.int32), table["on"].copy())
 
 
-def _event_stream(description: str) -> tuple[int, int | None, int | None] | None:
-    """Number, width and height of the first stream of events."""
+def _event_streams(description: str) -> dict[str, tuple[int, int | None, int | None]]:
+    """Number, width and height of each stream of events, by the camera it is from; by its number where that does not tell them apart."""
+    found: list[tuple[str, tuple[int, int | None, int | None]]] = []
     starts = list(_NODE.finditer(description))
     ends = [match.start() for match in starts[1:]] + [len(description)]
     # Of no node there is still an end.
@@ -127,8 +132,10 @@ def _event_stream(description: str) -> tuple[int, int | None, int | None] | None
         if re.search(r'key="typeIdentifier" type="string">EVTS<', content):
             sizes = [re.search(rf'key="size{axis}" type="int">(\d{{1,5}})<', content) for axis in "XY"]
             width, height = (int(size[1]) if size else None for size in sizes)
-            return int(number), width, height
-    return None
+            camera = re.search(r'key="source" type="string">([^<]+)<', content)
+            found.append((camera[1] if camera else number, (int(number), width, height)))
+    distinct = len({name for name, _ in found}) == len(found)
+    return {name if distinct else str(stream[0]): stream for name, stream in found}
 
 
 def _whole(content: bytes) -> bytes:

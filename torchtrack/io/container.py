@@ -29,8 +29,10 @@ import numpy as np
 import torch
 
 from torchtrack.camera import Camera
+from torchtrack.config.events import ReadingConfig
 from torchtrack.errors import CalibrationError, EventDataError, PoseError
 from torchtrack.files import is_file
+from torchtrack.io.event_file import DEFAULT_CHOICES
 from torchtrack.io.hdf5 import HDF5_MAGIC, Hdf5Events, open_hdf5
 from torchtrack.io.hdf5_storage import check_link, check_whole
 from torchtrack.io.sequence_types import Sequence, SequenceObject
@@ -52,17 +54,17 @@ def is_container(path: Path) -> bool:
         return bool(file.attrs.get("format") == _FORMAT)
 
 
-def read_container(path: Path) -> Sequence:
+def read_container(path: Path, *, choices: ReadingConfig = DEFAULT_CHOICES) -> Sequence:
     """Read a sequence in HDF5; its events stay on disk until they are streamed.
 
-    Model files are put into a temporary folder, which goes with the object that names it.
+    ``choices`` say how its events are read. Model files are put into a temporary folder, which goes with the object that names it.
 
     Raises:
         EventDataError: if something is missing, damaged or of the wrong shape.
         CalibrationError: if the camera makes no sense.
         PoseError: if the ground truth is not rigid, or its times do not increase.
     """
-    events = Hdf5Events(path)
+    events = Hdf5Events(path, choices=choices)
     with open_hdf5(path) as file:
         if file.attrs.get("version") != _VERSION:
             raise EventDataError(

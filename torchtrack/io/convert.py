@@ -11,9 +11,11 @@ from typing import Any, get_args
 
 import numpy as np
 
+from torchtrack.config.events import ReadingConfig
 from torchtrack.config.formats import OutputFormat
 from torchtrack.errors import UnknownFormatError
 from torchtrack.io.container import ContainerWriter, is_container, read_source
+from torchtrack.io.event_file import DEFAULT_CHOICES
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, EventSource
 from torchtrack.io.formats import open_events
 from torchtrack.io.npz import keys_of, open_archive, stream_array
@@ -57,6 +59,7 @@ def convert(
     width: int | None = None,
     height: int | None = None,
     strict: bool = False,
+    choices: ReadingConfig = DEFAULT_CHOICES,
 ) -> Conversion:
     """Write the events of one file into another, and all else of a sequence where both are sequences.
 
@@ -68,16 +71,16 @@ def convert(
         target: the file to write.
         format: its format; by default as its suffix says: ``.raw`` is EVT3, ``.h5`` a sequence if the source is one, else
             the layout of DSEC.
-        width, height, strict: as :func:`torchtrack.io.open_events` takes them.
+        width, height, strict, choices: as :func:`torchtrack.io.open_events` takes them.
 
     Raises:
         UnknownFormatError: if the format is not known, or cannot hold what it should.
         TorchtrackError: what reading or writing raises.
     """
     source, target = Path(source), Path(target)
-    sequence = read_sequence(source) if is_sequence(source) else None
+    sequence = read_sequence(source, choices=choices) if is_sequence(source) else None
     chosen = _format(target, format, sequence is not None)
-    events: EventSource = sequence.events if sequence else open_events(source, width, height, strict)
+    events: EventSource = sequence.events if sequence else open_events(source, width, height, strict, choices)
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
         written = Path(folder) / target.name

@@ -8,27 +8,25 @@ that holds anything else (a comment, an exponent, a sign) is halved until the od
 one by one.
 """
 
-import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from io import BufferedIOBase
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import BinaryIO, ClassVar
 
 import numpy as np
 
+from torchtrack.config.events import ReadingConfig, TimeUnit
 from torchtrack.errors import EventDataError
 from torchtrack.io.columns import Columns, join
-from torchtrack.io.digits import digits
-from torchtrack.io.event_file import EventFile
+from torchtrack.io.digits import digits, whole_numbers
+from torchtrack.io.plausibility import EVENTS, settled_unit, whole_microseconds
 from torchtrack.io.problems import Problem, Problems
-from torchtrack.io.seconds import parse_seconds
-from torchtrack.io.zip_archive import damage_reported, is_zip, open_archive
+from torchtrack.io.seconds import parse_time
+from torchtrack.io.text_file import TextFile, whole_lines
+from torchtrack.io.text_words import as_numbers, parse_whole, settled_polarity
 
 DAVIS240C_SIZE = (240, 180)
 _BLOCK_BYTES = 2 << 20
-_HEAD_BYTES = 1 << 16
 _FEW_BYTES = 512
 _EXPECTED = "expected 't x y p' (seconds, pixels, polarity 0 or 1)"
 
@@ -43,7 +41,7 @@ _FRACTION_DIGITS = 6
 
 
 @dataclass(frozen=True)
-class DavisTextEvents(EventFile):
+class DavisTextEvents(TextFile):
     """Events of a DAVIS text file; see :class:`torchtrack.io.event_file.EventFile`.
 
     The sensor size is that of the DAVIS240C, 240x180, when neither width nor height is given.
@@ -53,70 +51,72 @@ class DavisTextEvents(EventFile):
             given.
     """
 
+    unit_is_open: ClassVar[bool] = True
+
+    unit: TimeUnit = field(init=False, default="s")
+
     def _open(self) -> None:
         if not self.width and not self.height:
             for name, value in zip(("width", "height"), DAVIS240C_SIZE, strict=True):
                 object.__setattr__(self, name, value)
-        with self._stream() as stream, damage_reported(self.path):
-            head = stream.read(_HEAD_BYTES)
-        _check_head(head, self.path, Problems(str(self.path), strict=True))
-
-    @contextmanager
-    def _stream(self) -> Iterator[BufferedIOBase]:
-        """The text, out of its archive where it lies in one."""
-        if not is_zip(self.path):
-            with self.path.open("rb") as stream:
-                yield stream
-            return
-        with open_archive(self.path) as archive:
-            member = text_member(archive)
-            if member is None:
-                raise EventDataError(f"'{self.path}' is a zip archive without a text file of events.")
-            with damage_reported(self.path), cast(BufferedIOBase, archive.open(member)) as text:
-                yield text
+        head = self._head()
+        rows = [words for line in whole_lines(head).splitlines() if len(words := line.partition("#")[0].split()) == 4]
+        settled_polarity([words[3] for words in rows], self.choices.polarity, Problems(str(self.path), strict=False))
+        object.__setattr__(self, "unit", _unit(head, self.choices, Problems(str(self.path), strict=True)))
 
     def _read(self, max_events: int) -> Iterator[Columns]:
         line_number = 1
+        words = _Words.of(self.choices, self.unit)
         with self._stream() as stream:
             for block in _blocks(stream, self.path):
                 # One batch a block, however small the pieces were: those who cut windows pay for every batch.
-                yield join(_parse(block, line_number, self.problems))
+                yield join(_parse(block, line_number, words, self.problems))
                 line_number += block.count(b"\n")
 
 
-def text_member(archive: zipfile.ZipFile) -> str | None:
-    """The text file of an archive that holds the events: ``events.txt``, or the largest."""
-    texts = [entry for entry in archive.infolist() if entry.filename.lower().endswith(".txt")]
-    return max(texts, key=lambda entry: (Path(entry.filename).name == "events.txt", entry.file_size)).filename if texts else None
+@dataclass(frozen=True)
+class _Words:
+    """What the words of a line mean: the unit of its time, and whether its polarity may be any number, as the user says what it means."""
+
+    unit: TimeUnit = "s"
+    any_polarity: bool = False
+
+    @classmethod
+    def of(cls, choices: ReadingConfig, unit: TimeUnit) -> "_Words":
+        """As the user chooses."""
+        return cls(unit, isinstance(choices.polarity, int))
 
 
 def looks_like_davis_text(head: bytes) -> bool:
     """Whether the beginning of a file reads as DAVIS text: its first line with content does (or there is none)."""
     try:
         for line in head.split(b"\n"):
-            if _parse_line(line) is not None:
+            if _parse_line(line, _Words(any_polarity=True)) is not None:
                 return True
     except ValueError:
         return False
     return True
 
 
-def _check_head(head: bytes, path: Path, problems: Problems) -> None:
-    """Raise over a first line that is no event, and times that must be microseconds, without reading on."""
-    times: list[bytes] = []
-    for number, line in enumerate(head.split(b"\n"), start=1):
-        if line.partition(b"#")[0].strip():
+def _unit(head: bytes, choices: ReadingConfig, problems: Problems) -> TimeUnit:
+    """The unit of the times: seconds, where nobody says another and they can be. Raises over a first line that is no event."""
+    times: list[str] = []
+    for number, line in enumerate(whole_lines(head).encode().split(b"\n"), start=1):
+        words = line.partition(b"#")[0].split()
+        if words:
             if not times:
-                _parse_line_of(line, number, problems)
-            times.append(line.split()[0])
-    whole = times[:-1]
-    if len(set(whole)) > 1 and all(time.isdigit() for time in whole):
+                _parse_line_of(line, number, _Words.of(choices, choices.time_unit or "s"), problems)
+            times.append(words[0].decode("ascii", errors="replace"))
+    whole = sorted(set(times), key=times.index)
+    if choices.time_unit is None and len(whole) > 1 and all(time.isdigit() for time in whole):
         raise EventDataError(
-            f"{path}: times {whole[0].decode()}, {whole[1].decode()}, … have no decimals, but DAVIS text has seconds. Divide microseconds by 1e6."
+            f"{problems.source}: times {whole[0]}, {whole[1]}, … have no decimals, but DAVIS text has seconds. "
+            f"Divide microseconds by 1e6, or set {EVENTS.setting} to us (or s, ms or ns)."
         )
+    return settled_unit(as_numbers(times), "s", choices.time_unit, problems.source)
 
 
-def _blocks(stream: BufferedIOBase, path: Path) -> Iterator[bytes]:
+def _blocks(stream: BinaryIO, path: Path) -> Iterator[bytes]:
     """The text in blocks of whole lines, each ending with a newline."""
     rest = b""
     while data := stream.read(_BLOCK_BYTES):
@@ -132,20 +132,23 @@ def _blocks(stream: BufferedIOBase, path: Path) -> Iterator[bytes]:
         yield rest + b"\n"
 
 
-def _parse(block: bytes, line_number: int, problems: Problems) -> Iterator[Columns]:
+def _parse(block: bytes, line_number: int, words: _Words, problems: Problems) -> Iterator[Columns]:
     """Events of whole lines: at once if all are plain, else by halves, and line by line in the end."""
-    columns = _parse_plain(block)
+    columns = _parse_plain(block, words)
     if columns is not None:
         yield columns
     elif len(block) <= _FEW_BYTES or (middle := block.find(b"\n", len(block) // 2) + 1) in (0, len(block)):
-        yield _parse_lines(block, line_number, problems)
+        yield _parse_lines(block, line_number, words, problems)
     else:
-        yield from _parse(block[:middle], line_number, problems)
-        yield from _parse(block[middle:], line_number + block.count(b"\n", 0, middle), problems)
+        yield from _parse(block[:middle], line_number, words, problems)
+        yield from _parse(block[middle:], line_number + block.count(b"\n", 0, middle), words, problems)
 
 
-def _parse_plain(block: bytes) -> Columns | None:
-    """Events of a block where every line is ``digits.digits digits digits 0|1``, or None if any is not."""
+def _parse_plain(block: bytes, words: _Words) -> Columns | None:
+    """Events of a block where every line is ``digits.digits digits digits 0|1`` (no decimals but of seconds), or None if any is not."""
+    if words.unit != "s":
+        table = whole_numbers(block.replace(b"\t", b",").replace(b" ", b","), 4)
+        return None if table is None else Columns(whole_microseconds(table[0], words.unit, "events"), *table[1:])
     # Padding: digits are looked up at fixed places, which may lie past the last line.
     data = np.frombuffer(block + b" " * (_FRACTION_DIGITS + 2), np.uint8)
     if not _IS_PLAIN[data].all():
@@ -162,7 +165,7 @@ def _parse_plain(block: bytes) -> Columns | None:
     if not _is_regular(starts, ends, newlines, dots):
         return None
     polarity = data[starts[3]] - ord("0")
-    if (polarity > 1).any():
+    if (polarity > 1).any() and not words.any_polarity:
         return None
     t_us = 1_000_000 * digits(data, starts[0], dots) + _microseconds(data, dots + 1, ends[0])
     return Columns(t_us, digits(data, starts[1], ends[1]), digits(data, starts[2], ends[2]), polarity)
@@ -192,22 +195,22 @@ def _microseconds(data: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.
     return value + ((lengths > _FRACTION_DIGITS) & (data[starts + _FRACTION_DIGITS] >= ord("5")))
 
 
-def _parse_lines(block: bytes, line_number: int, problems: Problems) -> Columns:
-    events = (_parse_line_of(line, number, problems) for number, line in enumerate(block.split(b"\n"), start=line_number))
+def _parse_lines(block: bytes, line_number: int, words: _Words, problems: Problems) -> Columns:
+    events = (_parse_line_of(line, number, words, problems) for number, line in enumerate(block.split(b"\n"), start=line_number))
     table = np.array([event for event in events if event is not None], dtype=np.int64).reshape(-1, 4)
     return Columns(*table.T)
 
 
-def _parse_line_of(line: bytes, number: int, problems: Problems) -> tuple[int, int, int, int] | None:
+def _parse_line_of(line: bytes, number: int, meant: _Words, problems: Problems) -> tuple[int, int, int, int] | None:
     try:
-        return _parse_line(line)
+        return _parse_line(line, meant)
     except ValueError as error:
         shown = line[:80].decode("utf-8", errors="replace").strip()
         problems.found(Problem.MALFORMED, 1, f"line {number}: {_EXPECTED}, got '{shown}': {error}.")
         return None
 
 
-def _parse_line(line: bytes) -> tuple[int, int, int, int] | None:
+def _parse_line(line: bytes, meant: _Words) -> tuple[int, int, int, int] | None:
     """``t_us, x, y, polarity`` of one line; None if it holds nothing but a comment; ValueError if it is malformed."""
     words = line.partition(b"#")[0].decode("ascii", errors="replace").split()
     if not words:
@@ -216,15 +219,7 @@ def _parse_line(line: bytes) -> tuple[int, int, int, int] | None:
         raise ValueError(f"it has {len(words)} columns")
     if b"_" in line:
         raise ValueError("numbers hold no underscores")
-    t_us, x, y, polarity = parse_seconds(words[0]), _whole(words[1]), _whole(words[2]), _whole(words[3])
-    if polarity not in (-1, 0, 1):
+    t_us, x, y, polarity = parse_time(words[0], meant.unit), parse_whole(words[1]), parse_whole(words[2]), parse_whole(words[3])
+    if polarity not in (-1, 0, 1) and not meant.any_polarity:
         raise ValueError(f"polarity {polarity} is none of 0, 1 and -1")
     return t_us, x, y, polarity
-
-
-def _whole(word: str) -> int:
-    """A pixel coordinate or polarity; ``162.0`` counts as whole, ``162.5`` does not."""
-    value = float(word)
-    if not value.is_integer() or abs(value) >= 2**31:
-        raise ValueError(f"'{word}' is not a whole number of pixels or a polarity")
-    return int(value)

@@ -4,15 +4,20 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
+from torchtrack.config.events import ReadingConfig
 from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch
 from torchtrack.files import check_is_file, naming
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
 from torchtrack.io.event_stream import EventStream
+from torchtrack.io.polarity_code import PolarityCode
 from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.soundness import mended, sound
+
+DEFAULT_CHOICES = ReadingConfig()
 
 
 @dataclass(frozen=True)
@@ -25,17 +30,25 @@ class EventFile(EventStream):
         strict: whether faults are errors; otherwise what can be read is read, and the rest is counted in
             :attr:`problems` and reported by a warning at the end.
         start_us: events before this time are passed over.
+        choices: how what the file does not say is read: unit of times, code of polarity, which of several streams.
 
     Raises:
         MissingFileError: if there is no such file.
-        EventDataError: if it is damaged so that nothing can be read, or the sensor size is unknown or disagrees.
+        EventDataError: if it is damaged so that nothing can be read, the sensor size is unknown or disagrees, or something is
+            chosen that the format leaves no choice of.
     """
+
+    # Of a format: whether files do not say the unit of times for sure, and whether they can hold several streams.
+    unit_is_open: ClassVar[bool] = False
+    has_streams: ClassVar[bool] = False
 
     path: Path
     width: int = 0
     height: int = 0
     strict: bool = True
     start_us: int | None = None
+    choices: ReadingConfig = DEFAULT_CHOICES
+    streams: tuple[str, ...] = field(init=False, default=(), compare=False)
     problems: Problems = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -43,6 +56,7 @@ class EventFile(EventStream):
         if not self.path.is_dir():
             check_is_file(self.path, "event file")
         object.__setattr__(self, "problems", Problems(str(self.path), self.strict))
+        self._check_choices()
         with naming(self.path):
             self._open()
         check_sensor_size(self.width, self.height, str(self.path))
@@ -75,7 +89,7 @@ class EventFile(EventStream):
     def _checked(self, max_events: int) -> Iterator[EventBatch]:
         self.problems.clear()
         last_us, count = None, 0
-        parts = self._readable(max_events)
+        parts = self._with_polarity(self._readable(max_events))
         for part in parts if self.strict else mended(parts):
             events = self._started(part)
             usable = sound(events, self.width, self.height, self.problems, last_us, count)
@@ -95,6 +109,19 @@ class EventFile(EventStream):
             if self.strict:
                 raise
             self.problems.found(Problem.DAMAGED, 1, str(error))
+
+    def _with_polarity(self, parts: Iterator[Columns]) -> Iterator[Columns]:
+        """The same events, with booleans for the codes of polarity that the file has."""
+        code = PolarityCode(self.choices.polarity, self.problems)
+        yield from map(code.applied, parts)
+
+    def _check_choices(self) -> None:
+        """Raise :class:`EventDataError` where the user chooses what the format says itself."""
+        for name, has_choice in (("time_unit", self.unit_is_open), ("topic", self.has_streams)):
+            given = getattr(self.choices, name)
+            if given is not None and not has_choice:
+                says = "the unit of its times" if name == "time_unit" else "a single stream of events"
+                raise EventDataError(f"'{self.path}': events.{name} is '{given}', but this format has {says}. Leave it out.")
 
     def _started(self, events: Columns) -> Columns:
         if self.start_us is None or len(events) == 0 or events.t_us.min() >= self.start_us:

@@ -3,23 +3,26 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO, cast
 
+from torchtrack.config.events import ReadingConfig
 from torchtrack.errors import UnknownFormatError
 from torchtrack.files import check_is_file, is_file
 from torchtrack.io.aedat4 import AEDAT4_MAGIC, Aedat4File
-from torchtrack.io.csv_text import CsvFile, column_order
+from torchtrack.io.csv_text import CsvFile
 from torchtrack.io.dat import DatFile
-from torchtrack.io.davis_text import DavisTextEvents, looks_like_davis_text, text_member
+from torchtrack.io.davis_text import DavisTextEvents, looks_like_davis_text
 from torchtrack.io.es_file import ES_MAGIC, EsFile
-from torchtrack.io.event_file import EventFile
+from torchtrack.io.event_file import DEFAULT_CHOICES, EventFile
 from torchtrack.io.hdf5 import HDF5_MAGIC, Hdf5Events
 from torchtrack.io.npz import NpzEvents, keys_of
 from torchtrack.io.prophesee_header import parse_header
 from torchtrack.io.raw_file import RawFile
 from torchtrack.io.ros_bag import MCAP_MAGIC, ROS1_MAGIC, SQLITE_MAGIC, RosBag, is_bag_folder
+from torchtrack.io.text_file import HEAD_BYTES, as_utf8, text_member, utf8_head, whole_lines
+from torchtrack.io.text_layout import has_named_columns, looks_like_events
 from torchtrack.io.zip_archive import ZIP_MAGIC, open_archive
 
-_HEAD_BYTES = 1 << 16
 _SUPPORTED = (
     "numpy .npz (arrays t, x, y, p), DAVIS text (lines 't x y p', t in seconds; also zipped), CSV, Prophesee RAW (EVT2, EVT2.1, EVT3), "
     "DAT and HDF5, DSEC HDF5, AEDAT4, Event Stream (.es), ROS 1 and ROS 2 bags (event_camera_msgs, dvs_msgs)"
@@ -47,7 +50,13 @@ FORMAT_NAMES: dict[type[EventFile], str] = {
 }
 
 
-def open_events(path: str | os.PathLike[str], width: int | None = None, height: int | None = None, strict: bool = False) -> EventFile:
+def open_events(
+    path: str | os.PathLike[str],
+    width: int | None = None,
+    height: int | None = None,
+    strict: bool = False,
+    choices: ReadingConfig = DEFAULT_CHOICES,
+) -> EventFile:
     """Open a file of events; its format is told by its content.
 
     Args:
@@ -55,6 +64,7 @@ def open_events(path: str | os.PathLike[str], width: int | None = None, height: 
         width, height: sensor size in pixels, where the file does not say it (DAVIS text: 240x180 when not given).
         strict: whether what is wrong in the stream is an error. If not, what can be read is read; what was left out is
             counted in ``problems`` and reported by a warning at the end of the stream.
+        choices: how what the file does not say is read: unit of times, code of polarity, which of several streams.
 
     Raises:
         MissingFileError: if there is no such file.
@@ -63,7 +73,7 @@ def open_events(path: str | os.PathLike[str], width: int | None = None, height: 
         EventDataError: if it is damaged so that it cannot be opened. Events are checked as they are streamed.
     """
     path = Path(path)
-    return reader_of(path)(path, width or 0, height or 0, strict)
+    return reader_of(path)(path, width or 0, height or 0, strict, choices=choices)
 
 
 def reader_of(path: Path) -> Callable[..., EventFile]:
@@ -80,7 +90,7 @@ def reader_of(path: Path) -> Callable[..., EventFile]:
     if not path.is_file():
         raise UnknownFormatError(f"'{path}' is not a file. Supported: {_SUPPORTED}.")
     with path.open("rb") as stream:
-        head = stream.read(_HEAD_BYTES)
+        head = stream.read(HEAD_BYTES)
     found = _by_head(head, path)
     if found is None:
         raise UnknownFormatError(f"'{path}' is in no known event format (it starts with {head[:16]!r}). Supported: {_SUPPORTED}.")
@@ -96,16 +106,27 @@ def _by_head(head: bytes, path: Path) -> type[EventFile] | None:
     header = parse_header(head)
     if header is not None and header.encoding is not None:
         return DatFile if header.encoding == "dat" else RawFile
+    return _of_text(utf8_head(head), path.suffix.lower())
+
+
+def _of_text(head: bytes, suffix: str) -> type[EventFile] | None:
     if head.translate(None, delete=_BINARY) != head:
         return None
+    # Columns that are named may be in any order, and times in any unit.
+    if has_named_columns(whole_lines(head)):
+        return CsvFile
     if looks_like_davis_text(head):
         return DavisTextEvents
-    if column_order(head) is not None:
+    if looks_like_events(whole_lines(head)):
         return CsvFile
     # A text file that is named like one of events is taken for one, so that the error tells which line is wrong.
-    return {".txt": DavisTextEvents, ".csv": CsvFile}.get(path.suffix.lower())
+    return {".txt": DavisTextEvents, ".csv": CsvFile, ".tsv": CsvFile}.get(suffix)
 
 
 def _of_archive(path: Path) -> type[EventFile]:
     with open_archive(path) as archive:
-        return DavisTextEvents if not keys_of(archive) and text_member(archive) else NpzEvents
+        member = text_member(archive)
+        if keys_of(archive) or member is None:
+            return NpzEvents
+        with archive.open(member) as stream:
+            return _of_text(as_utf8(cast(BinaryIO, stream)).read(HEAD_BYTES), Path(member).suffix.lower()) or DavisTextEvents

@@ -2,8 +2,10 @@
 
 Layouts, told by what is there:
 
-- a group with the arrays ``x y t p`` (DSEC and our own: ``events``; M3ED: ``prophesee/left``) or ``xs ys ts ps``; integer times
-  are in µs, others in seconds. ``t_offset``, beside the group or in it, is added, as DSEC has it; ``ms_to_idx`` speeds up seeking.
+- a group with the arrays ``x y t p`` (DSEC and our own: ``events``; M3ED: ``prophesee/left``), ``xs ys ts ps`` or other usual names.
+  The unit of the times may be said by their name (``t_ns``), an attribute ``unit``, or the user; else integers are in µs, others in
+  seconds, where that is plausible. Of several such groups (a left and a right camera) one is chosen. ``t_offset`` (µs), beside the
+  group or in it, is added, as DSEC has it; ``ms_to_idx`` speeds up seeking.
 - ``CD/events``: records ``x y p t`` of Prophesee, compressed by their filter ECF, which has to be installed apart.
 
 The sensor size comes from ``width`` and ``height`` (attributes of the group or the file), ``resolution``, ``sensor_resolution``
@@ -16,23 +18,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import h5py
 import numpy as np
 
+from torchtrack.config.events import TimeUnit
 from torchtrack.errors import EventDataError, TorchtrackError, UnknownFormatError
 from torchtrack.files import check_is_file
+from torchtrack.io.column_names import unit_of
 from torchtrack.io.columns import Columns, shifted
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.event_source import PART_EVENTS
 from torchtrack.io.extras import optional
 from torchtrack.io.hdf5_storage import check_array, check_link
+from torchtrack.io.hdf5_streams import Hdf5Stream, streams_of
+from torchtrack.io.one_of_several import chosen_stream
+from torchtrack.io.plausibility import settled_unit, whole_microseconds
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-_LAYOUTS = (("x", "y", "t", "p"), ("xs", "ys", "ts", "ps"))
-_GROUPS = ("events", "prophesee/left", "davis/left/events", "/")
-_PLACES = ("CD/events", *_GROUPS[:-1], "t_offset", "ms_to_idx", "resolution")
+_PLACES = ("CD/events", "events", "prophesee/left", "davis/left/events", "t_offset", "ms_to_idx", "resolution")
 _ECF_FILTER = 0x8ECF
 _MOST_ITEM_BYTES = 256
 _DSEC_SIZE, _PROPHESEE_SIZE = (640, 480), (1280, 720)
@@ -69,8 +74,12 @@ class Hdf5Events(EventFile):
         EventDataError: if Prophesee's filter is missing, or arrays are of the wrong kind.
     """
 
-    group: str = field(init=False, default="")
+    unit_is_open: ClassVar[bool] = True
+    has_streams: ClassVar[bool] = True
+
+    stream: Hdf5Stream = field(init=False, default=Hdf5Stream(""))
     count: int = field(init=False, default=0)
+    unit: TimeUnit = field(init=False, default="us")
 
     @property
     def known_count(self) -> int | None:
@@ -81,13 +90,14 @@ class Hdf5Events(EventFile):
         with open_hdf5(self.path) as file:
             for name in _PLACES:
                 check_link(file, name, self.path)
-            group = find_events(file)
-            if group is None:
+            streams = streams_of(file, self.path)
+            if not streams:
                 raise UnknownFormatError(
                     f"'{self.path}' is an HDF5 file without events that are known: x, y, t and p in one group, or CD/events. "
                     f"It holds: {', '.join(sorted(file)) or 'nothing'}."
                 )
-            arrays = _arrays(file, group)
+            stream = streams[chosen_stream(tuple(streams), self.choices.topic, f"'{self.path}'")]
+            arrays = _arrays(file, stream)
             lengths = {array.shape for array in arrays}
             if len(lengths) != 1 or len(next(iter(lengths))) != 1:
                 raise EventDataError(f"'{self.path}': x, y, t and p must be flat and of one length, got {[array.shape for array in arrays]}.")
@@ -95,15 +105,26 @@ class Hdf5Events(EventFile):
                 _check_numbers(array, self.path)
                 check_array(array, self.path)
                 _check_filters(array, self.path)
-            object.__setattr__(self, "group", group)
-            object.__setattr__(self, "count", arrays[0].shape[0])
-            size = _sensor_size(file, group)
-        self._settle_size(*size, default=_PROPHESEE_SIZE if group == "CD/events" else _DSEC_SIZE)
+            unit = self._unit(file, stream, arrays[0])
+            for name, value in (("stream", stream), ("streams", tuple(streams)), ("count", arrays[0].shape[0]), ("unit", unit)):
+                object.__setattr__(self, name, value)
+            size = _sensor_size(file, stream.group)
+        self._settle_size(*size, default=_PROPHESEE_SIZE if stream.is_records else _DSEC_SIZE)
+
+    def _unit(self, file: h5py.File, stream: Hdf5Stream, times: h5py.Dataset) -> TimeUnit:
+        """The unit of the times: as the user, the file or the layout says, else what is plausible."""
+        if stream.is_records:
+            return self.choices.time_unit or "us"
+        said = next((unit_of(str(times.attrs[name])) for name in ("unit", "units") if name in times.attrs), None)
+        # Whole µs, by the custom of data sets that have these tables.
+        is_dsec = times.dtype.kind in "iu" and any(_beside(file, stream.group, name) is not None for name in ("ms_to_idx", "t_offset"))
+        told = self.choices.time_unit or said or stream.unit or ("us" if is_dsec else None)
+        return settled_unit(times[:PART_EVENTS], "us" if times.dtype.kind in "iu" else "s", told, f"'{self.path}'")
 
     def _read(self, max_events: int) -> Iterator[Columns]:
         with open_hdf5(self.path) as file:
-            offset_us = _time_offset(file, self.group)
-            arrays = _arrays(file, self.group)
+            offset_us = _time_offset(file, self.stream.group)
+            arrays = _arrays(file, self.stream)
             size = min(max_events, PART_EVENTS)
             for start in range(self._first(file, offset_us), self.count, size):
                 part = slice(start, min(start + size, self.count))
@@ -114,48 +135,32 @@ class Hdf5Events(EventFile):
             records = arrays[0][part]
             t, x, y, p = (records[name] for name in ("t", "x", "y", "p"))
         else:
-            x, y, t, p = (array[part] for array in arrays)
-        return Columns(shifted(_microseconds(t), offset_us), _whole(x), _whole(y), p > 0)
+            t, x, y, p = (array[part] for array in arrays)
+        return Columns(shifted(whole_microseconds(t, self.unit, f"'{self.path}'"), offset_us), _whole(x), _whole(y), p)
 
     def _first(self, file: h5py.File, offset_us: int) -> int:
         """Index of an event not after ``start_us``, by the table of milliseconds where there is one."""
-        table = file.get(f"{self.group}/ms_to_idx") or file.get("ms_to_idx")
-        if self.start_us is None or not isinstance(table, h5py.Dataset) or len(table) == 0 or table.dtype.kind not in "iu":
+        table = _beside(file, self.stream.group, "ms_to_idx")
+        if self.start_us is None or table is None or len(table) == 0 or table.dtype.kind not in "iu":
             return 0
         millisecond = min(max((self.start_us - offset_us) // 1000, 0), len(table) - 1)
         return min(max(int(table[millisecond]), 0), self.count)
 
 
-def find_events(file: h5py.File) -> str | None:
-    """The group of a file that holds events, or ``CD/events``; None if there is none."""
-    records = file.get("CD/events")
-    if isinstance(records, h5py.Dataset):
-        return "CD/events" if records.dtype.names and {"x", "y", "p", "t"} <= set(records.dtype.names) else None
-    for name in _GROUPS:
-        if _names(file, name) is not None:
-            return name
-    return None
+def _arrays(file: h5py.File, stream: Hdf5Stream) -> list[h5py.Dataset]:
+    """The one array of records, or those of t, x, y and p."""
+    return [file[stream.group]] if stream.is_records else [file[stream.group][name] for name in stream.names]
 
 
-def _names(file: h5py.File, group: str) -> tuple[str, ...] | None:
-    """Names of x, y, t and p in a group."""
-    found = file.get(group)
-    if not isinstance(found, h5py.Group):
-        return None
-    for name in {name for names in _LAYOUTS for name in names} & set(found):
-        check_link(found, name, Path(file.filename))
-    return next((names for names in _LAYOUTS if all(isinstance(found.get(name), h5py.Dataset) for name in names)), None)
-
-
-def _arrays(file: h5py.File, group: str) -> list[h5py.Dataset]:
-    """The one array of records, or those of x, y, t and p."""
-    names = _names(file, group)
-    return [file[group]] if names is None else [file[group][name] for name in names]
+def _beside(file: h5py.File, group: str, name: str) -> h5py.Dataset | None:
+    """An array in the group of the events, or in the file itself."""
+    found = (file.get(f"{group}/{name}"), file.get(name))
+    return next((array for array in found if isinstance(array, h5py.Dataset)), None)
 
 
 def _check_numbers(array: h5py.Dataset, path: Path) -> None:
     """Refuse an array of anything but numbers; of records, those of which t, x, y or p is none."""
-    fields = {name: array.dtype[name] for name in _LAYOUTS[0]} if array.dtype.names else {str(array.name).rpartition("/")[2]: array.dtype}
+    fields = {name: array.dtype[name] for name in "xytp"} if array.dtype.names else {str(array.name).rpartition("/")[2]: array.dtype}
     for name, dtype in fields.items():
         if dtype.kind not in ("iufb" if name.startswith("p") else "iuf"):
             raise EventDataError(f"'{path}': '{name}' must hold numbers, got {dtype}.")
@@ -179,11 +184,8 @@ def _check_filters(array: h5py.Dataset, path: Path) -> None:
 
 
 def _time_offset(file: h5py.File, group: str) -> int:
-    for place in (f"{group}/t_offset", "t_offset"):
-        found = file.get(place)
-        if isinstance(found, h5py.Dataset) and found.size == 1 and found.dtype.kind in "iu":
-            return int(found[()].item())
-    return 0
+    found = _beside(file, group, "t_offset")
+    return int(found[()].item()) if found is not None and found.size == 1 and found.dtype.kind in "iu" else 0
 
 
 def _sensor_size(file: h5py.File, group: str) -> tuple[int | None, int | None]:
@@ -212,17 +214,6 @@ def _length(value: Any) -> int | None:
     except (TypeError, ValueError, OverflowError):
         return None
     return length if 0 < length <= 1 << 16 else None
-
-
-def _microseconds(t: np.ndarray) -> np.ndarray:
-    """Whole µs; other numbers are seconds, rounded to the nearest µs."""
-    if t.dtype == np.uint64 and t.max(initial=0) > np.iinfo(np.int64).max:
-        raise EventDataError(f"times reach {t.max()}, which is beyond 64 bits with a sign. Check the unit.")
-    if t.dtype.kind != "f":
-        return t.astype(np.int64)
-    if not np.isfinite(t).all() or (np.abs(t) > 9e12).any():
-        raise EventDataError("times are not finite seconds.")
-    return np.floor(t.astype(np.float64) * 1e6 + 0.5).astype(np.int64)
 
 
 def _whole(pixels: np.ndarray) -> np.ndarray:

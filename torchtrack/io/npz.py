@@ -1,5 +1,7 @@
 """Events in ``.npz`` files, streamed: members ``t`` (µs), ``x``, ``y``, ``p``, compressed or stored.
 
+Other usual names are taken too (``timestamps``, ``t_ns``, …), and several sets (``left_t``, ``right_t``, …), of which one is chosen.
+
 ``numpy.load`` would read whole arrays; here the members are read through :mod:`zipfile`, chunk by chunk, so that memory
 does not grow with the file. Pickled objects are never loaded.
 """
@@ -10,20 +12,26 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import ClassVar, cast
 
 import numpy as np
 
+from torchtrack.config.events import TimeUnit
 from torchtrack.errors import EventDataError, UnknownFormatError
 from torchtrack.io.columns import Columns
+from torchtrack.io.event_arrays import EventArrays, event_sets
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.event_source import PART_EVENTS
+from torchtrack.io.one_of_several import chosen_stream
+from torchtrack.io.plausibility import EVENTS, settled_unit, whole_microseconds
 from torchtrack.io.zip_archive import ZIP_MAGIC, damage_reported, open_archive
 from torchtrack.limits import check_limit
 
 __all__ = ["ZIP_MAGIC", "NpzEvents", "keys_of", "open_archive", "read_array"]
 
 _EVENT_KEYS = ("t", "x", "y", "p")
+# What a sequence has, whose times are in µs.
+_OF_SEQUENCE = "K"
 # What numpy is known to raise over headers: it parses them as Python literals.
 _BAD_HEADER = (ValueError, KeyError, TypeError, SyntaxError, OverflowError, MemoryError, RecursionError, IndexError, tokenize.TokenError)
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -117,6 +125,8 @@ def stream_array(archive: zipfile.ZipFile, key: str, path: Path, size: int) -> I
 class NpzEvents(EventFile):
     """Events of an ``.npz`` file: integer arrays ``t`` (µs), ``x``, ``y`` and polarity ``p`` of one length.
 
+    Times in another unit, or that are no integers, are read where the unit is told by their name or by the user.
+
     The sensor size is taken from the arrays ``width`` and ``height`` where the file has them; see
     :class:`torchtrack.io.event_file.EventFile`.
 
@@ -126,7 +136,12 @@ class NpzEvents(EventFile):
             or differs from the one in the file.
     """
 
+    unit_is_open: ClassVar[bool] = True
+    has_streams: ClassVar[bool] = True
+
     count: int = field(init=False, default=0)
+    keys: tuple[str, ...] = field(init=False, default=_EVENT_KEYS)
+    unit: TimeUnit = field(init=False, default="us")
 
     @property
     def known_count(self) -> int | None:
@@ -134,26 +149,42 @@ class NpzEvents(EventFile):
         return self.count
 
     def _open(self) -> None:
-        with open_archive(self.path) as archive:
+        with open_archive(self.path) as archive, ExitStack() as stack:
             if not keys_of(archive):
                 raise UnknownFormatError(f"'{self.path}' is a zip archive, but holds no numpy arrays (.npy).")
             for name in ("width", "height"):
                 object.__setattr__(self, name, _sensor_length(archive, name, getattr(self, name), self.path))
-            members = [_open_member(archive, key, self.path) for key in _EVENT_KEYS]
-        for member, key in zip(members, _EVENT_KEYS, strict=True):
-            _check_event_member(member, key, members[0].shape)
-        object.__setattr__(self, "count", members[0].shape[0])
+            chosen = self._chosen(keys_of(archive))
+            told = self.choices.time_unit or chosen.unit or ("us" if _OF_SEQUENCE in keys_of(archive) else None)
+            members = [_open_member(archive, key, self.path) for key in chosen.names]
+            for member in members:
+                stack.callback(member.stream.close)
+            for member, key, name in zip(members, chosen.names, _EVENT_KEYS, strict=True):
+                _check_event_member(member, key, members[0].shape, name, told is not None)
+            count = members[0].shape[0]
+            unit = settled_unit(members[0].read(min(count, PART_EVENTS)), "us", told, f"'{self.path}'")
+        for field_name, value in (("count", count), ("keys", chosen.names), ("unit", unit)):
+            object.__setattr__(self, field_name, value)
+
+    def _chosen(self, keys: set[str]) -> EventArrays:
+        """The arrays to read."""
+        sets = {prefix or "events": arrays for prefix, arrays in event_sets(keys).items()}
+        if not sets:
+            return EventArrays(_EVENT_KEYS, None)
+        object.__setattr__(self, "streams", tuple(sets))
+        return sets[chosen_stream(self.streams, self.choices.topic, f"'{self.path}'")]
 
     def _read(self, max_events: int) -> Iterator[Columns]:
         with ExitStack() as stack:
             archive = stack.enter_context(open_archive(self.path))
-            members = [_open_member(archive, key, self.path) for key in _EVENT_KEYS]
+            members = [_open_member(archive, key, self.path) for key in self.keys]
             for member in members:
                 stack.enter_context(member.stream)
             part = min(max_events, PART_EVENTS)
             for start in range(0, self.count, part):
                 size = min(part, self.count - start)
-                yield Columns(*(member.read(size) for member in members))
+                t, x, y, p = (member.read(size) for member in members)
+                yield Columns(whole_microseconds(t, self.unit, f"'{self.path}'"), x, y, p)
             for member in members:
                 member.finish()
 
@@ -172,9 +203,12 @@ def _sensor_length(archive: zipfile.ZipFile, name: str, given: int, path: Path) 
     return int(stored.item())
 
 
-def _check_event_member(member: _Member, key: str, shape: tuple[int, ...]) -> None:
+def _check_event_member(member: _Member, key: str, shape: tuple[int, ...], name: str, unit_told: bool) -> None:
+    """Raise unless an array can be that of ``name``: t, x, y or p; times may have decimals where their unit is told."""
     if len(member.shape) != 1 or member.shape != shape:
         raise EventDataError(f"'{member.path}': t, x, y and p must be flat and of one length, but '{key}' has shape {member.shape} and t {shape}.")
-    if member.dtype.kind not in ("iub" if key == "p" else "iu"):
-        unit = "microseconds" if key == "t" else "numbers"
-        raise EventDataError(f"'{member.path}': '{key}' must be integer {unit}, got {member.dtype}. Convert and save it again.")
+    if name == "t" and member.dtype.kind == "f" and not unit_told:
+        got = f"'{member.path}': '{key}' must be integer microseconds, got {member.dtype}."
+        raise EventDataError(f"{got} If it has another unit, set {EVENTS.setting} to s, ms, us or ns.")
+    if member.dtype.kind not in {"t": "iuf", "p": "iufb"}.get(name, "iu"):
+        raise EventDataError(f"'{member.path}': '{key}' must be integer numbers, got {member.dtype}. Convert and save it again.")

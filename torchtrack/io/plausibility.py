@@ -21,6 +21,8 @@ _LATEST_S = 2.0**32
 # Of so many numbers at least a few would have decimals if they were seconds.
 _FEWEST_WHOLE = 4
 _GROUPS = 10
+# Of fewer steps in time, the rate is chance.
+_FEWEST_STEPS = 40
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Timed:
         name: for messages, as in "events".
         setting: the setting, and where else the unit can be said.
         possible, usual: least and most in a second.
-        fewest: of fewer the rate says nothing that would be an error; of ten times as many, it may be doubted.
+        fewest: of fewer the rate says nothing that would be an error; of twice as many, it may be doubted.
     """
 
     name: str
@@ -41,7 +43,7 @@ class Timed:
     fewest: int
 
 
-EVENTS = Timed("events", "events.time_unit (--time-unit)", possible=(10.0, 5e9), usual=(1e3, 2e8), fewest=50)
+EVENTS = Timed("events", "events.time_unit (--time-unit)", possible=(10.0, 5e9), usual=(1e3, 2e8), fewest=300)
 
 
 @dataclass(frozen=True)
@@ -50,14 +52,14 @@ class TimeNumbers:
 
     Args:
         shown: the first two that differ, for messages.
-        furthest: the largest absolute value.
+        distance: from zero: the median, so that a single wild time does not count.
         rate: how many there are in one of the unit; None where there are too few to say.
         count: how many numbers were looked at.
         whole: whether all are whole numbers, and differ.
     """
 
     shown: tuple[float, ...]
-    furthest: float
+    distance: float
     rate: float | None
     count: int
     whole: bool
@@ -70,12 +72,12 @@ class TimeNumbers:
             return None
         later = values[values != values[0]][:1]
         whole = len(np.unique(values[:1000])) >= _FEWEST_WHOLE and bool((values == np.floor(values)).all())
-        return cls((values[0].item(), *later.tolist()), float(np.abs(values).max()), _rate(values, fewest), len(values), whole)
+        return cls((values[0].item(), *later.tolist()), float(np.median(np.abs(values))), _rate(values, fewest), len(values), whole)
 
 
 def _rate(values: np.ndarray, fewest: int) -> float | None:
     """How many there are in one of the unit: the median of groups, which a jump or a wrap of the clock leaves as it is."""
-    if len(values) < fewest:
+    if len(values) < fewest or np.count_nonzero(np.diff(values)) < _FEWEST_STEPS:
         return None
     size = len(values) // _GROUPS
     groups = values[: size * _GROUPS].reshape(_GROUPS, size)
@@ -130,7 +132,7 @@ class _Fault:
 
 
 def _fault(found: TimeNumbers, unit: TimeUnit, timed: Timed) -> _Fault | None:
-    latest_s = found.furthest * US_PER_UNIT[unit] * 1e-6
+    latest_s = found.distance * US_PER_UNIT[unit] * 1e-6
     if latest_s > _LATEST_S:
         return _Fault(f"that would be {latest_s / 31_556_952:,.0f} years", possible=False)
     if unit == "s" and found.whole:
@@ -141,7 +143,7 @@ def _fault(found: TimeNumbers, unit: TimeUnit, timed: Timed) -> _Fault | None:
     reason = f"that would be {rate:,.3g} {timed.name} a second"
     if not timed.possible[0] <= rate <= timed.possible[1]:
         return _Fault(reason, possible=False)
-    return _Fault(reason, possible=True) if found.count >= 10 * timed.fewest and not _is_usual(found, unit, timed) else None
+    return _Fault(reason, possible=True) if found.count >= 2 * timed.fewest and not _is_usual(found, unit, timed) else None
 
 
 def _is_usual(found: TimeNumbers, unit: TimeUnit, timed: Timed) -> bool:

@@ -6,7 +6,9 @@ Seconds are therefore parsed as decimals and rounded to the nearest microsecond,
 
 from decimal import ROUND_FLOOR, Context, Decimal, InvalidOperation
 
-_MICROSECONDS = Decimal(1_000_000)
+from torchtrack.config.events import TimeUnit
+
+_US_PER_UNIT: dict[TimeUnit, Decimal] = {"s": Decimal(1_000_000), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}
 _HALF = Decimal("0.5")
 # Enough digits that nothing is rounded before the floor, for any time that fits 64 bits.
 _EXACT = Context(prec=100)
@@ -19,15 +21,24 @@ def parse_seconds(text: str) -> int:
     Raises:
         ValueError: if the text is no finite number, or its microseconds do not fit 64 bits.
     """
+    return parse_time(text, "s")
+
+
+def parse_time(text: str, unit: TimeUnit) -> int:
+    """Microseconds of a decimal number of a unit, rounded to the nearest, halves up.
+
+    Raises:
+        ValueError: if the text is no finite number, or its microseconds do not fit 64 bits.
+    """
     try:
-        seconds = Decimal(text)
+        time = Decimal(text)
     except InvalidOperation:
         raise ValueError(f"'{text}' is not a number") from None
-    if not seconds.is_finite() or seconds.adjusted() > 18:
-        raise ValueError(f"'{text}' is not a time in seconds")
-    t_us = int(_EXACT.add(_EXACT.multiply(seconds, _MICROSECONDS), _HALF).to_integral_value(ROUND_FLOOR))
+    if not time.is_finite() or time.adjusted() > 21:
+        raise ValueError(f"'{text}' is not a time in {unit}")
+    t_us = int(_EXACT.add(_EXACT.multiply(time, _US_PER_UNIT[unit]), _HALF).to_integral_value(ROUND_FLOOR))
     if abs(t_us) > _LARGEST_US:
-        raise ValueError(f"'{text}' seconds do not fit 64 bits of microseconds")
+        raise ValueError(f"'{text}' {unit} do not fit 64 bits of microseconds")
     return t_us
 
 

@@ -27,9 +27,11 @@ import numpy as np
 import torch
 
 from torchtrack.camera import Camera
+from torchtrack.config.events import ReadingConfig
 from torchtrack.errors import CalibrationError, EventDataError, MissingFileError, PoseError
 from torchtrack.files import is_file, naming
 from torchtrack.io.container import is_container, read_container
+from torchtrack.io.event_file import DEFAULT_CHOICES
 from torchtrack.io.npz import NpzEvents, keys_of, open_archive, read_array
 from torchtrack.io.sequence_types import Sequence, SequenceObject
 from torchtrack.io.trajectory import Trajectory
@@ -42,8 +44,8 @@ _LONGEST_LABEL = 200
 _EXTRA = ("velocity", "occluder_poses", "occluder_labels")
 
 
-def read_sequence(path: str | os.PathLike[str]) -> Sequence:
-    """Read a sequence; its events stay on disk until they are streamed.
+def read_sequence(path: str | os.PathLike[str], *, choices: ReadingConfig = DEFAULT_CHOICES) -> Sequence:
+    """Read a sequence; its events stay on disk until they are streamed, as ``choices`` say.
 
     Raises:
         MissingFileError: if the file, or a mesh that it names, is not there.
@@ -54,11 +56,11 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
     """
     path = Path(path)
     with naming(path):
-        return read_container(path) if is_container(path) else _read_archive(path)
+        return read_container(path, choices=choices) if is_container(path) else _read_archive(path, choices)
 
 
-def _read_archive(path: Path) -> Sequence:
-    events = NpzEvents(path)
+def _read_archive(path: Path, choices: ReadingConfig) -> Sequence:
+    events = NpzEvents(path, choices=choices)
     with open_archive(path) as archive:
         camera = _read_camera(archive, events, path)
         labels, mesh_files = _read_names(archive, "labels", path), _read_names(archive, "mesh_files", path)
