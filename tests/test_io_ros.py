@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from helpers import random_events
-from io_files import SIZE, assert_same
+from io_files import SIZE, assert_same, everything
 
-from torchtrack.errors import EventDataError, UnknownFormatError
+from torchtrack.config.events import ReadingConfig
+from torchtrack.errors import EventDataError, TorchtrackWarning, UnknownFormatError
 from torchtrack.events import EventBatch
 from torchtrack.io import open_events
 from torchtrack.io.problems import Problem, Problems
@@ -101,3 +102,61 @@ def test_a_bag_without_events(tmp_path):
         writer.write(connection, 1, b"\1")
     with pytest.raises(UnknownFormatError, match=r"no topic of events .*Its topics: /chatter \(std_msgs/msg/Int8\)"):
         open_events(tmp_path / "e.bag")
+
+
+def events_bag(path, module, topics, **options):
+    """A recording with a message of events in each topic, at times that tell them apart."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    ros2 = module.__name__.endswith("2")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE if ros2 else typesys.Stores.ROS1_NOETIC)
+    event = "uint16 x\nuint16 y\ntime ts\nbool polarity" if not ros2 else "uint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity"
+    array = "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events"
+    store.register(typesys.get_types_from_msg(event, "dvs_msgs/msg/Event"))
+    store.register(typesys.get_types_from_msg(array, "dvs_msgs/msg/EventArray"))
+    with module.Writer(path, **options) as writer:
+        for number, topic in enumerate(topics):
+            connection = writer.add_connection(topic, "dvs_msgs/msg/EventArray", typestore=store)
+            writer.write(connection, 1 + number, event_array(at_us(number + 1), ros2))
+    return path
+
+
+def at_us(t_us: int) -> EventBatch:
+    return EventBatch.from_numpy(np.array([5]), np.array([6]), np.array([t_us]), np.array([True]))
+
+
+def test_one_of_several_topics_is_told_and_chosen(tmp_path):
+    path = events_bag(tmp_path / "e.bag", pytest.importorskip("rosbags.rosbag1"), ["/left/events", "/right/events"])
+    with pytest.warns(TorchtrackWarning, match="'/left/events' is read; the others are '/right/events'. Choose one with events.topic"):
+        assert_same(everything(open_events(path)), at_us(1))
+    assert_same(everything(open_events(path, choices=ReadingConfig(topic="/right/events"))), at_us(2))
+    with pytest.raises(EventDataError, match="no events named '/up'; its streams of events are: /left/events, /right/events"):
+        open_events(path, choices=ReadingConfig(topic="/up"))
+
+
+def test_a_folder_without_its_list_is_read_in_the_order_of_its_files(tmp_path):
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    for number, name in ((1, "a_2.db3"), (2, "a_10.db3")):
+        whole = events_bag(tmp_path / f"whole{number}", rosbag2, ["/other", "/events"][-number:], version=9)
+        next(whole.glob("*.db3")).rename(folder / name)
+    with pytest.warns(TorchtrackWarning, match=r"has no metadata.yaml: a_2.db3, a_10.db3 are read in this order. `ros2 bag reindex"):
+        events = everything(open_events(folder))
+    assert events.t_us.tolist() == [1, 2]
+
+
+def cut(path, share: float):
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    return path
+
+
+def test_recordings_that_were_broken_off_come_with_advice_that_helps(tmp_path):
+    bag = cut(events_bag(tmp_path / "e.bag", pytest.importorskip("rosbags.rosbag1"), ["/events"]), 0.6)
+    with pytest.raises(EventDataError, match=r"e\.bag' is truncated or damaged .*`rosbag reindex .*e\.bag` writes the index"):
+        open_events(bag)
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    folder = events_bag(tmp_path / "mcap", rosbag2, ["/events"], version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    with pytest.raises(EventDataError, match=r"`mcap recover .*\.mcap -o recovered\.mcap` keeps what can be read"):
+        open_events(cut(next(folder.glob("*.mcap")), 0.6))
+    with pytest.raises(EventDataError, match="Try `ros2 bag reindex .*, or give one of its .db3 or .mcap files itself"):
+        open_events(folder)

@@ -11,7 +11,7 @@ one by one.
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from torchtrack.io.digits import digits, whole_numbers
 from torchtrack.io.plausibility import EVENTS, settled_unit, whole_microseconds
 from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.seconds import parse_time
-from torchtrack.io.text_file import TextFile, whole_lines
+from torchtrack.io.text_file import Readable, TextFile, whole_lines
 from torchtrack.io.text_words import as_numbers, parse_whole, settled_polarity
 
 DAVIS240C_SIZE = (240, 180)
@@ -116,7 +116,7 @@ def _unit(head: bytes, choices: ReadingConfig, problems: Problems) -> TimeUnit:
     return settled_unit(as_numbers(times), "s", choices.time_unit, problems.source)
 
 
-def _blocks(stream: BinaryIO, path: Path) -> Iterator[bytes]:
+def _blocks(stream: Readable, path: Path) -> Iterator[bytes]:
     """The text in blocks of whole lines, each ending with a newline."""
     rest = b""
     while data := stream.read(_BLOCK_BYTES):

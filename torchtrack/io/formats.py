@@ -2,8 +2,9 @@
 
 import os
 from collections.abc import Callable
+from io import BufferedIOBase
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import cast
 
 from torchtrack.config.events import ReadingConfig
 from torchtrack.errors import UnknownFormatError
@@ -129,4 +130,4 @@ def _of_archive(path: Path) -> type[EventFile]:
         if keys_of(archive) or member is None:
             return NpzEvents
         with archive.open(member) as stream:
-            return _of_text(as_utf8(cast(BinaryIO, stream)).read(HEAD_BYTES), Path(member).suffix.lower()) or DavisTextEvents
+            return _of_text(as_utf8(cast(BufferedIOBase, stream)).read(HEAD_BYTES), Path(member).suffix.lower()) or DavisTextEvents

@@ -1,20 +1,23 @@
 """Events in ROS bags: ROS 1 ``.bag``, ROS 2 ``.db3`` and ``.mcap``, as one file or as the folder of a recording (extra ``ros``)."""
 
+import re
 import sqlite3
 import struct
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
-from torchtrack.errors import EventDataError, TorchtrackError, UnknownFormatError
+from torchtrack.errors import EventDataError, TorchtrackError, TorchtrackWarning, UnknownFormatError
 from torchtrack.files import check_is_file, read_bytes
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.extras import optional
+from torchtrack.io.one_of_several import chosen_stream
 from torchtrack.io.problems import Problems
 from torchtrack.io.ros_compression import bounded_decompression, take_over_messages
 from torchtrack.io.ros_messages import ARRAYS, PACKETS, MessageDecoder
@@ -43,13 +46,15 @@ _DAMAGED = (
     struct.error,
     sqlite3.Error,
 )
+# The list of the files of a recording of ROS 2.
+_LIST = "metadata.yaml"
 # Small messages are decoded together.
 _FEWEST_BYTES = 1 << 18
 
 
 @dataclass(frozen=True)
 class RosBag(EventFile):
-    """Events of the first topic of a bag that has events, or of the one named; see :class:`torchtrack.io.event_file.EventFile`.
+    """Events of the first topic of a bag that has events, or of the one chosen; see :class:`torchtrack.io.event_file.EventFile`.
 
     Times are those of the events: sensor time with the encoding evt3, ROS time otherwise.
 
@@ -59,7 +64,9 @@ class RosBag(EventFile):
         EventDataError: if the bag is damaged.
     """
 
-    topic: str = field(default="")
+    has_streams: ClassVar[bool] = True
+
+    topic: str = field(init=False, default="")
 
     def _open(self) -> None:
         with self._messages() as (connection, messages):
@@ -89,33 +96,73 @@ class RosBag(EventFile):
     def _messages(self) -> Iterator[tuple[Any, Iterator[bytes]]]:
         """The connection with the events, and its messages; what the library raises becomes an :class:`EventDataError`."""
         purpose = f"reading '{self.path}'"
-        if self.path.is_dir():
-            _check_folder(self.path)
+        parts = _parts(self.path)
         module = optional("rosbags.rosbag1" if _is_ros1(self.path) else "rosbags.rosbag2", "rosbags", "ros", purpose)
         damaged = (module.ReaderError, *bounded_decompression(), *_DAMAGED)
         try:
-            with module.Reader(self.path) as reader:
-                unpack = take_over_messages(reader)
-                known = [connection for connection in reader.connections if connection.msgtype in _KINDS]
-                chosen = [connection for connection in known if self.topic in ("", connection.topic)]
-                if not chosen:
-                    topics = ", ".join(f"{connection.topic} ({connection.msgtype})" for connection in reader.connections) or "none"
-                    wanted = f"topic '{self.topic}' of events" if self.topic else "topic of events"
-                    raise UnknownFormatError(f"'{self.path}' has no {wanted} (event_camera_msgs or dvs_msgs). Its topics: {topics}.")
-                same = [connection for connection in chosen if connection.topic == chosen[0].topic]
-                yield chosen[0], (unpack(data) for _, _, data in reader.messages(connections=same))
+            with ExitStack() as stack:
+                readers = [stack.enter_context(module.Reader(part)) for part in parts]
+                unpack = [take_over_messages(reader) for reader in readers]
+                chosen = [self._of_topic(reader.connections) for reader in readers]
+                first = next(connections[0] for connections in chosen if connections)
+                read = zip(readers, unpack, chosen, strict=True)
+                yield first, (undo(data) for reader, undo, same in read if same for _, _, data in reader.messages(connections=same))
         except TorchtrackError:
             raise
         except damaged as error:
-            raise EventDataError(f"'{self.path}' is truncated or damaged ({type(error).__name__}: {error}). Copy it again.") from error
+            fault = f"'{self.path}' is truncated or damaged ({type(error).__name__}: {' '.join(str(error).split())})"
+            raise EventDataError(f"{fault}. {_advice(self.path)}") from error
+
+    def _of_topic(self, connections: list[Any]) -> list[Any]:
+        """The connections of the topic to read; which one that is, is settled by the first part."""
+        known = [connection for connection in connections if connection.msgtype in _KINDS]
+        if not self.topic:
+            if not known:
+                topics = ", ".join(f"{connection.topic} ({connection.msgtype})" for connection in connections) or "none"
+                raise UnknownFormatError(f"'{self.path}' has no topic of events (event_camera_msgs or dvs_msgs). Its topics: {topics}.")
+            streams = tuple(dict.fromkeys(connection.topic for connection in known))
+            object.__setattr__(self, "streams", streams)
+            object.__setattr__(self, "topic", chosen_stream(streams, self.choices.topic, f"'{self.path}'"))
+        return [connection for connection in known if connection.topic == self.topic]
+
+
+def _parts(path: Path) -> list[Path]:
+    """What to open: the file or folder itself, or the files of a folder that has no list of them, which is told."""
+    if not path.is_dir():
+        return [path]
+    if (path / _LIST).exists():
+        _check_folder(path)
+        return [path]
+    files = sorted(_files_of(path), key=lambda file: [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", file.name)])
+    for file in files:
+        check_is_file(file, "part of a recording")
+    names = ", ".join(file.name for file in files)
+    message = f"'{path}' has no {_LIST}: {names} are read in this order. `ros2 bag reindex {path}` makes the list anew."
+    warnings.warn(message, TorchtrackWarning, stacklevel=2)
+    return files
+
+
+def _files_of(folder: Path) -> list[Path]:
+    return [file for file in folder.iterdir() if file.suffix in (".db3", ".mcap")]
+
+
+def _advice(path: Path) -> str:
+    """How a recording that was broken off, or damaged, is made readable by the tools of its makers."""
+    if path.is_dir():
+        return f"Try `ros2 bag reindex {path}`, or give one of its .db3 or .mcap files itself."
+    if _is_ros1(path):
+        return f"If its recording was broken off, `rosbag reindex {path}` writes the index that is missing."
+    if path.suffix == ".mcap":
+        return f"If its recording was broken off, `mcap recover {path} -o recovered.mcap` keeps what can be read."
+    return f"If its recording was broken off, `sqlite3 {path} .recover | sqlite3 recovered.db3` keeps what can be read."
 
 
 def _check_folder(path: Path) -> None:
     """Refuse a recording whose list of files costs too much to read, or which has a pipe or a device in the place of a file."""
     try:
-        load_document(read_bytes(path / "metadata.yaml", "list of files", "text_bytes").decode("utf-8"))
+        load_document(read_bytes(path / _LIST, "list of files", "text_bytes").decode("utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise EventDataError(f"'{path / 'metadata.yaml'}' is damaged: {' '.join(str(error).split())}. Copy it again.") from error
+        raise EventDataError(f"'{path / _LIST}' is damaged: {' '.join(str(error).split())}. {_advice(path)}") from error
     for file in path.iterdir():
         if not file.is_dir():
             check_is_file(file, "part of a recording")
@@ -130,4 +177,4 @@ def _is_ros1(path: Path) -> bool:
 
 def is_bag_folder(path: Path) -> bool:
     """Whether a folder is a recording of ROS 2."""
-    return path.is_dir() and (path / "metadata.yaml").is_file()
+    return path.is_dir() and ((path / _LIST).is_file() or bool(_files_of(path)))

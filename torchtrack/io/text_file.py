@@ -4,8 +4,9 @@ import codecs
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedIOBase
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Protocol, cast, runtime_checkable
 
 from torchtrack.errors import EventDataError
 from torchtrack.io.event_file import EventFile
@@ -16,11 +17,20 @@ _UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _SUFFIXES = (".txt", ".csv", ".tsv")
 
 
+@runtime_checkable
+class Readable(Protocol):
+    """What bytes are read from."""
+
+    def read(self, size: int = -1, /) -> bytes:
+        """The next bytes: up to ``size`` of them."""
+        ...
+
+
 class TextFile(EventFile):
     """The base of readers of text; see :class:`torchtrack.io.event_file.EventFile`."""
 
     @contextmanager
-    def _stream(self) -> Iterator[BinaryIO]:
+    def _stream(self) -> Iterator[Readable]:
         """The text as UTF-8, out of its archive where it lies in one."""
         if not is_zip(self.path):
             with self.path.open("rb") as stream:
@@ -31,7 +41,7 @@ class TextFile(EventFile):
             if member is None:
                 raise EventDataError(f"'{self.path}' is a zip archive without a text file of events.")
             with damage_reported(self.path), archive.open(member) as text:
-                yield as_utf8(cast(BinaryIO, text))
+                yield as_utf8(cast(BufferedIOBase, text))
 
     def _head(self) -> bytes:
         """The beginning of the text, as UTF-8."""
@@ -50,12 +60,12 @@ def _is_hidden(name: str) -> bool:
     return name.startswith("__MACOSX/") or Path(name).name.startswith("._")
 
 
-def as_utf8(stream: BinaryIO) -> BinaryIO:
+def as_utf8(stream: BufferedIOBase) -> Readable:
     """The same text as UTF-8 without a byte order mark."""
     mark = stream.read(3)
     if mark.startswith(_UTF16_MARKS):
         stream.seek(0)
-        return cast(BinaryIO, codecs.EncodedFile(stream, "utf-8", "utf-16", errors="replace"))
+        return cast(Readable, codecs.EncodedFile(stream, "utf-8", "utf-16", errors="replace"))
     if mark != codecs.BOM_UTF8:
         stream.seek(0)
     return stream
