@@ -1,7 +1,7 @@
 """Mesh files through trimesh, in metres, with what is wrong with them said plainly."""
 
-import json
-import re
+import io
+import struct
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,79 +9,175 @@ from typing import Any, cast
 
 import numpy as np
 import trimesh
+from PIL import Image
 
-from torchtrack.errors import MissingFileError, ModelError, TorchtrackWarning, UnknownFormatError
+from torchtrack.errors import MissingFileError, ModelError, UnknownFormatError
+from torchtrack.limits import check_limit
+from torchtrack.object_model.gltf import read_gltf
+from torchtrack.object_model.notices import tell
+from torchtrack.object_model.obj import check_indices, read_obj
+from torchtrack.object_model.ply import read_ply
 from torchtrack.object_model.settings import METRES_PER_UNIT
-from torchtrack.object_model.surface import texture_image
+from torchtrack.object_model.side_files import MeshText, find_beside
+from torchtrack.object_model.stl_off import read_off, read_stl
+from torchtrack.object_model.textures import check_textures, tell_lost_textures
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 _SMALLEST_M, _LARGEST_M = 0.005, 5.0
+# Poses are float32: with the origin so many diameters away, their rounding moves the model by 1e-4 and 1e-5 of its diameter.
+_FARTHEST, _FAR = 1000.0, 100.0
+# What trimesh's readers raise, depending on what their parsing trips over.
+_READER_ERRORS: tuple[type[Exception], ...] = (
+    *(ValueError, TypeError, LookupError, AttributeError, NameError, AssertionError, ArithmeticError, OSError, EOFError, SyntaxError),
+    *(NotImplementedError, RecursionError, MemoryError, BufferError, DeprecationWarning, struct.error),
+)
 
 
 def check_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
     """The path, if it is a file with one of the suffixes.
 
     Raises:
-        MissingFileError: if there is no such file.
+        MissingFileError: if there is no such file, or what is there is a folder, a pipe or a device.
         UnknownFormatError: if its suffix is another.
+        LimitError: if it is larger than ``limits.mesh_bytes``.
     """
     path = Path(path)
-    if not path.is_file():
+    try:
+        exists, is_file = path.exists(), path.is_file()
+        size = path.stat().st_size if is_file else 0
+    except (OSError, ValueError) as error:
+        raise MissingFileError(f"the object model '{path}' cannot be opened ({error}). Check the path and its permissions.") from error
+    if exists and not is_file:
+        raise MissingFileError(f"the object model '{path}' is a {'folder' if path.is_dir() else 'pipe or device'}, not a file. Give a mesh file.")
+    if not exists:
         raise MissingFileError(f"the object model '{path}' does not exist. Check the path; a relative one starts at {Path.cwd()}.")
     if path.suffix.lower() not in suffixes:
         raise UnknownFormatError(f"'{path}' is not an object model: expected a file ending in {', '.join(suffixes)}. Convert it, or rename it.")
+    check_limit("mesh_bytes", size, path)
     return path
 
 
 def load_parts(path: str | Path) -> list[trimesh.Trimesh]:
     """The meshes of a file, moved to where its scene puts them, each with its own texture; in the file's unit.
 
-    Warns (:class:`TorchtrackWarning`) when the file names a texture image that cannot be found.
+    Warns (:class:`TorchtrackWarning`) of every texture that the file names and the model will not have, and of every part
+    that is no surface.
 
     Raises:
         MissingFileError, UnknownFormatError: as :func:`check_file`.
         ModelError: if the file cannot be read, or has no faces.
+        LimitError: if it is larger than the limits.
     """
     path = check_file(path, MESH_SUFFIXES)
-    some_missing = _warn_missing_textures(path)
     try:
-        scene = trimesh.load_scene(path, process=False)
-    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
-        raise ModelError(
-            f"cannot read '{path}' as a {path.suffix[1:].upper()} mesh ({error}). Open it in a mesh editor and export it again."
-        ) from error
-    parts = mesh_parts(scene)
+        text = _READERS[path.suffix.lower()](path)
+    except OSError as error:
+        raise ModelError(f"cannot read '{path}': {error}. Check the file and its permissions, or export it again.") from error
+    missing = _tell_missing(path, text.named)
+    scene = _loaded(path, text)
+    meshes = [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh)]
+    # Before any mesh is copied, which decodes its image.
+    check_textures(meshes, str(path))
+    tell_lost_textures(path, text, meshes, missing)
+    parts = mesh_parts(scene, str(path))
     if not parts:
         raise ModelError(
             f"'{path}' has no triangles: the tracker needs a surface. Export it as a triangle mesh, or give its lines with from_polylines."
         )
-    if not some_missing:
-        _warn_unread_textures(path, parts)
+    check_limit("faces", sum(len(part.faces) for part in parts), path)
     return parts
 
 
-def mesh_parts(mesh: "trimesh.Trimesh | trimesh.Scene | Iterable[trimesh.Trimesh]") -> list[trimesh.Trimesh]:
-    """Copies of the meshes that have faces, each where it belongs, without vertices that no face uses."""
-    pieces: Iterable[Any] = [mesh] if isinstance(mesh, trimesh.Trimesh) else mesh.dump() if isinstance(mesh, trimesh.Scene) else mesh
-    parts = [piece.copy() for piece in pieces if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
+_READERS = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}
+
+
+def _loaded(path: Path, text: MeshText) -> trimesh.Scene:
+    """The scene that trimesh reads."""
+    # A PLY's image is attached in tell_lost_textures: trimesh would print a traceback of one that it cannot open.
+    options: dict[str, Any] = {"skip_materials": True} if text.kind == "ply" else {}
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            # numpy would go on with the numbers before the first that it cannot read.
+            warnings.filterwarnings("error", message="string or file could not be read", category=DeprecationWarning)
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            return trimesh.load_scene(io.BytesIO(text.data), file_type=text.kind, resolver=text.files, process=False, **options)
+    except _READER_ERRORS as error:
+        if text.kind == "obj":
+            check_indices(path)
+        raise ModelError(
+            f"cannot read '{path}' as a {path.suffix[1:].upper()} mesh ({type(error).__name__}: {error}). "
+            "It is damaged, or of a kind that is not read: open it in a mesh editor and export it again."
+        ) from error
+
+
+def mesh_parts(mesh: "trimesh.Trimesh | trimesh.Scene | Iterable[trimesh.Trimesh]", name: str = "the model") -> list[trimesh.Trimesh]:
+    """Copies of the meshes that have faces, each where it belongs, without vertices that no face uses.
+
+    Warns (:class:`TorchtrackWarning`) of parts that have no faces, if others do.
+
+    Raises:
+        ModelError: if a face names a vertex that is not there.
+    """
+    with np.errstate(all="ignore"):
+        pieces: list[Any] = [mesh] if isinstance(mesh, trimesh.Trimesh) else mesh.dump() if isinstance(mesh, trimesh.Scene) else list(mesh)
+    parts = [piece for piece in pieces if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
+    for part in parts:
+        _check_corners(part, name)
+    if parts and len(parts) < len(pieces):
+        tell(f"{len(pieces) - len(parts)} of {len(pieces)} parts of '{name}' have no faces (points, lines, or nothing), and are not used.")
+    parts = [part.copy() for part in parts]
     for part in parts:
         part.remove_unreferenced_vertices()
     return parts
+
+
+def _check_corners(part: trimesh.Trimesh, name: str) -> None:
+    """Every vertex has three coordinates, and every corner of a face is a vertex."""
+    if np.shape(part.vertices)[1:] != (3,):
+        raise ModelError(f"some vertices of '{name}' have less than three coordinates: it is damaged. Export it again.")
+    wrong = np.flatnonzero(((part.faces < 0) | (part.faces >= len(part.vertices))).any(1))
+    if len(wrong):
+        face = wrong[0]
+        raise ModelError(
+            f"face {face} of '{name}' names the vertices {part.faces[face].tolist()}, and there are {len(part.vertices)}: "
+            f"it is damaged ({len(wrong)} such faces). Export it again."
+        )
 
 
 def checked_scale(points: np.ndarray, unit: str, name: str) -> float:
     """Metres per ``unit``, once points ``[n, 3]`` in that unit have passed the checks that every model must pass.
 
     Raises:
-        ModelError: if a coordinate is not finite, the unit is unknown, or the diameter is outside 5 mm to 5 m.
+        ModelError: if a coordinate is not finite, the unit is unknown, the diameter is outside 5 mm to 5 m, or the origin is
+            too far away.
     """
     if unit not in METRES_PER_UNIT:
         raise ModelError(f"unknown unit '{unit}' for '{name}': use one of {', '.join(METRES_PER_UNIT)}.")
     bad = ~np.isfinite(points).all(1)
     if bad.any():
         raise ModelError(f"{bad.sum()} of {len(points)} vertices of '{name}' are not finite (NaN or infinite). Repair the model and export it again.")
-    _check_diameter(float(np.linalg.norm(np.ptp(points, axis=0))), unit, name)
+    with np.errstate(over="ignore", invalid="ignore"):
+        diameter = float(np.linalg.norm(np.ptp(points, axis=0)))
+        middle = points.min(0) / 2 + points.max(0) / 2
+    _check_diameter(diameter, unit, name)
+    _check_origin(middle, diameter, unit, name)
     return METRES_PER_UNIT[unit]
+
+
+def _check_origin(middle: np.ndarray, diameter: float, unit: str, name: str) -> None:
+    """Refuse a model so far from its own origin that float32 poses of that origin cannot say where the model is."""
+    ratio = float(np.linalg.norm(middle)) / diameter
+    if ratio <= _FAR:
+        return
+    shift = ", ".join(f"{-value:.10g}" for value in middle)
+    problem = f"'{name}' lies {ratio:,.0f} times its diameter from its own origin, as models in map coordinates do"
+    advice = f"Move it by ({shift}) {unit} in a mesh editor, so that its middle is at the origin, and give initial poses of the moved model."
+    if ratio > _FARTHEST:
+        raise ModelError(
+            f"{problem}: poses, which are of that origin, would be rounded to more than 1e-4 of its size; "
+            f"expected less than {_FARTHEST:.0f} times. {advice}"
+        )
+    tell(f"{problem}: poses are of that origin, so a small error of rotation is a large one of translation. {advice}")
 
 
 def _check_diameter(diameter: float, unit: str, name: str) -> None:
@@ -99,63 +195,12 @@ def join_parts(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     return parts[0] if len(parts) == 1 else cast(trimesh.Trimesh, trimesh.util.concatenate(parts))
 
 
-def _warn_missing_textures(path: Path) -> bool:
-    """Warn of files that a mesh file names and that are not there; says whether there are any."""
-    missing = [name for name in _named_files(path) if not (path.parent / name).is_file()]
+def _tell_missing(path: Path, named: Iterable[str]) -> frozenset[str]:
+    """Warn of files that a mesh file names and that are not there; which they are."""
+    missing = [name for name in dict.fromkeys(named) if find_beside(path, name) is None]
     if missing:
-        _warn(
+        tell(
             f"'{path}' names {', '.join(repr(name) for name in missing)}, which cannot be found in '{path.parent}': "
             "only the geometry is used. Put the file there, or export the model as GLB, which holds its textures."
         )
-    return bool(missing)
-
-
-def _warn_unread_textures(path: Path, parts: list[trimesh.Trimesh]) -> None:
-    """Warn if the materials of a glTF file have textures of which none could be read."""
-    materials = _gltf_content(path).get("materials", []) if path.suffix.lower() in (".glb", ".gltf") else []
-    textured = any("baseColorTexture" in material.get("pbrMetallicRoughness", {}) for material in materials)
-    if textured and all(texture_image(part) is None for part in parts):
-        _warn(f"the texture of '{path}' cannot be read: only the geometry is used. Export it with PNG or JPEG images and UV coordinates.")
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, TorchtrackWarning, stacklevel=5)
-
-
-def _named_files(path: Path) -> list[str]:
-    """Material and image files that a mesh file refers to."""
-    suffix = path.suffix.lower()
-    if suffix == ".obj":
-        return _named_by_obj(path)
-    if suffix == ".ply":
-        with path.open("rb") as stream:
-            header = stream.read(10_000).split(b"end_header")[0].decode("latin-1")
-        return re.findall(r"^comment TextureFile (.+?)\s*$", header, re.MULTILINE)
-    if suffix in (".glb", ".gltf"):
-        images = _gltf_content(path).get("images", [])
-        return [image["uri"] for image in images if "uri" in image and not image["uri"].startswith("data:")]
-    return []
-
-
-def _named_by_obj(path: Path) -> list[str]:
-    """The material libraries of an OBJ file, and the images of those that are there."""
-    named = re.findall(r"^mtllib[ \t]+(.+?)\s*$", path.read_text(encoding="latin-1"), re.MULTILINE)
-    for library in list(named):
-        if (path.parent / library).is_file():
-            # Options such as "-bm 1" come before the image's name.
-            text = (path.parent / library).read_text(encoding="latin-1")
-            named += re.findall(r"^\s*map_Kd[ \t]+(?:-.*[ \t])?(\S.*?)\s*$", text, re.MULTILINE)
-    return named
-
-
-def _gltf_content(path: Path) -> dict[str, Any]:
-    """The JSON part of a glTF file; nothing, if it is damaged (its reader will say how)."""
-    with path.open("rb") as stream:
-        header = stream.read(20)
-        # A binary file begins with a header of 12 bytes, then the length and type of the JSON part.
-        text = stream.read(int.from_bytes(header[12:16], "little")) if header[:4] == b"glTF" else header + stream.read()
-    try:
-        content = json.loads(text)
-    except ValueError:
-        return {}
-    return content if isinstance(content, dict) else {}
+    return frozenset(missing)

@@ -14,16 +14,18 @@ from torchtrack.errors import ModelError
 from torchtrack.object_model.colour_edges import colour_edges
 from torchtrack.object_model.loading import MESH_SUFFIXES, check_file, checked_scale, join_parts, load_parts, mesh_parts
 from torchtrack.object_model.mesh_edges import NO_EDGES, EdgeTable, MeshEdges, contour_edges
+from torchtrack.object_model.notices import tell
 from torchtrack.object_model.polylines import POLYLINE_SUFFIXES, as_polylines, has_obj_lines, read_polylines, segments_of
 from torchtrack.object_model.sampling import NO_SAMPLES, sample_surface
 from torchtrack.object_model.settings import ModelSettings, Unit
 from torchtrack.object_model.surface import Surface, surface_from_parts
 from torchtrack.object_model.surface_points import NO_POINTS, SurfacePoints, join_points, thin_out
-from torchtrack.object_model.texture_edges import texture_edges
+from torchtrack.object_model.texture_edges import texture_edges, why_no_edges
 from torchtrack.object_model.winding import turn_outwards
 
 # Points on texture edges nearer than this fraction of the diameter see the same pixels.
 _SPACING_FRACTION = 0.0025
+_COLOUR_PIXELS = 4
 NO_TRIANGLES = np.zeros((0, 3, 3))
 
 
@@ -111,7 +113,7 @@ class ObjectModel:
             name,
             surface.vertices[np.unique(surface.faces)],
             edges=contour_edges(surface, table, settings.crease_angle_deg, drop_concave=outwards),
-            printed=_print_edges(surface, table, settings),
+            printed=_print_edges(surface, table, settings, name),
             samples=sample_surface(surface, settings.surface_point_count),
             triangles=surface.corners,
             mesh=_drawable(parts, surface),
@@ -186,12 +188,20 @@ def _tensor(values: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def _print_edges(surface: Surface, table: EdgeTable, settings: ModelSettings) -> SurfacePoints:
-    """Evenly spaced points on the edges of textures and colours."""
+def _print_edges(surface: Surface, table: EdgeTable, settings: ModelSettings, name: str) -> SurfacePoints:
+    """Evenly spaced points on the edges of textures and colours; warns of a texture that gives none."""
     spacing_m = _SPACING_FRACTION * surface.diameter
-    dense = join_points(
-        [texture_edges(surface, table, settings.texture_contrast), colour_edges(surface, table, settings.texture_contrast, spacing_m / 2)]
-    )
+    if settings.max_texture_points == 0:
+        return NO_POINTS
+    printed = texture_edges(surface, table, settings.texture_contrast)
+    for number, found in enumerate(printed):
+        # A texture of few pixels is a colour: trimesh gives one to every part without a material.
+        if len(found.points) == 0 and surface.textures[number].size > _COLOUR_PIXELS:
+            which = f"texture {number + 1} of {len(printed)}" if len(printed) > 1 else "the texture"
+            tell(
+                f"{which} of '{name}' gives no edges, so that only the geometry is used: {why_no_edges(surface, number, settings.texture_contrast)}."
+            )
+    dense = join_points([join_points(printed), colour_edges(surface, table, settings.texture_contrast, spacing_m / 2)])
     return thin_out(dense, spacing_m, settings.max_texture_points)
 
 

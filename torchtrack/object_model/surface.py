@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from PIL import Image
 
 from torchtrack.errors import ModelError
+from torchtrack.object_model.notices import tell
+from torchtrack.object_model.textures import UnreadableImageError, as_rgb, texture_image
 
 # Vertices closer than this fraction of the diameter are the same vertex.
 _WELD_FRACTION = 1e-6
@@ -21,6 +22,7 @@ _WELD_FRACTION = 1e-6
 _FLAT_FRACTION = 1e-7
 # Printed black still reflects about 2 % of the light: below it, a step in the file's values is not a step in the world.
 _DARKEST = 0.02
+_ROWS_OF_PIXELS = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,20 @@ def surface_from_parts(parts: Sequence[trimesh.Trimesh]) -> Surface:
     surface = surface.select(_sound_faces(surface))
     if len(surface.faces) == 0:
         raise ModelError(f"all {len(faces)} faces of the mesh are degenerate (no area): it has no surface to track. Export it again as triangles.")
+    _tell_flat_parts(surface, np.cumsum([0, *(len(part.faces) for part in parts)]))
     return surface
+
+
+def _tell_flat_parts(surface: Surface, first_face: np.ndarray) -> None:
+    """Warn of parts, whose faces begin at ``first_face [P + 1]``, of which no face is left."""
+    kept = np.zeros(first_face[-1], dtype=bool)
+    kept[surface.source_face] = True
+    left = np.add.reduceat(kept, first_face[:-1]) > 0
+    if not left.all():
+        tell(
+            f"{(~left).sum()} of {len(left)} parts of the model have no face with an area, or are copies of others, and are not used "
+            f"(the first is part {int(np.argmin(left)) + 1}): they are scaled to nothing, compressed, or stored twice."
+        )
 
 
 @dataclass(frozen=True)
@@ -128,7 +143,10 @@ def _look(mesh: trimesh.Trimesh) -> _Look:
     luminance = np.full((len(mesh.faces), 3), np.nan)
     image = texture_image(mesh)
     if image is not None:
-        return _Look(log_luminance(np.asarray(image.convert("RGB"))), np.asarray(visual.uv, dtype=np.float64)[mesh.faces], luminance)
+        try:
+            return _Look(log_luminance(as_rgb(image)), np.asarray(visual.uv, dtype=np.float64)[mesh.faces], luminance)
+        except UnreadableImageError as error:
+            raise ModelError(f"a texture of the mesh cannot be used: {error}.") from error
     if visual.kind == "vertex":
         luminance = log_luminance(visual.vertex_colors[:, :3])[mesh.faces]
     elif visual.kind == "face":
@@ -138,19 +156,6 @@ def _look(mesh: trimesh.Trimesh) -> _Look:
     return _Look(None, uv, luminance)
 
 
-def texture_image(mesh: trimesh.Trimesh) -> Image.Image | None:
-    """The colour image of a mesh that has one and can use it (with one UV coordinate per vertex)."""
-    uv = getattr(mesh.visual, "uv", None)
-    if uv is None or len(uv) != len(mesh.vertices):
-        return None
-    material = getattr(mesh.visual, "material", None)
-    for attribute in ("baseColorTexture", "image"):
-        image = getattr(material, attribute, None)
-        if image is not None:
-            return image
-    return None
-
-
 def log_luminance(colours: np.ndarray) -> np.ndarray:
     """Log of the linear luminance (BT.709) of 8-bit sRGB colours ``[..., 3]``, float32.
 
@@ -158,8 +163,14 @@ def log_luminance(colours: np.ndarray) -> np.ndarray:
     """
     encoded = np.arange(256) / 255
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
-    luminance = linear[np.asarray(colours, dtype=np.uint8)] @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
-    return np.log(luminance + np.float32(_DARKEST))
+    colours = np.asarray(colours, dtype=np.uint8)
+    luminance = np.empty(colours.shape[:-1], dtype=np.float32)
+    # Rows of an image at a time: the linear values of a large one take twelve bytes a pixel.
+    step = max(1, _ROWS_OF_PIXELS // max(1, colours[0].size // 3)) if len(colours) else 1
+    for start in range(0, len(colours), step):
+        luminance[start : start + step] = linear[colours[start : start + step]] @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+    luminance += np.float32(_DARKEST)
+    return np.log(luminance, out=luminance)
 
 
 def _weld(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,8 +6,25 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from torchtrack.errors import ModelError
+
 # Neighbours whose tangents differ by more than 60 degrees, or whose dark sides are opposite, lie on different edges.
 _SAME_EDGE_COSINE = 0.5
+# A model whose print has more points has far more area than an object of its size: they would fill the memory.
+MOST_POINTS = 4_000_000
+
+
+def check_point_count(count: int, most: int) -> None:
+    """Refuse a print that cannot be of an object.
+
+    Raises:
+        ModelError: if there are more points than ``most``.
+    """
+    if count > most:
+        raise ModelError(
+            f"edges of the print would have about {count:,} points, expected at most {most:,}: the model has very many large faces one over another, "
+            "or is damaged. Simplify it in a mesh editor, or set max_texture_points: 0."
+        )
 
 
 @dataclass(frozen=True)
@@ -42,6 +59,7 @@ def points_along(segments: np.ndarray, normals: np.ndarray, to_brighter: np.ndar
     start, along = segments[:, 0], segments[:, 1] - segments[:, 0]
     length = np.linalg.norm(along, axis=1)
     count = np.ceil(length / spacing_m).astype(np.int64).clip(min=1)
+    check_point_count(int(count.sum()), MOST_POINTS)
     of = np.repeat(np.arange(len(segments)), count)
     fraction = (np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[of]
     return oriented_points(start[of] + fraction[:, None] * along[of], along[of], normals[of], to_brighter[of], float(length.sum()))
@@ -73,13 +91,13 @@ def _pick(dense: SurfacePoints, kept: np.ndarray) -> SurfacePoints:
 
 def _keep_apart(dense: SurfacePoints, spacing_m: float) -> np.ndarray:
     """Indices of points no two of which, on the same edge, are nearer than ``spacing_m``."""
-    pairs = cKDTree(dense.points).query_pairs(spacing_m, output_type="ndarray")
-    alike = (dense.tangents[pairs[:, 0]] * dense.tangents[pairs[:, 1]]).sum(1) > _SAME_EDGE_COSINE
-    pairs = pairs[alike & ((dense.normals[pairs[:, 0]] * dense.normals[pairs[:, 1]]).sum(1) > _SAME_EDGE_COSINE)]
-    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
-    first = np.searchsorted(pairs[:, 0], np.arange(len(dense.points) + 1)).tolist()
-    later, alive = pairs[:, 1], np.ones(len(dense.points), dtype=bool)
+    tree, alive = cKDTree(dense.points), np.ones(len(dense.points), dtype=bool)
+    # Neighbours of the points that are kept alone: of a fine texture, the pairs of all points would not fit into memory.
     for point in range(len(dense.points)):
         if alive[point]:
-            alive[later[first[point] : first[point + 1]]] = False
+            near = np.array(tree.query_ball_point(dense.points[point], spacing_m))
+            near = near[near > point]
+            alike = dense.tangents[near] @ dense.tangents[point] > _SAME_EDGE_COSINE
+            alike &= dense.normals[near] @ dense.normals[point] > _SAME_EDGE_COSINE
+            alive[near[alike]] = False
     return np.flatnonzero(alive)

@@ -13,7 +13,7 @@ import numpy as np
 from torchtrack.object_model.image_edges import ImageEdges, image_edges
 from torchtrack.object_model.mesh_edges import EdgeTable, corners_at_ends
 from torchtrack.object_model.surface import Surface
-from torchtrack.object_model.surface_points import NO_POINTS, SurfacePoints, join_points, oriented_points
+from torchtrack.object_model.surface_points import NO_POINTS, SurfacePoints, check_point_count, oriented_points
 
 # Finer detail than this fraction of the diameter is blurred away: no event camera that sees the whole object resolves it.
 _BLUR_FRACTION = 0.002
@@ -24,14 +24,29 @@ _BORDER_BLURS = 2.0
 _MOST_REPEATS = 256
 _SUBPIXEL_BITS = 4
 _SAME_UV = 1e-5
+# Pairs of an edge point and a face that may show it.
+_MOST_CANDIDATES = 20_000_000
 # Faces that map to a line of the texture show none of its edges.
 _LEAST_UV_AREA = 1e-12
 
 
-def texture_edges(surface: Surface, table: EdgeTable, contrast: float) -> SurfacePoints:
-    """Dense points on the edges of all textures whose step is at least ``contrast`` in log luminance."""
-    borders = _uv_borders(surface, table)
-    return join_points([_edges_of_texture(surface, number, borders, contrast) for number in range(len(surface.textures))])
+def texture_edges(surface: Surface, table: EdgeTable, contrast: float) -> list[SurfacePoints]:
+    """For each texture, dense points on its edges whose step is at least ``contrast`` in log luminance."""
+    with np.errstate(over="ignore", invalid="ignore"):  # coordinates of a damaged file, which are left out
+        borders = _uv_borders(surface, table)
+        return [_edges_of_texture(surface, number, borders, contrast) for number in range(len(surface.textures))]
+
+
+def why_no_edges(surface: Surface, number: int, contrast: float) -> str:
+    """Why a texture gives no edges, in words."""
+    uv = surface.corner_uv[surface.texture_index == number]
+    with np.errstate(over="ignore", invalid="ignore"):
+        spread = np.ptp(uv, axis=1).max(1) if len(uv) else np.zeros(0)
+    if not ((spread > 0) & (spread < _MOST_REPEATS)).any():
+        return "its texture coordinates (UV) are all the same, not finite, or hundreds of images wide. Export it with UV coordinates from 0 to 1"
+    if np.ptp(surface.textures[number]) < contrast:
+        return f"no two places of it differ by {contrast} in log luminance. Lower texture_contrast if fainter print is to be used"
+    return "what differs in it is not on the model's faces, is at the borders of its UV islands, or is too faint, gradual or small"
 
 
 @dataclass(frozen=True)
@@ -75,15 +90,19 @@ def _place(surface: Surface, number: int, borders: np.ndarray, shape: tuple[int,
     area = _signed_area(uv)
     face = np.flatnonzero((surface.texture_index == number) & np.isfinite(uv).all((1, 2)) & (np.abs(area) > _LEAST_UV_AREA))
     low, high = np.floor(uv[face].min(1)), np.ceil(uv[face].max(1)) - 1
-    across, down = (np.maximum(high - low, 0) + 1).astype(np.int64).T
-    sane = across * down <= _MOST_REPEATS
-    face, low, across, down = face[sane], low[sane], across[sane], down[sane]
+    repeats = np.maximum(high - low, 0) + 1
+    # Before they are whole numbers: the coordinates of a damaged file may be too large for any.
+    sane = repeats.prod(1) <= _MOST_REPEATS
+    face, low = face[sane], low[sane]
+    across, down = repeats[sane].astype(np.int64).T
     row, step = expand_ranges(np.zeros(len(face), dtype=np.int64), across * down)
     tile = low[row] + np.stack([step % across[row], step // across[row]], 1)
     uv = uv[face[row]] - tile[:, None]
     height, width = shape
     pixels = np.stack([uv[..., 0] * width, (1 - uv[..., 1]) * height], -1) - 0.5
-    return _Placement(pixels, face[row], borders[face[row]])
+    # Far from zero, rounding may make a line of a face.
+    wide = np.abs(_signed_area(pixels)) > 0
+    return _Placement(pixels[wide], face[row][wide], borders[face[row]][wide])
 
 
 def _signed_area(triangles: np.ndarray) -> np.ndarray:
@@ -175,5 +194,7 @@ def _candidates(pixels: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, 
     # Cells of a row follow each other, so a triangle needs one range of points for each row of cells that it touches.
     triangle, line = expand_ranges(top, np.where(right >= left, (bottom - top + 1).clip(0), 0))
     start = first[line * columns + left[triangle]]
-    strip, position = expand_ranges(start, first[line * columns + right[triangle] + 1] - start)
+    count = first[line * columns + right[triangle] + 1] - start
+    check_point_count(int(count.sum()), _MOST_CANDIDATES)
+    strip, position = expand_ranges(start, count)
     return order[position], triangle[strip]
