@@ -1,6 +1,7 @@
 """Object models from meshes: every format, every check, and the edges that can be a contour."""
 
 import json
+import os
 import warnings
 from pathlib import Path
 
@@ -352,3 +353,66 @@ def test_large_scan_loads_without_a_warning(data_dir: Path):
         model = ObjectModel.from_file(data_dir / "sequences" / "bunny_normal_bunny.ply")
     assert 30_000 < len(model.edge_points) < 104_000
     assert model.diameter_m == pytest.approx(0.19, abs=1e-4)
+
+
+def boxes(count: int) -> trimesh.Trimesh:
+    """Boxes in a row that do not touch, one of which has a face wound wrongly."""
+    box = trimesh.creation.box((1, 1, 1))
+    vertices = (box.vertices[None] + 3.0 * np.arange(count)[:, None, None] * [1, 0, 0]).reshape(-1, 3)
+    faces = (box.faces[None] + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
+    faces[5] = faces[5, ::-1]
+    return trimesh.Trimesh(vertices / (3.0 * count), faces, process=False)
+
+
+def test_many_parts_are_turned_in_one_search():
+    """Each part is searched from its own first face, and all of them in one search."""
+    with pytest.warns(TorchtrackWarning, match="1 of 24000 faces of 'row' were wound against their neighbours"):
+        model = ObjectModel.from_mesh(boxes(2000), name="row")
+    assert len(model.edge_points) == 12 * 2000
+    assert model.mesh.volume == pytest.approx(2000 / 6000**3, rel=1e-6)
+
+
+@pytest.mark.parametrize("shift", [[448_262.0, 5_411_932, 120], [0, 0, -200]])
+def test_model_far_from_its_origin_is_refused(shift: list[float]):
+    far = cube().apply_translation(shift)
+    with pytest.raises(
+        ModelError,
+        match=rf"'far' lies .* times its diameter from its own origin.*Move it by \({0 - shift[0]:.10g}, {0 - shift[1]:.10g}, .*\) m in a mesh editor",
+    ):
+        ObjectModel.from_mesh(far, name="far")
+    with pytest.raises(ModelError, match="from its own origin"):
+        ObjectModel.from_polylines(np.asarray(far.vertices)[far.edges])
+
+
+def test_model_some_way_from_its_origin_is_told():
+    with pytest.warns(TorchtrackWarning, match=r"'away' lies 115 times its diameter from its own origin"):
+        model = ObjectModel.from_mesh(cube().apply_translation([0, 20, 0]), name="away")
+    torch.testing.assert_close(lengths(model), torch.full((12,), SIDE), atol=1e-5, rtol=0)
+
+
+def test_what_is_no_file(tmp_path: Path):
+    (tmp_path / "folder.ply").mkdir()
+    os.mkfifo(tmp_path / "pipe.glb")
+    for name, kind in (("folder.ply", "folder"), ("pipe.glb", "pipe or device")):
+        with pytest.raises(MissingFileError, match=rf"{name}' is a {kind}, not a file"):
+            ObjectModel.from_file(tmp_path / name)
+    with pytest.raises(MissingFileError, match="cannot be opened"):
+        ObjectModel.from_file(tmp_path / ("x" * 5000 + ".ply"))
+
+
+def test_faces_that_name_no_vertex():
+    with pytest.raises(ModelError, match=r"face 1 of 'box' names the vertices \[0, 1, 99\], and there are 3"):
+        ObjectModel.from_mesh(trimesh.Trimesh(np.eye(3), [[0, 1, 2], [0, 1, 99]], process=False), name="box")
+    with pytest.raises(ModelError, match="less than three coordinates"):
+        ObjectModel.from_mesh(trimesh.Trimesh(np.eye(3)[:, :2], [[0, 1, 2]], process=False))
+
+
+def test_coordinates_near_the_largest_number(tmp_path: Path):
+    (tmp_path / "huge.obj").write_text("v 1e308 0 0\nv -1e308 1e308 0\nv 0 0 1e308\nf 1 2 3\n")
+    with pytest.raises(ModelError, match="inf m across.*expected 5 mm to 5 m"):
+        ObjectModel.from_file(tmp_path / "huge.obj")
+
+
+def test_parts_without_faces_are_told():
+    with pytest.warns(TorchtrackWarning, match="1 of 2 parts of 'pair' have no faces"):
+        ObjectModel.from_mesh(trimesh.Scene([cube(), trimesh.PointCloud(np.eye(3))]), name="pair")

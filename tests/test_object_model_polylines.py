@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchtrack.errors import MissingFileError, ModelError, UnknownFormatError
+from torchtrack.errors import LimitError, MissingFileError, ModelError, UnknownFormatError
+from torchtrack.limits import Limits, limits
 from torchtrack.object_model import ObjectModel
 
 SQUARE = [[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0], [0, 0, 0]]
@@ -74,7 +75,7 @@ def test_missing_and_unknown_files(tmp_path: Path):
 )
 def test_json_that_is_not_understood(tmp_path: Path, text: str):
     (tmp_path / "page.json").write_text(text)
-    with pytest.raises(ModelError, match=r'page\.json.*expected JSON such as \{"unit": "mm", "polylines"'):
+    with pytest.raises(ModelError, match=r'page\.json.*Expected is JSON such as \{"unit": "mm", "polylines"'):
         ObjectModel.from_polylines(tmp_path / "page.json")
 
 
@@ -106,3 +107,33 @@ def test_same_checks_as_meshes(tmp_path: Path):
     (tmp_path / "page.json").write_text('{"unit": "furlong", "polylines": [[[0, 0, 0], [1, 0, 0]]]}')
     with pytest.raises(ModelError, match=r"unknown unit 'furlong' for 'page'"):
         ObjectModel.from_polylines(tmp_path / "page.json")
+
+
+HOSTILE = ["[" * 100_000, '{"polylines": ' + "[" * 100_000, '{"polylines": [[[1e999, 0, 0], [0, 0, 0]]]}', "\ud800"]
+HOSTILE += ['{"polylines": [[[1' + "0" * 400 + ", 0, 0], [0, 0, 0]]]}", '{"polylines": {"a": 1}}', '{"polylines": "abc"}', '{"polylines": [null]}']
+HOSTILE += ['{"polylines": [[[0, 0, 0], [0, 0]]]}', '{"polylines": [[[{}, 0, 0], [1, 0, 0]]]}']
+
+
+@pytest.mark.parametrize("text", HOSTILE, ids=range(10))
+def test_hostile_json(tmp_path: Path, text: str):
+    (tmp_path / "page.json").write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(ModelError, match="page"):
+        ObjectModel.from_file(tmp_path / "page.json")
+
+
+def test_points_are_limited(tmp_path: Path):
+    (tmp_path / "page.json").write_text(json.dumps({"polylines": [SQUARE]}))
+    with limits(Limits(vertices=4)), pytest.raises(LimitError, match=r"limits\.vertices"):
+        ObjectModel.from_file(tmp_path / "page.json")
+
+
+def test_lines_that_go_on_and_end_in_comments(tmp_path: Path):
+    (tmp_path / "page.obj").write_text(
+        "v 0 0 0\nv 0.1 0 0 # a corner\nv 0.1 0.1 0\nv 0 0.1 0\nl 1 2 \\\n 3 4 1\nv 0.02 0.02 0\nv 0.08 0.08 0\nl 5 6\n"
+    )
+    assert_square_with_line(ObjectModel.from_file(tmp_path / "page.obj"))
+
+
+def test_lists_of_wrong_types():
+    with pytest.raises(ModelError, match="not made of points of three numbers"):
+        ObjectModel.from_polylines([[[0, 0, 0], ["a", 0, 0]]])

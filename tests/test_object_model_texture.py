@@ -11,7 +11,7 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from torchtrack.errors import TorchtrackWarning
+from torchtrack.errors import ModelError, TorchtrackWarning
 from torchtrack.io import read_sequence
 from torchtrack.lie import transform_points
 from torchtrack.object_model import ModelSettings, ObjectModel
@@ -278,3 +278,20 @@ def test_print_lies_on_the_events(data_dir: Path, sequence: str, label: str):
     assert front.sum() > 300
     assert distance.median() < 1
     assert (distance < 2).double().mean() > 0.85
+
+
+def test_coordinates_that_are_broken_are_told():
+    """Hundreds of repeats, numbers beyond any image, NaN: no texture, and no negative ranges."""
+    for bad in (UV * 4095, UV * [1e30, -1e30], UV * np.nan, UV * 1e300, UV * 0 + 0.3):
+        with pytest.warns(TorchtrackWarning, match=r"the texture of 'object' gives no edges.*texture coordinates \(UV\)"):
+            assert len(ObjectModel.from_mesh(card(two_tone(60), uv=bad)).texture_points) == 0
+
+
+def test_print_on_very_many_faces_is_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("torchtrack.object_model.texture_edges._MOST_CANDIDATES", 100)
+    with pytest.raises(ModelError, match=r"about .* points, expected at most 100.*max_texture_points: 0"):
+        ObjectModel.from_mesh(card(two_tone(60)))
+
+
+def test_no_texture_wanted_is_no_texture_lost():
+    assert len(ObjectModel.from_mesh(card(two_tone(dark=60, bright=72)), settings=ModelSettings(max_texture_points=0)).texture_points) == 0

@@ -31,6 +31,7 @@ _HARMLESS = (
     "MSFT_texture_",
     "KHR_node_visibility",
 )
+_VALUES_PER_NODE = 200
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _FLOAT, _UINT32 = 5126, 5125
 # What reading a damaged tree of JSON runs into.
@@ -88,6 +89,8 @@ def _container(path: Path, data: bytes) -> tuple[Tree, bytes | None]:
 
 
 def _checked_tree(path: Path, text: bytes) -> Tree:
+    # A node takes some tens of values; text of brackets alone would take a hundred times its size in memory.
+    check_limit("scene_nodes", sum(text.count(sign) for sign in (b",", b"[", b"{")) // _VALUES_PER_NODE, path)
     tree = json.loads(text)
     version = str(tree.get("asset", {}).get("version", "2.0"))
     if not version.startswith("2"):

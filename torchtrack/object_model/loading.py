@@ -169,7 +169,7 @@ def _check_origin(middle: np.ndarray, diameter: float, unit: str, name: str) -> 
     ratio = float(np.linalg.norm(middle)) / diameter
     if ratio <= _FAR:
         return
-    shift = ", ".join(f"{-value:.10g}" for value in middle)
+    shift = ", ".join(f"{0 - value:.10g}" for value in middle)
     problem = f"'{name}' lies {ratio:,.0f} times its diameter from its own origin, as models in map coordinates do"
     advice = f"Move it by ({shift}) {unit} in a mesh editor, so that its middle is at the origin, and give initial poses of the moved model."
     if ratio > _FARTHEST:

@@ -102,7 +102,7 @@ class ObjectModel:
             ModelError: if there are no faces, or as :meth:`from_file`.
         """
         settings = settings or ModelSettings()
-        parts = mesh_parts(mesh)
+        parts = mesh_parts(mesh, name)
         if not parts:
             raise ModelError(f"'{name}' has no triangles: the tracker needs a surface. Give a triangle mesh, or lines with from_polylines.")
         scale = checked_scale(np.concatenate([part.vertices for part in parts]), unit, name)

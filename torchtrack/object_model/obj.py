@@ -17,7 +17,8 @@ from torchtrack.object_model.side_files import MeshText, SideFiles, find_beside
 
 _PLAIN_END = re.compile(rb"\r(?!\n)")
 _UNUSUAL = re.compile(
-    rb"^[ \t]+\S|^\w+\t|^f[^\n]*[-\t\x0b]|^f[^\n]*\s0|\\[ \t]*\r?\n|^[vf][^\n]*#|#[^\n]*(?:usemtl|mtllib)|^f[^\n]*[^\d\s/-][^\n]*$", re.MULTILINE
+    rb"^[ \t]+\S|^\w+\t|^f[^\n]*[-\t\x0b]|^f[^\n]*\s0|\\[ \t]*\r?\n|^[vf][^\n]*#|^[^\n#]*#[^\n]*(?:usemtl|mtllib)|^f[^\n]*[^\d\s/-][^\n]*$",
+    re.MULTILINE,
 )
 # Options of a texture map and how many values each takes, in the MTL format; -o, -s and -t take one to three.
 _OPTION = re.compile(
@@ -54,12 +55,12 @@ def read_obj(path: Path) -> MeshText:
     data = path.read_bytes()
     if _PLAIN_END.search(data):
         data = _PLAIN_END.sub(b"\n", data)
-    check_limit("vertices", len(re.findall(rb"^\s*v\s", data, re.MULTILINE)), path)
-    check_limit("faces", len(re.findall(rb"^\s*f\s", data, re.MULTILINE)), path)
+    check_limit("vertices", len(re.findall(rb"^[ \t]*v[ \t]", data, re.MULTILINE)), path)
+    check_limit("faces", len(re.findall(rb"^[ \t]*f[ \t]", data, re.MULTILINE)), path)
     text = _decoded(data)
     if _UNUSUAL.search(data):
         text = "\n".join(_plain_lines(text, path))
-    others = re.findall(r"^\s*(?:l|curv|curv2|surf)\s", text, re.MULTILINE)
+    others = re.findall(r"^[ \t]*(?:l|curv|curv2|surf)[ \t]", text, re.MULTILINE)
     if others:
         tell(
             f"{len(others)} lines, curves or free-form surfaces of '{path}' are not used: only its faces are. Convert them to faces, or delete them."
@@ -132,7 +133,7 @@ def check_indices(path: Path) -> None:
         ModelError: with that line.
     """
     text = _decoded(path.read_bytes())
-    count = len(re.findall(r"^\s*v\s", text, re.MULTILINE))
+    count = len(re.findall(r"^[ \t]*v[ \t]", text, re.MULTILINE))
     for number, line in joined_lines(text):
         kind, *values = line.split() or [""]
         for corner in values if kind == "f" else []:
@@ -150,7 +151,7 @@ def _materials(path: Path, text: str) -> tuple[ObjMaterials, str]:
     materials: list[str] = []
     images: dict[str, str] = {}
     missing: list[str] = []
-    named = re.findall(r"^\s*mtllib[ \t]+(.+?)\s*$", text, re.MULTILINE)
+    named = [name.strip() for name in re.findall(r"^[ \t]*mtllib[ \t]+(\S[^\n]*)$", text, re.MULTILINE)]
     # Several libraries may stand in one line; a name may hold blanks, too.
     for name in (name for line in named for name in ([line] if find_beside(path, line) else line.split())):
         found = find_beside(path, name)
@@ -176,16 +177,17 @@ def _materials(path: Path, text: str) -> tuple[ObjMaterials, str]:
 def image_name(value: str) -> str:
     """The image of a texture map of an MTL file, without the options before it."""
     value = value.strip()
-    while (option := _OPTION.match(value)) is not None:
-        value = value[option.end() :]
-    return value
+    start = 0
+    while (option := _OPTION.match(value, start)) is not None:
+        start = option.end()
+    return value[start:]
 
 
 def _tell_unused(path: Path, text: str, materials: ObjMaterials) -> None:
     """Warn of textures that the libraries of an OBJ file name and its faces do not use."""
     if not materials.images:
         return
-    used = re.findall(r"^usemtl[ \t]+(.+?)\s*$", text, re.MULTILINE)
+    used = [name.strip() for name in re.findall(r"^usemtl[ \t]+(\S[^\n]*)$", text, re.MULTILINE)]
     unknown = [name for name in dict.fromkeys(used) if name not in materials.materials]
     listed = ", ".join(f"'{image}' ('{name}')" for name, image in list(materials.images.items())[:5])
     if unknown:

@@ -89,7 +89,7 @@ def _header(path: Path, data: bytes) -> PlyHeader:
     if not data.startswith(b"ply") or end is None:
         raise _damaged(path, "it has no header from 'ply' to 'end_header'")
     lines = [line.split() for line in data[: end.start()].decode("latin-1").splitlines()[1:] if line.strip()]
-    texture = re.search(r"^comment[ \t]+TextureFile[ \t]+(.+?)\s*$", data[: end.start()].decode("latin-1"), re.MULTILINE | re.IGNORECASE)
+    texture = re.search(r"^comment[ \t]+TextureFile[ \t]+(\S[^\n]*)$", data[: end.start()].decode("latin-1"), re.MULTILINE | re.IGNORECASE)
     kind = next((line[1] for line in lines if line[0] == "format" and len(line) > 1), "")
     order = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}.get(kind)
     if order is None:
@@ -98,7 +98,7 @@ def _header(path: Path, data: bytes) -> PlyHeader:
         elements = _elements([line for line in lines if line[0] in ("element", "property")], order)
     except (ValueError, KeyError, IndexError) as error:
         raise _damaged(path, f"its header is wrong ({type(error).__name__}: {error})") from error
-    return PlyHeader(kind == "ascii", order, elements, texture.group(1) if texture else None, end.end())
+    return PlyHeader(kind == "ascii", order, elements, texture.group(1).strip() if texture else None, end.end())
 
 
 def _elements(lines: list[list[str]], order: str) -> tuple[_Element, ...]:

@@ -15,12 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from torchtrack.errors import ModelError
+from torchtrack.errors import LimitError, ModelError
+from torchtrack.limits import check_limit
 from torchtrack.object_model.loading import check_file
+from torchtrack.object_model.obj import joined_lines
 
 POLYLINE_SUFFIXES = (".json", ".obj")
 
 Polylines = list[np.ndarray]
+_EXPECTED = ' Expected is JSON such as {"unit": "mm", "polylines": [[[0, 0, 0], [50, 0, 0]]]}, or an OBJ file with "v" and "l" records.'
 
 
 def read_polylines(path: str | Path) -> tuple[Polylines, str | None]:
@@ -34,29 +37,31 @@ def read_polylines(path: str | Path) -> tuple[Polylines, str | None]:
     try:
         if path.suffix.lower() == ".obj":
             return _obj_lines(path.read_text(encoding="latin-1")), None
-        content = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_bytes()
+        # Of a point there are one bracket and three commas; a hostile file has nothing else.
+        check_limit("vertices", max(text.count(b"["), text.count(b",") // 3), path)
+        content = json.loads(text.decode("utf-8-sig"))
         return as_polylines(list(content["polylines"])), str(content["unit"]) if "unit" in content else None
     except ModelError as error:
-        raise ModelError(f"'{path}': {error}") from error
-    except (ValueError, KeyError, IndexError, TypeError) as error:
-        raise ModelError(
-            f'cannot read polylines from \'{path}\' ({type(error).__name__}: {error}): expected JSON such as {{"unit": "mm", '
-            '"polylines": [[[0, 0, 0], [50, 0, 0]]]}, or an OBJ file with "v" and "l" records.'
-        ) from error
+        raise ModelError(f"'{path}': {error}{_EXPECTED if path.suffix.lower() == '.json' else ''}") from error
+    except LimitError:
+        raise
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError, RecursionError, MemoryError, OSError) as error:
+        raise ModelError(f"cannot read polylines from '{path}' ({type(error).__name__}: {error}).{_EXPECTED}") from error
 
 
 def has_obj_lines(path: Path) -> bool:
     """Whether an OBJ file has lines and no faces."""
-    text = path.read_text(encoding="latin-1")
-    return re.search(r"^\s*l\s", text, re.MULTILINE) is not None and re.search(r"^\s*f\s", text, re.MULTILINE) is None
+    data = path.read_bytes()
+    return re.search(rb"^[ \t]*l[ \t]", data, re.MULTILINE) is not None and re.search(rb"^[ \t]*f[ \t]", data, re.MULTILINE) is None
 
 
 def _obj_lines(text: str) -> Polylines:
     """The ``l`` records of an OBJ file; indices start at 1, negative ones count from the newest vertex."""
     vertices: list[list[float]] = []
     lines = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        kind, *values = line.split() or ["#"]
+    for number, line in joined_lines(text):
+        kind, *values = line.split() or [""]
         if kind == "v":
             vertices.append([float(value) for value in values[:3]])
         elif kind == "l":
@@ -74,7 +79,10 @@ def as_polylines(lines: Iterable[Any]) -> Polylines:
     Raises:
         ModelError: if a line is not made of two or more points of three numbers.
     """
-    arrays = [np.asarray(line, dtype=np.float64) for line in lines]
+    try:
+        arrays = [np.asarray(line, dtype=np.float64) for line in lines]
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ModelError(f"a polyline is not made of points of three numbers [n, 3] ({error}).") from error
     for number, line in enumerate(arrays):
         if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2:
             raise ModelError(f"polyline {number} must be two or more points of three numbers [n, 3], got shape {list(line.shape)}.")
