@@ -279,6 +279,9 @@ TREES += [
 ]
 
 
+TREES += ['{"scenes": [{"nodes": [0]}], "nodes": [' + ", ".join(f'{{"children": [{i}]}}' for i in range(1, 200)) + ", {}]}"]
+
+
 @pytest.mark.parametrize("tree", TREES, ids=lambda text: text[:30])
 def test_damaged_trees(tmp_path: Path, tree: str):
     (tmp_path / "bad.gltf").write_text(tree)

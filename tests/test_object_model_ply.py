@@ -157,3 +157,8 @@ def test_list_that_is_longer_than_the_file(tmp_path: Path):
     data = ply([quad[:3] for quad in QUADS]).replace(b"list uchar int", b"list int int")
     with pytest.raises(ModelError, match="cut short|a number of corners is wrong"):
         read(tmp_path, data)
+
+
+def test_text_list_that_is_longer_than_its_line(tmp_path: Path):
+    with pytest.raises(ModelError, match="face 2 says that it has '10000000' corners, and 4 numbers follow"):
+        read(tmp_path, ply(QUADS, "ascii").replace(b"\n4 %d %d" % QUADS[2][:2], b"\n10000000 %d %d" % QUADS[2][:2]))

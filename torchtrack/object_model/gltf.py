@@ -32,6 +32,8 @@ _HARMLESS = (
     "KHR_node_visibility",
 )
 _VALUES_PER_NODE = 200
+# Assemblies are some ten levels deep; the time of a scene is that of its nodes times their depth.
+_DEEPEST = 100
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _FLOAT, _UINT32 = 5126, 5125
 # What reading a damaged tree of JSON runs into.
@@ -160,13 +162,14 @@ def _check_scene(path: Path, tree: Tree) -> None:
     scene = at(tree["scenes"], tree.get("scene", 0))
     if len(tree["scenes"]) > 1:
         tell(f"'{path}' has {len(tree['scenes'])} scenes; only {_named(scene, tree.get('scene', 0))} is read. Export the scene that you mean alone.")
-    shown, queue = set(), list(scene.get("nodes", []))
-    while queue:
-        number = queue.pop()
-        if number in shown:
-            raise ValueError(f"node {number} comes twice in its scene")
-        shown.add(number)
-        queue += at(nodes, number).get("children", [])
+    shown: set[int] = set()
+    level, depth = list(scene.get("nodes", [])), 0
+    while level:
+        depth += 1
+        if depth > _DEEPEST or not shown.isdisjoint(level):
+            raise ValueError(f"its nodes lie more than {_DEEPEST} deep in one another, or one comes twice in the scene")
+        shown.update(level)
+        level = [child for number in level for child in at(nodes, number).get("children", [])]
     _tell_hidden(path, tree, shown)
 
 

@@ -122,6 +122,14 @@ def _check_rows(path: Path, data: bytes, header: PlyHeader) -> None:
     lines = data[header.length :].splitlines()
     if len(lines) < rows:
         raise _damaged(path, f"its header declares {_declared(header)}, and {len(lines)} lines follow it: it was cut short")
+    start = 0
+    for element in header.elements:
+        if element.name == "face" and element.properties and element.properties[0].count is not None:
+            for row, line in enumerate(lines[start : start + element.rows]):
+                count, *numbers = line.split() or [b"nothing"]
+                if not count.isdigit() or int(count) > len(numbers):
+                    raise _damaged(path, f"face {row} says that it has '{count.decode('latin-1')}' corners, and {len(numbers)} numbers follow")
+        start += element.rows
 
 
 def _with_even_faces(path: Path, data: bytes, header: PlyHeader) -> bytes:
