@@ -39,6 +39,7 @@ def check_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
     Raises:
         MissingFileError: if there is no such file, or what is there is a folder, a pipe or a device.
         UnknownFormatError: if its suffix is another.
+        ModelError: if it is empty.
         LimitError: if it is larger than ``limits.mesh_bytes``.
     """
     path = Path(path)
@@ -53,6 +54,8 @@ def check_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
         raise MissingFileError(f"the object model '{path}' does not exist. Check the path; a relative one starts at {Path.cwd()}.")
     if path.suffix.lower() not in suffixes:
         raise UnknownFormatError(f"'{path}' is not an object model: expected a file ending in {', '.join(suffixes)}. Convert it, or rename it.")
+    if size == 0:
+        raise ModelError(f"the object model '{path}' is empty (0 bytes). Copy it again, or export it again.")
     check_limit("mesh_bytes", size, path)
     return path
 
