@@ -250,6 +250,8 @@ def test_glb_that_is_cut_short(tmp_path: Path):
 def test_sizes_are_limited_before_anything_is_made(tmp_path: Path):
     with pytest.raises(LimitError, match=r"20,001 scene nodes.*limits\.scene_nodes"):
         ObjectModel.from_file(rewrite(tmp_path, card(), lambda tree, _: tree.update(nodes=tree["nodes"][:1] + [{}] * 20_000)))
+    with pytest.raises(LimitError, match=r"20,000 scene nodes"):
+        ObjectModel.from_file(rewrite(tmp_path, card(), lambda tree, _: tree.update(meshes=tree["meshes"] * 20_000)))
     with pytest.raises(LimitError, match=r"faces.*limits\.faces"):
         ObjectModel.from_file(
             rewrite(tmp_path, card(), lambda tree, _: tree["accessors"][tree["meshes"][0]["primitives"][0]["indices"]].update(count=30_000_000))

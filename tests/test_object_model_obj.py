@@ -187,3 +187,8 @@ def test_sizes_are_limited(tmp_path: Path):
     path = card(tmp_path)
     with limits(Limits(texture_pixels=64 * 64 - 1)), pytest.raises(LimitError, match=r"card\.obj' asks for 4,096 texture pixels"):
         ObjectModel.from_file(path)
+
+
+def test_very_many_libraries(tmp_path: Path):
+    with pytest.raises(ModelError, match="names 500 material libraries, expected at most 100"):
+        ObjectModel.from_file(write(tmp_path / "box.obj", "mtllib " + " ".join(f"{i}.mtl" for i in range(500)) + "\n" + "\n".join(box_lines())))

@@ -196,6 +196,7 @@ def _named(item: Tree, number: int) -> str:
 def _check_sizes(path: Path, content: GltfContent) -> None:
     """Faces and vertices of all nodes together, before any is made."""
     tree = content.tree
+    check_limit("scene_nodes", sum(len(mesh["primitives"]) for mesh in tree.get("meshes", [])), path)
     per_mesh = [[_size(content, primitive) for primitive in mesh["primitives"]] for mesh in tree.get("meshes", [])]
     totals = [[sum(size[k] for size in sizes) for k in (0, 1)] for sizes in per_mesh]
     placed = [at(totals, node["mesh"]) for node in tree["nodes"] if "mesh" in node]

@@ -203,7 +203,7 @@ def _tell_missing(path: Path, named: Iterable[str]) -> frozenset[str]:
     missing = [name for name in dict.fromkeys(named) if find_beside(path, name) is None]
     if missing:
         tell(
-            f"'{path}' names {', '.join(repr(name) for name in missing)}, which cannot be found in '{path.parent}': "
+            f"'{path}' names {', '.join(repr(name) for name in missing[:5])}, which cannot be found in '{path.parent}': "
             "only the geometry is used. Put the file there, or export the model as GLB, which holds its textures."
         )
     return frozenset(missing)

@@ -20,6 +20,7 @@ _UNUSUAL = re.compile(
     rb"^[ \t]+\S|^\w+\t|^f[^\n]*[-\t\x0b]|^f[^\n]*\s0|\\[ \t]*\r?\n|^[vf][^\n]*#|^[^\n#]*#[^\n]*(?:usemtl|mtllib)|^f[^\n]*[^\d\s/-][^\n]*$",
     re.MULTILINE,
 )
+_MOST_LIBRARIES = 100
 # Options of a texture map and how many values each takes, in the MTL format; -o, -s and -t take one to three.
 _OPTION = re.compile(
     r"-(?:(?:blendu|blendv|cc|clamp|texres|imfchan|type|boost|bm)\s+\S+|mm\s+\S+\s+\S+|[ost](?:\s+[-+]?[\d.][\d.eE+-]*(?=\s)){1,3})\s+", re.IGNORECASE
@@ -153,7 +154,10 @@ def _materials(path: Path, text: str) -> tuple[ObjMaterials, str]:
     missing: list[str] = []
     named = [name.strip() for name in re.findall(r"^[ \t]*mtllib[ \t]+(\S[^\n]*)$", text, re.MULTILINE)]
     # Several libraries may stand in one line; a name may hold blanks, too.
-    for name in (name for line in named for name in ([line] if find_beside(path, line) else line.split())):
+    names = dict.fromkeys(name for line in dict.fromkeys(named) for name in ([line] if find_beside(path, line) else line.split()))
+    if len(names) > _MOST_LIBRARIES:
+        raise ModelError(f"'{path}' names {len(names)} material libraries, expected at most {_MOST_LIBRARIES}: it is damaged. Export it again.")
+    for name in names:
         found = find_beside(path, name)
         if found is None:
             missing.append(name)
