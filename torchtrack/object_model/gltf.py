@@ -154,6 +154,7 @@ def _check_scene(path: Path, tree: Tree) -> None:
     """Nodes form a forest within the limits; what of it is not shown is said."""
     nodes = tree.setdefault("nodes", [])
     check_limit("scene_nodes", len(nodes), path)
+    check_limit("scene_nodes", sum(len(mesh["primitives"]) for mesh in tree.get("meshes", [])), path)
     children = [child for node in nodes for child in node.get("children", [])]
     if len(set(children)) < len(children) or any(not 0 <= child < len(nodes) for child in children):
         raise ValueError("a node is the child of two others, or is not there")
@@ -196,7 +197,6 @@ def _named(item: Tree, number: int) -> str:
 def _check_sizes(path: Path, content: GltfContent) -> None:
     """Faces and vertices of all nodes together, before any is made."""
     tree = content.tree
-    check_limit("scene_nodes", sum(len(mesh["primitives"]) for mesh in tree.get("meshes", [])), path)
     per_mesh = [[_size(content, primitive) for primitive in mesh["primitives"]] for mesh in tree.get("meshes", [])]
     totals = [[sum(size[k] for size in sizes) for k in (0, 1)] for sizes in per_mesh]
     placed = [at(totals, node["mesh"]) for node in tree["nodes"] if "mesh" in node]
