@@ -97,8 +97,9 @@ def _show_run(console: Console, summary: RunSummary, output: Path) -> ExitCode:
     """Show what came of a run; returns the exit code."""
     console.print(run_headline(summary))
     console.print(run_table(summary))
-    if summary.dropped_windows:
-        console.print(f"{summary.dropped_windows} windows ({summary.dropped_events} events) came too fast and were dropped")
+    if summary.joined_windows or summary.dropped_windows:
+        left_out = f"{summary.dropped_windows} were dropped, {summary.dropped_events} events left out"
+        console.print(f"events came too fast: {summary.joined_windows} windows were joined with the next, {left_out}")
     console.print(f"Results are in {output}")
     return ExitCode.INTERRUPTED if summary.interrupted else ExitCode.DONE
 

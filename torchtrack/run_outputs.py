@@ -50,7 +50,7 @@ class RunOutputs:
         self._sinks: list[Sink] = []
 
     def windows(self, length: WindowLength) -> Iterator[EventWindow]:
-        """The windows of the session; a live one drops those that come too fast, and ends at an interrupt."""
+        """The windows of the session; those of a live one that come too fast are joined, and it ends at an interrupt."""
         windows = cut_windows(self.session.chunks(), self.session.start_us, length)
         self._keep_up = self.session.keep_up(windows)
         return self._keep_up.until(lambda: self._interrupt.requested) if self._keep_up else windows
@@ -91,7 +91,7 @@ class RunOutputs:
             more=self._further_facts(),
         )
         if self._keep_up:
-            summary = replace(summary, dropped_windows=self._keep_up.dropped_windows, dropped_events=self._keep_up.dropped_events)
+            summary = replace(summary, **self._keep_up.waiting.left_out())
         (self._folder / "config.yaml").write_text(as_yaml(self._config), encoding="utf-8")
         text = json.dumps(summary.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
         (self._folder / "summary.json").write_text(f"{text}\n", encoding="utf-8")

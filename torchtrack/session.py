@@ -69,7 +69,7 @@ class Session:
         )
 
     def keep_up(self, windows: Iterator[EventWindow]) -> KeepUp | None:
-        """The ``windows`` of a live source, less those that come too fast; None for a file."""
+        """The ``windows`` of a live source, joined where they come too fast; None for a file."""
         return None if self.live is None else KeepUp(windows, self.live_windows, self.live.stop)
 
     @property

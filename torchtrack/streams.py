@@ -15,10 +15,11 @@ from torchtrack.baselines import tracker_class
 from torchtrack.config.run import TrackingConfig
 from torchtrack.errors import ConfigError, TorchtrackError
 from torchtrack.events import EventWindow, concatenate
+from torchtrack.haste import Pace
 from torchtrack.refined_steps import Refinement
 from torchtrack.session import Session
 from torchtrack.smoothed_steps import SmoothedObjects
-from torchtrack.state import TrackerState, joined, take_part
+from torchtrack.state import StepResult, TrackerState, joined, take_part
 from torchtrack.stepping import Step, timed_step
 from torchtrack.tracker import Tracker
 from torchtrack.window_length import WindowLength
@@ -191,6 +192,8 @@ def _one_batch(streams: Sequence[_Stream], config: TrackingConfig) -> Iterator[t
     tracker, state, rows = _together(streams, config)
     # Before the first window is asked for: a live camera does not wait.
     tracker.prepare(state)
+    pace = Pace(tracker)
+    result: StepResult | None = None
     while True:
         windows = [(stream, _next_window(stream)) for stream in streams]
         yield from ((stream.number, window) for stream, window in windows if isinstance(window, Ended))
@@ -200,9 +203,11 @@ def _one_batch(streams: Sequence[_Stream], config: TrackingConfig) -> Iterator[t
         if len(due) < len(streams):
             streams = [stream for stream, _ in due]
             tracker, state, rows = _together(streams, config)
+            pace, result = Pace(tracker), None
         events = concatenate(window.events.of_stream(place) for place, (_, window) in enumerate(due))
         t_end_us = torch.tensor([window.t_end_us for _, window in due], device=config.device)
-        state, result, seconds = timed_step(tracker, state, events, t_end_us, [stream.length for stream in streams])
+        taker = pace.tracker([window for _, window in due], result)
+        state, result, seconds = timed_step(taker, state, events, t_end_us, [stream.length for stream in streams])
         for (stream, window), own in zip(due, rows, strict=True):
             stream.state = take_part(state, *own)
             yield stream.number, Step(window, stream.state, take_part(result, *own), seconds / len(due))

@@ -42,6 +42,7 @@ from torchtrack.setup_check import check_start
 from torchtrack.slow_circuits import LOOK_US, dated, late_share_after
 from torchtrack.speed_limit import held_back
 from torchtrack.state import StepResult, TrackerState, choose_rows
+from torchtrack.step_check import check_step
 from torchtrack.time_surface import update_last_event
 from torchtrack.tracked_objects import TrackedObjects
 from torchtrack.turns import may_have_turned
@@ -127,9 +128,11 @@ class Tracker(TrackedObjects):
             t_end_us: end of the window; the newest event of each stream when not given.
 
         Raises:
-            EventDataError: if an event is outside the sensor, where kernels are used.
+            EventDataError: if the events of a stream are not in time order, or not after ``state.t_us`` and up to ``t_end_us``,
+                except on a GPU; if an event is outside the sensor, where kernels are used.
         """
         t_us = self._window_end(state, events, t_end_us)
+        check_step(state.t_us, events, t_us)
         with torch.autocast(t_us.device.type, enabled=False), switch.kernels(wanted=self.kernels):
             steady = self._steady(state, events, t_us)
             if steady is not None:

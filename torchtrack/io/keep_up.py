@@ -1,18 +1,90 @@
-"""Keeping up with a live stream: windows wait in a bounded queue, and whole ones are dropped, never a part of one, never silently."""
+"""Keeping up with a live stream: windows wait in a bounded queue, and where they come too fast, several are tracked as one, with fewer events.
+
+Where a tracker is behind, what waits is joined to windows of up to ``MOST_JOINED``, each with about as many events as one of
+those that it is made of: evenly left out, as a window needs events from all of its time, and the newest of all is kept. So a
+tracker down to an eighth of the needed speed follows the whole stream, and the lag is at most that of ``capacity`` windows, and
+the time of one step. Windows of more than ``LONGEST_US`` are not made: what has waited longer is dropped. All that is left out is counted.
+"""
 
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 
-from torchtrack.events import EventWindow
+import torch
 
+from torchtrack.events import EventBatch, EventWindow, concatenate
+
+MOST_JOINED = 12
+"""So many windows are tracked as one at most, while fewer than may wait do."""
+LONGEST_US = 1_000_000
+"""Windows that wait are joined to no longer ones than this (µs); then the oldest is dropped."""
+FEWEST_EVENTS = 2_000
+"""No events are left out of joined windows that have fewer."""
 _WAIT_S = 0.05
+# So long after the last joined window a tracker is still in haste (µs): one more search, and it is behind again.
+_CALM_US = 100_000
+
+
+class HastyWindow(EventWindow):
+    """A window for a tracker that is behind its stream, or was just now: it has no time for what can wait."""
+
+
+class WaitingWindows:
+    """The windows that wait, in order; not for several threads.
+
+    Args:
+        capacity: how many may wait.
+
+    Attributes:
+        joined_windows: how many were joined with the one after them, so far.
+        dropped_windows: how many were dropped.
+        dropped_events: events that were left out, with those of dropped windows.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.joined_windows = self.dropped_windows = self.dropped_events = 0
+        self._capacity, self._waiting = capacity, deque[EventWindow]()
+        self._haste_until_us: int | None = None
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def put(self, window: EventWindow) -> None:
+        """A window has come; of too many, the two oldest become one."""
+        self._waiting.append(window)
+        if len(self._waiting) <= self._capacity:
+            return
+        oldest = self._waiting.popleft()
+        if self._waiting and self._waiting[0].t_end_us - oldest.t_start_us <= LONGEST_US:
+            self._waiting.appendleft(self._joined([oldest, self._waiting.popleft()]))
+        else:
+            self.dropped_windows += 1
+            self.dropped_events += len(oldest.events)
+
+    def take(self) -> EventWindow:
+        """What is to be tracked next: the oldest window, or all those that wait as one."""
+        taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), MOST_JOINED))]
+        window = self._joined(taken) if len(taken) > 1 else taken[0]
+        if len(taken) > 1:
+            self._haste_until_us = window.t_end_us + _CALM_US
+        in_haste = self._haste_until_us is not None and window.t_end_us <= self._haste_until_us
+        return HastyWindow(window.events, window.t_start_us, window.t_end_us) if in_haste else window
+
+    def left_out(self) -> dict[str, int]:
+        """The counts, by name."""
+        return {name: getattr(self, name) for name in ("joined_windows", "dropped_windows", "dropped_events")}
+
+    def _joined(self, windows: list[EventWindow]) -> EventWindow:
+        """Windows as one, with the events that one of them has in the mean, or ``FEWEST_EVENTS``."""
+        events = concatenate(window.events for window in windows)
+        kept = _thinned(events, max(len(events) // len(windows), FEWEST_EVENTS))
+        self.joined_windows += len(windows) - 1
+        self.dropped_events += len(events) - len(kept)
+        return EventWindow(kept, windows[0].t_start_us, windows[-1].t_end_us)
 
 
 class KeepUp:
     """Takes windows as they come, and hands them to someone who may be slower.
-
-    Where more than ``capacity`` windows wait, the oldest is dropped: what is tracked stays near the present.
 
     Args:
         windows: the windows; they are taken from a thread of its own.
@@ -20,13 +92,12 @@ class KeepUp:
         stop_source: called once when the consumer has finished, so that ``windows`` ends.
 
     Attributes:
-        dropped_windows, dropped_events: what was dropped so far.
+        waiting: the windows that wait, with counts of what was left out.
     """
 
     def __init__(self, windows: Iterable[EventWindow], capacity: int, stop_source: Callable[[], None] = lambda: None) -> None:
-        self.dropped_windows = self.dropped_events = 0
-        self._windows, self._capacity, self._stop_source = windows, capacity, stop_source
-        self._queue: deque[EventWindow] = deque()
+        self.waiting = WaitingWindows(capacity)
+        self._windows, self._stop_source = windows, stop_source
         self._changed = threading.Condition()
         self._closed = self._ended = False
         self._error: BaseException | None = None
@@ -44,7 +115,7 @@ class KeepUp:
             while not stopped():
                 window = self._next()
                 if window is None:
-                    if self._ended and not self._queue:
+                    if self._ended and not self.waiting:
                         break
                     continue
                 count += 1
@@ -59,21 +130,17 @@ class KeepUp:
             thread.join()
 
     def _next(self) -> EventWindow | None:
-        """The window that waits longest, or None if there is none after a short wait."""
+        """What is to be tracked next, or None if there is nothing after a short wait."""
         with self._changed:
-            if not self._queue and not self._ended:
+            if not self.waiting and not self._ended:
                 self._changed.wait(_WAIT_S)
-            return self._queue.popleft() if self._queue else None
+            return self.waiting.take() if self.waiting else None
 
     def _take(self) -> None:
         try:
             for window in self._windows:
                 with self._changed:
-                    self._queue.append(window)
-                    if len(self._queue) > self._capacity:
-                        dropped = self._queue.popleft()
-                        self.dropped_windows += 1
-                        self.dropped_events += len(dropped.events)
+                    self.waiting.put(window)
                     self._changed.notify()
                 if self._closed:
                     break
@@ -83,3 +150,10 @@ class KeepUp:
             with self._changed:
                 self._ended = True
                 self._changed.notify()
+
+
+def _thinned(events: EventBatch, count: int) -> EventBatch:
+    """So many of the events at most, spread evenly, with the newest."""
+    if len(events) <= count:
+        return events
+    return events[torch.arange(1, count + 1) * len(events) // count - 1]

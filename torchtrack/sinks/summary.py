@@ -54,7 +54,8 @@ class RunSummary:
         tracking_real_time_factor: stream time by the time of the tracker alone, without reading, drawing and writing.
         step_median_ms, step_p95_ms: time of one tracker step.
         objects: by label.
-        dropped_windows, dropped_events: of a live source, what came too fast to be tracked.
+        joined_windows: of a live source, those that came too fast, and were tracked as one with the next.
+        dropped_windows, dropped_events: of a live source, what came too fast to be tracked; events of joined windows among them.
     """
 
     source: str
@@ -72,6 +73,7 @@ class RunSummary:
     step_median_ms: float
     step_p95_ms: float
     objects: dict[str, ObjectSummary]
+    joined_windows: int = 0
     dropped_windows: int = 0
     dropped_events: int = 0
 
