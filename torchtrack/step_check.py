@@ -1,5 +1,7 @@
 """What a step is given is checked before anything is computed: events in time order, after the state and up to the window's end."""
 
+from itertools import pairwise
+
 from jaxtyping import Int
 from torch import Tensor
 
@@ -36,23 +38,25 @@ def check_step(state_us: Int[Tensor, "s"], events: EventBatch, t_end_us: Int[Ten
         at = int(back.nonzero()[0])
         before, after = events.t_us[at : at + 2].tolist()
         raise EventDataError(
-            f"stream {int(events.stream_index[at])}: time goes back from {before} to {after} µs at event {at + 1}. Sort the events of each stream by time."
+            f"stream {int(events.stream_index[at])}: time goes back from {before} to {after} µs at event {at + 1}. "
+            "Sort the events of each stream by time."
         )
     _check_within(bounds, state_us, events, t_end_us)
 
 
 def _check_within(bounds: list[int], state_us: Tensor, events: EventBatch, t_end_us: Tensor) -> None:
     """Sorted events lie within their windows where the first and the last one do."""
-    for stream, (first, last) in enumerate(zip(bounds, bounds[1:], strict=False)):
+    for stream, (first, last) in enumerate(pairwise(bounds)):
         if first == last:
             continue
         (oldest, newest), start_us, end_us = events.t_us[[first, last - 1]].tolist(), int(state_us[stream]), int(t_end_us[stream])
         if oldest < start_us:
             raise EventDataError(
-                f"stream {stream}: an event of {oldest} µs is older than the state, which is of {start_us} µs. Give each event once, in the order in which "
-                "they came; what comes late is to be left out."
+                f"stream {stream}: an event of {oldest} µs is older than the state, which is of {start_us} µs. "
+                "Give each event once, in time order; leave out what comes late."
             )
         if newest > end_us:
             raise EventDataError(
-                f"stream {stream}: an event of {newest} µs is after the window's end at {end_us} µs. Cut the events with slice_time, or leave out t_end_us."
+                f"stream {stream}: an event of {newest} µs is after the window's end at {end_us} µs. "
+                "Cut the events with slice_time, or leave out t_end_us."
             )

@@ -50,5 +50,5 @@ class EventsConfig(ReadingConfig):
     hot_pixels: bool = Field(False, description="Leave out pixels that fire all the time, found in the first half second of a file.")
     background_us: int | None = Field(None, ge=1, description="Leave out events without a neighbour that fired in so many µs before.")
     live_windows: int = Field(
-        64, ge=1, le=100_000, description="Windows of a live source that may wait; of more, the oldest are joined. Those that wait are tracked as few, with fewer events."
+        64, ge=1, le=100_000, description="Windows of a live source that may wait; of more, the oldest are joined and their events thinned out."
     )

@@ -13,6 +13,7 @@ import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ _HEADER_BYTES = 1 << 12
 
 class LiveSource(EventStream):
     """Events as they come. :meth:`chunks` goes on where the one before it stopped; it ends when the sender does, or after :meth:`stop`.
+    A camera that is unplugged, or any other fault of what it reads from, is an :class:`EventDataError`.
 
     Args:
         name: what the source is called.
@@ -89,13 +91,14 @@ class DvSource(LiveSource):
         self._reader = reader
 
     def _receive(self) -> Columns | None:
-        store = self._reader.getNextEventBatch()
-        if store is None:
-            if not self._reader.isRunning():
+        with _faults_told(self.name):
+            store = self._reader.getNextEventBatch()
+            if store is None and not self._reader.isRunning():
                 return None
+            events = None if store is None else store.numpy()
+        if events is None:
             time.sleep(_POLL_S)
             return Columns.empty()
-        events = store.numpy()
         return Columns(
             events["timestamp"].astype(np.int64), events["x"].astype(np.int32), events["y"].astype(np.int32), events["polarity"].astype(np.int8) > 0
         )
@@ -106,7 +109,8 @@ class StreamSource(LiveSource):
 
     def __init__(self, name: str, descriptor: int, width: int = 0, height: int = 0) -> None:
         self._descriptor = descriptor
-        self._rest = os.read(descriptor, _HEADER_BYTES)
+        with _faults_told(name):
+            self._rest = os.read(descriptor, _HEADER_BYTES)
         header = parse_header(self._rest)
         encoding = header.encoding if header is not None and header.encoding in ("evt2", "evt21", "evt3") else "evt3"
         stored = header.size if header is not None else (None, None)
@@ -115,9 +119,10 @@ class StreamSource(LiveSource):
         self._decoder = make_decoder(encoding, self.problems)
 
     def _receive(self) -> Columns | None:
-        if not select.select([self._descriptor], [], [], _WAIT_S)[0]:
-            return Columns.empty()
-        data = os.read(self._descriptor, _READ_BYTES)
+        with _faults_told(self.name):
+            if not select.select([self._descriptor], [], [], _WAIT_S)[0]:
+                return Columns.empty()
+            data = os.read(self._descriptor, _READ_BYTES)
         if not data:
             return None
         data = self._rest + data
@@ -135,7 +140,8 @@ class Evk4Source(LiveSource):
         self._device = iter(drivers.open(serial=serial or None))
 
     def _receive(self) -> Columns | None:
-        received = next(self._device, None)
+        with _faults_told(self.name):
+            received = next(self._device, None)
         if received is None:
             return None
         events = received[1].polarity_events
@@ -157,7 +163,7 @@ def open_live(source: str, width: int | None = None, height: int | None = None) 
     """
     scheme, _, rest = source.partition("://")
     if scheme in ("-", "stdin"):
-        return StreamSource("standard input", sys.stdin.fileno(), width or 0, height or 0)
+        return _opened(source, lambda: StreamSource("standard input", sys.stdin.fileno(), width or 0, height or 0))
     purpose = f"the source '{source}'"
     if scheme == "evk4":
         drivers = optional("neuromorphic_drivers", "neuromorphic-drivers", "live", purpose)
@@ -171,9 +177,25 @@ def open_live(source: str, width: int | None = None, height: int | None = None) 
     return _opened(source, lambda: DvSource(source, dv.io.NetworkReader(host, int(port))))
 
 
+@contextmanager
+def _faults_told(name: str) -> Iterator[None]:
+    """What a driver or the system raises within it, as a camera is unplugged, becomes an :class:`EventDataError`."""
+    try:
+        yield
+    except (RuntimeError, OSError, ValueError, LookupError) as error:
+        raise EventDataError(
+            f"'{name}' has failed while events were read: {_reason(error)}. "
+            "Check cable and power, and that no other program uses it; then start again."
+        ) from error
+
+
+def _reason(error: Exception) -> str:
+    """What an exception says, on one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def _opened(source: str, make: Callable[[], LiveSource]) -> LiveSource:
     try:
         return make()
     except (RuntimeError, OSError, LookupError, ValueError, TypeError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise EventDataError(f"'{source}' cannot be opened: {reason}. Check that it is there, connected and not in use.") from error
+        raise EventDataError(f"'{source}' cannot be opened: {_reason(error)}. Check that it is there, connected and not in use.") from error
