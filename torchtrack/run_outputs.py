@@ -91,7 +91,9 @@ class RunOutputs:
             more=self._further_facts(),
         )
         if self._keep_up:
-            summary = replace(summary, **self._keep_up.waiting.left_out())
+            waiting = self._keep_up.waiting
+            joined, dropped = waiting.joined_windows, waiting.dropped_windows
+            summary = replace(summary, joined_windows=joined, dropped_windows=dropped, dropped_events=waiting.dropped_events)
         (self._folder / "config.yaml").write_text(as_yaml(self._config), encoding="utf-8")
         text = json.dumps(summary.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
         (self._folder / "summary.json").write_text(f"{text}\n", encoding="utf-8")

@@ -70,10 +70,6 @@ class WaitingWindows:
         in_haste = self._haste_until_us is not None and window.t_end_us <= self._haste_until_us
         return HastyWindow(window.events, window.t_start_us, window.t_end_us) if in_haste else window
 
-    def left_out(self) -> dict[str, int]:
-        """The counts, by name."""
-        return {name: getattr(self, name) for name in ("joined_windows", "dropped_windows", "dropped_events")}
-
     def _joined(self, windows: list[EventWindow]) -> EventWindow:
         """Windows as one, with the events that one of them has in the mean, or ``FEWEST_EVENTS``."""
         events = concatenate(window.events for window in windows)
