@@ -43,17 +43,14 @@ def first_difference(
     """
     renamed = RENAMED if renamed is None else renamed
     for window, (fields_there, theirs) in enumerate(zip(base, here, strict=False)):
-        named = {name_here(name, renamed): value for name, value in fields_there.items()}
-        named.pop(None, None)
-        for field in named.keys() | theirs.keys():
-            if field in named and field not in theirs:
-                return Difference(window, str(field), "only the tree at BASE has it; list it in RENAMED if it was renamed")
+        named = {here_as: value for name, value in fields_there.items() if (here_as := name_here(name, renamed)) is not None}
+        for field in theirs:
             if field not in named and field not in added:
-                return Difference(window, str(field), "only the tree here has it; list it in RENAMED or ADDED")
+                return Difference(window, field, "only the tree here has it; list it in RENAMED or ADDED")
         for field, value in named.items():
-            what = _unequal(value, theirs[str(field)])
+            what = _unequal(value, theirs[field]) if field in theirs else "only the tree at BASE has it; list it in RENAMED"
             if what:
-                return Difference(window, str(field), what)
+                return Difference(window, field, what)
     if len(base) != len(here):
         return Difference(min(len(base), len(here)), "windows", f"{len(base)} windows at BASE, {len(here)} here")
     return None

@@ -4,7 +4,7 @@ Run in a process of its own, with that tree first on the path::
 
     python runner.py INPUTS OUTPUTS RUNS.json TREE
 
-``TREE`` is where torchtrack must come from. Whenever a run is stored, its number is printed. Only public names of the
+``TREE`` is where torchtrack must come from. Whenever a run is stored, its number is written, a line of its own. Only public names of the
 package are used; where they differ between two trees, :func:`make_tracker` is the one place for it.
 """
 
@@ -94,7 +94,8 @@ def main(inputs: Path, outputs: Path, runs: Path, tree: Path) -> None:
         name = run["scene"]
         scenes[name] = scenes.get(name) or Scene(inputs, name)
         torch.save([numbers_of(result) for result in results_of(scenes[name], run)], outputs / f"{number}.pt")
-        print(number, flush=True)
+        sys.stdout.write(f"{number}\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":
