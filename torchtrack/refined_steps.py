@@ -41,7 +41,9 @@ class Refinement:
 
     def add(self, step: Step) -> list[Step]:
         """Take one step; returns those that are due, in order."""
-        return _through(self._stages, [step])
+        # What came after a gap tells nothing of the motion before it.
+        before_gap = self.rest() if step.window.after_gap else []
+        return before_gap + _through(self._stages, [step])
 
     def rest(self) -> list[Step]:
         """Those that are still held back, when no more come."""

@@ -1,5 +1,6 @@
 """What a run tracks: events, camera, object models, the initial poses, and the truth where it is known."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchtrack.camera import Camera
 from torchtrack.config.events import EventsConfig
 from torchtrack.config.run import CameraConfig, ObjectConfig, PoseConfig, RunConfig
-from torchtrack.errors import ConfigError, EventDataError
+from torchtrack.errors import ConfigError, EventDataError, TorchtrackWarning
 from torchtrack.events import EventBatch, EventWindow
 from torchtrack.files import naming
 from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence, read_trajectory
@@ -20,10 +21,15 @@ from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, 
 from torchtrack.io.keep_up import KeepUp
 from torchtrack.io.live import LiveSource, open_live
 from torchtrack.io.polarity_code import told_if_alike
+from torchtrack.io.problems import Problems
 from torchtrack.lie import check_pose, rotation_from_quaternion
 from torchtrack.limits import check_limit, limits
 from torchtrack.object_model import ObjectModel
 from torchtrack.stepping import clipped
+
+
+# A pose from longer before the first event is doubtful: an object that moves fires events. From so long, the clocks differ.
+_DOUBTFUL_START_S, _FARTHEST_START_S = 1.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,7 @@ class Session:
         end_us: where tracking ends, or None for the end of the stream.
         live: the live source that the events are from, or None for a file.
         live_windows: how many windows of a live source may wait.
+        problems: what was wrong with the events that were read, where their source counts it.
     """
 
     name: str
@@ -53,6 +60,7 @@ class Session:
     end_us: int | None
     live: LiveSource | None = None
     live_windows: int = 64
+    problems: Problems | None = None
 
     def chunks(self) -> Iterator[EventBatch]:
         """The events after the start and up to the end."""
@@ -144,6 +152,7 @@ def _opened(config: RunConfig) -> Session:
         end_us=config.end_us,
         live=source if isinstance(source, LiveSource) else None,
         live_windows=config.events.live_windows,
+        problems=getattr(source, "problems", None),
     )
 
 
@@ -167,7 +176,7 @@ def _open_source(config: RunConfig) -> tuple[str, EventSource, Camera, dict[str,
     if isinstance(config.source, str):
         return _open_live(config.source, config.camera)
     if is_sequence(config.source):
-        sequence = read_sequence(config.source, choices=config.events)
+        sequence = read_sequence(config.source, config.events.strict, choices=config.events)
         camera = _camera(config.camera) if config.camera else sequence.camera
         return sequence.name, sequence.events, camera, {obj.label: obj for obj in sequence.objects}
     if config.camera is None:
@@ -217,15 +226,33 @@ def _load_model(obj: ObjectConfig, found: SequenceObject | None, config: RunConf
 
 def _start(config: RunConfig, events: EventSource, truth: tuple[Trajectory | None, ...]) -> int:
     """Time of the initial poses: as configured, else the first moment that has events and, where there is truth, truth."""
-    span = f"after {config.start_us} µs " if config.start_us is not None else ""
-    span += f"up to {config.end_us} µs " if config.end_us is not None else ""
     before = config.start_us if config.start_us is not None else -(2**62)
     first = next(clipped(events.chunks(), before, config.end_us), None)
     if first is None:
-        raise EventDataError(f"'{config.source}' has no events {span}to track with. Check the file, and start_us and end_us.")
+        raise EventDataError(_no_events(config, events))
     if config.start_us is not None:
+        _check_start(config, int(first.t_us[0]))
         return config.start_us
     return max([int(first.t_us[0]) - 1, *(int(trajectory.t_us[0]) for trajectory in truth if trajectory is not None)])
+
+
+def _no_events(config: RunConfig, events: EventSource) -> str:
+    """That there is nothing to track with, and where events are."""
+    span = f"after {config.start_us} µs " if config.start_us is not None else ""
+    span += f"up to {config.end_us} µs " if config.end_us is not None else ""
+    of_all = None if isinstance(events, LiveSource) else next(iter(events.chunks()), None)
+    where = "" if of_all is None else f" Its first event is at {int(of_all.t_us[0])} µs."
+    return f"'{config.source}' has no events {span}to track with.{where} Check the file, and start_us and end_us: they are in the time of its events."
+
+
+def _check_start(config: RunConfig, first_us: int) -> None:
+    """Refuse initial poses from long before the first event, which are likely on another clock; tell of those from some time before."""
+    before_s = 1e-6 * (first_us - (config.start_us or 0))
+    told = f"start_us: the initial pose is of {config.start_us} µs, but the first event of '{config.source}' after that is at {first_us} µs, "
+    if before_s > _FARTHEST_START_S:
+        raise ConfigError(f"{told}{before_s:.0f} s later: they are on different clocks. Leave start_us out, or give it in the time of the events.")
+    if before_s > _DOUBTFUL_START_S:
+        warnings.warn(f"{told}{before_s:.1f} s later. It is taken to have stayed there. Check start_us.", TorchtrackWarning, stacklevel=2)
 
 
 def _initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) -> Float[Tensor, "4 4"]:

@@ -2,13 +2,15 @@
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from torchtrack.bursts import LONG_AGO_US
 from torchtrack.events import EventBatch, EventWindow, windows_by_count, windows_by_time
+from torchtrack.motion import initial_covariance
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracker import Tracker
 from torchtrack.window_length import WindowLength, tell_lengths
@@ -38,8 +40,28 @@ def cut_windows(chunks: Iterable[EventBatch], t_start_us: int, length: WindowLen
 def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState, length: WindowLength) -> Iterator[Step]:
     """One step per window, which says how long the next one is to last; nothing is recorded for gradients."""
     for window in windows:
+        if window.after_gap:
+            state = passed_over(tracker, state, torch.full_like(state.t_us, window.t_start_us))
         state, result, seconds = timed_step(tracker, state, window.events, window.t_end_us, [length])
         yield Step(window, state, result, seconds)
+
+
+def passed_over(tracker: Tracker, state: TrackerState, t_us: Int[Tensor, "s"]) -> TrackerState:
+    """The state after times without events, up to ``t_us`` of those streams that it is later for.
+
+    Objects are where they were, as far as is known: how they moved since is as unknown as at the start.
+    """
+    passed = t_us > state.t_us
+    objects = passed[tracker.stream_index]
+    unknown = initial_covariance(tracker.diameter_m, tracker.config.motion)
+    return replace(
+        state,
+        velocity=torch.where(objects[:, None], 0.0, state.velocity),
+        acceleration=torch.where(objects[:, None], 0.0, state.acceleration),
+        covariance=torch.where(objects[:, None, None], unknown, state.covariance),
+        burst_age_us=torch.where(passed[:, None, None, None], LONG_AGO_US, state.burst_age_us),
+        t_us=torch.maximum(t_us, state.t_us),
+    )
 
 
 def timed_step(

@@ -20,7 +20,7 @@ from torchtrack.refined_steps import Refinement
 from torchtrack.session import Session
 from torchtrack.smoothed_steps import SmoothedObjects
 from torchtrack.state import StepResult, TrackerState, joined, take_part
-from torchtrack.stepping import Step, timed_step
+from torchtrack.stepping import Step, passed_over, timed_step
 from torchtrack.tracker import Tracker
 from torchtrack.window_length import WindowLength
 
@@ -206,6 +206,9 @@ def _one_batch(streams: Sequence[_Stream], config: TrackingConfig) -> Iterator[t
             pace, result = Pace(tracker), None
         events = concatenate(window.events.of_stream(place) for place, (_, window) in enumerate(due))
         t_end_us = torch.tensor([window.t_end_us for _, window in due], device=config.device)
+        if any(window.after_gap for _, window in due):
+            starts_us = [window.t_start_us if window.after_gap else 0 for _, window in due]
+            state = passed_over(tracker, state, torch.tensor(starts_us, device=config.device))
         taker = pace.tracker([window for _, window in due], result)
         state, result, seconds = timed_step(taker, state, events, t_end_us, [stream.length for stream in streams])
         for (stream, window), own in zip(due, rows, strict=True):

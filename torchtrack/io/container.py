@@ -54,17 +54,18 @@ def is_container(path: Path) -> bool:
         return bool(file.attrs.get("format") == _FORMAT)
 
 
-def read_container(path: Path, *, choices: ReadingConfig = DEFAULT_CHOICES) -> Sequence:
+def read_container(path: Path, strict: bool = False, *, choices: ReadingConfig = DEFAULT_CHOICES) -> Sequence:
     """Read a sequence in HDF5; its events stay on disk until they are streamed.
 
-    ``choices`` say how its events are read. Model files are put into a temporary folder, which goes with the object that names it.
+    ``choices`` say how its events are read; ``strict``: what is wrong in the stream is an error. Model files are put into a temporary
+    folder, which goes with the object that names it.
 
     Raises:
         EventDataError: if something is missing, damaged or of the wrong shape.
         CalibrationError: if the camera makes no sense.
         PoseError: if the ground truth is not rigid, or its times do not increase.
     """
-    events = Hdf5Events(path, choices=choices)
+    events = Hdf5Events(path, strict=strict, choices=choices)
     with open_hdf5(path) as file:
         if file.attrs.get("version") != _VERSION:
             raise EventDataError(

@@ -78,7 +78,8 @@ def convert(
         TorchtrackError: what reading or writing raises.
     """
     source, target = Path(source), Path(target)
-    sequence = read_sequence(source, choices=choices) if is_sequence(source) else None
+    # Where its events are from is copied beside them: none may be left out, nor change places.
+    sequence = read_sequence(source, strict=True, choices=choices) if is_sequence(source) else None
     chosen = _format(target, format, sequence is not None)
     events: EventSource = sequence.events if sequence else open_events(source, width, height, strict, choices)
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,6 @@ from torchtrack.io.columns import Columns
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.prophesee_header import read_header
 from torchtrack.io.raw_file import words_of
-from torchtrack.io.time_high import unwrap
 
 _EVENT_BYTES = 8
 _KINDS = (0x00, 0x0C)
@@ -41,6 +40,11 @@ class DatFile(EventFile):
         """How many events there are."""
         return max(self.path.stat().st_size - self.offset, 0) // _EVENT_BYTES
 
+    @property
+    def counter_bits(self) -> int | None:
+        """Of how many bits the counter of µs is."""
+        return _CLOCK_BITS
+
     def _open(self) -> None:
         header = read_header(self.path)
         if header is None or header.encoding != "dat" or header.fields.get("version", "2") != "2":
@@ -56,13 +60,8 @@ class DatFile(EventFile):
         self._settle_size(*header.size, default=_DEFAULT_SIZE)
 
     def _read(self, max_events: int) -> Iterator[Columns]:
-        last = 0
         with self.path.open("rb") as stream:
             stream.seek(self.offset)
             for words in words_of(stream, np.dtype("<u8"), self.problems):
                 shown, address = words.view("<u4")[0::2], words.view("<u4")[1::2]
-                t_us = shown.astype(np.int64)
-                if last >= 1 << _CLOCK_BITS or t_us[0] < last or (shown[1:] < shown[:-1]).any():
-                    t_us = unwrap(t_us, _CLOCK_BITS, last)
-                last = max(int(t_us[-1]), 0)
-                yield Columns(t_us, (address & 0x3FFF).astype(np.uint16), ((address >> 14) & 0x3FFF).astype(np.uint16), address >> 28 > 0)
+                yield Columns(shown.astype(np.int64), (address & 0x3FFF).astype(np.uint16), ((address >> 14) & 0x3FFF).astype(np.uint16), address >> 28 > 0)

@@ -13,9 +13,10 @@ from torchtrack.files import check_is_file, naming
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
 from torchtrack.io.event_stream import EventStream
+from torchtrack.io.mending import Mender, all_of
 from torchtrack.io.polarity_code import PolarityCode
 from torchtrack.io.problems import Problem, Problems
-from torchtrack.io.soundness import mended, sound
+from torchtrack.io.soundness import inside
 
 DEFAULT_CHOICES = ReadingConfig()
 
@@ -29,7 +30,7 @@ class EventFile(EventStream):
         width, height: sensor size in pixels; 0 where the file says it, or the format has a default.
         strict: whether faults are errors; otherwise what can be read is read, and the rest is counted in
             :attr:`problems` and reported by a warning at the end.
-        start_us: events before this time are passed over.
+        start_us: events before this time are passed over; where the clock changes, it is the time after mending.
         choices: how what the file does not say is read: unit of times, code of polarity, which of several streams.
 
     Raises:
@@ -45,7 +46,7 @@ class EventFile(EventStream):
     path: Path
     width: int = 0
     height: int = 0
-    strict: bool = True
+    strict: bool = False
     start_us: int | None = None
     choices: ReadingConfig = DEFAULT_CHOICES
     streams: tuple[str, ...] = field(init=False, default=(), compare=False)
@@ -78,6 +79,11 @@ class EventFile(EventStream):
         """How many events there are, where the file tells that without being read; an estimate where it is compressed."""
         return None
 
+    @property
+    def counter_bits(self) -> int | None:
+        """Of how many bits the counter of µs is, where the format says that it begins again."""
+        return None
+
     @abstractmethod
     def _open(self) -> None:
         """Read the header, and set what it says."""
@@ -88,16 +94,12 @@ class EventFile(EventStream):
 
     def _checked(self, max_events: int) -> Iterator[EventBatch]:
         self.problems.clear()
-        last_us, count = None, 0
-        parts = self._with_polarity(self._readable(max_events))
-        for part in parts if self.strict else mended(parts):
-            events = self._started(part)
-            usable = sound(events, self.width, self.height, self.problems, last_us, count)
-            count += len(events)
-            if len(usable):
-                last_us = int(usable.t_us[-1])
-            for start in range(0, len(usable), max_events):
-                yield usable[start : start + max_events].batch()
+        mender, count = Mender(self.problems, waits=True, counter_bits=self.counter_bits), 0
+        for part in self._with_polarity(self._readable(max_events)):
+            events = inside(part, self.width, self.height, self.problems, count)
+            count += len(part)
+            yield from all_of(map(self._started, mender.add(events)), max_events)
+        yield from all_of(map(self._started, mender.rest()), max_events)
         self.problems.warn()
 
     def _readable(self, max_events: int) -> Iterator[Columns]:

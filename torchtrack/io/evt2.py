@@ -10,9 +10,11 @@ import numpy as np
 
 from torchtrack.io.columns import Columns
 from torchtrack.io.problems import Problem, Problems
-from torchtrack.io.time_high import spread, unwrap
+from torchtrack.io.time_high import HighClock, spread
 
 TIME_HIGH_BITS, TIME_LOW_BITS = 28, 6
+# A time high word comes at least every so many words.
+MOST_HELD_WORDS = 1 << 16
 _TIME_HIGH = 8
 _FIRST_OTHER = np.uint32(2 << 28)
 _KNOWN = np.isin(np.arange(16), (0, 1, 8, 10, 14, 15))
@@ -25,19 +27,37 @@ class Evt2Decoder:
 
     def __init__(self, problems: Problems) -> None:
         self._problems = problems
-        self._high: int | None = None
+        self._clock = HighClock(TIME_HIGH_BITS, 1 << TIME_LOW_BITS, problems)
+        self._rest = np.zeros(0, self.dtype)
 
     def feed(self, words: np.ndarray) -> Columns:
-        """The events of the next words; those before the first time are left out."""
+        """The events of the next words; those before the first time are left out.
+
+        Words from a leap of the clock on are held back until the next time high word tells whether it is one.
+        """
+        return self._decoded(np.concatenate([self._rest, words]) if len(self._rest) else words)
+
+    def finish(self) -> Columns:
+        """The events of words that are held back, when no more come."""
+        return self._decoded(self._rest, is_last=True)
+
+    def _decoded(self, words: np.ndarray, *, is_last: bool = False) -> Columns:
         is_event = words < _FIRST_OTHER
         others = np.flatnonzero(~is_event)
         kinds = words[others] >> 28
-        count_unknown(kinds, _KNOWN, self._problems)
         at = others[kinds == _TIME_HIGH]
+        shown = words[at] & 0x0FFFFFFF
+        self._rest = words[:0]
+        if not is_last and self._clock.doubts(shown) and len(words) - at[-1] < MOST_HELD_WORDS:
+            until = int(at[-1])
+            sure = self._decoded(words[:until], is_last=True)
+            self._rest = words[until:].copy()
+            return sure
+        count_unknown(kinds, _KNOWN, self._problems)
         events = words[is_event]
         # How many events come before each time high word: all words before it but the other ones.
         before = at - np.searchsorted(others, at)
-        high = self._advance(words[at])
+        high = self._clock.advance(shown)
         times = spread(high, before, len(events))
         first = 0
         if high[0] < 0:
@@ -49,22 +69,13 @@ class Evt2Decoder:
 
     def skip(self, words: np.ndarray) -> int | None:
         """Pass words over; returns the latest time that may have been reached (µs), None while it is unknown."""
-        self._advance(words[(words >> 28) == _TIME_HIGH])
-        return None if self._high is None else (self._high + 1 << TIME_LOW_BITS) - 1
-
-    def _advance(self, words: np.ndarray) -> np.ndarray:
-        """High parts of the time: the one that held before, -1 where it is unknown, and those of time high words."""
-        high, self._high = continued(words & 0x0FFFFFFF, TIME_HIGH_BITS, self._high)
-        return high
+        self._clock.passed(words[(words >> 28) == _TIME_HIGH] & 0x0FFFFFFF)
+        return reached_us(self._clock)
 
 
-def continued(shown: np.ndarray, bits: int, last: int | None) -> tuple[np.ndarray, int | None]:
-    """Unwrapped high parts with the one before them in front (-1 for None), and the last one known."""
-    high = np.full(len(shown) + 1, -1 if last is None else last, np.int64)
-    if len(shown):
-        high[1:] = unwrap(shown.astype(np.int64), bits, int(shown[0]) if last is None else last)
-        last = int(high[-1])
-    return high, last
+def reached_us(clock: HighClock) -> int | None:
+    """The latest time that may have been reached (µs), None while it is unknown."""
+    return None if clock.last is None else (clock.last + 1 << TIME_LOW_BITS) - 1
 
 
 def headless(before: np.ndarray, count: int, problems: Problems) -> int:

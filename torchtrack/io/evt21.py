@@ -10,9 +10,9 @@ Reference: docs.prophesee.ai, EVT 2.1 format.
 import numpy as np
 
 from torchtrack.io.columns import Columns
-from torchtrack.io.evt2 import TIME_HIGH_BITS, TIME_LOW_BITS, continued, count_unknown, headless
+from torchtrack.io.evt2 import MOST_HELD_WORDS, TIME_HIGH_BITS, TIME_LOW_BITS, count_unknown, headless, reached_us
 from torchtrack.io.problems import Problems
-from torchtrack.io.time_high import spread
+from torchtrack.io.time_high import HighClock, spread
 
 _TIME_HIGH = 8
 _KNOWN = np.isin(np.arange(16), (0, 1, 8, 10, 14, 15))
@@ -26,19 +26,34 @@ class Evt21Decoder:
     def __init__(self, problems: Problems, legacy: bool = False) -> None:
         self._problems = problems
         self._legacy = legacy
-        self._high: int | None = None
+        self._clock = HighClock(TIME_HIGH_BITS, 1 << TIME_LOW_BITS, problems)
+        self._rest = np.zeros(0, self.dtype)
 
     def feed(self, words: np.ndarray) -> Columns:
-        """The events of the next words; those before the first time are left out."""
+        """The events of the next words; those before the first time are left out, those after a leap come later, as in EVT 2.0."""
+        return self._decoded(np.concatenate([self._rest, words]) if len(self._rest) else words)
+
+    def finish(self) -> Columns:
+        """The events of words that are held back, when no more come."""
+        return self._decoded(self._rest, is_last=True)
+
+    def _decoded(self, words: np.ndarray, *, is_last: bool = False) -> Columns:
         address, valid = self._halves(words)
         kinds = address >> 28
+        at = np.flatnonzero(kinds == _TIME_HIGH)
+        shown = address[at] & 0x0FFFFFFF
+        self._rest = words[:0]
+        if not is_last and self._clock.doubts(shown) and len(words) - at[-1] < MOST_HELD_WORDS:
+            until = int(at[-1])
+            sure = self._decoded(words[:until], is_last=True)
+            self._rest = words[until:].copy()
+            return sure
         count_unknown(kinds, _KNOWN, self._problems)
         is_event = kinds < 2
         bits = np.unpackbits(np.ascontiguousarray(valid[is_event]).view(np.uint8).reshape(-1, 4), axis=1, bitorder="little")
         word, bit = np.nonzero(bits)
-        at = np.flatnonzero(kinds == _TIME_HIGH)
         before = np.searchsorted(word, np.cumsum(is_event)[at]) if len(at) else at
-        high = self._advance(address[at])
+        high = self._clock.advance(shown)
         times = spread(high, before, len(word))
         if high[0] < 0:
             first = headless(before, len(word), self._problems)
@@ -51,17 +66,13 @@ class Evt21Decoder:
     def skip(self, words: np.ndarray) -> int | None:
         """Pass words over; returns the latest time that may have been reached (µs), None while it is unknown."""
         address, _ = self._halves(words)
-        self._advance(address[(address >> 28) == _TIME_HIGH])
-        return None if self._high is None else (self._high + 1 << TIME_LOW_BITS) - 1
+        self._clock.passed(address[(address >> 28) == _TIME_HIGH] & 0x0FFFFFFF)
+        return reached_us(self._clock)
 
     def _halves(self, words: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The halves with kind and address, and with the valid bits."""
         halves = words.view("<u4")
         return (halves[0::2], halves[1::2]) if self._legacy else (halves[1::2], halves[0::2])
-
-    def _advance(self, address: np.ndarray) -> np.ndarray:
-        high, self._high = continued(address & 0x0FFFFFFF, TIME_HIGH_BITS, self._high)
-        return high
 
 
 def is_legacy(words: np.ndarray) -> bool:

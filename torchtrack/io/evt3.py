@@ -22,9 +22,9 @@ Reference: docs.prophesee.ai, EVT 3.0 format.
 import numpy as np
 
 from torchtrack.io.columns import Columns
-from torchtrack.io.evt2 import count_unknown
+from torchtrack.io.evt2 import MOST_HELD_WORDS, count_unknown
 from torchtrack.io.problems import Problem, Problems
-from torchtrack.io.time_high import spread, unwrap
+from torchtrack.io.time_high import HighClock, spread
 
 _ROW, _EVENT, _BASE, _VECTOR_12, _VECTOR_8, _LOW, _HIGH = 0, 2, 3, 4, 5, 6, 8
 _KNOWN = np.isin(np.arange(16), (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15))
@@ -48,16 +48,30 @@ class Evt3Decoder:
 
     def __init__(self, problems: Problems) -> None:
         self._problems = problems
+        self._clock = HighClock(_BITS, 1 << _BITS, problems)
+        self._rest = np.zeros(0, self.dtype)
         # -1 stands for not known yet.
-        self._high, self._low, self._row = -1, 0, -1
+        self._low, self._row = 0, -1
         # Column where the next vector starts, packed with its polarity.
         self._base = _UNKNOWN
 
     def feed(self, words: np.ndarray) -> Columns:
-        """The events of the next words, without those whose time or address is not known yet."""
+        """The events of the next words, without those whose time or address is not known yet; those after a leap come later, as in EVT 2.0."""
+        return self._decoded(np.concatenate([self._rest, words]) if len(self._rest) else words)
+
+    def finish(self) -> Columns:
+        """The events of words that are held back, when no more come."""
+        return self._decoded(self._rest, is_last=True)
+
+    def _decoded(self, words: np.ndarray, *, is_last: bool = False) -> Columns:
+        self._rest = words[:0]
         if len(words) == 0:
             return Columns.empty()
         kinds = words >> _BITS
+        if not is_last and (until := self._doubtful(words, kinds)) is not None:
+            sure = self._decoded(words[:until], is_last=True)
+            self._rest = words[until:].copy()
+            return sure
         _report_unknown(kinds, self._problems)
         ends = np.cumsum(_EVENTS_OF[words], dtype=np.int32)
         rows, row_at = self._rows(words, kinds)
@@ -73,9 +87,16 @@ class Evt3Decoder:
         """Pass words over; returns the time reached (µs), None while it is unknown."""
         kinds = words >> _BITS
         self._rows(words, kinds)
-        times, _ = self._times(words, kinds)
+        until = self._doubtful(words, kinds)
+        # What leaps at the end is not believed.
+        times, _ = self._times(words[:until], kinds[:until])
         self._move_base(words, kinds)
         return int(times[-1]) if times[-1] >= 0 else None
+
+    def _doubtful(self, words: np.ndarray, kinds: np.ndarray) -> int | None:
+        """The last time high word, where it leaps, and only the next one tells whether it is damaged."""
+        highs = np.flatnonzero(kinds[-MOST_HELD_WORDS:] == _HIGH) + max(len(words) - MOST_HELD_WORDS, 0)
+        return int(highs[-1]) if self._clock.doubts(words[highs[-4:]] & 0xFFF) else None
 
     def _headed(self, events: Columns) -> Columns:
         """Only events whose time, row and column are known."""
@@ -98,9 +119,7 @@ class Evt3Decoder:
         at = np.flatnonzero((kinds == _LOW) | (kinds == _HIGH))
         is_high = kinds[at] == _HIGH
         shown = (words[at] & 0xFFF).astype(np.int64)
-        highs = np.full(np.count_nonzero(is_high) + 1, self._high, np.int64)
-        if len(highs) > 1:
-            highs[1:] = unwrap(shown[is_high], _BITS, int(shown[is_high][0]) if self._high < 0 else self._high)
+        highs = self._clock.advance(shown[is_high])
         high = highs[np.cumsum(is_high)]
         low = np.where(is_high, 0, shown)
         # A time high that says nothing new leaves the low bits as they are.
@@ -109,9 +128,9 @@ class Evt3Decoder:
         held = np.maximum.accumulate(np.where(repeated, -1, np.arange(len(at)))) if len(at) else at
         low = np.where(held < 0, self._low, low[held]) if len(at) else low
         times = np.empty(len(at) + 1, np.int64)
-        times[0] = -1 if self._high < 0 else (self._high << _BITS) | self._low
+        times[0] = -1 if highs[0] < 0 else (highs[0] << _BITS) | self._low
         times[1:] = np.where(high < 0, -1, (high << _BITS) | low)
-        self._high, self._low = int(highs[-1]), int(low[-1]) if len(at) else self._low
+        self._low = int(low[-1]) if len(at) else self._low
         return times, at
 
     def _columns(self, words: np.ndarray, kinds: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

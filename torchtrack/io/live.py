@@ -24,10 +24,11 @@ from torchtrack.io.columns import Columns
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
 from torchtrack.io.event_stream import EventStream
 from torchtrack.io.extras import optional
+from torchtrack.io.mending import Mender, all_of
 from torchtrack.io.problems import Problems
 from torchtrack.io.prophesee_header import parse_header
 from torchtrack.io.raw_file import make_decoder
-from torchtrack.io.soundness import sound
+from torchtrack.io.soundness import inside
 
 _WAIT_S = 0.05
 _POLL_S = 0.0005
@@ -49,8 +50,9 @@ class LiveSource(EventStream):
         self.name, self.width, self.height = name, width, height
         self.problems = Problems(name, strict=False)
         self._stopped = threading.Event()
+        self._ended = False
         self._waiting: list[EventBatch] = []
-        self._last_us: int | None = None
+        self._mender = Mender(self.problems, waits=False)
 
     def stop(self) -> None:
         """End the stream soon; may be called from another thread."""
@@ -61,21 +63,20 @@ class LiveSource(EventStream):
         check_max_events(max_events)
         while not self._stopped.is_set():
             if not self._waiting:
-                received = self._receive()
-                if received is None:
+                if self._ended:
                     return
-                self._waiting = self._batches(received, max_events)
+                received = self._receive()
+                self._ended = received is None
+                self._waiting = list(all_of(self._mended(received), max_events))
                 continue
             # It stays in line until the next one is asked for: who looks at the first events only does not lose them.
             yield self._waiting[0]
             del self._waiting[0]
 
-    def _batches(self, received: Columns, max_events: int) -> list[EventBatch]:
-        usable = sound(received, self.width, self.height, self.problems, self._last_us)
-        if len(usable) == 0:
-            return []
-        self._last_us = int(usable.t_us[-1])
-        return [usable[start : start + max_events].batch() for start in range(0, len(usable), max_events)]
+    def _mended(self, received: Columns | None) -> list[Columns]:
+        if received is None:
+            return self._mender.rest()
+        return self._mender.add(inside(received, self.width, self.height, self.problems))
 
     @abstractmethod
     def _receive(self) -> Columns | None:
@@ -124,7 +125,8 @@ class StreamSource(LiveSource):
                 return Columns.empty()
             data = os.read(self._descriptor, _READ_BYTES)
         if not data:
-            return None
+            left = self._decoder.finish()
+            return left if len(left) else None
         data = self._rest + data
         size = self._decoder.dtype.itemsize
         whole = len(data) - len(data) % size

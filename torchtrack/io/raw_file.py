@@ -80,6 +80,8 @@ class RawFile(EventFile):
             for words in words_of(stream, decoder.dtype, self.problems):
                 events = decoder.feed(words)
                 yield replace(events, t_us=shifted(events.t_us, self.base_us))
+            left = decoder.finish()
+            yield replace(left, t_us=shifted(left.t_us, self.base_us))
 
 
 def make_decoder(encoding: str, problems: Problems, legacy: bool = False) -> WordDecoder:

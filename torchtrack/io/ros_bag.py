@@ -88,6 +88,7 @@ class RosBag(EventFile):
                     yield decoder.events(waiting)
                     waiting, size = [], 0
             yield decoder.events(waiting)
+            yield decoder.rest()
 
     def _decoder(self, connection: Any, problems: Problems) -> MessageDecoder:
         return MessageDecoder(_KINDS[connection.msgtype], not _is_ros1(self.path), problems)

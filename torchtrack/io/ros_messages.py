@@ -96,6 +96,10 @@ class MessageDecoder:
                 words = []
         return join([*parts, self._decoded(words)])
 
+    def rest(self) -> Columns:
+        """The events that are held back, when no more messages come."""
+        return self._evt3.finish()
+
     def _decoded(self, words: list[np.ndarray]) -> Columns:
         """The events of EVT3 words, at once: messages are small."""
         return self._evt3.feed(np.concatenate(words)) if words else Columns.empty()
@@ -132,7 +136,8 @@ class MessageDecoder:
         """libcaer_cmp: every packet counts from its own time."""
         start = np.array([8 << 12, 6 << 12, 0], np.uint16)
         words = _AS_EVT3[words >> 12] << 12 | words & 0xFFF
-        turned = Evt3Decoder(self.problems).feed(np.concatenate([start, words]))
+        decoder = Evt3Decoder(self.problems)
+        turned = join([decoder.feed(np.concatenate([start, words])), decoder.finish()])
         return Columns(turned.t_us + (base_ns + 500) // 1000, turned.y, turned.x, turned.polarity)
 
     def _array(self, cursor: _Cursor) -> Columns:

@@ -44,8 +44,12 @@ _LONGEST_LABEL = 200
 _EXTRA = ("velocity", "occluder_poses", "occluder_labels")
 
 
-def read_sequence(path: str | os.PathLike[str], *, choices: ReadingConfig = DEFAULT_CHOICES) -> Sequence:
+def read_sequence(path: str | os.PathLike[str], strict: bool = False, *, choices: ReadingConfig = DEFAULT_CHOICES) -> Sequence:
     """Read a sequence; its events stay on disk until they are streamed, as ``choices`` say.
+
+    Args:
+        path: the file.
+        strict: whether what is wrong in the stream is an error, see :func:`torchtrack.io.open_events`.
 
     Raises:
         MissingFileError: if the file, or a mesh that it names, is not there.
@@ -56,11 +60,11 @@ def read_sequence(path: str | os.PathLike[str], *, choices: ReadingConfig = DEFA
     """
     path = Path(path)
     with naming(path):
-        return read_container(path, choices=choices) if is_container(path) else _read_archive(path, choices)
+        return read_container(path, strict, choices=choices) if is_container(path) else _read_archive(path, strict, choices)
 
 
-def _read_archive(path: Path, choices: ReadingConfig) -> Sequence:
-    events = NpzEvents(path, choices=choices)
+def _read_archive(path: Path, strict: bool, choices: ReadingConfig) -> Sequence:
+    events = NpzEvents(path, strict=strict, choices=choices)
     with open_archive(path) as archive:
         camera = _read_camera(archive, events, path)
         labels, mesh_files = _read_names(archive, "labels", path), _read_names(archive, "mesh_files", path)

@@ -9,7 +9,7 @@ from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch
 from torchtrack.io.columns import Columns
 from torchtrack.io.problems import Problems
-from torchtrack.io.soundness import sound
+from torchtrack.io.soundness import check_order, inside
 
 
 class EventWriter(ABC):
@@ -36,7 +36,8 @@ class EventWriter(ABC):
         """
         if len(events) == 0:
             return
-        columns = sound(Columns.of(events), self.width, self.height, Problems("events to write", strict=True), self._last_us, self._count)
+        columns = inside(Columns.of(events), self.width, self.height, Problems("events to write", strict=True), self._count)
+        check_order(columns.t_us, "events to write", self._last_us, self._count)
         self._append(columns)
         self._last_us = int(columns.t_us[-1])
         self._count += len(columns)
