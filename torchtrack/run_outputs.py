@@ -90,6 +90,7 @@ class RunOutputs:
             interrupted=self._interrupt.requested,
             more=self._further_facts(),
         )
+        summary = summary.with_problems(self.session.problems)
         if self._keep_up:
             waiting = self._keep_up.waiting
             joined, dropped = waiting.joined_windows, waiting.dropped_windows

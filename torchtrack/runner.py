@@ -14,7 +14,10 @@ from torchtrack.executor.groups import run_in_groups
 from torchtrack.executor.tasks import without_errors
 from torchtrack.interrupt import Interrupt
 from torchtrack.io import EventSource
+from torchtrack.io.event_stream import EventStream
 from torchtrack.io.live import LiveSource
+from torchtrack.io.mending import mended_batches
+from torchtrack.io.problems import Problems
 from torchtrack.limits import limits
 from torchtrack.refined_steps import Refinement, refined_steps
 from torchtrack.run_outputs import RunOutputs
@@ -33,7 +36,11 @@ __all__ = ["run", "run_many", "track"]
 
 
 def track(
-    source: EventSource | Iterable[EventBatch], tracker: Tracker, state: TrackerState, window: WindowConfig | None = None
+    source: EventSource | Iterable[EventBatch],
+    tracker: Tracker,
+    state: TrackerState,
+    window: WindowConfig | None = None,
+    problems: Problems | None = None,
 ) -> Iterator[StepResult]:
     """Track one stream from ``state`` on, one result per window, in constant memory; refined where the tracker's settings say so.
 
@@ -41,16 +48,22 @@ def track(
     A live source is never held back.
 
     Args:
-        source: a source of events, or batches of them in time order; events up to the state's time are passed over.
+        source: a source of events, or batches of them; events up to the state's time are passed over. What is wrong with the times of batches
+            is mended as for files: what comes late by up to 10 ms is sorted in, what was sent twice or is too late is dropped, and where the
+            clock wraps or jumps back, time goes on.
         tracker: the tracker, of one stream.
         state: where it starts, from :meth:`Tracker.init`.
         window: how to cut the stream; as the tracker is configured when not given.
+        problems: where it is counted what was wrong with batches; if strict, the first fault is an error. By default a warning tells it.
 
     Raises:
         EventDataError: if the stream has no events after the state's time, or they are malformed.
     """
     start_us = int(state.t_us[0])
     chunks = source.chunks() if isinstance(source, EventSource) else source
+    if not isinstance(source, EventStream):
+        camera = tracker.cameras[0]
+        chunks = mended_batches(chunks, camera.width, camera.height, problems or Problems("the stream", strict=False))
     seen, length = False, WindowLength(window or tracker.config.window)
     objects = SmoothedObjects(tracker.centre_obj.double().cpu(), tracker.diameter_m.double().cpu(), tracker.intrinsics.double().cpu())
     taken = steps(cut_windows(clipped(chunks, start_us), start_us, length), tracker, state, length)

@@ -27,7 +27,6 @@ from torchtrack.limits import check_limit, limits
 from torchtrack.object_model import ObjectModel
 from torchtrack.stepping import clipped
 
-
 # A pose from longer before the first event is doubtful: an object that moves fires events. From so long, the clocks differ.
 _DOUBTFUL_START_S, _FARTHEST_START_S = 1.0, 10.0
 

@@ -64,4 +64,6 @@ class DatFile(EventFile):
             stream.seek(self.offset)
             for words in words_of(stream, np.dtype("<u8"), self.problems):
                 shown, address = words.view("<u4")[0::2], words.view("<u4")[1::2]
-                yield Columns(shown.astype(np.int64), (address & 0x3FFF).astype(np.uint16), ((address >> 14) & 0x3FFF).astype(np.uint16), address >> 28 > 0)
+                yield Columns(
+                    shown.astype(np.int64), (address & 0x3FFF).astype(np.uint16), ((address >> 14) & 0x3FFF).astype(np.uint16), address >> 28 > 0
+                )

@@ -9,6 +9,7 @@ the time of one step. Windows of more than ``LONGEST_US`` are not made: what has
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import torch
 
@@ -60,15 +61,19 @@ class WaitingWindows:
         else:
             self.dropped_windows += 1
             self.dropped_events += len(oldest.events)
+            if oldest.after_gap and self._waiting:
+                self._waiting.appendleft(replace(self._waiting.popleft(), after_gap=True))
 
     def take(self) -> EventWindow:
         """What is to be tracked next: the oldest window, or all those that wait as one."""
-        taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), MOST_JOINED))]
+        taken = [self._waiting.popleft()]
+        while self._waiting and len(taken) < MOST_JOINED and not self._waiting[0].after_gap:
+            taken.append(self._waiting.popleft())
         window = self._joined(taken) if len(taken) > 1 else taken[0]
         if len(taken) > 1:
             self._haste_until_us = window.t_end_us + _CALM_US
         in_haste = self._haste_until_us is not None and window.t_end_us <= self._haste_until_us
-        return HastyWindow(window.events, window.t_start_us, window.t_end_us) if in_haste else window
+        return HastyWindow(window.events, window.t_start_us, window.t_end_us, window.after_gap) if in_haste else window
 
     def _joined(self, windows: list[EventWindow]) -> EventWindow:
         """Windows as one, with the events that one of them has in the mean, or ``FEWEST_EVENTS``."""
@@ -76,7 +81,7 @@ class WaitingWindows:
         kept = _thinned(events, max(len(events) // len(windows), FEWEST_EVENTS))
         self.joined_windows += len(windows) - 1
         self.dropped_events += len(events) - len(kept)
-        return EventWindow(kept, windows[0].t_start_us, windows[-1].t_end_us)
+        return EventWindow(kept, windows[0].t_start_us, windows[-1].t_end_us, windows[0].after_gap)
 
 
 class KeepUp:

@@ -196,7 +196,9 @@ class Mender:
             advice = f"a counter of {bits} bits began again. Add 2^{bits} to the times from there on, or read it without strict, which does so."
             self._problems.found(Problem.WRAPPED, 1, f"{detail}: {advice}")
         elif not wrap:
-            advice = "the clock was set back, or another recording begins. Split the stream there, or read it without strict, which goes on in the new clock."
+            advice = (
+                "the clock was set back, or another recording begins. Split the stream there, or read it without strict, which goes on from there."
+            )
             self._problems.found(Problem.RESET, 1, f"{detail} and stays there: {advice}")
         if wrap != self._counter:
             shown = newest_us - self._shift_us, back_us - self._shift_us

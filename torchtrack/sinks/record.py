@@ -12,6 +12,7 @@ from torchtrack.io import Trajectory
 from torchtrack.lie import so3_log
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axis
+from torchtrack.sinks.silences import Silences
 from torchtrack.stepping import Step
 
 
@@ -74,17 +75,16 @@ class Record:
         self.objects = [ObjectRecord(*of_object) for of_object in zip(truth, axes, strict=True)]
         self.step_seconds = array("d")
         self.event_count = 0
-        self.first_us: int | None = None
-        self.last_us = 0
+        self.silences = Silences()
+        self._duration_us = 0
 
     def add(self, step: Step) -> None:
         """Take one step."""
         result = step.result
         self.step_seconds.append(step.seconds)
         self.event_count += len(step.window.events)
-        self.last_us = step.window.t_end_us
-        if self.first_us is None:
-            self.first_us = step.window.t_start_us
+        self.silences.add(step)
+        self._duration_us += step.window.t_end_us - step.window.t_start_us
         t_us, T = result.t_us[:1].cpu(), result.T_cam_obj.cpu()
         for index, (status, quality) in enumerate(zip(result.status.tolist(), result.quality.tolist(), strict=True)):
             self.objects[index].add(t_us, T[index], status, quality)
@@ -98,5 +98,5 @@ class Record:
 
     @property
     def duration_s(self) -> float:
-        """Stream time that was tracked."""
-        return 1e-6 * (self.last_us - self.first_us) if self.first_us is not None else 0.0
+        """Stream time that was tracked, without what was passed over."""
+        return 1e-6 * self._duration_us

@@ -3,7 +3,7 @@
 import math
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -12,8 +12,10 @@ import torch
 
 import torchtrack
 from torchtrack.eval.metrics import Metrics, summarise
+from torchtrack.io.problems import ClockChange, Problems
 from torchtrack.quality import Status
 from torchtrack.sinks.record import ObjectRecord, Record
+from torchtrack.sinks.silences import Silence
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,10 @@ class RunSummary:
         objects: by label.
         joined_windows: of a live source, those that came too fast, and were tracked as one with the next.
         dropped_windows, dropped_events: of a live source, what came too fast to be tracked; events of joined windows among them.
+        problems: what was wrong with the events, and how often: what was left out, and what was mended.
+        clock_changes: where the clock wrapped or jumped back, and time went on: poses have the time that went on.
+        gaps: the longest times of 50 ms and more without events.
+        gap_count: how many of these there are.
     """
 
     source: str
@@ -76,10 +82,21 @@ class RunSummary:
     joined_windows: int = 0
     dropped_windows: int = 0
     dropped_events: int = 0
+    problems: dict[str, int] = field(default_factory=dict)
+    clock_changes: tuple[ClockChange, ...] = ()
+    gaps: tuple[Silence, ...] = ()
+    gap_count: int = 0
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; numbers that are not finite become None, as JSON has none."""
         return finite(asdict(self))
+
+    def with_problems(self, problems: Problems | None) -> "RunSummary":
+        """The same with what was wrong with the events, where that is counted."""
+        if problems is None:
+            return self
+        counts = {problem.value: number for problem, number in problems.counts.items()}
+        return replace(self, problems=counts, clock_changes=tuple(problems.clock_changes))
 
 
 def summarise_run(
@@ -104,6 +121,8 @@ def summarise_run(
         step_median_ms=float(np.median(step_ms)),
         step_p95_ms=float(np.percentile(step_ms, 95)),
         objects={label: _summarise_object(of, record.duration_s, dict(more.get(label, {}))) for label, of in by_label},
+        gaps=record.silences.longest,
+        gap_count=record.silences.count,
     )
 
 
