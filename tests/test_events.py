@@ -291,3 +291,40 @@ def test_maximum_age_closes_windows_early():
 def test_windows_of_no_extent_are_refused(make):
     with pytest.raises(EventDataError, match="window"):
         list(make())
+
+
+# ---- silence
+
+
+@pytest.mark.parametrize("silent_us", [3_600_000_000, 10**15])
+def test_long_silence_is_passed_over(silent_us):
+    times = [1, 2, 41, silent_us, silent_us + 12_000]
+    windows = list(windows_by_time([batch_at(times)], 10_000, 0))
+    assert len(windows) == 103
+    assert all(window.t_end_us - window.t_start_us == 10_000 for window in windows)
+    assert [number for number, window in enumerate(windows) if window.after_gap] == [101]
+    assert [(w.t_start_us, w.events.t_us.tolist()) for w in windows[-2:]] == [
+        (silent_us - 1, [silent_us]),
+        (silent_us + 9_999, [silent_us + 12_000]),
+    ]
+
+
+def test_silence_before_the_first_event_is_passed_over():
+    windows = list(windows_by_time([batch_at([7_000_000])], 500_000, 0))
+    assert [(w.t_start_us, w.after_gap) for w in windows] == [(0, False), (500_000, False), (6_999_999, True)]
+
+
+@pytest.mark.parametrize("max_age_us", [None, 10_000])
+def test_long_silence_ends_a_window_by_count(max_age_us):
+    times = [1, 2, 3, 3_000_000_000, 3_000_000_001, 3_000_000_002]
+    windows = list(windows_by_count([batch_at(times[:2]), batch_at(times[2:])], 2, max_age_us, 0))
+    with_events = [(w.t_start_us, w.events.t_us.tolist(), w.after_gap) for w in windows if len(w.events)]
+    assert [events for _, events, _ in with_events] == [[1, 2], [3], times[3:5], times[5:]]
+    assert with_events[2] == (2_999_999_999, times[3:5], True)
+    assert len(windows) <= 105
+    assert all(window.t_end_us - window.t_start_us <= 10_000 for window in windows)
+
+
+def test_windows_by_count_start_where_events_are():
+    windows = list(windows_by_count([batch_at([5_000_000, 5_000_001])], 2, None, 0))
+    assert [(w.t_start_us, w.t_end_us, w.after_gap) for w in windows] == [(4_999_999, 5_000_001, True)]

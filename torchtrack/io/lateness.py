@@ -38,6 +38,12 @@ class Arrivals:
         """The times before and after the first step back."""
         return int(self.newest_before[self.first_late]), int(self._t_us[self.first_late])
 
+    def follows(self, marked: np.ndarray) -> np.ndarray:
+        """Which come at the newest time, and right after a ``marked`` one that is earlier, or others of the kind."""
+        at_newest = self._t_us == self.newest_before
+        last_other = np.maximum.accumulate(np.where(at_newest, -1, np.arange(len(at_newest))))
+        return np.asarray(at_newest & (last_other >= 0) & marked[last_other])
+
     @property
     def latest_by(self) -> int:
         """How late the latest one is (µs)."""
@@ -83,18 +89,15 @@ def merged(held: Sequence[Columns], events: Columns, arrivals: Arrivals, recent:
     count = sum(map(len, held))
     both = join([*held, events])
     t_us = both.t_us.astype(np.int64)
-    # What was sent twice ends at the newest time.
-    suspected = np.zeros(len(both), bool)
-    suspected[count:] = arrivals.late | ((events.t_us == arrivals.newest_before) & (np.arange(len(events)) > arrivals.first_late))
-    repeated = suspected & _again(both)
-    too_late = np.zeros(len(both), bool)
-    if recent.newest_us is not None:
-        passed = np.flatnonzero(suspected & ~repeated & (t_us <= recent.newest_us))
-        known = recent.knows(both[passed])
-        repeated[passed[known]] = True
-        too_late = ~repeated & suspected & (t_us < recent.newest_us)
-    late = np.zeros(len(both), bool)
+    late, again, too_late = np.zeros(len(both), bool), _again(both), np.zeros(len(both), bool)
     late[count:] = arrivals.late
+    if recent.newest_us is not None:
+        passed = np.flatnonzero(t_us <= recent.newest_us)
+        again[passed] |= recent.knows(both[passed])
+        too_late = late & ~again & (t_us < recent.newest_us)
+    repeated = late & again
+    # What was sent twice ends at the newest time. Events of one time may well be equal otherwise.
+    repeated[count:] |= arrivals.follows(repeated[count:]) & again[count:]
     sorted_in = int((late & ~repeated & ~too_late).sum())
     kept = both[~(repeated | too_late)]
     return kept[np.argsort(kept.t_us, kind="stable")], int(repeated.sum()), int(too_late.sum()), sorted_in
