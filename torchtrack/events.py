@@ -18,7 +18,7 @@ from torchtrack.errors import EventDataError
 from torchtrack.polarity import brighter
 
 # What nothing was seen of for so long may be anywhere: further windows without events would tell no more.
-LONGEST_SILENCE_US = 1_000_000
+LONGEST_SILENCE_US = 500_000
 
 
 @dataclass(frozen=True)
