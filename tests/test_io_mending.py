@@ -167,9 +167,11 @@ def test_strict_reading_names_the_fault(events, message):
         mended(events, 1000, strict=True)
 
 
-def test_times_beyond_64_bits_are_refused():
-    with pytest.raises(EventDataError, match="beyond 64 bits"):
+def test_times_near_the_ends_of_64_bits_are_refused_where_they_are_in_no_order():
+    with pytest.raises(EventDataError, match="a time of 9.* µs makes no sense"):
         mended(at(stream().t_us.astype(np.uint64)[::-1] + np.uint64(2**63)), 1000)
+    with pytest.raises(EventDataError, match="a time of -9.* µs makes no sense"):
+        mended(at(np.where(np.arange(COUNT) < MIDDLE, stream().t_us, -(2**63))), 1000)
 
 
 # ---- through the readers

@@ -18,7 +18,7 @@ import numpy as np
 
 from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch
-from torchtrack.io.columns import Columns, join
+from torchtrack.io.columns import Columns, join, shifted
 from torchtrack.io.lateness import Arrivals, Recent, merged
 from torchtrack.io.problems import ClockChange, Problem, Problems
 from torchtrack.io.soundness import in_order, inside
@@ -36,6 +36,8 @@ _COUNTERS = (1 << 31, 1 << 32)
 _WRAP_SLACK_US = 10_000_000
 # Where times stand still, no more than this is waited for.
 _MOST_HELD = 1 << 21
+# Where times are compared, sums and differences of them fit 64 bits.
+_LARGEST_US = 1 << 61
 # Disorder is looked at in blocks; where time goes far back more than once in so many events, each event is judged by itself.
 _BLOCK, _EVENTS_A_RETURN = 4096, 256
 
@@ -69,7 +71,7 @@ class Mender:
         Raises:
             EventDataError: if time goes back, and faults are errors.
         """
-        self._take(self._shifted(part) if self._shift_us else part)
+        self._take(self._shifted(part) if self._shift_us and len(part) else part)
         return self._released(at_end=False)
 
     def rest(self) -> list[Columns]:
@@ -80,7 +82,7 @@ class Mender:
         return self._released(at_end=True)
 
     def _shifted(self, events: Columns) -> Columns:
-        return replace(events, t_us=events.t_us.astype(np.int64) + self._shift_us)
+        return replace(events, t_us=shifted(self._sound_times(events), self._shift_us))
 
     def _take(self, part: Columns) -> None:
         if len(part) == 0:
@@ -89,11 +91,17 @@ class Mender:
             self._append(part)
             self._at += len(part)
             return
-        if part.t_us.dtype.kind == "u" and part.t_us.max() > np.iinfo(np.int64).max:
-            raise EventDataError(f"{self._problems.source}: a time of {part.t_us.max()} µs is beyond 64 bits. Check the file's times and their unit.")
         apart, self._apart = self._apart, Columns.empty()
         self._at -= len(apart)
-        self._put_in(join([apart, replace(part, t_us=part.t_us.astype(np.int64))]) if len(apart) else replace(part, t_us=part.t_us.astype(np.int64)))
+        part = replace(part, t_us=self._sound_times(part))
+        self._put_in(join([apart, part]) if len(apart) else part)
+
+    def _sound_times(self, events: Columns) -> np.ndarray:
+        """The times as int64, far enough from its ends."""
+        for time_us in (int(events.t_us.min()), int(events.t_us.max())):
+            if abs(time_us) > _LARGEST_US:
+                raise EventDataError(f"{self._problems.source}: a time of {time_us} µs makes no sense. Check the file's times and their unit.")
+        return events.t_us.astype(np.int64)
 
     def _append(self, events: Columns) -> None:
         self._held.append(events)
@@ -190,6 +198,8 @@ class Mender:
 
     def _with_new_clock(self, events: Columns, back_us: int, detail: str) -> Columns:
         newest_us, wrap = self._newest_us or 0, self._wrap(back_us)
+        if newest_us > _LARGEST_US:
+            raise EventDataError(f"{self._problems.source}: a time of {newest_us} µs makes no sense. Check the file's times and their unit.")
         more = wrap or newest_us + 1 - back_us
         if wrap and wrap != self._counter:
             bits = wrap.bit_length() - 1
@@ -204,7 +214,7 @@ class Mender:
             shown = newest_us - self._shift_us, back_us - self._shift_us
             self._problems.clock_changed(ClockChange("wrap" if wrap else "reset", back_us + more, *shown))
         self._shift_us += more
-        return replace(events, t_us=events.t_us + more)
+        return replace(events, t_us=shifted(events.t_us, more))
 
     def _wild(self, back_us: int) -> int:
         """How many of the newest events are wild, if the stream goes on at ``back_us``; 0 if they are too many, or not apart."""
