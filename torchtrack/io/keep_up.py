@@ -1,9 +1,9 @@
 """Keeping up with a live stream: windows wait in a bounded queue, and where they come too fast, several are tracked as one, with fewer events.
 
 Where a tracker is behind, what waits is joined to windows of up to ``MOST_JOINED``, each with about as many events as one of
-those that it is made of: evenly left out, as a window needs events from all of its time, and the newest of all is kept. So a
-tracker down to an eighth of the needed speed follows the whole stream, and the lag is at most that of ``capacity`` windows, and
-the time of one step. Windows of more than ``LONGEST_US`` are not made: what has waited longer is dropped. All that is left out is counted.
+those that it is made of: evenly left out, as a window needs events from all of its time, and the newest of all is kept. All of
+the stream's time is tracked, and a pose comes late by the time of ``capacity`` windows and of one step at most. Joined windows
+are no longer than ``LONGEST_US``: what would make one longer is dropped. All that is left out is counted.
 """
 
 import threading
