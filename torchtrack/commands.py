@@ -24,6 +24,7 @@ from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table, run_headline, run_table
 from torchtrack.executor import TaskFailure
 from torchtrack.exit_codes import ExitCode
+from torchtrack.files import naming
 from torchtrack.io import read_calibration
 from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines
 from torchtrack.runner import run, run_many
@@ -46,7 +47,8 @@ def output_console() -> Console:
 
 def track(config_or_source: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
     """Track one source, show the summary; returns the exit code."""
-    return _run(_run_config(config_or_source, overrides), quiet)
+    with naming(Path(config_or_source)):
+        return _run(_run_config(config_or_source, overrides), quiet)
 
 
 def track_many(
@@ -111,7 +113,8 @@ def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mappi
     config = load(EvaluateConfig, path, _method_overrides(path, overrides, chosen) | dict(given))
     if chosen is not None:
         config = config.model_copy(update={"methods": {label: config.methods[label] for label in chosen}})
-    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
+    # What is wrong is told with the file that asks for it.
+    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress, naming(path):
         planned = plan(config, _scene_progress(progress))
         bar = progress.add_task("sequences", total=len(planned.jobs))
         evaluation = evaluate_all(config, lambda job: progress.advance(bar), planned)
@@ -165,7 +168,8 @@ def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, job
         if executor != "local":
             raise ConfigError(f"command line: --executor {executor} is for several scenes, and '{config_file}' is one.")
         scene = load(SceneConfig, file, overrides)
-        path = _simulated(scene, target if target.suffix else target / f"{scene.name}.npz", quiet, preview)
+        with naming(file):
+            path = _simulated(scene, target if target.suffix else target / f"{scene.name}.npz", quiet, preview)
         output_console().print(f"The sequence is in {path}")
         return ExitCode.DONE
     if target.suffix:
@@ -200,7 +204,8 @@ def demo(config_file: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
     """Simulate a scene, track it, show the errors; returns the exit code."""
     config = load(DemoConfig, Path(config_file), overrides)
     scene = load(SceneConfig, config.scene)
-    sequence = _simulated(scene, config.output / f"{scene.name}.npz", quiet)
+    with naming(config.scene):
+        sequence = _simulated(scene, config.output / f"{scene.name}.npz", quiet)
     shared = {name: getattr(config, name) for name in DemoConfig.model_fields if name in RunConfig.model_fields}
     return _run(RunConfig(source=sequence, **shared), quiet)
 

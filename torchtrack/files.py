@@ -53,13 +53,14 @@ def read_bytes(path: Path, what: str, limit: str) -> bytes:
 
 
 @contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Errors of ours that come out of it and do not name the file are told with it."""
+def naming(path: Path | None) -> Iterator[None]:
+    """Errors of ours that come out of it and do not name the file, where there is one, are told with it."""
     try:
         yield
     except MissingExtraError:
         raise
     except TorchtrackError as error:
-        if path.name in str(error):
+        if path is None or path.name in str(error):
             raise
-        raise type(error)(f"'{path}': {error}") from error
+        error.args = (f"'{path}': {error}", *error.args[1:])
+        raise

@@ -32,7 +32,7 @@ class Limits(BaseModel):
     text_nodes: int = Field(100_000, ge=1, description="Values in such a file, those that aliases (*name) repeat counted each time.")
     text_depth: int = Field(50, ge=1, le=200, description="Levels of lists and mappings within one another in such a file.")
     pose_file_bytes: int = Field(512 * _MEGABYTE, ge=1, description="Bytes of a file of poses.")
-    array_bytes: int = Field(512 * _MEGABYTE, ge=1, description="Bytes of an array that is read whole, such as poses.")
+    array_bytes: int = Field(256 * _MEGABYTE, ge=1, description="Bytes of an array that is read whole, such as poses.")
     expansion: int = Field(2000, ge=1, description="How many times larger than its file what a file holds may be; zlib reaches 1000.")
     block_bytes: int = Field(
         256 * _MEGABYTE, ge=1, description="Bytes of a part of a recording that is read at once (packet, message, chunk), once decompressed."

@@ -83,7 +83,7 @@ def _npz_inputs() -> Iterator[tuple[str, str, str, Make]]:
         members = _members(**changes) if kind == "events" else _sequence_members(**changes)
         return f"npz_{name}", kind, "x.npz", partial(_archive, members=members)
 
-    bomb = _header("(33554432,)") + bytes(1 << 28)
+    bomb = _header("(67108864,)") + bytes(1 << 26)
     yield npz("width_bomb", width=bomb)
     yield npz("huge_shape", t=_header("(4611686018427387904,)"))
     yield npz("negative_shape", t=_header("(-5,)"))
@@ -114,7 +114,7 @@ def _npz_inputs() -> Iterator[tuple[str, str, str, Make]]:
     ):
         yield npz(name, t=b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text)
     yield npz("version_9", t=b"\x93NUMPY\x09\x00" + bytes(20))
-    yield npz("poses_bomb", "sequence", poses=_header("(2097152, 4, 4)", "<f8") + bytes(1 << 28))
+    yield npz("poses_bomb", "sequence", poses=_header("(20971520, 4, 4)", "<f8") + bytes(1 << 24))
     yield npz("poses_nan", "sequence", poses=_array(np.full((3, 4, 4), np.nan)))
     yield npz("poses_huge", "sequence", poses=_array(np.tile(np.eye(4), (3, 1, 1)) * 1e308))
     yield npz("pose_times", "sequence", pose_t=_array(np.array([-(2**63), 0, 2**63 - 1])))

@@ -11,6 +11,7 @@ from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.config.load import as_yaml, load
 from torchtrack.config.run import RunConfig
 from torchtrack.eval.evaluate import plan
+from torchtrack.files import naming
 from torchtrack.io import is_sequence, open_events, read_calibration, read_sequence, read_trajectory
 from torchtrack.object_model import ObjectModel
 from torchtrack.session import open_session
@@ -48,12 +49,14 @@ def _sequence(path: Path) -> None:
         ObjectModel.from_file(obj.model_path(), name=obj.label)
         if obj.ground_truth is not None:
             obj.ground_truth.at(torch.tensor([0, 5000]))
-    undistortion_table(sequence.camera)
+    with naming(path):
+        undistortion_table(sequence.camera)
 
 
 def _calibration(path: Path) -> None:
     size = SIZE if path.suffix == ".txt" else {}
-    undistortion_table(read_calibration(path, **size))
+    with naming(path):
+        undistortion_table(read_calibration(path, **size))
 
 
 def _poses(path: Path) -> None:
@@ -72,7 +75,8 @@ def _lines(path: Path) -> None:
 def _track(path: Path) -> None:
     config = load(RunConfig, path)
     as_yaml(config)
-    open_session(config)
+    with naming(path):
+        open_session(config)
 
 
 def _evaluate(path: Path) -> None:
@@ -80,16 +84,18 @@ def _evaluate(path: Path) -> None:
     as_yaml(config)
     # Cells may name scenes, and simulating one takes too long.
     if not config.cells:
-        plan(config)
+        with naming(path):
+            plan(config)
 
 
 def _simulate(path: Path) -> None:
     scenes = scenes_of(path) if is_suite(path) else [load(SceneConfig, path)]
     for scene in scenes:
         as_yaml(scene)
-        scene.camera.build()
-        for obj in (*scene.objects, *scene.occluders):
-            obj.build()
+        with naming(path):
+            scene.camera.build()
+            for obj in (*scene.objects, *scene.occluders):
+                obj.build()
 
 
 def _demo(path: Path) -> None:

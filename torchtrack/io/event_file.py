@@ -95,11 +95,12 @@ class EventFile(EventStream):
     def _checked(self, max_events: int) -> Iterator[EventBatch]:
         self.problems.clear()
         mender, count = Mender(self.problems, waits=True, counter_bits=self.counter_bits), 0
-        for part in self._with_polarity(self._readable(max_events)):
-            events = inside(part, self.width, self.height, self.problems, count)
-            count += len(part)
-            yield from all_of(map(self._started, mender.add(events)), max_events)
-        yield from all_of(map(self._started, mender.rest()), max_events)
+        with naming(self.path):
+            for part in self._with_polarity(self._readable(max_events)):
+                events = inside(part, self.width, self.height, self.problems, count)
+                count += len(part)
+                yield from all_of(map(self._started, mender.add(events)), max_events)
+            yield from all_of(map(self._started, mender.rest()), max_events)
         self.problems.warn()
 
     def _readable(self, max_events: int) -> Iterator[Columns]:

@@ -104,7 +104,10 @@ def read_array(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray:
         flat = member.read(int(np.prod(member.shape)))
         member.finish()
     native = flat.astype(member.dtype.newbyteorder("="))
-    return native.reshape(member.shape, order="F" if member.fortran_order else "C")
+    try:
+        return native.reshape(member.shape, order="F" if member.fortran_order else "C")
+    except ValueError as error:
+        raise EventDataError(f"'{path}': the array '{key}' has the shape {member.shape}, which no array can have ({error}).") from error
 
 
 def stream_array(archive: zipfile.ZipFile, key: str, path: Path, size: int) -> Iterator[np.ndarray]:
@@ -195,9 +198,10 @@ def _sensor_length(archive: zipfile.ZipFile, name: str, given: int, path: Path) 
         if not given:
             raise EventDataError(f"'{path}' does not say the sensor's {name}. Give width and height in pixels.")
         return given
+    with (member := _open_member(archive, name, path)).stream:
+        if int(np.prod(member.shape, dtype=object)) != 1 or member.dtype.kind not in "iu":
+            raise EventDataError(f"'{path}': '{name}' must be one integer, got shape {member.shape} of {member.dtype}.")
     stored = read_array(archive, name, path)
-    if stored.size != 1 or stored.dtype.kind not in "iu":
-        raise EventDataError(f"'{path}': '{name}' must be one integer, got shape {stored.shape} of {stored.dtype}.")
     if given and given != stored.item():
         raise EventDataError(f"'{path}' says that the sensor's {name} is {stored.item()}, but {given} was given. Leave it out, or correct it.")
     return int(stored.item())
