@@ -10,7 +10,12 @@ from torchtrack.limits import Limits, limits
 
 def test_what_is_no_file_is_told_as_what_it_is(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    for name, why in (("nothing", "does not exist"), ("pipe", "is a pipe or a device"), (".", "is a folder"), ("a" * 300, "cannot be opened: File name")):
+    for name, why in (
+        ("nothing", "does not exist"),
+        ("pipe", "is a pipe or a device"),
+        (".", "is a folder"),
+        ("a" * 300, "cannot be opened: File name"),
+    ):
         with pytest.raises(MissingFileError, match=why):
             check_is_file(tmp_path / name, "file")
         assert not is_file(tmp_path / name)
