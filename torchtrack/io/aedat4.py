@@ -103,11 +103,12 @@ class Aedat4File(EventFile):
 
     def _packets(self, stream: BinaryIO) -> Iterator[bytes]:
         """The packets of the stream of events."""
-        last = self.end if self.end >= self.offset else self.path.stat().st_size
+        size_now = self.path.stat().st_size
+        last = self.end if self.end >= self.offset else size_now
         while stream.tell() < last:
             head = stream.read(8)
             stream_id, size = int.from_bytes(head[:4], "little", signed=True), int.from_bytes(head[4:], "little", signed=True)
-            if len(head) < 8 or not 0 <= size <= _LARGEST_PACKET or stream.tell() + size > self.path.stat().st_size:
+            if len(head) < 8 or not 0 <= size <= _LARGEST_PACKET or stream.tell() + size > size_now:
                 self.problems.found(Problem.DAMAGED, 1, f"it ends within a packet at byte {stream.tell()}, or is damaged there. Copy it again.")
                 return
             if stream_id == self.stream_id:
