@@ -33,7 +33,7 @@ def test_values_that_were_never_written_are_no_events(tmp_path):
         file.create_dataset(name, (1 << 40,), "<i8", chunks=(1 << 16,))
 
     path = hdf5(tmp_path / "a.h5", **dict.fromkeys("xytp", unwritten))
-    with pytest.raises(LimitError, match=r"a\.h5: /events/x' asks for .* expansion, and the limit is 2,000.*limits.expansion"):
+    with pytest.raises(LimitError, match=r"a\.h5: /events/\w' asks for .* expansion, and the limit is 2,000.*limits.expansion"):
         open_events(path)
 
 
