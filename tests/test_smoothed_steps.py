@@ -46,7 +46,7 @@ class Kept:
     def finish(self):
         return len(self.steps)
 
-    def close(self):
+    def close(self, error=None):
         pass
 
 

@@ -123,7 +123,7 @@ class Counting:
     def finish(self):
         return len(self.steps)
 
-    def close(self):
+    def close(self, error=None):
         self.closed = True
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
 from tyro.conf import Positional, arg, subcommand
 
 from torchtrack.cli_io import Bench, Convert, Info, refuse_settings
@@ -19,7 +18,9 @@ from torchtrack.config.load import load, typed
 from torchtrack.config.settings import CommandLineText
 from torchtrack.errors import ConfigError, TorchtrackError
 from torchtrack.exit_codes import ExitCode
+from torchtrack.interrupt import ended_in_good_order
 from torchtrack.limits import Limits, limits
+from torchtrack.standard_streams import flushed, report, take_any_text
 
 
 def _option(metavar: str, *aliases: str) -> Any:
@@ -65,6 +66,8 @@ class Track:
     """Where these are: on this machine, or Ray's (the cluster at RAY_ADDRESS)."""
     compiled: bool = False
     """Compile the tracker: a step takes half the time, the first start some minutes."""
+    resume: bool = False
+    """Go on with a run in the same folder that ended early, from its last pose; of several, leave out those that are complete."""
     quiet: bool = False
     """No progress bar."""
 
@@ -74,13 +77,13 @@ class Track:
 
         if not self.configs:
             raise ConfigError("command line: track needs a config file or a source.")
-        given = _given(self, ("configs", "quiet", *_OF_MANY)) | overrides
+        given = _given(self, ("configs", "quiet", "resume", *_OF_MANY)) | overrides
         of_many = {name: getattr(self, name) for name in _OF_MANY if getattr(self, name) is not None}
         if len(self.configs) > 1:
-            return track_many(self.configs, given, **of_many, quiet=self.quiet)
+            return track_many(self.configs, given, **of_many, resume=self.resume, quiet=self.quiet)
         if of_many:
             raise ConfigError(f"command line: {', '.join(of_many)}: only for several sources, and one is given.")
-        return track(self.configs[0], given, quiet=self.quiet)
+        return track(self.configs[0], given, resume=self.resume, quiet=self.quiet)
 
 
 @dataclass(frozen=True)
@@ -249,15 +252,31 @@ _Command = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its :class:`ExitCode`."""
+    take_any_text()
     try:
-        options, overrides = split_overrides(sys.argv[1:] if arguments is None else arguments)
+        with ended_in_good_order():
+            return flushed(_run(sys.argv[1:] if arguments is None else arguments))
+    except SystemExit as ended:
+        # After a help text, or a mistake in the options.
+        raise SystemExit(flushed(ended.code)) from None
+
+
+def _run(arguments: Sequence[str]) -> int:
+    """Run one command; an error is told in one line."""
+    try:
+        options, overrides = split_overrides(arguments)
         command = tyro.cli(_Command, prog="torchtrack", description="6DoF object pose tracking with an event camera.", args=options)
         with limits(_limits(overrides)):
             code: int = command.run(overrides)
     except ConfigError as error:
-        return _report(error, ExitCode.WRONG_SETTINGS)
+        return report(str(error), ExitCode.WRONG_SETTINGS)
     except TorchtrackError as error:
-        return _report(error, ExitCode.FAILED)
+        return report(str(error), ExitCode.FAILED)
+    except OSError as error:
+        if error.filename is None:
+            # Of no file that was named: a bug, or one of the system's own.
+            raise
+        return report(f"cannot use '{error.filename}': {error.strerror}. Check that it is there, and may be read or written.", ExitCode.FAILED)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     return code
@@ -297,11 +316,3 @@ def _given(command: Any, without: tuple[str, ...]) -> dict[str, Any]:
     # A flag that is not there says nothing: the file may set it.
     values = {name: value for name, value in vars(command).items() if name not in without and value is not None and value is not False}
     return {name: CommandLineText(value) if isinstance(value, str) else value for name, value in values.items()}
-
-
-def _report(error: Exception, code: int) -> int:
-    """Tell one error on stderr, without a traceback."""
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
-    console.print("error:", style="bold red", end=" ")
-    console.print(str(error), markup=False)
-    return code

@@ -26,14 +26,18 @@ from torchtrack.executor import TaskFailure
 from torchtrack.exit_codes import ExitCode
 from torchtrack.files import naming
 from torchtrack.io import read_calibration
+from torchtrack.io.atomic import check_other_file
 from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines
 from torchtrack.runner import run, run_many
 from torchtrack.session import open_session
 from torchtrack.sim import SceneConfig
 from torchtrack.sim.suite import is_suite, run_suite, scenes_of, simulate_to_file
 from torchtrack.sim.video import VideoConfig, write_video_events
+from torchtrack.sinks.folder import check_folder
 from torchtrack.sinks.progress import ProgressBar
+from torchtrack.sinks.resume import check_resumable, is_complete
 from torchtrack.sinks.summary import RunSummary
+from torchtrack.standard_streams import OutputConsole
 
 # Tables need this much where the output is no terminal, which says how wide it is.
 _FILE_WIDTH = 200
@@ -41,14 +45,14 @@ _FILE_WIDTH = 200
 
 def output_console() -> Console:
     """Standard output, as wide as the terminal, or as tables need in a file or a pipe."""
-    console = Console(highlight=False, soft_wrap=True)
-    return console if console.is_terminal else Console(highlight=False, soft_wrap=True, width=_FILE_WIDTH)
+    console = OutputConsole(highlight=False, soft_wrap=True)
+    return console if console.is_terminal else OutputConsole(highlight=False, soft_wrap=True, width=_FILE_WIDTH)
 
 
-def track(config_or_source: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
-    """Track one source, show the summary; returns the exit code."""
+def track(config_or_source: str, overrides: Mapping[str, Any], *, resume: bool = False, quiet: bool) -> int:
+    """Track one source, or go on with that, show the summary; returns the exit code."""
     with naming(Path(config_or_source)):
-        return _run(_run_config(config_or_source, overrides), quiet)
+        return _run(_run_config(config_or_source, overrides), quiet, resume)
 
 
 def track_many(
@@ -58,14 +62,20 @@ def track_many(
     streams: int = 1,
     jobs: int = 1,
     executor: ExecutorName = "local",
+    resume: bool = False,
     quiet: bool,
 ) -> int:
-    """Track several sources, show the summary of each as it comes; returns the exit code, which is not 0 where one failed."""
+    """Track several sources, show the summary of each as it comes; returns the exit code, which is not 0 where one failed.
+
+    With ``resume`` those that are complete are left out, and those that ended early go on.
+    """
     configs = [_in_own_folder(_run_config(text, overrides), Path(text).stem) for text in configs_or_sources]
     console, codes = output_console(), [ExitCode.DONE]
+    for text in (text for text, config in zip(configs_or_sources, configs, strict=True) if resume and is_complete(config.output)):
+        console.print(f"{text}: complete already, left out", markup=False)
     with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
         bar = progress.add_task("sources", total=len(configs))
-        for number, outcome in run_many(configs, streams=streams, jobs=jobs, executor=executor):
+        for number, outcome in run_many(configs, streams=streams, jobs=jobs, executor=executor, resume=resume):
             progress.advance(bar)
             if isinstance(outcome, TaskFailure):
                 _tell_failure(f"{configs_or_sources[number]}: {outcome.reason}")
@@ -86,13 +96,16 @@ def _run_config(config_or_source: str, overrides: Mapping[str, Any]) -> RunConfi
     return load(RunConfig, None, {"source": CommandLineText(config_or_source), **overrides})
 
 
-def _run(config: RunConfig, quiet: bool) -> int:
+def _run(config: RunConfig, quiet: bool, resume: bool = False) -> int:
     console = output_console()
+    if resume:
+        check_resumable(config)
+    check_folder(config.output)
     session = open_session(config)
     if config.compiled and not quiet:
         Console(stderr=True).print("compiling the tracker, which takes a minute or two for the first time")
     progress = [] if quiet else [ProgressBar(Console(stderr=True), session.name, session.known_duration_s)]
-    return _show_run(console, run(config, progress, session), config.output)
+    return _show_run(console, run(config, progress, session, resume=resume), config.output)
 
 
 def _show_run(console: Console, summary: RunSummary, output: Path) -> ExitCode:
@@ -212,6 +225,8 @@ def demo(config_file: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
 
 def outline(image: str, calibration: str, output: str, distance_m: float, width: int | None, height: int | None) -> int:
     """Write a polyline model of the dark shapes of a picture; returns the exit code."""
+    for source in (image, calibration):
+        check_other_file(Path(source), Path(output))
     camera = read_calibration(calibration, width, height)
     lines = outline_dark_shapes(read_grey_image(Path(image)), camera, distance_m)
     write_polylines(Path(output), lines)

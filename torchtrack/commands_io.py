@@ -5,7 +5,6 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from torchtrack.commands import output_console
@@ -18,6 +17,7 @@ from torchtrack.io.event_file import DEFAULT_CHOICES, EventFile
 from torchtrack.io.formats import FORMAT_NAMES, open_events
 from torchtrack.io.info import EventInfo, as_plain
 from torchtrack.io.raw_file import RawFile
+from torchtrack.standard_streams import OutputConsole
 
 _ONE_POLARITY = " (all alike: polarity may be coded in another way, --polarity)"
 
@@ -42,7 +42,7 @@ def info(file: Input, max_events: int | None, *, as_json: bool) -> int:
         facts = source.info(max_events)
     if as_json:
         # Plain text: a console would break lines and colour them.
-        Console(soft_wrap=True, highlight=False, markup=False).print(json.dumps({"format": format_name(source), **as_plain(facts)}, indent=2))
+        OutputConsole(soft_wrap=True, highlight=False, markup=False).print(json.dumps({"format": format_name(source), **as_plain(facts)}, indent=2))
         return ExitCode.DONE
     table = Table(show_header=False, box=None)
     for row in _rows(source, facts):

@@ -11,6 +11,7 @@
     ├── ModelError            (ValueError)         an object model that cannot be tracked
     ├── PoseError             (ValueError)         a matrix that is not a pose, or an object that cannot be seen
     ├── LimitError            (ValueError)         a file that asks for more than a stated limit
+    ├── OutputError           (OSError)            results cannot be written where they were to go
     └── MissingExtraError     (ImportError)        an optional library is not installed
 
     TorchtrackWarning         (UserWarning)        work goes on, but something should be looked at
@@ -53,6 +54,10 @@ class PoseError(TorchtrackError, ValueError):
 
 class LimitError(TorchtrackError, ValueError):
     """A file that asks for more than a stated limit; see :mod:`torchtrack.limits`."""
+
+
+class OutputError(TorchtrackError, OSError):
+    """Results cannot be written where they were to go."""
 
 
 class MissingExtraError(TorchtrackError, ImportError):

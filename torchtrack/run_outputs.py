@@ -1,6 +1,5 @@
 """Everything that one run writes: what follows its session step by step."""
 
-import json
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, suppress
@@ -10,116 +9,169 @@ from typing import Any
 
 from torchtrack.config.load import as_yaml
 from torchtrack.config.run import RunConfig
-from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
+from torchtrack.errors import EventDataError, MissingFileError, OutputError, TorchtrackError, UnknownFormatError
 from torchtrack.events import EventWindow
 from torchtrack.interrupt import Interrupt
+from torchtrack.io.atomic import writing
 from torchtrack.io.keep_up import KeepUp
 from torchtrack.session import Session, open_session
 from torchtrack.sinks import Sink
 from torchtrack.sinks.alignment import AlignmentRecord
-from torchtrack.sinks.folder import output_folder
+from torchtrack.sinks.folder import CONFIG, SUMMARY, OutputFolder
 from torchtrack.sinks.overlay import Overlay
 from torchtrack.sinks.poses import PoseFiles
 from torchtrack.sinks.record import Record
-from torchtrack.sinks.summary import RunSummary, summarise_run
+from torchtrack.sinks.resume import check_resumable, take_up
+from torchtrack.sinks.summary import Ended, Facts, RunSummary, summarise_run, write_summary
 from torchtrack.stepping import Step, cut_windows
 from torchtrack.window_length import WindowLength
 
-OUTPUT_FILES = ("trajectory_*.tum", "poses.csv", "config.yaml", "summary.json", "overlay*.mp4", "overlay*.png")
-
 
 class RunOutputs:
-    """Writes trajectories, poses, overlay, settings and summary into the output folder: all of it, or nothing.
+    """Writes trajectories, poses, overlay, settings and summary into the output folder while the run goes on.
 
     Args:
         config: of the run.
         interrupt: whether it is to end early.
         sinks: further sinks.
         session: what :func:`open_session` made of ``config``, where that was done before.
+        resume: take up the run that the folder holds.
+
+    Raises:
+        OutputError: if the folder cannot be written into, or another run does so.
+        MissingFileError, ConfigError: if there is no run to take up with these settings.
+        TorchtrackError: as :func:`open_session`.
     """
 
-    def __init__(self, config: RunConfig, interrupt: Interrupt, sinks: Sequence[Sink] = (), session: Session | None = None) -> None:
-        self.session = session or open_session(config)
-        self._config, self._interrupt, self._further = config, interrupt, sinks
+    def __init__(
+        self, config: RunConfig, interrupt: Interrupt, sinks: Sequence[Sink] = (), session: Session | None = None, *, resume: bool = False
+    ) -> None:
+        self._config, self._interrupt, self._further, self._resumes = config, interrupt, sinks, resume
+        self._begun_s = time.perf_counter()
         self._keep_up: KeepUp | None = None
-        self._record = Record(self.session.ground_truth, self.session.models)
-        self._begun = time.perf_counter()
-        # The files, and within them the sinks that write them; both open with the first step.
-        self._files, self._writing = ExitStack(), ExitStack()
-        self._folder: Path | None = None
         self._sinks: list[Sink] = []
+        self._at_work: Sink | None = None
+        self._begun = self._done = False
+        self._resumed_us: int | None = None
+        if resume:
+            check_resumable(config)
+        with ExitStack() as opening:
+            self._folder = opening.enter_context(closing(OutputFolder(config.output)))
+            self.session = session or open_session(config)
+            self._known = _known_facts(config)
+            self._record = Record(self.session.ground_truth, self.session.models)
+            if resume:
+                self._take_up()
+            self._open = opening.pop_all()
+        # The sinks; they open with the first window.
+        self._writing = ExitStack()
+
+    def _take_up(self) -> None:
+        """Go on from the last pose of the earlier part of the run, where it has any."""
+        earlier = take_up(self._config.output, self.session.labels)
+        if len(earlier.t_us):
+            self._record.resume(earlier, self.session.start_us)
+            self._resumed_us = int(earlier.t_us[-1])
+            self.session = replace(self.session, T_cam_obj=earlier.T_cam_obj[-1], start_us=self._resumed_us)
 
     def windows(self, length: WindowLength) -> Iterator[EventWindow]:
         """The windows of the session; those of a live one that come too fast are joined, and it ends at an interrupt."""
         windows = cut_windows(self.session.chunks(), self.session.start_us, length)
         self._keep_up = self.session.keep_up(windows)
-        return self._keep_up.until(lambda: self._interrupt.requested) if self._keep_up else windows
+        for window in self._keep_up.until(lambda: self._interrupt.requested) if self._keep_up else windows:
+            if not self._begun:
+                self._begin()
+            yield window
+
+    def _begin(self) -> None:
+        """Make the files, once there is something to track."""
+        config, session, folder = self._config, self.session, self._folder.path
+        if not self._resumes:
+            self._folder.set_aside()
+        self._begun = True
+        with writing(folder / CONFIG):
+            (folder / CONFIG).write_bytes(as_yaml(config).encode("utf-8", "backslashreplace"))
+        write_summary(folder / SUMMARY, self._summary("running", ""), room_for_end=True)
+        self._open_sink(self._record)
+        self._open_sink(PoseFiles(folder, session.labels, self._record))
+        if config.overlay.enabled:
+            name = "overlay.mp4" if self._resumed_us is None else f"overlay_from_{self._resumed_us}us.mp4"
+            self._open_sink(Overlay(folder / name, session, config.overlay, config.tracker))
+        if config.alignment:
+            self._open_sink(AlignmentRecord(session))
+        for sink in self._further:
+            self._open_sink(sink)
+
+    def _open_sink(self, sink: Sink) -> None:
+        self._sinks.append(self._writing.enter_context(closing(sink)))
 
     def add(self, step: Step) -> None:
-        """Write one step."""
-        if self._folder is None:
-            self._folder = self._opened()
-        for sink in self._sinks:
+        """Write one step; a sink that raised an error is given no more."""
+        if self._at_work is not None:
+            self._sinks.remove(self._at_work)
+        for sink in tuple(self._sinks):
+            self._at_work = sink
             sink.add(step)
-
-    def _opened(self) -> Path:
-        config, session = self._config, self.session
-        folder = self._files.enter_context(output_folder(config.output, OUTPUT_FILES))
-        self._files.enter_context(self._writing)
-        own: list[Sink] = [self._record, PoseFiles(folder, session.labels, self._record)]
-        own += [Overlay(folder, session, config.overlay, config.tracker)] if config.overlay.enabled else []
-        own += [AlignmentRecord(session)] if config.alignment else []
-        self._sinks = [self._writing.enter_context(closing(sink)) for sink in (*own, *self._further)]
-        return folder
+        self._at_work = None
 
     def finish(self) -> RunSummary:
-        """Put all files in place.
+        """Complete all files.
 
         Raises:
-            EventDataError: if there was no step.
+            EventDataError: if there was no window.
+            OutputError: if a file cannot be written.
         """
-        if self._folder is None:
+        if not self._begun:
             raise EventDataError(f"'{self.session.name}': not one window was tracked.")
         self._writing.close()
-        summary = summarise_run(
-            self.session.name,
-            self.session.labels,
-            self._record,
-            wall_s=time.perf_counter() - self._begun,
-            device=self._config.device,
-            interrupted=self._interrupt.requested,
-            more=self._further_facts(),
-        )
-        summary = summary.with_problems(self.session.problems)
-        if self._keep_up:
-            waiting = self._keep_up.waiting
-            joined, dropped = waiting.joined_windows, waiting.dropped_windows
-            summary = replace(summary, joined_windows=joined, dropped_windows=dropped, dropped_events=waiting.dropped_events)
-        (self._folder / "config.yaml").write_text(as_yaml(self._config), encoding="utf-8")
-        text = json.dumps(summary.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
-        (self._folder / "summary.json").write_text(f"{text}\n", encoding="utf-8")
-        self._files.close()
+        stopped = self._interrupt.requested
+        summary = self._summary("interrupted" if stopped else "completed", self._interrupt.reason)
+        write_summary(self._folder.path / SUMMARY, summary)
+        self._done = True
+        if not stopped:
+            self._folder.drop_previous()
         return summary
 
-    def close(self) -> None:
-        """Take away what was not finished."""
-        with suppress(_NotFinishedError), self._files:
-            raise _NotFinishedError
+    def close(self, error: BaseException | None = None) -> None:
+        """Leave the folder; where ``error`` has ended the run, with a summary that says so."""
+        with self._open:
+            if error is not None and self._begun and not self._done:
+                self._done = True
+                self._fail(error)
+
+    def _fail(self, error: BaseException) -> None:
+        """Close the files, and write the summary; that they cannot be written is not told above what ended the run."""
+        told = str(error) if isinstance(error, TorchtrackError) else f"{type(error).__name__}: {error}".removesuffix(": ")
+        try:
+            with suppress(OutputError):
+                self._writing.close()
+        finally:
+            with suppress(OutputError):
+                ended: Ended = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+                write_summary(self._folder.path / SUMMARY, self._summary(ended, told))
+
+    def _summary(self, ended: Ended, message: str) -> RunSummary:
+        wall_s = time.perf_counter() - self._begun_s
+        facts = Facts(ended, message, wall_s, self._config.device, self._resumed_us, self._further_facts())
+        summary = summarise_run(self.session.name, self.session.labels, self._record, facts)
+        if self._keep_up:
+            return replace(summary, dropped_windows=self._keep_up.dropped_windows, dropped_events=self._keep_up.dropped_events)
+        return summary
 
     def _further_facts(self) -> dict[str, dict[str, Any]]:
-        """By label: what optional sinks measured, and the rotation that is known from elsewhere."""
-        facts: dict[str, dict[str, Any]] = {label: {} for label in self.session.labels}
-        if self._config.reference_angular_velocity is not None:
-            known = {"reference_angular_velocity": read_numbers(self._config.reference_angular_velocity, 3)}
-            facts = {label: {**found, **known} for label, found in facts.items()}
+        """By label: what optional sinks measured, and what is known from elsewhere."""
+        facts = {label: dict(self._known) for label in self.session.labels}
         for sink in self._sinks:
             if isinstance(sink, AlignmentRecord):
                 facts = {label: {**found, **sink.facts()[label]} for label, found in facts.items()}
         return facts
 
 
-class _NotFinishedError(Exception):
-    """Never seen outside: it has the files taken away."""
+def _known_facts(config: RunConfig) -> dict[str, Any]:
+    """What is known of every object from elsewhere: the rotation that it should have."""
+    if config.reference_angular_velocity is None:
+        return {}
+    return {"reference_angular_velocity": read_numbers(config.reference_angular_velocity, 3)}
 
 
 def read_numbers(path: Path, count: int) -> list[float]:

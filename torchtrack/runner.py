@@ -1,5 +1,6 @@
 """Runs, one or many: source → tracker → outputs."""
 
+import multiprocessing
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -21,8 +22,9 @@ from torchtrack.io.problems import Problems
 from torchtrack.limits import limits
 from torchtrack.refined_steps import Refinement, refined_steps
 from torchtrack.run_outputs import RunOutputs
-from torchtrack.session import Session, open_session
+from torchtrack.session import Session
 from torchtrack.sinks import Sink
+from torchtrack.sinks.resume import has_begun, is_complete
 from torchtrack.sinks.summary import RunSummary
 from torchtrack.smoothed_steps import SmoothedObjects
 from torchtrack.state import StepResult, TrackerState
@@ -75,39 +77,43 @@ def track(
         raise EventDataError(f"the stream has no events after {start_us} µs, where tracking starts. Check the start time and the file.")
 
 
-def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None = None) -> RunSummary:
-    """Track a source and write trajectories, poses, overlay, settings and summary into the output folder.
+def run(config: RunConfig, sinks: Sequence[Sink] = (), session: Session | None = None, *, resume: bool = False) -> RunSummary:
+    """Track a source and write trajectories, poses, overlay, settings and summary into the output folder, as the run goes on.
 
-    Ctrl-C ends the run after the window at hand; the outputs are complete up to there. On an error nothing is written.
+    Ctrl-C, SIGTERM and SIGHUP end the run after the window at hand. However a run ends, what was tracked up to there is in the folder, and
+    ``summary.json`` says how it ended. An earlier result there has the suffix ``.previous`` until the new run is complete.
 
     Args:
         config: what to do.
-        sinks: further sinks, such as a progress bar.
+        sinks: further sinks, such as a progress bar; an exception of one ends the run, and is raised again.
         session: what :func:`open_session` made of ``config``, where that was done before.
+        resume: go on with the run in the output folder that ended early, from its last pose.
 
     Raises:
+        OutputError: if the folder cannot be written into, or another run does so.
         TorchtrackError: of the kind that fits, if anything that the run needs is missing or wrong.
+        OSError: if a file cannot be read.
     """
-    session = session or open_session(config)
     with threads(config.threads), limits(config.limits), Interrupt() as interrupt:
-        (outcome,) = follow([lambda: RunOutputs(config, interrupt, sinks, session)], config, lambda: interrupt.requested)
-    if isinstance(outcome, TorchtrackError):
+        (outcome,) = follow([lambda: RunOutputs(config, interrupt, sinks, session, resume=resume)], config, lambda: interrupt.requested)
+    if isinstance(outcome, TorchtrackError | OSError):
         raise outcome
     return outcome
 
 
 def run_many(
-    configs: Sequence[RunConfig], *, streams: int = 1, jobs: int = 1, executor: ExecutorName = "local"
+    configs: Sequence[RunConfig], *, streams: int = 1, jobs: int = 1, executor: ExecutorName = "local", resume: bool = False
 ) -> Iterator[tuple[int, RunSummary | TaskFailure]]:
     """Track many sources as :func:`run` does each; gives the number of each and its summary, or why it failed, as it comes.
 
-    Ctrl-C ends it, and leaves complete outputs or none.
+    Ctrl-C ends it; what was tracked up to there stays, as in :func:`run`.
 
     Args:
         configs: one for each source, with a folder of its own for the results.
         streams: so many are tracked as one batch, as far as their tracking settings are the same.
         jobs: processes.
         executor: where they are.
+        resume: leave out those that are complete, and go on with those that ended early.
 
     Raises:
         ConfigError: if ``streams`` is less than one, two results would go to one folder, or a source is live: it would wait for the others.
@@ -120,14 +126,21 @@ def run_many(
     if live := [config.source for config in configs if not isinstance(config.source, Path)]:
         raise ConfigError(f"'{live[0]}' is live, and others would make it wait. Track it alone.")
     alike = [config.model_dump_json(include={*TrackingConfig.model_fields, "threads"}) for config in configs]
-    for numbers, outcomes in run_in_groups(_run_group, configs, alike, streams, executor, jobs):
-        yield from zip(numbers, outcomes, strict=True)
+    left = [number for number, config in enumerate(configs) if not (resume and is_complete(config.output))]
+    tasks = [(configs[number], resume and has_begun(configs[number].output)) for number in left]
+    for numbers, outcomes in run_in_groups(_run_group, tasks, [alike[number] for number in left], streams, executor, jobs):
+        yield from zip((left[number] for number in numbers), outcomes, strict=True)
         if any(outcome.interrupted for outcome in outcomes if isinstance(outcome, RunSummary)):
             return
 
 
-def _run_group(configs: Sequence[RunConfig], tell: Tell) -> list[RunSummary | TaskFailure]:
-    """Runs that have their tracking settings in common, as one batch."""
-    with threads(configs[0].threads), limits(configs[0].limits), Interrupt() as interrupt:
-        outputs = [partial(RunOutputs, config, interrupt) for config in configs]
-        return without_errors(follow(outputs, configs[0], lambda: interrupt.requested))
+def _run_group(tasks: Sequence[tuple[RunConfig, bool]], tell: Tell) -> list[RunSummary | TaskFailure]:
+    """Runs that have their tracking settings in common, as one batch; of each, whether it is taken up."""
+    (first, _), *_ = tasks
+    with threads(first.threads), limits(first.limits), Interrupt() as interrupt:
+        outputs = [partial(RunOutputs, config, interrupt, resume=resume) for config, resume in tasks]
+        outcomes = without_errors(follow(outputs, first, lambda: interrupt.requested))
+    if interrupt.requested and multiprocessing.parent_process() is not None:
+        # A process that was told to end, by one that waits for just that.
+        raise KeyboardInterrupt
+    return outcomes

@@ -3,8 +3,9 @@
 Each stream has its own camera, objects, clock and end. One that ends or fails leaves, and the others go on as they were.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Generic, Protocol, TypeVar, runtime_checkable
@@ -49,28 +50,30 @@ class Follower(Protocol[R_co]):
         """What came of all steps: called once, after the last."""
         ...
 
-    def close(self) -> None:
-        """Called at the very end; whoever was not finished leaves nothing behind."""
+    def close(self, error: BaseException | None = None) -> None:
+        """Called when ``error`` has ended the tracking of the session, and in any case at the very end."""
         ...
 
 
 def follow(
     followers: Sequence[Callable[[], Follower[R]]], config: TrackingConfig, stopped: Callable[[], bool] = lambda: False
-) -> list[R | TorchtrackError]:
+) -> list[R | TorchtrackError | OSError]:
     """Track many sessions at once; returns what came of each, or the error that ended it, which ends no other.
+
+    Any other exception ends all of them, and is raised again.
 
     Args:
         followers: each is called once, and opens its session.
         config: how all of them are tracked.
         stopped: asked after each step; all are finished with what they have once it says so.
     """
-    outcomes: dict[int, R | TorchtrackError] = {}
+    outcomes: dict[int, R | TorchtrackError | OSError] = {}
     opened: dict[int, Follower[R]] = {}
     with ExitStack() as stack:
         for number, opening in enumerate(followers):
             try:
-                opened[number] = _refined(stack.enter_context(closing(opening())), config)
-            except TorchtrackError as error:
+                opened[number] = _entered(stack, _refined(opening(), config))
+            except (TorchtrackError, OSError) as error:
                 outcomes[number] = error
         for number, step in _steps(opened, config):
             if number not in outcomes:
@@ -82,23 +85,44 @@ def follow(
     return [outcomes[number] for number in range(len(followers))]
 
 
+def _entered(stack: ExitStack, follower: Follower[R]) -> Follower[R]:
+    """The follower, closed at the end with what has ended the tracking of all."""
+    stack.push(lambda kind, error, trace: follower.close(error))
+    return follower
+
+
 class _Refined(Generic[R]):
     """A follower that is given steps once they are refined."""
 
     def __init__(self, follower: Follower[R], refinement: Refinement) -> None:
         self._follower, self._refinement = follower, refinement
-        self.session, self.windows, self.close = follower.session, follower.windows, follower.close
+        self._due = deque[Step]()
+        self.session, self.windows = follower.session, follower.windows
 
     def add(self, step: Step) -> None:
         """Take one step, and give on those that are due."""
-        for due in self._refinement.add(step):
-            self._follower.add(due)
+        self._due.extend(self._refinement.add(step))
+        while self._due:
+            self._follower.add(self._due.popleft())
 
     def finish(self) -> R:
         """Give on what was held back."""
-        for left in self._refinement.rest():
-            self._follower.add(left)
+        self._due.extend(self._refinement.rest())
+        while self._due:
+            self._follower.add(self._due.popleft())
         return self._follower.finish()
+
+    def close(self, error: BaseException | None = None) -> None:
+        """Where an error has ended it, give on what was held back, to whoever takes it."""
+        try:
+            # A second Ctrl-C is of somebody who does not want to wait.
+            if isinstance(error, Exception):
+                self._due.extend(self._refinement.rest())
+                while self._due:
+                    with suppress(TorchtrackError, OSError):
+                        self._follower.add(self._due.popleft())
+        finally:
+            self._follower.close(error)
 
 
 def _refined(follower: Follower[R], config: TrackingConfig) -> Follower[R]:
@@ -114,15 +138,18 @@ def _refined(follower: Follower[R], config: TrackingConfig) -> Follower[R]:
     return _Refined(follower, Refinement(SmoothedObjects.of(session.models, session.camera), config.tracker, alone))
 
 
-def _take(number: int, step: "Step | Ended", follower: Follower[R], outcomes: dict[int, R | TorchtrackError]) -> None:
+def _take(number: int, step: "Step | Ended", follower: Follower[R], outcomes: dict[int, R | TorchtrackError | OSError]) -> None:
     """Hand a step on; at the end of a stream, note what came of it."""
     try:
         if isinstance(step, Step):
             follower.add(step)
+        elif step.error is not None:
+            raise step.error
         else:
-            outcomes[number] = step.error or follower.finish()
-    except TorchtrackError as error:
+            outcomes[number] = follower.finish()
+    except (TorchtrackError, OSError) as error:
         outcomes[number] = error
+        follower.close(error)
 
 
 def build_tracker(sessions: Sequence[Session], config: TrackingConfig) -> Tracker:
@@ -149,7 +176,7 @@ def build_tracker(sessions: Sequence[Session], config: TrackingConfig) -> Tracke
 class Ended:
     """A stream gives no more steps: it came to its end, or failed."""
 
-    error: TorchtrackError | None = None
+    error: TorchtrackError | OSError | None = None
 
 
 @dataclass
@@ -225,7 +252,7 @@ def _together(streams: Sequence[_Stream], config: TrackingConfig) -> tuple[Track
 def _next_window(stream: _Stream) -> EventWindow | Ended:
     try:
         window = next(stream.windows, None)
-    except TorchtrackError as error:
+    except (TorchtrackError, OSError) as error:
         return Ended(error)
     return Ended() if window is None else window
 

@@ -14,6 +14,7 @@ from torchtrack.bench.setup import Setup
 from torchtrack.commands import output_console
 from torchtrack.errors import ConfigError, MissingExtraError
 from torchtrack.exit_codes import ExitCode
+from torchtrack.io.atomic import check_writable
 from torchtrack.runner import threads
 
 
@@ -29,9 +30,11 @@ def bench(part: str, output: Path, compare: Path | None, setup: Setup) -> int:
     Raises:
         ConfigError: if an option is out of bounds, or ``compare`` holds something else.
         MissingFileError: if there is nothing to compare with.
+        OutputError: if the folder cannot be written into.
         MissingExtraError: if a part needs a library that is not installed; of ``all``, that part is left out.
     """
     _check(compare, part, setup)
+    check_writable(output / "bench.json")
     parts = get_args(Part) if part == "all" else (part,)
     older = {name: older_medians(compare, name) for name in parts} if compare is not None else {}
     with threads(setup.threads):

@@ -20,6 +20,7 @@ from torchtrack.events import EventWindow
 from torchtrack.executor import TaskFailure, Tell
 from torchtrack.executor.groups import run_in_groups
 from torchtrack.executor.tasks import without_errors
+from torchtrack.io.atomic import check_writable
 from torchtrack.limits import limits as file_limits
 from torchtrack.quality import Status
 from torchtrack.session import open_session
@@ -59,8 +60,10 @@ def plan(config: EvaluateConfig, simulating: Told = lambda name, share: None) ->
     Raises:
         ConfigError: if nothing is named, or a cell is none of the paper's.
         MissingFileError: if a path that is named is not there.
+        OutputError: if the output folder cannot be written into.
     """
     check_cells(config.cells)
+    check_writable(config.output / "metrics.json")
     found = find_sequences(config.paths) if config.paths or not config.cells else []
     cells, failures = cell_sequences(config.cells, config.cache, config.jobs, simulating, config.executor)
     failed = {failure.sequence for failure in failures}
@@ -83,6 +86,7 @@ def evaluate(config: EvaluateConfig, on_done: Callable[[Job], None] = lambda job
     Raises:
         ConfigError: if nothing is named.
         MissingFileError: if a path that is named is not there.
+        OutputError: if the output folder cannot be written into.
     """
     planned = planned or plan(config)
     journal = Journal(config.output / "outcomes.jsonl", _limits(config))
@@ -181,7 +185,7 @@ class _Measurement:
         by_label = zip(self.session.labels, self._record.objects, strict=True)
         return [*(self._result(label, of, of.errors) for label, of in by_label if of.errors is not None), *self._left_out]
 
-    def close(self) -> None:
+    def close(self, error: BaseException | None = None) -> None:
         """Nothing is open."""
 
     def _result(self, label: str, of_object: ObjectRecord, errors: PoseErrors) -> ObjectResult:

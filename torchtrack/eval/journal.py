@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from torchtrack.config.run import RunConfig
 from torchtrack.errors import UnknownFormatError
 from torchtrack.eval.metrics import PoseErrors, summarise
 from torchtrack.eval.results import NotApplicable, ObjectResult
+from torchtrack.io.atomic import writing
+from torchtrack.io.line_file import LineFile
 
 Measured = Sequence[ObjectResult | NotApplicable]
 """What was measured of one sequence under one method."""
@@ -60,8 +63,11 @@ class Journal:
 
     def add(self, name: str, measured: Measured) -> None:
         """Write one measurement."""
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("a" if self._before is None else "w", encoding="utf-8") as file:
+        with writing(self._path):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            if self._before is not None:
+                self._path.unlink(missing_ok=True)
+        with closing(LineFile(self._path)) as file:
             file.write((self._before or "") + _line(name, measured))
         self._before = None
 

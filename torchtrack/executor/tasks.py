@@ -33,8 +33,8 @@ def attempt(function: Callable[[T, Tell], R], task: T, tell: Tell) -> R | TaskFa
 
 
 def reason_of(error: Exception) -> str:
-    """What went wrong; an error that is not ours is a bug, and is told with the place where it happened."""
-    return str(error) if isinstance(error, TorchtrackError) else "".join(traceback.format_exception(error))
+    """What went wrong; an error that is neither ours nor the system's is a bug, and is told with the place where it happened."""
+    return str(error) if isinstance(error, TorchtrackError | OSError) else "".join(traceback.format_exception(error))
 
 
 def killed(how: str) -> TaskFailure:
@@ -42,6 +42,6 @@ def killed(how: str) -> TaskFailure:
     return TaskFailure(f"the process that worked on it ended {ATTEMPTS} times, the last time {how}. Is there memory enough? Try fewer jobs.")
 
 
-def without_errors(outcomes: Sequence[R | TorchtrackError]) -> list[R | TaskFailure]:
+def without_errors(outcomes: Sequence[R | TorchtrackError | OSError]) -> list[R | TaskFailure]:
     """Errors as what can be sent from one process to another."""
-    return [TaskFailure(reason_of(outcome)) if isinstance(outcome, TorchtrackError) else outcome for outcome in outcomes]
+    return [TaskFailure(reason_of(outcome)) if isinstance(outcome, TorchtrackError | OSError) else outcome for outcome in outcomes]

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 from torchtrack.config.events import ReadingConfig
 from torchtrack.config.formats import OutputFormat
 from torchtrack.errors import UnknownFormatError
+from torchtrack.io.atomic import check_other_file, temporary_folder, writing
 from torchtrack.io.container import ContainerWriter, is_container, read_source
 from torchtrack.io.event_file import DEFAULT_CHOICES
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, EventSource
@@ -75,16 +75,17 @@ def convert(
 
     Raises:
         UnknownFormatError: if the format is not known, or cannot hold what it should.
+        OutputError: if the target is the source, or cannot be written.
         TorchtrackError: what reading or writing raises.
     """
     source, target = Path(source), Path(target)
+    check_other_file(source, target)
     # Where its events are from is copied beside them: none may be left out, nor change places.
     sequence = read_sequence(source, strict=True, choices=choices) if is_sequence(source) else None
     chosen = _format(target, format, sequence is not None)
     events: EventSource = sequence.events if sequence else open_events(source, width, height, strict, choices)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
-        written = Path(folder) / target.name
+    with temporary_folder(target) as folder, writing(target):
+        written = folder / target.name
         if sequence is not None and chosen in ("npz", "sequence"):
             count = _write_sequence(sequence, source, written, chosen)
         else:

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import tempfile
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from pathlib import Path
@@ -15,6 +14,7 @@ import trimesh
 from torchtrack.camera import Camera
 from torchtrack.errors import EventDataError
 from torchtrack.events import EventBatch, check_events
+from torchtrack.io.atomic import temporary_folder, writing
 from torchtrack.io.sequence_arrays import distortion_arrays, pose_arrays
 from torchtrack.io.trajectory import Trajectory
 
@@ -54,6 +54,7 @@ def write_sequence(
     Raises:
         EventDataError: if events are unsorted or outside the sensor, labels are unfit, or the counts disagree.
         PoseError: if the trajectories do not share their times.
+        OutputError: if the files cannot be written.
     """
     path = Path(path)
     textured = textured if textured is not None else [None] * len(labels)
@@ -75,9 +76,7 @@ def write_sequence(
         "mesh_files": np.array(mesh_files),
         "meta": np.array(json.dumps(meta)),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-        written = Path(folder)
+    with temporary_folder(path) as written, writing(path):
         for mesh, mesh_file in zip(meshes, mesh_files, strict=True):
             _geometry(mesh).export(written / mesh_file)
         for label, model in zip(labels, textured, strict=True):

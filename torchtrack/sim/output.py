@@ -1,6 +1,7 @@
 """Simulated sequences as files: ``.npz`` with the meshes beside it, or all in one ``.h5``."""
 
 import tempfile
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -58,14 +59,9 @@ def write(sequence: SimulatedSequence, path: str | Path) -> Path:
 def _write_container(sequence: SimulatedSequence, path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder, atomic_path(path) as temporary:
         objects = [_exported(sequence, number, Path(folder)) for number in range(len(sequence.labels))]
-        writer = ContainerWriter(temporary, sequence.camera, objects, sequence.meta, _extra_arrays(sequence))
-        try:
+        with closing(ContainerWriter(temporary, sequence.camera, objects, sequence.meta, _extra_arrays(sequence))) as writer:
             writer.write(sequence.events)
             writer.annotate(sequence.source.numpy().astype(np.int16))
-        except BaseException:
-            writer.file.close()
-            raise
-        writer.close()
 
 
 def _exported(sequence: SimulatedSequence, number: int, folder: Path) -> SequenceObject:

@@ -21,6 +21,7 @@ from torchtrack.config.load import load, read_yaml
 from torchtrack.config.settings import Settings
 from torchtrack.errors import ConfigError, MissingFileError, TorchtrackError
 from torchtrack.executor import TaskFailure, Tell, run_tasks
+from torchtrack.io.atomic import check_writable
 from torchtrack.io.sequence import read_sequence
 from torchtrack.limits import limits
 from torchtrack.sim.output import check_output, write
@@ -112,9 +113,11 @@ def simulate_to_file(scene: SceneConfig, path: Path, progress: Progress | None =
 
     Raises:
         EventDataError: if ``path`` is neither a ``.npz`` nor a ``.h5`` file.
+        OutputError: if it cannot be written.
         TorchtrackError: as :func:`torchtrack.sim.simulation.simulate`.
     """
     check_output(path)
+    check_writable(path)
     with limits(scene.limits):
         sequence = simulate(scene, progress)
     if preview:

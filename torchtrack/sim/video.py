@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
 from torchtrack.events import EventBatch, concatenate
-from torchtrack.io.atomic import atomic_path
+from torchtrack.io.atomic import atomic_path, check_writable
 from torchtrack.sim.event_camera import EventCamera
 from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
 from torchtrack.sim.surface import grey_reflectance
@@ -184,9 +184,11 @@ def write_video_events(config: VideoConfig, path: Path) -> int:
 
     Raises:
         MissingFileError, UnknownFormatError, EventDataError: as :func:`video_frames`; also if ``path`` is not a ``.npz`` file.
+        OutputError: if it cannot be written.
     """
     if path.suffix != ".npz":
         raise EventDataError(f"events of a video are written to a .npz file, got '{path}'.")
+    check_writable(path)
     parts = list(events_of_video(config))
     if not parts:
         raise EventDataError(f"'{config.video}' holds fewer than two frames.")

@@ -48,5 +48,8 @@ class AlignmentRecord:
 
     def _of(self, name: str, index: int) -> dict[str, float]:
         medians, shares = np.array(self._median_px[name][index]), np.array(self._share[name][index])
-        known = medians[np.isfinite(medians)]
-        return {"median_px": float(np.median(known)) if len(known) else float("nan"), "share_near": float(np.median(shares))}
+        return {"median_px": _median(medians[np.isfinite(medians)]), "share_near": _median(shares)}
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else float("nan")

@@ -20,19 +20,17 @@ _CORNERS = 32
 
 
 class Overlay:
-    """Draws the windows that the video has a frame for into ``overlay.mp4``.
+    """Draws the windows that the video has a frame for into ``path``, such as ``overlay.mp4``.
 
     Time surface, corners and their flow are found here: not every tracker needs them.
     """
 
-    def __init__(self, folder: Path, session: Session, config: OverlayConfig, tracker: TrackerConfig) -> None:
+    def __init__(self, path: Path, session: Session, config: OverlayConfig, tracker: TrackerConfig) -> None:
         self._session, self._config = session, _with_flow_of_corners(tracker)
         first_stream = torch.zeros(len(session.models), dtype=torch.int64)
         self._sensors = Sensors(*sensor_tables([session.camera]), stream_index=first_stream, tiles=None)
         self._last_event_us = empty_last_event(1, *self._sensors.image_size)
-        self._writer = OverlayWriter(
-            folder / "overlay.mp4", frames_per_second=config.frames_per_second, slow_motion=config.slow_motion, stills=config.stills
-        )
+        self._writer = OverlayWriter(path, frames_per_second=config.frames_per_second, slow_motion=config.slow_motion, stills=config.stills)
 
     def add(self, step: Step) -> None:
         """Draw one step, if it is due."""

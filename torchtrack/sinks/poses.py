@@ -1,12 +1,15 @@
 """Poses as text while a run goes on: one TUM trajectory per object, and one table of everything."""
 
 import csv
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
+from torchtrack.io.line_file import LineFile
 from torchtrack.io.seconds import format_seconds
 from torchtrack.lie import quaternion_from_rotation
 from torchtrack.quality import Status
+from torchtrack.sinks.folder import POSES
 from torchtrack.sinks.record import Record
 from torchtrack.stepping import Step
 
@@ -17,21 +20,19 @@ COLUMNS = (
 
 
 class PoseFiles:
-    """Writes ``trajectory_LABEL.tum`` and ``poses.csv`` into a folder, row by row.
+    """Writes ``trajectory_LABEL.tum`` and ``poses.csv`` into a folder, row by row; each row is on disk when its step is taken.
 
-    Errors are left empty where there is no truth.
+    Files that are there already are written on. Errors are left empty where there is no truth.
+
+    Raises:
+        OutputError: if they cannot be written; the files end with a whole line then.
     """
 
     def __init__(self, folder: Path, labels: Sequence[str], record: Record) -> None:
         """``record`` has taken a step before this sink does: the errors come from there."""
         self._labels, self._record = labels, record
-        # Open until close(): a run of any length must not keep its poses in memory.
-        self._tum = [(folder / f"trajectory_{label}.tum").open("w", encoding="utf-8") for label in labels]
-        self._table = (folder / "poses.csv").open("w", encoding="utf-8", newline="")
-        self._rows = csv.writer(self._table)
-        self._rows.writerow(COLUMNS)
-        for file in self._tum:
-            file.write("# t tx ty tz qx qy qz qw (seconds, metres)\n")
+        self._tum = [_begun(tum_path(folder, label), "# t tx ty tz qx qy qz qw (seconds, metres)\n") for label in labels]
+        self._table = _begun(folder / POSES, _rows([COLUMNS]))
 
     def add(self, step: Step) -> None:
         """Write one row per object."""
@@ -41,13 +42,33 @@ class PoseFiles:
         quaternions = quaternion_from_rotation(T[:, :3, :3]).tolist()
         judged = zip(result.status.tolist(), result.quality.tolist(), result.observation_count.tolist(), strict=True)
         columns = zip(self._labels, T[:, :3, 3].tolist(), quaternions, judged, strict=True)
+        rows: list[Sequence[object]] = []
         for index, (label, translation, quaternion, (status, quality, count)) in enumerate(columns):
             pose = [f"{value:.12g}" for value in (*translation, *quaternion)]
             self._tum[index].write(f"{format_seconds(t_us)} {' '.join(pose)}\n")
             errors = [f"{value:.6g}" for value in self._record.newest_errors(index)]
-            self._rows.writerow([t_us, label, *pose, Status(status).name, f"{quality:.4g}", count, *(errors or ("", ""))])
+            rows.append([t_us, label, *pose, Status(status).name, f"{quality:.4g}", count, *(errors or ("", ""))])
+        self._table.write(_rows(rows))
 
     def close(self) -> None:
         """Close the files."""
         for file in (*self._tum, self._table):
             file.close()
+
+
+def tum_path(folder: Path, label: str) -> Path:
+    """Where the trajectory of an object is."""
+    return folder / f"trajectory_{label}.tum"
+
+
+def _begun(path: Path, header: str) -> LineFile:
+    file = LineFile(path)
+    if path.stat().st_size == 0:
+        file.write(header)
+    return file
+
+
+def _rows(rows: Sequence[Sequence[object]]) -> str:
+    text = io.StringIO()
+    csv.writer(text).writerows(rows)
+    return text.getvalue()

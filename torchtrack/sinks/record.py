@@ -3,8 +3,10 @@
 from array import array
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.eval.metrics import PoseErrors, pose_errors
@@ -14,6 +16,23 @@ from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axis
 from torchtrack.sinks.silences import Silences
 from torchtrack.stepping import Step
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """The windows that a run has written before it ended early.
+
+    Args:
+        t_us: ``[n]``, ends of the windows.
+        T_cam_obj: poses of all objects.
+        status: :class:`torchtrack.quality.Status` of each.
+        quality: of each.
+    """
+
+    t_us: Int[Tensor, "n"]
+    T_cam_obj: Float[Tensor, "n b 4 4"]
+    status: Int[Tensor, "n b"]
+    quality: Float[Tensor, "n b"]
 
 
 class ObjectRecord:
@@ -41,6 +60,18 @@ class ObjectRecord:
         self._newest = ()
         if self.truth is not None:
             self._add_errors(pose_errors(t_us, T_cam_obj[None], self.truth, self.axis))
+
+    def add_many(self, t_us: Tensor, T_cam_obj: Tensor, statuses: Sequence[int], qualities: Sequence[float]) -> None:
+        """Take the windows of an earlier part of the run, before any other: times ``[n]``, poses ``[n, 4, 4]``."""
+        if not len(t_us):
+            return
+        self.statuses.update(statuses)
+        self.quality_sum += sum(qualities)
+        rotations = T_cam_obj[:, :3, :3]
+        self.turned = self.turned + so3_log(rotations[1:] @ rotations[:-1].mT).sum(0)
+        self._last_rotation = rotations[-1]
+        if self.truth is not None:
+            self._add_errors(pose_errors(t_us, T_cam_obj, self.truth, self.axis))
 
     def _add_errors(self, errors: PoseErrors) -> None:
         for t_us, rotation, translation in zip(errors.t_us.tolist(), errors.rotation_deg.tolist(), errors.translation_cm.tolist(), strict=True):
@@ -77,10 +108,25 @@ class Record:
         self.event_count = 0
         self.silences = Silences()
         self._duration_us = 0
+        self.windows = 0
+        # Stream time of an earlier part of the run (s), of which neither events nor step times are known.
+        self.earlier_s = 0.0
+
+    def resume(self, earlier: Earlier, start_us: int) -> None:
+        """Take what an earlier part of the run has written; ``start_us``: where that began."""
+        if not len(earlier.t_us):
+            return
+        self.windows = len(earlier.t_us)
+        self._duration_us = int(earlier.t_us[-1]) - start_us
+        self.earlier_s = self.duration_s
+        for index, of_object in enumerate(self.objects):
+            T, status, quality = earlier.T_cam_obj[:, index], earlier.status[:, index], earlier.quality[:, index]
+            of_object.add_many(earlier.t_us, T, status.tolist(), quality.tolist())
 
     def add(self, step: Step) -> None:
         """Take one step."""
         result = step.result
+        self.windows += 1
         self.step_seconds.append(step.seconds)
         self.event_count += len(step.window.events)
         self.silences.add(step)

@@ -1,21 +1,29 @@
 """The summary of a run: what ran on what, how fast, how well."""
 
+import json
 import math
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
 import torchtrack
 from torchtrack.eval.metrics import Metrics, summarise
+from torchtrack.io.atomic import writing
 from torchtrack.io.problems import ClockChange, Problems
 from torchtrack.quality import Status
 from torchtrack.sinks.record import ObjectRecord, Record
 from torchtrack.sinks.silences import Silence
+
+# For what may come into a summary at its end: why it ended, gaps, changes of the clock.
+_ROOM_BYTES = 8192
+
+Ended = Literal["running", "completed", "interrupted", "failed"]
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,9 @@ class RunSummary:
 
     Args:
         source: name of what was tracked.
-        interrupted: whether it was stopped before the stream's end.
+        ended: ``completed``; ``interrupted`` or ``failed`` before the stream's end; ``running`` while it goes on, and after a process was killed.
+        message: why it ended early.
+        interrupted: whether ``ended`` is ``interrupted``.
         device, threads: where the tracker ran.
         versions: of torchtrack and what it stands on.
         windows, events: how many.
@@ -62,9 +72,13 @@ class RunSummary:
         clock_changes: where the clock wrapped or jumped back, and time went on: poses have the time that went on.
         gaps: the longest times of 50 ms and more without events.
         gap_count: how many of these there are.
+        resumed_us: where a run that had ended early was taken up last (µs); windows, stream time and objects are of all of it, events, rates and
+            times of what came after.
     """
 
     source: str
+    ended: Ended
+    message: str
     interrupted: bool
     device: str
     threads: int
@@ -86,6 +100,7 @@ class RunSummary:
     clock_changes: tuple[ClockChange, ...] = ()
     gaps: tuple[Silence, ...] = ()
     gap_count: int = 0
+    resumed_us: int | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; numbers that are not finite become None, as JSON has none."""
@@ -99,19 +114,32 @@ class RunSummary:
         return replace(self, problems=counts, clock_changes=tuple(problems.clock_changes))
 
 
-def summarise_run(
-    source: str, labels: Sequence[str], record: Record, *, wall_s: float, device: str, interrupted: bool, more: Mapping[str, Mapping[str, Any]]
-) -> RunSummary:
-    """The summary of what ``record`` has seen; ``more`` has further facts by label and name."""
+@dataclass(frozen=True)
+class Facts:
+    """What a summary says beside what was recorded: how the run ended, where, in what time, and more by label and name."""
+
+    ended: Ended
+    message: str
+    wall_s: float
+    device: str
+    resumed_us: int | None = None
+    more: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+def summarise_run(source: str, labels: Sequence[str], record: Record, facts: Facts) -> RunSummary:
+    """The summary of what ``record`` has seen; rates and means of nothing are NaN."""
     step_ms = 1e3 * np.frombuffer(record.step_seconds)
+    duration_s = record.duration_s - record.earlier_s
     by_label = zip(labels, record.objects, strict=True)
     return RunSummary(
         source=source,
-        interrupted=interrupted,
-        device=device_name(device),
+        ended=facts.ended,
+        message=facts.message,
+        interrupted=facts.ended == "interrupted",
+        device=device_name(facts.device),
         threads=torch.get_num_threads(),
         versions=versions(),
-        windows=len(step_ms),
+        windows=record.windows,
         events=record.event_count,
         duration_s=record.duration_s,
         event_rate_per_s=record.event_count / record.duration_s,
@@ -123,15 +151,50 @@ def summarise_run(
         objects={label: _summarise_object(of, record.duration_s, dict(more.get(label, {}))) for label, of in by_label},
         gaps=record.silences.longest,
         gap_count=record.silences.count,
+        event_rate_per_s=_ratio(record.event_count, duration_s),
+        wall_s=facts.wall_s,
+        real_time_factor=_ratio(duration_s, facts.wall_s),
+        tracking_real_time_factor=_ratio(duration_s, 1e-3 * float(step_ms.sum())),
+        step_median_ms=float(np.median(step_ms)) if len(step_ms) else math.nan,
+        step_p95_ms=float(np.percentile(step_ms, 95)) if len(step_ms) else math.nan,
+        objects={label: _summarise_object(of, record.duration_s, dict(facts.more.get(label, {}))) for label, of in by_label},
+        resumed_us=facts.resumed_us,
     )
 
 
+def write_summary(path: Path, summary: RunSummary, *, room_for_end: bool = False) -> None:
+    """Write ``summary.json``, over what is there.
+
+    Args:
+        path: of the file.
+        summary: what it says.
+        room_for_end: fill the file up with blanks to what the summary at the end may need: a disk that is full by then can still take it.
+
+    Raises:
+        OutputError: if it cannot be written.
+    """
+    text = json.dumps(summary.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
+    # A name that is no UTF-8 becomes what JSON calls an escape.
+    data = text.encode("utf-8", "backslashreplace")
+    if room_for_end:
+        data = data.ljust(2 * len(data) + _ROOM_BYTES)
+    with writing(path):
+        path.touch()
+        # Over what is there: to empty the file first would give the room away.
+        with path.open("rb+", buffering=0) as file:
+            file.write(data + b"\n")
+            file.truncate(len(data) + 1)
+
+
+def _ratio(value: float, by: float) -> float:
+    return value / by if by else math.nan
+
+
 def _summarise_object(record: ObjectRecord, duration_s: float, more: dict[str, Any]) -> ObjectSummary:
-    windows = sum(record.statuses.values())
     return ObjectSummary(
         status={Status(status).name: count for status, count in sorted(record.statuses.items())},
-        mean_quality=record.quality_sum / windows,
-        angular_velocity_rad_s=tuple((record.turned / duration_s).tolist()),
+        mean_quality=_ratio(record.quality_sum, sum(record.statuses.values())),
+        angular_velocity_rad_s=tuple(_ratio(turned, duration_s) for turned in record.turned.tolist()),
         errors=summarise(record.errors) if record.errors is not None else None,
         unseen_turns=record.axis is not None,
         more=more,

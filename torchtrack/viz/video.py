@@ -1,7 +1,8 @@
 """A video and a few stills, in constant memory, that appear on disk whole or not at all."""
 
 import os
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 
@@ -9,8 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from torchtrack.errors import TorchtrackError
-from torchtrack.io.atomic import atomic_path
+from torchtrack.errors import OutputError, TorchtrackError
+from torchtrack.io.atomic import atomic_path, writing
 
 # A pause of the events longer than this is shortened to it (seconds of video).
 _LONGEST_PAUSE_S = 2.0
@@ -82,15 +83,18 @@ class OverlayWriter:
     def close(self) -> None:
         """Finish the video and write the stills."""
         self._release()
-        for t_us, picture in self._stills.chosen():
-            with atomic_path(self.path.with_name(f"{self.path.stem}_{t_us * 1e-6:.3f}s.png")) as temporary:
-                temporary.write_bytes(picture)
-        self._stills = _EvenStills(0)
-        self._files.close()
+        try:
+            for t_us, picture in self._stills.chosen():
+                still = self.path.with_name(f"{self.path.stem}_{t_us * 1e-6:.3f}s.png")
+                with writing(still):
+                    still.write_bytes(picture)
+        finally:
+            self._stills = _EvenStills(0)
+            self._files.close()
 
     def _open(self, image: np.ndarray) -> cv2.VideoWriter:
         height, width = _even(image).shape[:2]
-        temporary = self._files.enter_context(atomic_path(self.path))
+        temporary = self._files.enter_context(_unfinished(self.path))
         video = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), self._frames_per_second, (width, height))
         if not video.isOpened():
             error = TorchtrackError(
@@ -105,6 +109,29 @@ class OverlayWriter:
         if self._video is not None:
             self._video.release()
             self._video = None
+
+
+@contextmanager
+def _unfinished(path: Path) -> Iterator[Path]:
+    """A path beside a video's to write it to; what was written replaces ``path`` when the block ends without an error.
+
+    It is always the same: what a process that was killed has left is written over, or taken away, by the next one.
+
+    Raises:
+        OutputError: if the video is not whole, as on a disk that is full, which OpenCV does not tell.
+    """
+    unfinished = path.with_name(f"{path.stem}.part{path.suffix}")
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield unfinished
+        if unfinished.exists():
+            with writing(path):
+                if not cv2.VideoCapture(str(unfinished)).isOpened():
+                    raise OutputError(f"cannot write to '{path}': the video is not whole. Is the disk full?")
+                unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def save_still(path: str | os.PathLike[str], image: UInt8[np.ndarray, "h w 3"]) -> None:

@@ -6,6 +6,7 @@ An array's header says its length, which is known at the end alone; until then t
 import tempfile
 import zipfile
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ class NpzWriter(EventWriter):
         super().__init__(path, width, height)
         self._arrays = {"width": np.int64(width), "height": np.int64(height), **(arrays or {})}
         self._types = {**_TYPES, **(columns or {})}
-        self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.")
+        self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".columns.")
         self._files = {name: (Path(self._folder.name) / name).open("wb+") for name in self._types}
 
     def _append(self, events: Columns) -> None:
@@ -48,7 +49,9 @@ class NpzWriter(EventWriter):
 
     def close(self) -> None:
         """Put the columns together, and close the file."""
-        with zipfile.ZipFile(self.path, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+        with self._folder, ExitStack() as columns, zipfile.ZipFile(self.path, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+            for file in self._files.values():
+                columns.callback(file.close)
             for name, file in self._files.items():
                 file.seek(0)
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -56,8 +59,6 @@ class NpzWriter(EventWriter):
                     np.lib.format.write_array_header_1_0(member, header)
                     while data := file.read(_COPY_BYTES):
                         member.write(data)
-                file.close()
             for name, values in self._arrays.items():
                 with archive.open(f"{name}.npy", "w") as member:
                     np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
-        self._folder.cleanup()

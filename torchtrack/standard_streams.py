@@ -1,0 +1,57 @@
+"""Standard output and error: what is told there, and what if it cannot be."""
+
+import contextlib
+import io
+import os
+import sys
+from typing import Any
+
+from rich.console import Console
+
+from torchtrack.exit_codes import ExitCode
+from torchtrack.io.atomic import writing
+
+_NAME = "standard output"
+
+
+class OutputConsole(Console):
+    """Standard output. Where nobody reads it any more (a pipe into ``head``) the program ends without a word."""
+
+    def print(self, *objects: Any, **settings: Any) -> None:
+        """Print, as :meth:`rich.console.Console.print` does.
+
+        Raises:
+            OutputError: if that cannot be, as where the disk is full.
+        """
+        with writing(_NAME):
+            super().print(*objects, **settings)
+
+
+def take_any_text() -> None:
+    """Have both streams show ``?`` in place of what their encoding does not know, as of ``LANG=C``: an error over a ° would hide a result."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def flushed(code: Any) -> Any:
+    """The exit code, once all of standard output is written; where it cannot be, that is told, and the code is :attr:`ExitCode.FAILED`."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        # What is left would be tried, and told, once more when Python ends.
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            return ExitCode.FAILED
+        return report(f"cannot write to '{_NAME}': {error.strerror}.", ExitCode.FAILED)
+    return code
+
+
+def report(text: str, code: int) -> int:
+    """Tell one error on stderr, without a traceback; gives the exit code."""
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    with contextlib.suppress(OSError):
+        console.print("error:", style="bold red", end=" ")
+        console.print(text, markup=False)
+    return code
