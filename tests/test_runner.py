@@ -1,4 +1,6 @@
 import csv
+import errno
+import io
 import json
 import os
 import signal
@@ -14,12 +16,12 @@ import torchtrack
 from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import WindowConfig
-from torchtrack.errors import CalibrationError, ConfigError, EventDataError, MissingFileError, PoseError, UnknownFormatError
+from torchtrack.errors import CalibrationError, ConfigError, EventDataError, MissingFileError, OutputError, PoseError, UnknownFormatError
 from torchtrack.events import EventBatch
-from torchtrack.io import read_sequence, read_tum
+from torchtrack.io import line_file, read_sequence, read_tum
 from torchtrack.lie import rotation_angle_deg
-from torchtrack.runner import run, track
-from torchtrack.session import open_session
+from torchtrack.runner import run, run_many, track
+from torchtrack.session import Session, open_session
 from torchtrack.stepping import clipped
 from torchtrack.streams import build_tracker
 
@@ -81,21 +83,245 @@ def test_start_and_end_bound_the_run(sequence_path, tmp_path):
     assert summary.objects["box"].errors.max_rotation_deg < 1.5
 
 
-def test_nothing_is_written_on_an_error_and_an_earlier_run_stays(sequence_path, tmp_path):
-    run(quick(sequence_path, tmp_path / "out"))
-    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+class Broken:
+    """A sink that raises an error at one of its steps."""
 
-    class Broken:
+    def __init__(self, error, at=4):
+        self._error, self._left, self.closed = error, at, False
+
+    def add(self, step):
+        self._left -= 1
+        if self._left == 0:
+            raise self._error
+
+    def close(self):
+        self.closed = True
+
+
+def summary_in(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.mark.parametrize("preset", ["default", "causal"])
+@pytest.mark.parametrize("error", [EventDataError("bad events"), RuntimeError("unplugged"), OSError(28, "No space left on device")])
+def test_a_sink_that_fails_ends_the_run_and_what_was_tracked_stays(sequence_path, tmp_path, preset, error):
+    sink = Broken(error)
+    with pytest.raises(type(error)) as raised:
+        run(quick(sequence_path, tmp_path / "out", preset=preset), [sink])
+    assert raised.value is error and sink.closed
+    trajectory, told = read_tum(tmp_path / "out" / "trajectory_box.tum"), summary_in(tmp_path / "out")
+    # What was held back to be smoothed is written too.
+    assert len(trajectory) == told["windows"] == (8 if preset == "default" else 4)
+    assert (told["ended"], told["interrupted"]) == ("failed", False)
+    assert str(error.args[-1]) in told["message"]
+    assert told["objects"]["box"]["errors"]["mean_rotation_deg"] < 1.5
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.yaml", "poses.csv", "summary.json", "trajectory_box.tum"]
+
+
+def failing_after(windows, error):
+    """A session's windows that end with an error."""
+
+    def raising(self):
+        for chunk in chunks(self):
+            yield chunk[: len(chunk) * windows // 8]
+            raise error
+
+    chunks = Session.chunks
+    return raising
+
+
+@pytest.mark.parametrize("error", [EventDataError("cut off"), OSError(5, "Input/output error"), RuntimeError("unplugged")])
+def test_a_source_that_fails_leaves_what_was_tracked(sequence_path, tmp_path, monkeypatch, error):
+    monkeypatch.setattr(Session, "chunks", failing_after(5, error))
+    with pytest.raises(type(error)) as raised:
+        run(quick(sequence_path, tmp_path / "out"))
+    assert raised.value is error
+    told = summary_in(tmp_path / "out")
+    assert told["ended"] == "failed" and told["windows"] == len(read_tum(tmp_path / "out" / "trajectory_box.tum")) >= 3
+
+
+def test_one_of_many_that_fails_leaves_what_was_tracked_and_the_others_go_on(folder, tmp_path, monkeypatch):
+    raising, chunks = failing_after(4, EventDataError("cut off")), Session.chunks
+    monkeypatch.setattr(Session, "chunks", lambda self: raising(self) if self.name == "one" else chunks(self))
+    configs = [quick(folder / f"{name}.npz", tmp_path / name) for name in ("one", "two")]
+    outcomes = dict(run_many(configs, streams=2))
+    assert outcomes[0].reason == "cut off" and outcomes[1].ended == "completed"
+    assert [summary_in(tmp_path / name)["ended"] for name in ("one", "two")] == ["failed", "completed"]
+    assert len(read_tum(tmp_path / "one" / "trajectory_box.tum")) == summary_in(tmp_path / "one")["windows"] > 0
+
+
+def test_poses_are_on_disk_as_they_come(sequence_path, tmp_path):
+    seen = []
+
+    class Reader:
         def add(self, step):
-            raise EventDataError("the disk of the test is full")
+            lines = (tmp_path / "out" / "poses.csv").read_text().splitlines()
+            seen.append((len(lines) - 1, len(read_tum(tmp_path / "out" / "trajectory_box.tum")), summary_in(tmp_path / "out")["ended"]))
 
         def close(self):
             pass
 
-    with pytest.raises(EventDataError, match="full"):
-        run(quick(sequence_path, tmp_path / "out"), [Broken()])
-    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    run(quick(sequence_path, tmp_path / "out", preset="causal"), [Reader()])
+    assert seen == [(number, number, "running") for number in range(1, 9)]
+    assert summary_in(tmp_path / "out")["ended"] == "completed"
+
+
+def test_an_earlier_result_is_set_aside_until_the_new_one_is_complete(sequence_path, tmp_path):
+    out = tmp_path / "out"
+    run(quick(sequence_path, out))
+    (out / "notes.txt").write_text("mine")
+    before = (out / "poses.csv").read_bytes()
+    for _ in range(2):
+        # The newest complete one is kept, however often a new one fails.
+        with pytest.raises(RuntimeError):
+            run(quick(sequence_path, out, preset="causal"), [Broken(RuntimeError("again"), at=2)])
+        assert (out / "poses.csv.previous").read_bytes() == before
+        assert json.loads((out / "summary.json.previous").read_text())["ended"] == "completed"
+        assert summary_in(out)["ended"] == "failed"
+    run(quick(sequence_path, out))
+    assert (out / "poses.csv").read_bytes() == before
+    assert sorted(path.name for path in out.iterdir()) == ["config.yaml", "notes.txt", "poses.csv", "summary.json", "trajectory_box.tum"]
+
+
+def test_of_results_that_are_not_complete_the_newest_is_set_aside(sequence_path, tmp_path):
+    for at in (2, 4, 3):
+        with pytest.raises(RuntimeError):
+            run(quick(sequence_path, tmp_path / "out", preset="causal"), [Broken(RuntimeError("again"), at=at)])
+    assert [len((tmp_path / "out" / f"poses.csv{suffix}").read_text().splitlines()) for suffix in (".previous", "")] == [5, 4]
+
+
+def test_a_config_that_is_no_runs_is_not_replaced(sequence_path, tmp_path):
+    (tmp_path / "config.yaml").write_text("mine")
+    with pytest.raises(OutputError, match=r"its config\.yaml is not of a run"):
+        run(quick(sequence_path, tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"] and (tmp_path / "config.yaml").read_text() == "mine"
+
+
+def test_two_runs_into_one_folder_the_second_is_refused(sequence_path, tmp_path):
+    class Second:
+        error = None
+
+        def add(self, step):
+            try:
+                run(quick(sequence_path, tmp_path / "out"))
+            except OutputError as error:
+                self.error = error
+
+        def close(self):
+            pass
+
+    second = Second()
+    assert run(quick(sequence_path, tmp_path / "out", end_us=6000), [second]).ended == "completed"
+    assert f"another run writes there (process {os.getpid()})" in str(second.error)
+
+
+def test_an_output_that_cannot_be_is_told_before_anything_is_tracked(sequence_path, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for output, expected in (
+        (tmp_path / "file", "file': it is a file"),
+        (tmp_path / "file" / "below" / "out", "file' is a file, where a folder should be"),
+        (tmp_path / ("x" * 300), "name too long"),
+        (sequence_path / "out", "tiny.npz' is a file, where a folder should be"),
+    ):
+        with pytest.raises(OutputError, match=expected):
+            run(quick(sequence_path, output))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"] and (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("preset", ["default", "causal"])
+def test_a_full_disk_leaves_whole_lines_and_a_summary(sequence_path, tmp_path, monkeypatch, preset):
+    out, written = tmp_path / "out", 0
+    write = io.FileIO.write
+
+    def filling(file, data):
+        nonlocal written
+        if not str(file.name).endswith("poses.csv"):
+            return write(file, data)
+        if written + len(data) > 700:
+            if written == 700:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            data = data[: 700 - written]
+        written += len(data)
+        return write(file, data)
+
+    # What a raw file does on a disk that is full: a part, then nothing.
+    monkeypatch.setattr(line_file, "_write", filling)
+    with pytest.raises(OutputError, match=r"poses\.csv': No space left on device"):
+        run(quick(sequence_path, out, preset=preset))
+    text = (out / "poses.csv").read_bytes()
+    assert text.endswith(b"\n") and 300 < len(text) <= 700
+    assert summary_in(out)["ended"] == "failed" and "No space left" in summary_in(out)["message"]
+
+
+def interrupted(sequence_path, out, windows=3, **settings):
+    """A run that ends early, after some windows."""
+    with pytest.raises(RuntimeError):
+        run(quick(sequence_path, out, preset="causal", **settings), [Broken(RuntimeError("power"), at=windows)])
+
+
+def test_a_run_is_taken_up_where_it_ended(sequence_path, tmp_path):
+    whole = run(quick(sequence_path, tmp_path / "whole", preset="causal"))
+    interrupted(sequence_path, tmp_path / "out")
+    before = (tmp_path / "out" / "poses.csv").read_bytes()
+    # Killed while it wrote: a line that is not whole, and a window that only one file has.
+    (tmp_path / "out" / "poses.csv").write_bytes(before + b"20499,box,0.1")
+    with (tmp_path / "out" / "trajectory_box.tum").open("a") as file:
+        file.write("0.020499 0 0 0 0 0 0 1\n")
+    summary = run(quick(sequence_path, tmp_path / "out", preset="causal"), resume=True)
+    assert (tmp_path / "out" / "poses.csv").read_bytes().startswith(before)
+    trajectory, expected = (read_tum(tmp_path / name / "trajectory_box.tum") for name in ("out", "whole"))
+    assert trajectory.t_us.tolist() == expected.t_us.tolist()
+    assert rotation_angle_deg(trajectory.T_cam_obj[:, :3, :3], expected.T_cam_obj[:, :3, :3]).max() < 1.5
+    assert (summary.ended, summary.resumed_us, summary.windows) == ("completed", 15_499, 8)
+    assert summary.duration_s == whole.duration_s
+    assert summary.events < whole.events
+    of_object = summary.objects["box"]
+    assert of_object.status == {"TRACKING": 8} and of_object.errors.windows == 7
+    rows = list(csv.DictReader((tmp_path / "out" / "poses.csv").read_text().splitlines()))
+    errors = [float(row["rotation_error_deg"]) for row in rows if row["rotation_error_deg"]]
+    assert of_object.errors.mean_rotation_deg == pytest.approx(np.mean(errors), rel=1e-4)
+    assert of_object.mean_quality == pytest.approx(np.mean([float(row["quality"]) for row in rows]), rel=1e-3)
+
+
+def test_a_run_that_has_no_pose_yet_is_taken_up_at_its_start(sequence_path, tmp_path):
+    interrupted(sequence_path, tmp_path / "out", windows=1)
+    (tmp_path / "out" / "poses.csv").write_bytes(b"t_us,la")
+    (tmp_path / "out" / "trajectory_box.tum").write_bytes(b"")
+    summary = run(quick(sequence_path, tmp_path / "out", preset="causal"), resume=True)
+    assert (summary.windows, summary.resumed_us) == (8, None)
+    assert len(read_tum(tmp_path / "out" / "trajectory_box.tum")) == 8
+    assert len(list(csv.DictReader((tmp_path / "out" / "poses.csv").read_text().splitlines()))) == 8
+
+
+def test_what_cannot_be_taken_up_is_told(sequence_path, tmp_path):
+    with pytest.raises(MissingFileError, match="holds no run to take up"):
+        run(quick(sequence_path, tmp_path / "out"), resume=True)
+    assert list(tmp_path.iterdir()) == []
+    interrupted(sequence_path, tmp_path / "out")
+    with pytest.raises(ConfigError, match=r"other settings: tracker\.window\.duration_us was 5000, is 4000"):
+        run(quick(sequence_path, tmp_path / "out", preset="causal", tracker={"window": {"duration_us": 4000}}), resume=True)
+    table = tmp_path / "out" / "poses.csv"
+    good = table.read_text()
+    for bad, expected in ((good.replace(",box,", ",cup,"), "row 2 .* not of the object 'box'"), (good.replace("t_us", "t"), "is no table of poses")):
+        table.write_text(bad)
+        with pytest.raises(UnknownFormatError, match=expected):
+            run(quick(sequence_path, tmp_path / "out", preset="causal"), resume=True)
+    table.write_text(good)
+    run(quick(sequence_path, tmp_path / "out", preset="causal"), resume=True)
+    with pytest.raises(ConfigError, match="is complete"):
+        run(quick(sequence_path, tmp_path / "out", preset="causal"), resume=True)
+
+
+def test_of_many_those_that_are_complete_are_left_out(folder, tmp_path):
+    configs = [quick(folder / f"{name}.npz", tmp_path / name, preset="causal") for name in ("one", "two")]
+    run(configs[0])
+    interrupted(folder / "two.npz", tmp_path / "two")
+    before = (tmp_path / "one" / "summary.json").read_bytes()
+    outcomes = dict(run_many(configs, resume=True))
+    assert list(outcomes) == [1] and outcomes[1].ended == "completed" and outcomes[1].resumed_us is not None
+    assert outcomes[1].windows == len(read_tum(tmp_path / "two" / "trajectory_left.tum")) == len(read_tum(tmp_path / "two" / "trajectory_right.tum"))
+    assert (tmp_path / "one" / "summary.json").read_bytes() == before
 
 
 def test_a_new_run_replaces_all_files_of_an_earlier_one(sequence_path, tmp_path):
@@ -108,24 +334,38 @@ def test_a_new_run_replaces_all_files_of_an_earlier_one(sequence_path, tmp_path)
     assert "notes.txt" in names
 
 
-def test_interrupt_ends_the_run_with_complete_outputs(sequence_path, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_interrupt_ends_the_run_with_complete_outputs(sequence_path, tmp_path, number):
     class InterruptAtThird:
         count = 0
 
         def add(self, step):
             self.count += 1
             if self.count == 3:
-                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), number)
 
         def close(self):
             pass
 
-    handler = signal.getsignal(signal.SIGINT)
+    handler = signal.getsignal(number)
     summary = run(quick(sequence_path, tmp_path / "out", preset="causal"), [InterruptAtThird()])
     assert summary.interrupted
-    assert signal.getsignal(signal.SIGINT) is handler
+    assert signal.getsignal(number) is handler
     assert len(read_tum(tmp_path / "out" / "trajectory_box.tum")) == summary.windows == 3
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["interrupted"] is True
+    told = summary_in(tmp_path / "out")
+    assert (told["ended"], told["interrupted"], told["message"]) == ("interrupted", True, f"ended by {number.name}")
+
+
+def test_a_signal_that_is_ignored_stays_ignored(sequence_path, tmp_path):
+    class Hangup(Broken):
+        def add(self, step):
+            os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert run(quick(sequence_path, tmp_path / "out"), [Hangup(None)]).ended == "completed"
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_threads_are_as_before_after_a_run(sequence_path, tmp_path):

@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
+from torchtrack.errors import OutputError
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io.atomic import writing
 
@@ -23,8 +24,12 @@ class OutputConsole(Console):
         Raises:
             OutputError: if that cannot be, as where the disk is full.
         """
-        with writing(_NAME):
-            super().print(*objects, **settings)
+        try:
+            with writing(_NAME):
+                super().print(*objects, **settings)
+        except OutputError:
+            _silence()
+            raise
 
 
 def take_any_text() -> None:
@@ -39,13 +44,19 @@ def flushed(code: Any) -> Any:
     try:
         sys.stdout.flush()
     except OSError as error:
-        # What is left would be tried, and told, once more when Python ends.
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence()
         if isinstance(error, BrokenPipeError):
             return ExitCode.FAILED
         return report(f"cannot write to '{_NAME}': {error.strerror}.", ExitCode.FAILED)
     return code
+
+
+def _silence() -> None:
+    """Have standard output go nowhere: what is left of it would be tried, and told, once more when Python ends."""
+    with contextlib.suppress(OSError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def report(text: str, code: int) -> int:

@@ -1,6 +1,7 @@
 """Text files that grow by whole lines, which are on disk as soon as they are written."""
 
 import os
+from io import FileIO
 from pathlib import Path
 
 from torchtrack.io.atomic import writing
@@ -28,7 +29,7 @@ class LineFile:
         with writing(self._path):
             try:
                 while written < len(data):
-                    written += self._file.write(data[written:])
+                    written += _write(self._file, data[written:])
             except OSError:
                 torn = written - (data[:written].rfind(b"\n") + 1)
                 if torn:
@@ -39,3 +40,8 @@ class LineFile:
         """Close the file."""
         with writing(self._path):
             self._file.close()
+
+
+def _write(file: FileIO, data: bytes) -> int:
+    """Write some of the data; gives how much of it."""
+    return file.write(data)

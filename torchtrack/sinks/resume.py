@@ -111,4 +111,4 @@ def _lines(path: Path) -> int:
 
 def _keep_lines(path: Path, count: int) -> None:
     with writing(path), path.open("rb+") as file:
-        file.truncate(sum(len(line) for line in islice(file, count)))
+        file.truncate(sum(len(line) for line in islice(file, count) if line.endswith(b"\n")))
