@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from conftest import REPOSITORY
@@ -139,15 +140,15 @@ def test_a_file_that_may_not_be_read_is_one_line(sequence_path, monkeypatch, cap
 
 
 def standard_output(monkeypatch, descriptor):
-    stream = open(descriptor, "w", encoding="utf-8")
+    stream = os.fdopen(descriptor, "w", encoding="utf-8")
     monkeypatch.setattr(sys, "stdout", stream)
     return stream
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("arguments", [["settings"], ["info", "{sequence}"], ["info", "{sequence}", "--json"], ["--help"]])
 def test_a_full_disk_behind_standard_output_is_one_line(sequence_path, monkeypatch, capsys, arguments):
-    with standard_output(monkeypatch, "/dev/full"):
+    with standard_output(monkeypatch, os.open("/dev/full", os.O_WRONLY)):
         try:
             code = main([argument.format(sequence=sequence_path) for argument in arguments])
         except SystemExit as exit:
