@@ -273,10 +273,8 @@ def _run(arguments: Sequence[str]) -> int:
     except TorchtrackError as error:
         return report(str(error), ExitCode.FAILED)
     except OSError as error:
-        if error.filename is None:
-            # Of no file that was named: a bug, or one of the system's own.
-            raise
-        return report(f"cannot use '{error.filename}': {error.strerror}. Check that it is there, and may be read or written.", ExitCode.FAILED)
+        what = "the system refused" if error.filename is None else f"cannot use '{error.filename}'"
+        return report(f"{what}: {error.strerror or error}. Check that it is there, and may be read or written.", ExitCode.FAILED)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     return code

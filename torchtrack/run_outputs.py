@@ -89,9 +89,9 @@ class RunOutputs:
         if not self._resumes:
             self._folder.set_aside()
         self._begun = True
+        write_summary(folder / SUMMARY, self._summary("running", ""), room_for_end=True)
         with writing(folder / CONFIG):
             (folder / CONFIG).write_bytes(as_yaml(config).encode("utf-8", "backslashreplace"))
-        write_summary(folder / SUMMARY, self._summary("running", ""), room_for_end=True)
         self._open_sink(self._record)
         self._open_sink(PoseFiles(folder, session.labels, self._record))
         if config.overlay.enabled:

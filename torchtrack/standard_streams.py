@@ -41,6 +41,9 @@ def take_any_text() -> None:
 
 def flushed(code: Any) -> Any:
     """The exit code, once all of standard output is written; where it cannot be, that is told, and the code is :attr:`ExitCode.FAILED`."""
+    if sys.stdout is None:
+        # Closed from the start.
+        return code
     try:
         sys.stdout.flush()
     except OSError as error:

@@ -65,9 +65,9 @@ class OutputFolder:
                     file.replace(aside)
 
     def drop_previous(self) -> None:
-        """Take away what was set aside."""
+        """Take away what was set aside, and what a run that was killed has left of a video."""
         with writing(self.path):
-            for file in _files(self.path, _PREVIOUS):
+            for file in (*_files(self.path, _PREVIOUS), *self.path.glob("overlay*.part.mp4")):
                 file.unlink()
 
     def close(self) -> None:

@@ -3,6 +3,7 @@
 import csv
 import io
 from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 from torchtrack.io.line_file import LineFile
@@ -31,8 +32,17 @@ class PoseFiles:
     def __init__(self, folder: Path, labels: Sequence[str], record: Record) -> None:
         """``record`` has taken a step before this sink does: the errors come from there."""
         self._labels, self._record = labels, record
-        self._tum = [_begun(tum_path(folder, label), "# t tx ty tz qx qy qz qw (seconds, metres)\n") for label in labels]
-        self._table = _begun(folder / POSES, _rows([COLUMNS]))
+        with ExitStack() as opening:
+
+            def begun(path: Path, header: str) -> LineFile:
+                file = opening.enter_context(closing(LineFile(path)))
+                if path.stat().st_size == 0:
+                    file.write(header)
+                return file
+
+            self._table = begun(folder / POSES, _rows([COLUMNS]))
+            self._tum = [begun(tum_path(folder, label), "# t tx ty tz qx qy qz qw (seconds, metres)\n") for label in labels]
+            self._files = opening.pop_all()
 
     def add(self, step: Step) -> None:
         """Write one row per object."""
@@ -52,20 +62,12 @@ class PoseFiles:
 
     def close(self) -> None:
         """Close the files."""
-        for file in (*self._tum, self._table):
-            file.close()
+        self._files.close()
 
 
 def tum_path(folder: Path, label: str) -> Path:
     """Where the trajectory of an object is."""
     return folder / f"trajectory_{label}.tum"
-
-
-def _begun(path: Path, header: str) -> LineFile:
-    file = LineFile(path)
-    if path.stat().st_size == 0:
-        file.write(header)
-    return file
 
 
 def _rows(rows: Sequence[Sequence[object]]) -> str:
