@@ -78,7 +78,11 @@ class RunOutputs:
         """The windows of the session; those of a live one that come too fast are joined, and it ends at an interrupt."""
         windows = cut_windows(self.session.chunks(), self.session.start_us, length)
         self._keep_up = self.session.keep_up(windows)
-        for window in self._keep_up.until(lambda: self._interrupt.requested) if self._keep_up else windows:
+        return self._beginning(self._keep_up.until(lambda: self._interrupt.requested) if self._keep_up else windows)
+
+    def _beginning(self, windows: Iterator[EventWindow]) -> Iterator[EventWindow]:
+        """The same windows; the files are made when the first one is there."""
+        for window in windows:
             if not self._begun:
                 self._begin()
             yield window
@@ -155,7 +159,9 @@ class RunOutputs:
         facts = Facts(ended, message, wall_s, self._config.device, self._resumed_us, self._further_facts())
         summary = summarise_run(self.session.name, self.session.labels, self._record, facts)
         if self._keep_up:
-            return replace(summary, dropped_windows=self._keep_up.dropped_windows, dropped_events=self._keep_up.dropped_events)
+            waiting = self._keep_up.waiting
+            joined, dropped = waiting.joined_windows, waiting.dropped_windows
+            return replace(summary, joined_windows=joined, dropped_windows=dropped, dropped_events=waiting.dropped_events)
         return summary
 
     def _further_facts(self) -> dict[str, dict[str, Any]]:
