@@ -157,7 +157,7 @@ class RunOutputs:
     def _summary(self, ended: Ended, message: str) -> RunSummary:
         wall_s = time.perf_counter() - self._begun_s
         facts = Facts(ended, message, wall_s, self._config.device, self._resumed_us, self._further_facts())
-        summary = summarise_run(self.session.name, self.session.labels, self._record, facts)
+        summary = summarise_run(self.session.name, self.session.labels, self._record, facts).with_problems(self.session.problems)
         if self._keep_up:
             waiting = self._keep_up.waiting
             joined, dropped = waiting.joined_windows, waiting.dropped_windows
