@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from torchtrack.errors import MissingExtraError, MissingFileError, TorchtrackError
+from torchtrack.errors import MissingExtraError, MissingFileError, OutputError, TorchtrackError
 from torchtrack.limits import check_limit
 
 
@@ -57,7 +57,8 @@ def naming(path: Path | None) -> Iterator[None]:
     """Errors of ours that come out of it and do not name the file, where there is one, are told with it."""
     try:
         yield
-    except MissingExtraError:
+    except (MissingExtraError, OutputError):
+        # What is missing, and what cannot be written, is no fault of this file.
         raise
     except TorchtrackError as error:
         if path is None or path.name in str(error):
