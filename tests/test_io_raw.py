@@ -12,7 +12,9 @@ from torchtrack.io.columns import Columns, join
 from torchtrack.io.evt2 import Evt2Decoder
 from torchtrack.io.evt3 import Evt3Decoder
 from torchtrack.io.evt21 import Evt21Decoder
+from torchtrack.io.mending import Mender
 from torchtrack.io.problems import Problem, Problems
+from torchtrack.io.raw_file import make_decoder
 
 ROW, EVENT, BASE, VECT12, VECT8, LOW, HIGH = (kind << 12 for kind in (0, 2, 3, 4, 5, 6, 8))
 UP = 0x800
@@ -232,3 +234,40 @@ def test_a_single_wild_time_word_is_ignored(tmp_path):
     with pytest.warns(TorchtrackWarning, match="1 time words that contradict their neighbours"):
         events = everything(source)
     assert events.t_us.tolist() == [5, 5, 7, 8]
+
+
+# ---- time words with a flipped bit
+
+
+def steady(encoding: str) -> tuple[np.ndarray, np.ndarray]:
+    """Words with an event each 8 µs over 0.2 s, and which of them are time high words."""
+    t_us = np.arange(0, 200_000, 8)
+    if encoding == "evt2":
+        rows = [[8 << 28 | t >> 6] * (t % 64 == 0) + [word2(1, t % 64, t // 8 % 64, 3)] for t in t_us.tolist()]
+        words = np.array([word for row in rows for word in row], "<u4")
+        return words, words >> 28 == 8
+    if encoding == "evt21":
+        rows = [[8 << 60 | t >> 6 << 32] * (t % 64 == 0) + [1 << 60 | t % 64 << 54 | 32 << 43 | 3 << 32 | 1] for t in t_us.tolist()]
+        words = np.array([word for row in rows for word in row], "<u8")
+        return words, words >> np.uint64(60) == 8
+    rows = [[HIGH | t >> 12] * (t % 64 == 0) + [LOW | t % 4096, ROW | 3, EVENT | t // 8 % 64] for t in t_us.tolist()]
+    words = np.array([word for row in rows for word in row], "<u2")
+    return words, words >> 12 == 8
+
+
+@pytest.mark.parametrize("encoding", ["evt2", "evt21", "evt3"])
+@pytest.mark.parametrize("block", [50, 1000, 100_000])
+def test_a_flipped_bit_in_a_time_word_costs_no_more_than_lies_between_two_words(encoding, block):
+    words, is_high = steady(encoding)
+    bits = {"evt2": range(28), "evt21": range(32, 60), "evt3": range(12)}[encoding]
+    for number, bit in enumerate(bits[:: 5 if block == 50 else 2]):
+        broken = words.copy()
+        broken[np.flatnonzero(is_high)[1500 + 7 * number]] ^= words.dtype.type(1 << bit)
+        decoder = make_decoder(encoding, Problems("words", strict=False))
+        parts = [decoder.feed(broken[start : start + block]) for start in range(0, len(broken), block)]
+        problems = Problems("words", strict=False)
+        mender = Mender(problems, waits=True)
+        found = join([piece for part in [*parts, decoder.finish()] for piece in mender.add(part)] + mender.rest())
+        assert len(found) >= 25_000 - 16
+        assert np.isin(found.t_us, np.arange(0, 200_000, 8)).mean() > 0.999
+        assert (found.t_us[-1], problems.clock_changes) == (199_992, [])

@@ -78,14 +78,14 @@ def _rows(source: EventFile, facts: EventInfo) -> list[tuple[str, str]]:
 
 
 def _faults(facts: EventInfo) -> list[tuple[str, str]]:
-    return [("left out", f"{count:,} {problem}") for problem, count in facts.problems.items()] or [("left out", "nothing")]
+    return [("left out or mended", f"{count:,} {problem}") for problem, count in facts.problems.items()] or [("left out", "nothing")]
 
 
 def convert_file(source: Input, target: str, format: OutputFormat | None) -> int:
     """Write the events of one file into another, say how many; returns the exit code."""
     with warnings.catch_warnings():
         # Said below, with the counts.
-        warnings.filterwarnings("ignore", ".*some of it was left out", TorchtrackWarning)
+        warnings.filterwarnings("ignore", ".*(some of it was left out|it was mended)", TorchtrackWarning)
         done = convert(source.path, target, format, source.width, source.height, source.strict, source.choices)
     console = output_console()
     console.print(f"{done.count:,} events are in {target} ({done.format})")
