@@ -39,6 +39,8 @@ class Arguments:
     """With --only: put the input into this folder, and do not read it."""
     kind: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Mutate only seeds whose name begins so."""
+    hostile: bool = True
+    """Read also those that are made by hand."""
     jobs: Annotated[int, tyro.conf.arg(metavar="N", aliases=["-j"])] = 2
     """Processes."""
     slowest: Annotated[int, tyro.conf.arg(metavar="N")] = 0
@@ -80,7 +82,7 @@ def _chosen(arguments: Arguments, seeds: list[Seed], folder: Path) -> list[Input
             sys.exit(f"no hostile input is called '{wanted}'; there are {', '.join(item.name for item in hostile)}")
         return found
     numbers = range(arguments.first, arguments.first + arguments.count)
-    return [*(hostile if arguments.kind is None else ()), *(_mutation(number, seeds, folder) for number in numbers)]
+    return [*(hostile if arguments.hostile and arguments.kind is None else ()), *(_mutation(number, seeds, folder) for number in numbers)]
 
 
 def _mutation(number: int, seeds: list[Seed], folder: Path) -> Input:

@@ -69,7 +69,7 @@ def _mesh(path: Path) -> None:
 
 
 def _lines(path: Path) -> None:
-    ObjectModel.from_polylines(path, name="lines")
+    ObjectModel.from_file(path, name="lines")
 
 
 def _track(path: Path) -> None:

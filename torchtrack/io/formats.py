@@ -22,7 +22,7 @@ from torchtrack.io.raw_file import RawFile
 from torchtrack.io.ros_bag import MCAP_MAGIC, ROS1_MAGIC, SQLITE_MAGIC, RosBag, is_bag_folder
 from torchtrack.io.text_file import HEAD_BYTES, as_utf8, text_member, utf8_head, whole_lines
 from torchtrack.io.text_layout import has_named_columns, looks_like_events
-from torchtrack.io.zip_archive import ZIP_MAGIC, open_archive
+from torchtrack.io.zip_archive import ZIP_MAGIC, damage_reported, open_archive
 
 _SUPPORTED = (
     "numpy .npz (arrays t, x, y, p), DAVIS text (lines 't x y p', t in seconds; also zipped), CSV, Prophesee RAW (EVT2, EVT2.1, EVT3), "
@@ -129,5 +129,5 @@ def _of_archive(path: Path) -> type[EventFile]:
         member = text_member(archive)
         if keys_of(archive) or member is None:
             return NpzEvents
-        with archive.open(member) as stream:
+        with damage_reported(path), archive.open(member) as stream:
             return _of_text(as_utf8(cast(BufferedIOBase, stream)).read(HEAD_BYTES), Path(member).suffix.lower()) or DavisTextEvents
