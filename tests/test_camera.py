@@ -17,7 +17,8 @@ from torchtrack.camera import (
     undistort,
     undistortion_table,
 )
-from torchtrack.errors import CalibrationError
+from torchtrack.errors import CalibrationError, LimitError, TorchtrackWarning
+from torchtrack.limits import Limits, limits
 
 PINHOLE = Camera(612.3, 610.9, 318.2, 241.7, 640, 480)
 LENSES = {
@@ -187,3 +188,106 @@ def test_tables_of_cameras_of_different_sizes_stack_without_change() -> None:
     assert stacked.shape == (2, 12, 10, 2)
     assert torch.equal(stacked[0, :6, :8], tables[0])
     assert torch.equal(stacked[1], tables[1])
+
+
+# ---- numbers that no camera has, and numbers that few have
+
+USUAL = {"fx": 600.0, "fy": 600.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": 0.93, "fy": 1.25, "cx": 0.5, "cy": 0.5}, "as short as fx=0.93.*normalised: multiply fx and cx by the width"),
+        ({"fx": 4.2, "fy": 4.2}, "as short as .*in mm"),
+        ({"fx": 60.0}, "as short as"),
+        ({"fx": 600_000.0, "fy": 600_000.0}, "as long as"),
+        ({"fx": 2000.0}, "as different as fx=2000, fy=600"),
+        ({"cx": 2000.0}, "far outside the image: cx is 2000 for 640 pixels"),
+        ({"cy": -500.0}, "far outside the image: cy is -500 for 480 pixels"),
+        ({"distortion_model": "plumb_bob", "distortion": np.zeros((2, 2))}, r"shape \[n\], \[1, n\] or \[n, 1\], got \[2, 2\]"),
+        ({"distortion_model": "plumb_bob", "distortion": "k1"}, "must be a list of numbers"),
+        ({"distortion_model": "plumb_bob", "distortion": 0.1}, "must have shape"),
+    ],
+)
+def test_numbers_that_no_camera_has(change, message):
+    with pytest.raises(CalibrationError, match=message):
+        Camera(**{**USUAL, **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": 800.0}, "fx=800 and fy=600 differ by more than 20 %"),
+        ({"cx": 160.0, "cy": 120.0}, r"would be the middle of 321 x 241: is it for another resolution"),
+        ({"cx": 640.0, "cy": 360.0}, "for another resolution"),
+        ({"cx": 239.5, "cy": 319.5}, "width and height look exchanged"),
+        ({"distortion_model": "plumb_bob", "distortion": (-0.1, 0.01, -0.2, 0.1)}, "p1=-0.2 and p2=0.1"),
+    ],
+)
+def test_numbers_that_few_cameras_have_are_told(change, message):
+    with pytest.warns(TorchtrackWarning, match=message):
+        Camera(**{**USUAL, **change})
+
+
+def test_of_a_region_of_an_image_the_size_says_nothing():
+    region = Camera(600.0, 600.0, -900.0, 700.0, 8, 8, derived=True)
+    assert region == Camera(600.0, 600.0, -900.0, 700.0, 8, 8, derived=True)
+    with pytest.raises(CalibrationError, match="as long as|far outside"):
+        Camera(600.0, 600.0, -900.0, 700.0, 8, 8)
+
+
+@pytest.mark.parametrize("shape", [(5,), (1, 5), (5, 1)])
+@pytest.mark.parametrize("kind", [np.array, torch.tensor, lambda values: torch.tensor(values, requires_grad=True), list])
+def test_distortion_of_any_shape_and_kind(shape, kind):
+    values = np.reshape([-0.1, 0.01, 0.001, -0.002, 0.0], shape).tolist()
+    for camera in (Camera(**USUAL, distortion_model="plumb_bob", distortion=kind(values)), None):
+        camera = camera or Camera.from_matrix(PINHOLE.matrix, 640, 480, "plumb_bob", kind(values))
+        assert camera.distortion == pytest.approx((-0.1, 0.01, 0.001, -0.002, 0.0))
+        assert hash(camera) == hash(camera)
+
+
+def matrix(**entries: float) -> np.ndarray:
+    K = PINHOLE.matrix
+    for name, value in entries.items():
+        K[int(name[1]), int(name[2])] = value
+    return K
+
+
+@pytest.mark.parametrize(
+    ("K", "message"),
+    [
+        (matrix(k22=2.0), r"must be \[fx, 0, cx\]"),
+        (PINHOLE.matrix.T, "It is transposed"),
+        (matrix(k10=1.0), r"must be \[fx, 0, cx\]"),
+        (matrix(k01=50.0), "a skew of 50, which moves pixels by up to 19"),
+        (matrix(k00=np.nan), "finite"),
+        (matrix(k00=-600.0), "focal lengths must be positive"),
+        ([["a"]], "must hold numbers"),
+    ],
+)
+def test_matrices_of_no_camera(K, message):
+    with pytest.raises(CalibrationError, match=message):
+        Camera.from_matrix(K, 640, 480)
+
+
+def test_a_small_skew_is_left_out_and_told():
+    with pytest.warns(TorchtrackWarning, match="a skew of 0.5 .up to 0.2 px., which is left out"):
+        assert Camera.from_matrix(matrix(k01=0.5), 640, 480) == PINHOLE
+
+
+def test_tables_larger_than_the_limit_are_refused_before_they_are_made():
+    camera = Camera(8000.0, 8000.0, 4096.0, 4096.0, 8192, 8192)
+    for table in (undistortion_table, lambda camera: distortion_table(camera, 3)):
+        with pytest.raises(LimitError, match=r"limits\.sensor_pixels"):
+            table(camera)
+    with limits(Limits(sensor_pixels=100)), pytest.raises(LimitError, match=r"the camera of 640x480 pixels"):
+        undistortion_table(PINHOLE)
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_tables_do_not_depend_on_the_bands_that_they_are_made_in(camera, monkeypatch):
+    whole = undistortion_table(camera), distortion_table(camera, 3)
+    monkeypatch.setattr("torchtrack.camera._BAND_PIXELS", 5000)
+    assert torch.equal(undistortion_table(camera), whole[0])
+    assert torch.equal(distortion_table(camera, 3), whole[1])

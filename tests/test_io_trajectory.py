@@ -166,7 +166,7 @@ def test_real_ground_truth(data_dir):
     [
         ("0.5 1 2 3 0 0 1", r"line 2: expected 't tx ty tz qx qy qz qw' \(8 numbers\), got '0.5 1 2 3 0 0 1'"),
         ("0.5 1 2 x 0 0 0 1", "line 2: .*'x'"),
-        ("half 1 2 3 0 0 0 1", "line 2: .*'half' is not a number"),
+        ("half 1 2 3 0 0 0 1", "line 2: .*'half'"),
         ("0.5 1 2 3 0 0 0 0", "line 2: the quaternion qx qy qz qw has norm 0"),
         ("0.5 1 2 3 0 0 0 nan", "line 2: the quaternion"),
         ("0.5 nan 2 3 0 0 0 1", "NaN"),

@@ -11,6 +11,9 @@ Every function has finite values and gradients at the identity and near a half t
 see a safe denominator. Formulas: Barfoot, *State Estimation for Robotics*, ch. 7.
 """
 
+import math
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -191,6 +194,22 @@ def rotation_angle_deg(rotation_a: Float[Tensor, "*b 3 3"], rotation_b: Float[Te
     The paper writes it as an arc cosine of the trace, which loses half the digits near zero; the logarithm does not.
     """
     return torch.rad2deg(so3_log(rotation_a.transpose(-1, -2) @ rotation_b).norm(dim=-1))
+
+
+# Text rounds quaternions; a norm further from 1 than this means that these are other numbers.
+_QUATERNION_TOLERANCE = 0.01
+
+
+def quaternion_problem(xyzw: Sequence[float | int]) -> str | None:
+    """What is wrong with a quaternion ``x, y, z, w`` that people or tools wrote; None where its norm is 1 within 1 %."""
+    norm = math.hypot(*xyzw)
+    # Written so that NaN fails too.
+    if abs(norm - 1) <= _QUATERNION_TOLERANCE:
+        return None
+    return (
+        f"the quaternion qx qy qz qw has norm {norm:.4g}, expected 1. Check the order of the numbers (w is the last); "
+        "Euler angles and rotation vectors, in degrees or radians, are no quaternion."
+    )
 
 
 def check_pose(T: Tensor, name: str = "T_cam_obj", tolerance: float = 1e-3) -> None:

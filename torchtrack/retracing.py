@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchtrack.contours import Contours, reproject
 from torchtrack.events import EventBatch, EventWindow
+from torchtrack.first_state import first_state
 from torchtrack.quality import Status
 from torchtrack.state import StepResult, TrackerState, take_part
 from torchtrack.stepping import Step
@@ -92,7 +93,7 @@ def _in_reverse(window: EventWindow, about_us: int) -> EventBatch:
 def _turned(state: TrackerState, number: int, alone: Tracker) -> TrackerState:
     """What is known of one object, as the state of a tracker of it alone for which time runs backwards."""
     known = take_part(state, slice(number, number + 1), slice(0, 1))
-    fresh = alone.init(known.T_cam_obj, known.t_us)
+    fresh = first_state(alone, known.T_cam_obj, known.t_us)
     trust = known.model_trust and known.model_trust.of_width(alone.element_groups.shape[1])
     return replace(
         known,

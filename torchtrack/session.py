@@ -11,18 +11,18 @@ from torch import Tensor
 
 from torchtrack.camera import Camera
 from torchtrack.config.events import EventsConfig
-from torchtrack.config.run import CameraConfig, ObjectConfig, PoseConfig, RunConfig
-from torchtrack.errors import ConfigError, EventDataError, TorchtrackWarning
+from torchtrack.config.run import CameraConfig, ObjectConfig, RunConfig
+from torchtrack.errors import CalibrationError, ConfigError, EventDataError, TorchtrackWarning
 from torchtrack.events import EventBatch, EventWindow
 from torchtrack.files import naming
-from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence, read_trajectory
+from torchtrack.initial_pose import initial_pose
+from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS
 from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, Region, downscaled_camera, find_hot_pixels, region_camera
 from torchtrack.io.keep_up import KeepUp
 from torchtrack.io.live import LiveSource, open_live
 from torchtrack.io.polarity_code import told_if_alike
 from torchtrack.io.problems import Problems
-from torchtrack.lie import check_pose, rotation_from_quaternion
 from torchtrack.limits import check_limit, limits
 from torchtrack.object_model import ObjectModel
 from torchtrack.stepping import clipped
@@ -138,7 +138,7 @@ def _opened(config: RunConfig) -> Session:
     known = tuple(_matching(obj, of_sequence, config.source) for obj in chosen)
     truth = tuple(obj.ground_truth if obj else None for obj in known)
     start_us = _start(config, events, truth)
-    poses = [_initial_pose(*pair, start_us) for pair in zip(chosen, truth, strict=True)]
+    poses = [initial_pose(*pair, start_us) for pair in zip(chosen, truth, strict=True)]
     return Session(
         name=name,
         events=events,
@@ -176,7 +176,7 @@ def _open_source(config: RunConfig) -> tuple[str, EventSource, Camera, dict[str,
         return _open_live(config.source, config.camera)
     if is_sequence(config.source):
         sequence = read_sequence(config.source, config.events.strict, choices=config.events)
-        camera = _camera(config.camera) if config.camera else sequence.camera
+        camera = _sequence_camera(config.camera, sequence.events, config.source) if config.camera else sequence.camera
         return sequence.name, sequence.events, camera, {obj.label: obj for obj in sequence.objects}
     if config.camera is None:
         # Opened first, so that a file that is not there or is not one of events is told as such.
@@ -199,9 +199,23 @@ def _open_live(source: str, config: CameraConfig | None) -> tuple[str, EventSour
 
 def _camera(config: CameraConfig) -> Camera:
     if config.calibration is not None:
-        return read_calibration(config.calibration, config.width, config.height)
+        sizes = config.width, config.height
+        return read_calibration(config.calibration, *sizes, name=config.name, distortion_model=config.distortion_model)
     check_limit("sensor_pixels", (config.width or 0) * (config.height or 0), "camera")
-    return Camera(**config.model_dump(exclude={"calibration"}))
+    given = config.model_dump(exclude={"calibration", "name"})
+    try:
+        return Camera(**{**given, "distortion_model": config.distortion_model or "none"})
+    except CalibrationError as error:
+        raise CalibrationError(f"camera: {error}") from error
+
+
+def _sequence_camera(config: CameraConfig, events: EventSource, source: Path) -> Camera:
+    """A camera given in place of the one that a sequence brings."""
+    camera = _camera(config)
+    if (camera.width, camera.height) != (events.width, events.height):
+        sizes = f"{events.width}x{events.height} pixels, but the camera {camera.width}x{camera.height}"
+        raise ConfigError(f"camera: '{source}' has {sizes}. Correct the calibration, or leave the camera out.")
+    return camera
 
 
 def _matching(obj: ObjectConfig, of_sequence: dict[str, SequenceObject], source: Path | str) -> SequenceObject | None:
@@ -252,24 +266,3 @@ def _check_start(config: RunConfig, first_us: int) -> None:
         raise ConfigError(f"{told}{before_s:.0f} s later: they are on different clocks. Leave start_us out, or give it in the time of the events.")
     if before_s > _DOUBTFUL_START_S:
         warnings.warn(f"{told}{before_s:.1f} s later. It is taken to have stayed there. Check start_us.", TorchtrackWarning, stacklevel=2)
-
-
-def _initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) -> Float[Tensor, "4 4"]:
-    if obj.initial_pose is not None:
-        T = _configured_pose(obj.initial_pose, start_us)
-        check_pose(T, f"initial_pose of '{obj.label}'")
-        return T
-    if truth is None:
-        raise ConfigError(f"objects: '{obj.label}' needs an initial_pose, as the source has no ground truth for it.")
-    return truth.at(torch.tensor([start_us]))[0]
-
-
-def _configured_pose(pose: PoseConfig, start_us: int) -> Float[Tensor, "4 4"]:
-    if pose.trajectory is not None:
-        return read_trajectory(pose.trajectory).at(torch.tensor([start_us]))[0]
-    if pose.matrix is not None:
-        return torch.tensor(pose.matrix, dtype=torch.float64)
-    T = torch.eye(4, dtype=torch.float64)
-    T[:3, :3] = rotation_from_quaternion(torch.tensor(pose.quaternion_xyzw, dtype=torch.float64))
-    T[:3, 3] = torch.tensor(pose.translation_m, dtype=torch.float64)
-    return T

@@ -27,7 +27,7 @@ def check_setup(objects: Sequence[ObjectModel], cameras: Sequence[Camera], strea
             )
 
 
-def check_start(T_cam_obj: Tensor, centre_obj: Float[Tensor, "b 3"], names: Sequence[str]) -> None:
+def check_poses(T_cam_obj: Tensor, centre_obj: Float[Tensor, "b 3"], names: Sequence[str]) -> None:
     """Raise ``PoseError`` unless there is a rigid motion for every object that puts it before the camera.
 
     Args:

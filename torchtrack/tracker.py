@@ -38,9 +38,10 @@ from torchtrack.relocation import LastSeen, anywhere, is_lost, looked_for_anew
 from torchtrack.search import explained_at_rest, judge_fit, rehearse
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.sensors import farthest_event_px
-from torchtrack.setup_check import check_start
+from torchtrack.setup_check import check_poses
 from torchtrack.slow_circuits import LOOK_US, dated, late_share_after
 from torchtrack.speed_limit import held_back
+from torchtrack.start_check import check_in_view
 from torchtrack.state import StepResult, TrackerState, choose_rows
 from torchtrack.step_check import check_step
 from torchtrack.time_surface import update_last_event
@@ -105,10 +106,11 @@ class Tracker(TrackedObjects):
         """The state before the first window, from each object's pose at ``t_us``.
 
         Raises:
-            PoseError: if a pose is not a rigid motion, or an object is behind the camera.
+            PoseError: if a pose is not a rigid motion, or an object is behind or around the camera, outside the image, or no pixel large.
         """
         T_cam_obj = torch.as_tensor(T_cam_obj, dtype=torch.float64, device=self.intrinsics.device)
-        check_start(T_cam_obj, self.centre_obj, self.object_names)
+        check_poses(T_cam_obj, self.centre_obj, self.object_names)
+        check_in_view(T_cam_obj, self.object_models, [self.cameras[stream] for stream in self.stream_index.tolist()])
         return first_state(self, T_cam_obj, torch.as_tensor(t_us, dtype=torch.int64, device=T_cam_obj.device).expand(self.streams).clone())
 
     def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:

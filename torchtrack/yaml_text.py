@@ -63,7 +63,9 @@ class LimitedLoader(yaml.SafeLoader):
             return super().construct_object(node, deep)
         except _BAD_SCALAR as error:
             kind = node.tag.rpartition(":")[2]
-            told = f"'{str(node.value)[:60]}' is no {kind} ({error}); put text in quotes"
+            # What cannot be encoded could not be shown either.
+            shown = str(node.value)[:60].encode("utf-8", "replace").decode()
+            told = f"'{shown}' is no {kind} ({error}); put text in quotes"
             raise yaml.constructor.ConstructorError(None, None, told, node.start_mark) from error
 
     # The library hands on what is no mapping too, and says so itself.

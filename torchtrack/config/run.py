@@ -6,11 +6,12 @@ from typing import Any, Literal, get_args
 from pydantic import Field, model_validator
 
 from torchtrack.camera import DistortionModel
-from torchtrack.config.events import EventsConfig, EventSourcePath
+from torchtrack.config.events import EventsConfig, EventSourcePath, TimeUnit
 from torchtrack.config.merge import merged
 from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.lie import quaternion_problem
 from torchtrack.limits import Limits, current_limits
 
 Models = Literal["textured", "geometry"]
@@ -22,14 +23,25 @@ class PoseConfig(Settings):
 
     matrix: tuple[Row, Row, Row, Row] | None = Field(None, description="The 4x4 matrix, row by row.")
     translation_m: tuple[float, float, float] | None = Field(None, description="Position of the object's origin in the camera frame (m).")
-    quaternion_xyzw: Row = Field((0, 0, 0, 1), description="Rotation beside translation_m, as a quaternion x, y, z, w.")
+    quaternion_xyzw: Row = Field((0.0, 0.0, 0.0, 1.0), description="Rotation beside translation_m, as a quaternion x, y, z, w of norm 1.")
     trajectory: ConfigPath | None = Field(None, description="A file of poses (TUM, CSV, or a CSV of OptiTrack); the pose is taken at the start time.")
+    name: str | None = Field(None, description="Which of several in the file of poses: the rigid body of OptiTrack.")
+    time_unit: TimeUnit | None = Field(None, description="Unit of the file's times: s, ms, us or ns; by default s, or as its first line says.")
 
     @model_validator(mode="after")
     def _one_way(self) -> "PoseConfig":
         ways = [name for name in ("matrix", "translation_m", "trajectory") if getattr(self, name) is not None]
         if len(ways) != 1:
             raise ValueError(f"give exactly one of matrix, translation_m (with quaternion_xyzw) or trajectory; got {' and '.join(ways) or 'none'}")
+        if self.trajectory is None and (self.name, self.time_unit) != (None, None):
+            raise ValueError("name and time_unit are of a trajectory; leave them out")
+        return self
+
+    @model_validator(mode="after")
+    def _unit_quaternion(self) -> "PoseConfig":
+        problem = quaternion_problem(self.quaternion_xyzw)
+        if problem is not None:
+            raise ValueError(f"quaternion_xyzw: {problem}")
         return self
 
 
@@ -59,7 +71,8 @@ class CameraConfig(Settings):
     cy: float | None = Field(None, description="Principal point (px).")
     width: int | None = Field(None, ge=1, le=65_536, description="Sensor width (px), where the calibration does not say it.")
     height: int | None = Field(None, ge=1, le=65_536, description="Sensor height (px), where the calibration does not say it.")
-    distortion_model: DistortionModel = Field("none", description="Lens model, as in OpenCV.")
+    name: str | None = Field(None, description="Which camera of a calibration of several: its key, such as cam0, or its topic.")
+    distortion_model: DistortionModel | None = Field(None, description="Lens model, as in OpenCV; none by default, or as the calibration says.")
     distortion: tuple[float, ...] = Field((), description="Its coefficients.")
 
     @model_validator(mode="after")
@@ -69,6 +82,12 @@ class CameraConfig(Settings):
             raise ValueError(f"give a calibration file, or fx, fy, cx, cy, width and height; {', '.join(missing)} missing")
         if self.calibration is not None and not {"fx", "fy", "cx", "cy"} <= set(missing):
             raise ValueError("give a calibration file or fx, fy, cx and cy, not both")
+        if self.calibration is not None and self.distortion:
+            raise ValueError("distortion: the calibration file says it. Leave it out, or give all of the camera here")
+        if self.calibration is None and self.name is not None:
+            raise ValueError("name: it is of a camera in a calibration file. Leave it out")
+        if self.distortion and self.distortion_model is None:
+            raise ValueError("distortion_model: say which model the coefficients of distortion are of, plumb_bob or fisheye")
         return self
 
 

@@ -28,12 +28,12 @@ class PoseErrors:
 
 
 def pose_errors(t_us: Int[Tensor, "p"], T_cam_obj: Float[Tensor, "p 4 4"], truth: Trajectory, axis: RevolutionAxis | None = None) -> PoseErrors:
-    """Errors at the times ``t_us``, with the truth interpolated on SE(3); times that the truth does not cover are left out.
+    """Errors at the times ``t_us``, with the truth interpolated on SE(3); times that it does not cover, and gaps in it, are left out.
 
     A turn about the ``axis`` of a surface of revolution is no error, since nothing shows it: of all poses that look the
     same, the one nearest to the truth is compared (as in Hodan et al., "BOP: benchmark for 6D object pose estimation", 2018).
     """
-    covered = (t_us >= truth.t_us[0]) & (t_us <= truth.t_us[-1])
+    covered = truth.covers(t_us)
     t_us, estimated = t_us[covered], T_cam_obj[covered].double()
     true = truth.at(t_us)
     if axis is not None:

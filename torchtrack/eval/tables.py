@@ -1,5 +1,6 @@
 """Errors and speed as tables for the terminal."""
 
+import math
 from collections.abc import Mapping
 
 from rich.table import Table
@@ -61,7 +62,8 @@ def run_table(summary: RunSummary) -> Table:
         if errors is not None:
             mean, worst = _error(errors.mean_rotation_deg, errors.mean_translation_cm), _error(errors.max_rotation_deg, errors.max_translation_cm)
             cells = (mean, worst, f"{100 * errors.lost_fraction:.1f}%")
-        table.add_row(label, *cells, f"{of_object.mean_quality:.2f}", _statuses(of_object.status))
+        quality = f"{of_object.mean_quality:.2f}" if math.isfinite(of_object.mean_quality) else "-"
+        table.add_row(label, *cells, quality, _statuses(of_object.status))
     return table
 
 

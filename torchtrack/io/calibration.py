@@ -1,6 +1,6 @@
 """Camera calibration files: the DAVIS ``calib.txt``, a YAML form of our own, and those of other tools.
 
-OpenCV, ROS, Metavision and Kalibr are read too, see :mod:`torchtrack.io.foreign_calibration`.
+OpenCV, ROS, Metavision, Kalibr and more are read too, see :mod:`torchtrack.io.foreign_calibration`.
 
 ``calib.txt`` holds one line of numbers, ``fx fy cx cy`` and then distortion coefficients (plumb bob:
 ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``); it does not say the sensor size. The YAML form says everything:
@@ -18,6 +18,8 @@ OpenCV, ROS, Metavision and Kalibr are read too, see :mod:`torchtrack.io.foreign
 """
 
 import os
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +27,13 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from torchtrack.camera import Camera, DistortionModel
-from torchtrack.errors import CalibrationError, MissingFileError
-from torchtrack.io.foreign_calibration import foreign_camera, load_yaml
+from torchtrack.errors import CalibrationError, TorchtrackWarning
+from torchtrack.io.calibration_numbers import Given, agreed_size
+from torchtrack.io.foreign_calibration import foreign_camera, load_calibration_text
+from torchtrack.io.lens_model import lens
+from torchtrack.io.whole_text import read_text_file, shown
+
+_FORMS = "expected 'fx fy cx cy k1 k2 p1 p2 k3', or YAML with fx, fy, cx, cy, width, height and distortion, or as OpenCV, ROS or Kalibr write it"
 
 
 class _CalibrationFile(BaseModel):
@@ -44,28 +51,59 @@ class _CalibrationFile(BaseModel):
     distortion: tuple[float, ...] = ()
 
 
-def read_calibration(path: str | os.PathLike[str], width: int | None = None, height: int | None = None) -> Camera:
-    """The camera of a calibration file; DAVIS text and YAML are told apart by content.
+def read_calibration(
+    path: str | os.PathLike[str],
+    width: int | None = None,
+    height: int | None = None,
+    *,
+    name: str | None = None,
+    distortion_model: DistortionModel | None = None,
+) -> Camera:
+    """The camera of a calibration file; its form is told by its content.
+
+    Warns (:class:`~torchtrack.errors.TorchtrackWarning`) where numbers are unusual, or one of several cameras is taken.
 
     Args:
         path: the file.
         width, height: sensor size in pixels; needed for ``calib.txt``, and must agree with a file that says it.
+        name: which camera of several: its key (``cam0``) or its topic.
+        distortion_model: lens model, where the file does not say it; must agree with a file that does.
 
     Raises:
         MissingFileError: if there is no such file.
-        CalibrationError: if it cannot be read, its numbers make no sense, or the sensor size is missing or disagrees.
+        LimitError: if it is larger than ``limits.text_bytes``.
+        CalibrationError: if it cannot be read, its numbers make no sense, or what is given disagrees or is missing.
     """
     path = Path(path)
-    if not path.is_file():
-        raise MissingFileError(f"calibration file '{path}' does not exist.")
-    text = path.read_text(encoding="utf-8", errors="replace")
-    numbers = _numbers(text)
+    text = read_text_file(path, "calibration file", "text_bytes", CalibrationError)
+    given = Given(width, height, name, distortion_model)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", TorchtrackWarning)
+        try:
+            camera = _read(text, given)
+        except CalibrationError as error:
+            raise CalibrationError(f"{path}: {shown(error)}") from error
+    for warning in caught:
+        warnings.warn(f"{path}: {warning.message}", warning.category, stacklevel=2)
+    return camera
+
+
+def _read(text: str, given: Given) -> Camera:
+    values = _numbers(text)
+    if values is not None:
+        return _from_numbers(values, given)
+    if text.lstrip().startswith("<"):
+        raise CalibrationError("this is XML. Save it as YAML: OpenCV does so for a name that ends in .yml.")
     try:
-        if numbers is not None:
-            return _from_numbers(numbers, width, height)
-        return _from_yaml(text, width, height)
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from error
+        documents = load_calibration_text(text)
+    except yaml.YAMLError as error:
+        raise CalibrationError(f"neither numbers nor YAML ({' '.join(str(error).split())[:500]}).") from error
+    if not documents or not all(isinstance(document, dict) for document in documents):
+        raise CalibrationError(f"{_FORMS}.")
+    cameras = [_from_mapping({str(key): value for key, value in document.items()}, given) for document in documents]
+    if len(set(cameras)) > 1:
+        raise CalibrationError(f"it holds {len(documents)} documents (parted by ---), and their cameras differ. Keep one.")
+    return cameras[0]
 
 
 def _numbers(text: str) -> list[float] | None:
@@ -77,32 +115,36 @@ def _numbers(text: str) -> list[float] | None:
         return None
 
 
-def _from_numbers(numbers: list[float], width: int | None, height: int | None) -> Camera:
-    if len(numbers) not in (4, 8, 9, 12):
-        raise CalibrationError(f"expected 'fx fy cx cy' and 0, 4, 5 or 8 distortion coefficients, got {len(numbers)} numbers.")
-    if width is None or height is None:
+def _from_numbers(values: list[float], given: Given) -> Camera:
+    if len(values) not in (4, 8, 9, 12):
+        raise CalibrationError(f"expected 'fx fy cx cy' and 0, 4, 5 or 8 distortion coefficients, got {len(values)} numbers.")
+    if given.width is None or given.height is None:
         raise CalibrationError("this form does not say the sensor size. Give width and height in pixels (DAVIS240C: 240 and 180).")
-    fx, fy, cx, cy, *distortion = numbers
-    model: DistortionModel = "plumb_bob" if any(distortion) else "none"
-    return Camera(fx, fy, cx, cy, width, height, model, tuple(distortion) if any(distortion) else ())
+    fx, fy, cx, cy, *distortion = values
+    _check_name(given)
+    # The form is of the plumb-bob model, where nobody says another.
+    model, coefficients = lens({"distortion_model": "plumb_bob"} if given.distortion_model is None else {}, distortion, given)
+    return Camera(fx, fy, cx, cy, given.width, given.height, model, coefficients)
 
 
-def _from_yaml(text: str, width: int | None, height: int | None) -> Camera:
-    try:
-        content: Any = load_yaml(text)
-    except yaml.YAMLError as error:
-        raise CalibrationError(f"neither numbers nor YAML ({' '.join(str(error).split())}).") from error
-    if not isinstance(content, dict):
-        raise CalibrationError("expected 'fx fy cx cy k1 k2 p1 p2 k3', or YAML with fx, fy, cx, cy, width, height and distortion.")
-    foreign = foreign_camera(content, width, height)
+def _check_name(given: Given) -> None:
+    if given.name is not None:
+        raise CalibrationError(f"camera.name: there is one camera here, and it has no name like '{given.name}'. Leave camera.name out.")
+
+
+def _from_mapping(content: Mapping[str, Any], given: Given) -> Camera:
+    foreign = foreign_camera(content, given)
     if foreign is not None:
         return foreign
+    _check_name(given)
     try:
-        read = _CalibrationFile.model_validate(content)
+        read = _CalibrationFile.model_validate({"width": given.width, "height": given.height, **content})
     except ValidationError as error:
+        if not {"fx", "fy", "cx", "cy"} & set(content):
+            raise CalibrationError(f"{_FORMS}; its keys are {', '.join(list(content)[:20])}.") from error
         problems = "; ".join(f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}" for problem in error.errors())
         raise CalibrationError(problems + ".") from error
-    for name, given, stored in (("width", width, read.width), ("height", height, read.height)):
-        if given is not None and given != stored:
-            raise CalibrationError(f"{name} is {stored} here, but {given} was given. Leave it out, or correct it.")
-    return Camera(**read.model_dump())
+    width, height = agreed_size((read.width, read.height), given)
+    if given.distortion_model not in (None, read.distortion_model):
+        raise CalibrationError(f"distortion_model is {read.distortion_model} here, but {given.distortion_model} was given. Correct it.")
+    return Camera(read.fx, read.fy, read.cx, read.cy, width, height, read.distortion_model, read.distortion)

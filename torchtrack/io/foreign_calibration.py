@@ -1,11 +1,14 @@
 """Calibrations as other tools write them, in YAML or JSON.
 
-- OpenCV (``FileStorage``) and ROS (``camera_info``): ``camera_matrix`` and ``distortion_coefficients`` with ``data``, ``image_width``
-  and ``image_height``;
+- OpenCV (``FileStorage``, with ``fisheye_model``) and ROS 1 and 2 (``camera_info``): ``camera_matrix``, ``K`` or ``k``, with
+  ``distortion_coefficients``, ``D`` or ``d``, ``distortion_model``, and ``image_width`` and ``image_height`` or ``width`` and ``height``;
 - Metavision: ``K`` and ``D``, or ``camera_matrix`` and ``distortion_coefficients``, with ``width`` and ``height`` or ``image_size``;
-- Kalibr (``camchain``): ``cam0`` with ``intrinsics``, ``distortion_coeffs`` and ``resolution``; of more cameras the first is taken.
+- Kalibr (``camchain``), DSEC (``cam_to_cam``) and Basalt: see :mod:`torchtrack.io.calibration_cameras`;
+- camodocal and VINS (``projection_parameters``, ``distortion_parameters``, ``model_type``).
 """
 
+import json
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,26 +16,28 @@ import numpy as np
 import yaml
 
 from torchtrack.camera import Camera
-from torchtrack.errors import CalibrationError
+from torchtrack.errors import CalibrationError, TorchtrackWarning
+from torchtrack.io.calibration_cameras import cameras_of, chosen
+from torchtrack.io.calibration_numbers import Given, agreed_size, first_of, numbers, size_of
+from torchtrack.io.lens_model import lens
+from torchtrack.yaml_text import LimitedLoader, load_documents
 
-_MATRIX = ("camera_matrix", "K", "intrinsic_matrix")
-_DISTORTION = ("distortion_coefficients", "distortion_coeffs", "D", "dist_coeffs")
-_SIZE = ("image_size", "resolution", "img_size")
-_WIDTH, _HEIGHT = ("image_width", "width", "img_width"), ("image_height", "height", "img_height")
-_MODELS = {
-    **dict.fromkeys(("radtan", "plumb_bob", "rational_polynomial", "brown_conrady", "brown"), "plumb_bob"),
-    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt"), "fisheye"),
-    "none": "none",
-}
-# What OpenCV can hold beyond the eight coefficients of plumb bob: thin prisms and tilted sensors.
-_COUNTS = {"plumb_bob": (4, 5, 8), "fisheye": (4,), "none": (0,)}
+_MATRIX = ("camera_matrix", "cameraMatrix", "K", "k", "intrinsic_matrix", "intrinsics", "projection_parameters")
+_DISTORTION = ("distortion_coefficients", "distortion_coeffs", "distCoeffs", "D", "d", "dist_coeffs", "distortion", "distortion_parameters")
+_FOCAL = (("fx", "mu"), ("fy", "mv"), ("cx", "u0"), ("cy", "v0"))
+# In OpenCV's order; the last is camodocal's.
+_BY_NAME = (
+    ("plumb_bob", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    ("fisheye", ("k1", "k2", "k3", "k4")),
+    ("fisheye", ("k2", "k3", "k4", "k5")),
+)
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(LimitedLoader):
     """YAML with the matrices of OpenCV, which are mappings with a tag."""
 
 
-def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
+def _matrix(loader: _Loader, node: yaml.Node) -> Any:
     """A matrix of OpenCV as the mapping that it is."""
     return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None
 
@@ -40,103 +45,104 @@ def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 
 
-def load_yaml(text: str) -> Any:
-    """What a YAML or JSON text holds, also in OpenCV's dialect.
+def load_calibration_text(text: str) -> list[Any]:
+    """What the documents of a YAML or JSON text hold, also in OpenCV's dialect; empty ones are left out.
 
     Raises:
-        yaml.YAMLError: if it is neither.
+        yaml.YAMLError: if it is neither, or larger than is read.
     """
+    # JSON may be indented by tabs, which YAML may not.
+    if text.lstrip()[:1] in ("{", "["):
+        try:
+            return [json.loads(text)]
+        except json.JSONDecodeError:
+            pass
+        except (ValueError, RecursionError) as error:
+            raise yaml.YAMLError(f"JSON that cannot be read: {error}") from error
     # OpenCV writes a colon where the standard has a space.
     head, newline, rest = text.partition("\n")
-    return yaml.load(rest if head.startswith("%YAML:") else head + newline + rest, Loader=_Loader)
+    documents = load_documents(rest if head.startswith("%YAML:") else head + newline + rest, _Loader)
+    return [document for document in documents if document is not None]
 
 
-def foreign_camera(content: Mapping[str, Any], width: int | None = None, height: int | None = None) -> Camera | None:
+def foreign_camera(content: Mapping[str, Any], given: Given) -> Camera | None:
     """The camera of a calibration of another tool; None if it is none of those that are known.
 
     Args:
         content: what the file holds.
-        width, height: sensor size (px), where the file does not say it.
+        given: what is said beside it.
 
     Raises:
         CalibrationError: if it is one, but something is missing or makes no sense.
     """
-    chain = sorted(key for key in content if key.startswith("cam") and isinstance(content[key], Mapping) and "intrinsics" in content[key])
-    if chain:
-        return _kalibr(content[chain[0]], chain[0])
-    matrix = _first(content, _MATRIX)
-    if matrix is None:
+    cameras = cameras_of(content)
+    if not any(cameras) and first_of(content, _MATRIX) is None:
         return None
-    K = _numbers(matrix, "the camera matrix")
-    if K.size != 9:
-        raise CalibrationError(f"the camera matrix must have 9 numbers, got {K.size}.")
-    coefficients = _first(content, _DISTORTION)
-    model = str(_first(content, ("distortion_model", "camera_model", "model")) or "plumb_bob")
-    size = _size(content)
-    model, distortion = _distortion(model, [] if coefficients is None else _numbers(coefficients, "the distortion").tolist())
-    return Camera.from_matrix(K.reshape(3, 3), *_agreed(size, (width, height)), model, distortion)
-
-
-def _kalibr(camera: Mapping[str, Any], name: str) -> Camera:
-    if camera.get("camera_model", "pinhole") != "pinhole":
-        raise CalibrationError(f"{name} has the camera model '{camera['camera_model']}'; pinhole is known.")
-    intrinsics = _numbers(camera["intrinsics"], "intrinsics").tolist()
-    if len(intrinsics) != 4:
-        raise CalibrationError(f"{name}: expected intrinsics fx, fy, cx, cy, got {len(intrinsics)} numbers.")
-    model, distortion = _distortion(str(camera.get("distortion_model", "none")), _numbers(camera.get("distortion_coeffs", []), "distortion").tolist())
-    fx, fy, cx, cy = intrinsics
-    return Camera(fx, fy, cx, cy, *_agreed(_size(camera), (None, None)), model, distortion)
-
-
-def _first(content: Mapping[str, Any], names: tuple[str, ...]) -> Any:
-    return next((content[name] for name in names if name in content), None)
-
-
-def _numbers(value: Any, what: str) -> np.ndarray:
-    """Numbers of a list, nested or not, or of a mapping with ``data``."""
+    name, camera = chosen(cameras, given)
     try:
-        numbers = np.asarray(value["data"] if isinstance(value, Mapping) else value, np.float64).ravel()
-    except (KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(f"{what} must be numbers, got {value!r}.") from error
-    return numbers
+        return _camera(camera, given)
+    except CalibrationError as error:
+        raise CalibrationError(f"{name}: {error}" if name else str(error)) from error
 
 
-def _size(content: Mapping[str, Any]) -> tuple[int | None, int | None]:
-    pair = _first(content, _SIZE)
-    if pair is not None:
-        values = list(pair.values()) if isinstance(pair, Mapping) else pair
-        if not isinstance(values, list) or len(values) != 2:
-            raise CalibrationError(f"the image size must be width and height, got {pair!r}.")
-        return _length(values[0]), _length(values[1])
-    return _length(_first(content, _WIDTH)), _length(_first(content, _HEIGHT))
+def _camera(content: Mapping[str, Any], given: Given) -> Camera:
+    _tell_parts_of_the_sensor(content)
+    matrix = first_of(content, _MATRIX)
+    if matrix is None:
+        raise CalibrationError(f"there is no camera matrix: none of {', '.join(_MATRIX)}.")
+    parameters = {str(key): value for key, value in matrix.items()} if isinstance(matrix, Mapping) and "data" not in matrix else None
+    named, coefficients = _coefficients(content, parameters or {})
+    # What names its parameters may name those of the lens among them, and their names say the model.
+    said = {**content, **({"xi": parameters["xi"]} if parameters and "xi" in parameters else {})}
+    model, distortion = lens({"distortion_model": named, **said} if named else said, coefficients, given)
+    K = _by_order(matrix) if parameters is None else _by_name(parameters)
+    return Camera.from_matrix(K, *agreed_size(size_of(content), given), model, distortion)
 
 
-def _length(value: Any) -> int | None:
-    if value is not None and not isinstance(value, int):
-        raise CalibrationError(f"width and height must be whole numbers, got {value!r}.")
-    return value
+def _by_order(matrix: Any) -> np.ndarray:
+    values = numbers(matrix, "the camera matrix")
+    if values.size == 4:
+        fx, fy, cx, cy = values
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    if values.size != 9:
+        raise CalibrationError(f"the camera matrix must have 9 numbers, got {values.size}; or be fx, fy, cx, cy.")
+    return values.reshape(3, 3)
 
 
-def _agreed(stored: tuple[int | None, int | None], given: tuple[int | None, int | None]) -> tuple[int, int]:
-    for name, there, here in zip(("width", "height"), stored, given, strict=True):
-        if there is not None and here is not None and there != here:
-            raise CalibrationError(f"{name} is {there} here, but {here} was given. Leave it out, or correct it.")
-    width, height = (there if there is not None else here for there, here in zip(stored, given, strict=True))
-    if width is None or height is None:
-        raise CalibrationError("this file does not say the sensor size. Give width and height in pixels.")
-    return width, height
+def _by_name(parameters: Mapping[str, Any]) -> np.ndarray:
+    values = [first_of(parameters, names) for names in _FOCAL]
+    if None in values:
+        raise CalibrationError(f"the camera's parameters must name fx, fy, cx and cy; they name {', '.join(parameters)}.")
+    return _by_order(values)
 
 
-def _distortion(model: str, coefficients: list[float]) -> tuple[str, tuple[float, ...]]:
-    """Model and coefficients as :class:`Camera` has them; zeros at the end are left out where they are too many."""
-    if model.lower() not in _MODELS:
-        raise CalibrationError(f"the distortion model '{model}' is not known; known are {', '.join(_MODELS)}.")
-    name = _MODELS[model.lower()]
-    if not any(coefficients):
-        return "none", ()
-    used = max(index + 1 for index, value in enumerate(coefficients) if value)
-    fitting = [count for count in _COUNTS[name] if count >= used]
-    if not fitting:
-        raise CalibrationError(f"the model '{model}' has {used} coefficients here, but up to {_COUNTS[name][-1]} are known.")
-    count = len(coefficients) if len(coefficients) in fitting else fitting[0]
-    return name, tuple((coefficients + [0.0] * count)[:count])
+def _coefficients(content: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[str | None, list[float]]:
+    """Distortion coefficients in OpenCV's order, and the model that their names say; none where none are said."""
+    stored = first_of(content, _DISTORTION)
+    if isinstance(stored, Mapping) and "data" not in stored:
+        parameters, stored = {str(key): value for key, value in stored.items()}, None
+    if stored is not None:
+        return None, numbers(stored, "the distortion").tolist()
+    named = {key for key in parameters if key[:1] in "kp" and key[1:].isdigit()}
+    for model, names in _BY_NAME:
+        if set(names[:4]) <= named <= set(names):
+            count = max(names.index(key) for key in named) + 1
+            return model, numbers([parameters.get(key, 0.0) for key in names[:count]], "the distortion").tolist()
+    if named:
+        raise CalibrationError(f"the distortion names {', '.join(sorted(named))}, which are the coefficients of no model that is known.")
+    return None, []
+
+
+def _tell_parts_of_the_sensor(content: Mapping[str, Any]) -> None:
+    """Warn of binning, and of a region of interest, which ROS says beside the intrinsics of the whole sensor."""
+    binned = [content.get(name) not in (None, 0, 1) for name in ("binning_x", "binning_y")]
+    roi = content.get("roi")
+    cut = isinstance(roi, Mapping) and any(roi.get(name) for name in ("x_offset", "y_offset", "width", "height"))
+    if any(binned) or cut:
+        what = " and ".join(word for word, there in (("binning", any(binned)), ("a region of interest (roi)", cut)) if there)
+        warnings.warn(
+            f"{what} is said beside the intrinsics, which are of the whole sensor: the events must be so too. For events that are binned or "
+            "cut, give the calibration of what they show.",
+            TorchtrackWarning,
+            stacklevel=2,
+        )

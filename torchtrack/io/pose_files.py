@@ -7,6 +7,8 @@ become ``T_cam_world @ T_world_obj``.
 import csv
 import json
 import os
+import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +17,26 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.errors import MissingFileError, PoseError
-from torchtrack.io.seconds import parse_seconds
-from torchtrack.io.trajectory import Trajectory, read_tum
-from torchtrack.lie import rotation_from_quaternion
+from torchtrack.config.events import TimeUnit
+from torchtrack.errors import PoseError, TorchtrackWarning
+from torchtrack.io.pose_times import pose_times_us
+from torchtrack.io.trajectory import Trajectory, read_tum, trajectory_of
+from torchtrack.io.whole_text import read_text_file, shown
 
 _POSITION, _QUATERNION = ("tx", "ty", "tz"), ("qx", "qy", "qz", "qw")
+_TIMES = ("t_us", "time_us", "t_ms", "time_ms", "t_ns", "time_ns", "t_s", "time_s", "t", "time", "timestamp", "timestamp_us", "timestamp_ns")
+_UNITS: dict[str, TimeUnit] = {"s": "s", "ms": "ms", "us": "us", "ns": "ns"}
 _OTHER_NAMES = {"x": "tx", "y": "ty", "z": "tz", "px": "tx", "py": "ty", "pz": "tz", "q_x": "qx", "q_y": "qy", "q_z": "qz", "q_w": "qw"}
 _METRES = {"meters": 1.0, "metres": 1.0, "m": 1.0, "millimeters": 1e-3, "millimetres": 1e-3, "mm": 1e-3, "centimeters": 1e-2, "cm": 1e-2}
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """What is said beside a file: which object, the time between images (µs), and the unit of its times."""
+
+    name: str | None
+    frame_us: int | None
+    time_unit: TimeUnit | None
 
 
 def read_trajectory(
@@ -31,117 +45,165 @@ def read_trajectory(
     name: str | None = None,
     frame_us: int | None = None,
     T_cam_world: Float[Tensor, "4 4"] | None = None,
+    time_unit: TimeUnit | None = None,
 ) -> Trajectory:
     """The poses of one object over time.
 
     - TUM: lines ``t tx ty tz qx qy qz qw``, seconds and metres.
-    - CSV: a first line that names ``t`` (seconds) or ``t_us``, ``tx ty tz`` (metres; also ``x y z``) and ``qx qy qz qw``.
+    - CSV: a first line that names ``t`` (seconds) or ``t_us`` (``_ms``, ``_ns``), ``tx ty tz`` (metres; also ``x y z``) and ``qx qy qz qw``.
     - BOP (``scene_gt.json``): per image the poses ``cam_R_m2c`` and ``cam_t_m2c`` (mm); ``frame_us`` says how far images lie apart.
     - OptiTrack (CSV of Motive): a rigid body with quaternions; times in seconds.
+
+    Warns (:class:`~torchtrack.errors.TorchtrackWarning`) where one of several objects is taken.
 
     Args:
         path: the file.
         name: which object: of BOP its ``obj_id``, of OptiTrack its rigid body; the first one by default.
         frame_us: time from one image to the next (µs), for BOP.
         T_cam_world: where the camera is, for poses in a world frame.
+        time_unit: of the times of TUM and CSV, where the file does not say it; seconds by default.
 
     Raises:
         MissingFileError: if there is no such file.
-        PoseError: if it is none of these, something is missing, or the poses make no sense.
+        LimitError: if it is larger than ``limits.pose_file_bytes``, or has more than ``limits.poses``.
+        PoseError: if it is none of these, something is missing, or the poses or times make no sense.
     """
     path = Path(path)
-    if not path.is_file():
-        raise MissingFileError(f"trajectory file '{path}' does not exist.")
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    text = read_text_file(path, "trajectory file", "pose_file_bytes", PoseError)
+    wanted = _Wanted(name, frame_us, time_unit)
     try:
         if text.lstrip().startswith("{"):
-            read = _read_bop(text, name, frame_us)
+            read = _read_bop(text, wanted)
         elif text.startswith("Format Version"):
-            read = _read_optitrack(text, name)
-        elif "," in next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), ""):
-            read = _read_csv(text)
+            read = _read_optitrack(text, wanted)
+        elif "," in next((line for line in text.splitlines() if line.strip() and not _is_comment(line)), ""):
+            read = _read_csv(text, wanted)
         else:
-            return _in_camera(read_tum(path), T_cam_world)
+            return _in_camera(read_tum(path, time_unit), T_cam_world)
     except PoseError as error:
-        raise PoseError(f"'{path}': {error}") from error
+        raise PoseError(f"'{path}': {shown(error)}") from error
     return _in_camera(read, T_cam_world)
+
+
+def _is_comment(line: str) -> bool:
+    """Whether a line is one; EuRoC's first line, which names the columns, is none."""
+    return line.startswith("#") and line.count(",") < 7
 
 
 def _in_camera(trajectory: Trajectory, T_cam_world: Tensor | None) -> Trajectory:
     return trajectory if T_cam_world is None else Trajectory(trajectory.t_us, T_cam_world.to(torch.float64) @ trajectory.T_cam_obj)
 
 
-def _trajectory(t_us: list[int], positions: list[list[float]], quaternions: list[list[float]]) -> Trajectory:
-    T = torch.eye(4, dtype=torch.float64).repeat(len(t_us), 1, 1)
-    xyzw = torch.tensor(quaternions, dtype=torch.float64).reshape(-1, 4)
-    norms = xyzw.norm(dim=-1)
-    if bool(((norms - 1).abs() > 0.01).any()):
-        raise PoseError(f"a quaternion has norm {float(norms[(norms - 1).abs().argmax()]):.4g}, expected 1. Check the order of the columns.")
-    T[:, :3, :3] = rotation_from_quaternion(xyzw)
-    T[:, :3, 3] = torch.tensor(positions, dtype=torch.float64).reshape(-1, 3)
-    return Trajectory(torch.tensor(t_us, dtype=torch.int64), T)
+def _rows_of(text: str) -> list[list[str]]:
+    try:
+        return list(csv.reader(text.splitlines()))
+    except csv.Error as error:
+        raise PoseError(f"it is not CSV ({error}).") from error
 
 
-def _read_csv(text: str) -> Trajectory:
-    rows = [row for row in csv.reader(text.splitlines()) if "".join(row).strip()]
-    names = [_OTHER_NAMES.get(word.strip().lower().lstrip("# "), word.strip().lower().lstrip("# ")) for word in rows[0]]
-    time = next((word for word in ("t_us", "time_us", "t", "time", "timestamp") if word in names), None)
+def _read_csv(text: str, wanted: _Wanted) -> Trajectory:
+    lines = [line for line in text.splitlines() if not _is_comment(line)]
+    rows = [row for row in _rows_of("\n".join(lines)) if "".join(row).strip()]
+    headings = [word.strip().lower().lstrip("# ") for word in rows[0]] if rows else []
+    names = [_column_name(heading) for heading in headings]
+    time = next((name for name in names if name in _TIMES), None)
     missing = [word for word in (*_POSITION, *_QUATERNION) if word not in names]
     if time is None or missing:
-        raise PoseError(f"the first line must name t or t_us, tx, ty, tz, qx, qy, qz and qw; it names {', '.join(names)}.")
-    t_us, positions, quaternions = [], [], []
+        raise PoseError(f"the first line must name t or t_us, tx, ty, tz, qx, qy, qz and qw; it names {', '.join(names)[:300]}.")
+    several = sorted({word for word in (time, *_POSITION, *_QUATERNION) if names.count(word) > 1})
+    if several:
+        raise PoseError(f"the first line names {', '.join(several)} more than once. Keep the columns of one object.")
+    scale = _length_m(headings[names.index("tx")])
+    times, poses = [], []
     for number, row in enumerate(rows[1:], start=2):
         try:
             values = dict(zip(names, row, strict=True))
-            t_us.append(int(values[time]) if time.endswith("_us") else parse_seconds(values[time]))
-            positions.append([float(values[word]) for word in _POSITION])
-            quaternions.append([float(values[word]) for word in _QUATERNION])
+            times.append(values[time])
+            poses.append([scale * float(values[word]) for word in _POSITION] + [float(values[word]) for word in _QUATERNION])
         except ValueError as error:
             raise PoseError(f"line {number} cannot be read: {error}.") from error
-    return _trajectory(t_us, positions, quaternions)
+    return trajectory_of(pose_times_us(times, wanted.time_unit or _told_unit(headings[names.index(time)])), poses)
 
 
-def _read_bop(text: str, name: str | None, frame_us: int | None) -> Trajectory:
-    if frame_us is None:
+def _column_name(heading: str) -> str:
+    """Our name of a column: without a unit in brackets, and without EuRoC's frames."""
+    bare = heading.partition("[")[0].strip().removeprefix("p_rs_r_").removeprefix("p_").removeprefix("q_rs_").removeprefix("q_")
+    return _OTHER_NAMES.get(bare, bare) if heading[:2] != "q_" else f"q{bare}"
+
+
+def _told_unit(heading: str) -> TimeUnit | None:
+    """The unit that the name of a column of times says: ``t_us``, or ``timestamp [ns]``."""
+    word = heading.replace("[", "_").replace("]", "").replace(" ", "").rpartition("_")[2]
+    return _UNITS.get(word)
+
+
+def _length_m(heading: str) -> float:
+    """The unit of positions, by what stands in brackets."""
+    word = heading.partition("[")[2].rstrip("] ").strip() or "m"
+    if word not in _METRES:
+        raise PoseError(f"the unit '{word}' is not known; known are {', '.join(_METRES)}.")
+    return _METRES[word]
+
+
+def _read_bop(text: str, wanted: _Wanted) -> Trajectory:
+    if wanted.frame_us is None:
         raise PoseError("BOP numbers its images and does not say their times. Give frame_us, the time from one to the next (µs).")
     try:
         scene: dict[str, list[dict[str, Any]]] = json.loads(text)
-        wanted = name if name is not None else str(next(iter(sorted(scene.items(), key=lambda item: int(item[0]))))[1][0]["obj_id"])
-        found = [(int(image), entry) for image, entries in scene.items() for entry in entries if str(entry["obj_id"]) == wanted]
-        found.sort(key=lambda item: item[0])
+        of_images = sorted(((int(image), entries) for image, entries in scene.items()), key=lambda item: item[0])
+        ids = list(dict.fromkeys(str(entry["obj_id"]) for _, entries in of_images for entry in entries))
+        chosen = _one_of(ids, wanted.name, "obj_id")
+        found = [(image * wanted.frame_us, entry) for image, entries in of_images for entry in entries if str(entry["obj_id"]) == chosen]
         T = np.tile(np.eye(4), (len(found), 1, 1))
         for pose, (_, entry) in zip(T, found, strict=True):
             pose[:3, :3] = np.reshape(entry["cam_R_m2c"], (3, 3))
             pose[:3, 3] = 1e-3 * np.asarray(entry["cam_t_m2c"], np.float64)
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, StopIteration) as error:
-        raise PoseError(f"this is not the scene_gt.json of BOP ({type(error).__name__}: {error}).") from error
-    return Trajectory(torch.tensor([image * frame_us for image, _ in found], dtype=torch.int64), torch.from_numpy(T))
+        t_us = np.array([time for time, _ in found], np.int64)
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        if isinstance(error, PoseError):
+            raise
+        raise PoseError(f"this is not the scene_gt.json of BOP ({type(error).__name__}: {str(error)[:200]}).") from error
+    return Trajectory(torch.from_numpy(t_us), torch.from_numpy(T))
 
 
-def _read_optitrack(text: str, name: str | None) -> Trajectory:
-    rows = list(csv.reader(text.splitlines()))
+def _one_of(names: list[str], wanted: str | None, kind: str) -> str:
+    """The wanted one of several names, or the first, which is told.
+
+    Raises:
+        PoseError: if there is none like it.
+    """
+    listed = ", ".join(names)[:500]
+    if not names or (wanted is not None and wanted not in names):
+        raise PoseError(f"there is no {kind} '{wanted}'. Those there are: {listed or 'none'}.")
+    if wanted is None and len(names) > 1:
+        warnings.warn(f"{len(names)} of {kind}: {listed}. '{names[0]}' is taken; name (initial_pose.name) chooses another.", TorchtrackWarning, 2)
+    return names[0] if wanted is None else wanted
+
+
+def _read_optitrack(text: str, wanted: _Wanted) -> Trajectory:
+    rows = _rows_of(text)
     header = dict(zip(rows[0][0::2], rows[0][1::2], strict=False))
     start = next((index for index, row in enumerate(rows) if row[:1] == ["Frame"]), None)
     if start is None or start < 4:
         raise PoseError("the export of Motive has no line 'Frame, Time (Seconds), …'. Export it as CSV with its header.")
     if header.get("Rotation Type", "Quaternion") != "Quaternion":
         raise PoseError(f"rotations are of type {header['Rotation Type']}. Export them as Quaternion.")
-    columns = _body_columns(rows[:start], rows[start], name)
+    columns = _body_columns(rows[:start], rows[start], wanted.name)
     unit = header.get("Length Units", "Meters").lower()
     if unit not in _METRES:
         raise PoseError(f"the unit '{unit}' is not known; known are {', '.join(_METRES)}.")
-    t_us, positions, quaternions = [], [], []
+    times, poses = [], []
     for row in rows[start + 1 :]:
         words = [row[column] if column < len(row) else "" for column in columns]
         # A body that the cameras lost has no numbers.
         if len(row) > 1 and all(words):
             try:
-                t_us.append(parse_seconds(row[1]))
-                quaternions.append([float(word) for word in words[:4]])
-                positions.append([_METRES[unit] * float(word) for word in words[4:]])
+                poses.append([_METRES[unit] * float(word) for word in words[4:]] + [float(word) for word in words[:4]])
+                float(row[1])
             except ValueError as error:
                 raise PoseError(f"frame {row[0]} cannot be read: {error}.") from error
-    return _trajectory(t_us, positions, quaternions)
+            times.append(row[1])
+    return trajectory_of(pose_times_us(times, wanted.time_unit or "s"), poses)
 
 
 def _body_columns(header: list[list[str]], axes: list[str], name: str | None) -> list[int]:
@@ -154,7 +216,7 @@ def _body_columns(header: list[list[str]], axes: list[str], name: str | None) ->
         raise PoseError("the export of Motive has no rigid body. Export rigid bodies.")
     names = padded[padded.index(types) + 1]
     bodies = list(dict.fromkeys(names[column] for column in range(width) if types[column] == "Rigid Body"))
-    chosen = bodies[0] if name is None else name
+    chosen = _one_of(bodies, name, "rigid body")
     columns = [
         next((c for c in range(width) if types[c] == "Rigid Body" and names[c] == chosen and kinds[c] == kind and axes[c] == axis), None)
         for kind, of_kind in (("Rotation", "XYZW"), ("Position", "XYZ"))

@@ -8,7 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.events import EventBatch, concatenate
+from torchtrack.first_state import first_state
 from torchtrack.motion import initial_covariance
+from torchtrack.setup_check import check_poses
 from torchtrack.state import TrackerState
 from torchtrack.time_surface import update_last_event
 from torchtrack.tracker import Tracker
@@ -99,7 +101,9 @@ def start_state(tracker: Tracker, batch: Batch, speed_sigma_m_s: float | None = 
             f"the tracker needs one object and one stream for each of the {len(batch.t_us)} samples: "
             f"Tracker([model] * {len(batch.t_us)}, [camera] * {len(batch.t_us)}, stream_index=range({len(batch.t_us)}))."
         )
-    state = tracker.init(batch.T_start, batch.t_us[:, 0])
+    # Objects of samples may be anywhere before the camera.
+    check_poses(batch.T_start, tracker.centre_obj, tracker.object_names)
+    state = first_state(tracker, batch.T_start.double(), batch.t_us[:, 0])
     state = replace(state, last_event_us=update_last_event(state.last_event_us, batch.past()))
     if speed_sigma_m_s is None:
         return state

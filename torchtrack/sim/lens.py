@@ -31,7 +31,7 @@ def ideal_camera(camera: Camera) -> Camera:
     low = np.floor(table.min(axis=(0, 1))).astype(int) - _MARGIN_PX
     high = np.ceil(table.max(axis=(0, 1))).astype(int) + _MARGIN_PX
     width, height = (high - low + 1).tolist()
-    return Camera(camera.fx, camera.fy, camera.cx - low[0], camera.cy - low[1], width, height)
+    return Camera(camera.fx, camera.fy, camera.cx - low[0], camera.cy - low[1], width, height, derived=True)
 
 
 class LensRenderer:

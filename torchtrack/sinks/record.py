@@ -14,6 +14,7 @@ from torchtrack.io import Trajectory
 from torchtrack.lie import so3_log
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axis
+from torchtrack.quality import Status
 from torchtrack.sinks.silences import Silences
 from torchtrack.stepping import Step
 
@@ -42,7 +43,8 @@ class ObjectRecord:
         """``truth`` is None where it is not known, ``axis`` where a turn about any shows."""
         self.truth, self.axis = truth, axis
         self.statuses: Counter[int] = Counter()
-        self.quality_sum = 0.0
+        # Of windows with too few events nothing is known.
+        self.quality_sum, self.judged_windows = 0.0, 0
         # Sum of the rotations between windows (rad, camera axes): full turns count.
         self.turned = torch.zeros(3, dtype=torch.float64)
         self._last_rotation: Tensor | None = None
@@ -52,7 +54,8 @@ class ObjectRecord:
     def add(self, t_us: Tensor, T_cam_obj: Tensor, status: int, quality: float) -> None:
         """Take one window: time ``[1]``, pose ``[4, 4]``."""
         self.statuses[status] += 1
-        self.quality_sum += quality
+        if status != Status.TOO_FEW_EVENTS:
+            self.quality_sum, self.judged_windows = self.quality_sum + quality, self.judged_windows + 1
         rotation = T_cam_obj[:3, :3]
         if self._last_rotation is not None:
             self.turned = self.turned + so3_log(rotation @ self._last_rotation.T)

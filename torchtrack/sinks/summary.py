@@ -32,7 +32,7 @@ class ObjectSummary:
 
     Args:
         status: windows by status.
-        mean_quality: mean over all windows, 0 to 1.
+        mean_quality: mean over all windows that had enough events to judge by, 0 to 1; NaN where none had.
         angular_velocity_rad_s: mean over the run, camera axes.
         errors: against ground truth; None where it is not known.
         unseen_turns: whether the object is a surface of revolution, whose turns about its axis are no errors.
@@ -186,7 +186,7 @@ def _ratio(value: float, by: float) -> float:
 def _summarise_object(record: ObjectRecord, duration_s: float, more: dict[str, Any]) -> ObjectSummary:
     return ObjectSummary(
         status={Status(status).name: count for status, count in sorted(record.statuses.items())},
-        mean_quality=_ratio(record.quality_sum, sum(record.statuses.values())),
+        mean_quality=_ratio(record.quality_sum, record.judged_windows),
         angular_velocity_rad_s=tuple(_ratio(turned, duration_s) for turned in record.turned.tolist()),
         errors=summarise(record.errors) if record.errors is not None else None,
         unseen_turns=record.axis is not None,

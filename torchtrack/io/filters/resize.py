@@ -87,7 +87,7 @@ def region_camera(camera: Camera, left: int, top: int, columns: int, rows: int) 
         EventDataError: if the region is not within the image.
     """
     _check_region(left, top, columns, rows, camera.width, camera.height)
-    return replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=columns, height=rows)
+    return replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=columns, height=rows, derived=True)
 
 
 def downscaled_camera(camera: Camera, factor: int) -> Camera:
@@ -107,6 +107,7 @@ def downscaled_camera(camera: Camera, factor: int) -> Camera:
         cy=(camera.cy + 0.5) / factor - 0.5,
         width=camera.width // factor,
         height=camera.height // factor,
+        derived=True,
     )
 
 

@@ -1,0 +1,43 @@
+"""The pose that an object starts with: as configured, or by the ground truth of its sequence."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.config.run import ObjectConfig, PoseConfig
+from torchtrack.errors import ConfigError
+from torchtrack.io import Trajectory, read_trajectory
+from torchtrack.lie import check_pose, rotation_from_quaternion
+
+
+def initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) -> Float[Tensor, "4 4"]:
+    """``T_cam_obj`` at the start, float64.
+
+    Args:
+        obj: what is configured of the object.
+        truth: its ground truth, or None where it is not known.
+        start_us: time of the start.
+
+    Raises:
+        ConfigError: if there is neither.
+        PoseError: if it is no rigid motion, or a trajectory has nothing measured at the start.
+    """
+    if obj.initial_pose is not None:
+        T = _configured_pose(obj.initial_pose, start_us)
+        check_pose(T, f"initial_pose of '{obj.label}'")
+        return T
+    if truth is None:
+        raise ConfigError(f"objects: '{obj.label}' needs an initial_pose, as the source has no ground truth for it.")
+    return truth.measured_at(start_us, f"the ground truth of '{obj.label}'")
+
+
+def _configured_pose(pose: PoseConfig, start_us: int) -> Float[Tensor, "4 4"]:
+    if pose.trajectory is not None:
+        read = read_trajectory(pose.trajectory, name=pose.name, time_unit=pose.time_unit)
+        return read.measured_at(start_us, f"'{pose.trajectory}'")
+    if pose.matrix is not None:
+        return torch.tensor(pose.matrix, dtype=torch.float64)
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3] = rotation_from_quaternion(torch.tensor(pose.quaternion_xyzw, dtype=torch.float64))
+    T[:3, 3] = torch.tensor(pose.translation_m, dtype=torch.float64)
+    return T
