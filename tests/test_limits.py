@@ -4,7 +4,7 @@ from torchtrack.cli import main
 from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
 from torchtrack.errors import LimitError
-from torchtrack.io import open_events
+from torchtrack.io import open_events, read_trajectory
 from torchtrack.limits import Limits, check_limit, current_limits, limits
 
 
@@ -53,3 +53,10 @@ def test_a_config_file_says_limits_and_inherits_those_that_hold(tmp_path):
     assert load(RunConfig, path, {"limits.faces": 9}).limits == Limits(poses=7, faces=9)
     with limits(Limits(poses=3)):
         assert RunConfig(source="a.npz").limits.poses == 3
+
+
+def test_a_file_of_too_many_poses_is_refused_before_it_is_parsed(tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_text("t_us,tx,ty,tz,qx,qy,qz,qw\n" + "no pose\n" * 1200)
+    with limits(Limits(poses=100)), pytest.raises(LimitError, match=r"poses.csv' asks for 201 poses, and the limit is 100"):
+        read_trajectory(path)

@@ -192,3 +192,20 @@ def test_sizes_are_limited(tmp_path: Path):
 def test_very_many_libraries(tmp_path: Path):
     with pytest.raises(ModelError, match="names 500 material libraries, expected at most 100"):
         ObjectModel.from_file(write(tmp_path / "box.obj", "mtllib " + " ".join(f"{i}.mtl" for i in range(500)) + "\n" + "\n".join(box_lines())))
+
+
+def test_points_of_two_coordinates(tmp_path: Path):
+    with pytest.raises(ModelError, match=r"flat\.obj"):
+        ObjectModel.from_file(write(tmp_path / "flat.obj", "v 0 0\nv 1 0\nv 0 1\n"))
+
+
+def test_textures_of_one_dimension_are_told(tmp_path: Path):
+    path = card(tmp_path)
+    write(path, "\n".join(line[:4] if line.startswith("vt") else line for line in path.read_text().splitlines()))
+    with pytest.warns(TorchtrackWarning, match="its faces have no texture coordinates"):
+        ObjectModel.from_file(path)
+
+
+def test_errors_name_the_file(tmp_path: Path):
+    with pytest.raises(ModelError, match=r"flat\.obj' cannot be used: all 1 faces of the mesh are degenerate"):
+        ObjectModel.from_file(write(tmp_path / "flat.obj", "v 0 0 0\nv .1 0 0\nv .2 0 0\nf 1 2 3\n"), name="thing")

@@ -146,6 +146,8 @@ def test_indices_out_of_range(tmp_path: Path, corner: int, kind: str):
         (b"element vertex 8\n", b"", ModelError, "header is wrong"),
         (b"binary_little_endian", b"binary_middle_endian", ModelError, "its format is 'binary_middle_endian'"),
         (b"element face", b"element tristrips", ModelError, "triangle strips"),
+        (b"element face", b"element nothing 3\nelement face", ModelError, "do not fit its header"),
+        (b"property float y", b"property float x", ModelError, "do not fit its header"),
     ],
 )
 def test_damaged_headers(tmp_path: Path, old: bytes, new: bytes, error: type[Exception], told: str):

@@ -1,5 +1,7 @@
 """How polarities are coded: 0 and 1, or -1 and 1; any other code is a question, not a guess."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from torchtrack.errors import EventDataError
@@ -22,13 +24,13 @@ def known_codes(values: np.ndarray) -> np.ndarray | None:
     return None if known.all() else known
 
 
-def brighter(values: np.ndarray, source: str = "events", setting: str = "") -> np.ndarray:
+def brighter(values: np.ndarray, source: str = "events", advice: Callable[[np.ndarray], str] | None = None) -> np.ndarray:
     """Where it got brighter, of values that are 0 or 1, -1 or 1, or booleans.
 
     Args:
         values: polarities, of any numeric type.
         source: name of the source, for messages.
-        setting: what else the user can do, for messages.
+        advice: what the user can do about such values, for messages.
 
     Raises:
         EventDataError: if there is another value.
@@ -36,7 +38,7 @@ def brighter(values: np.ndarray, source: str = "events", setting: str = "") -> n
     if values.dtype.kind == "b":
         return values
     if known_codes(values) is not None:
-        raise EventDataError(f"{source}: polarity holds {shown_values(values)}; expected 0 and 1, or -1 and 1.{setting}")
+        raise EventDataError(f"{source}: polarity holds {shown_values(values)}; expected 0 and 1, or -1 and 1.{advice(values) if advice else ''}")
     result: np.ndarray = values > 0
     return result
 

@@ -29,7 +29,10 @@ def absolute_path(value: Any, info: Any) -> Any:
     """
     if not isinstance(value, str | Path):
         return value
-    expanded = os.path.expandvars(Path(value).expanduser())
+    try:
+        expanded = os.path.expandvars(Path(value).expanduser())
+    except RuntimeError as error:
+        raise ValueError("nobody of the name after ~ has a home folder") from error
     if missing := re.findall(r"\$\{?(\w+)", expanded):
         raise ValueError(f"the environment variable {missing[0]} is not set")
     folder = (info.context or {}).get("folder")

@@ -18,7 +18,7 @@ from torchtrack.io.digits import whole_numbers
 from torchtrack.io.plausibility import settled_unit, whole_microseconds
 from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.seconds import parse_time
-from torchtrack.io.text_file import TextFile, whole_lines
+from torchtrack.io.text_file import ENOUGH_LINES, TextFile, whole_lines
 from torchtrack.io.text_layout import TextLayout, find_layout, is_names
 from torchtrack.io.text_words import as_numbers, parse_polarity, parse_whole, settled_polarity
 
@@ -45,7 +45,7 @@ class CsvFile(TextFile):
         if layout is None:
             raise EventDataError(f"{source}: expected lines 't,x,y,p' or 'x,y,p,t' of numbers, or a first line that names t, x, y and p.")
         object.__setattr__(self, "layout", layout)
-        rows = [layout.words(line) for line in head.splitlines()[layout.skip :]]
+        rows = [layout.words(line) for line in head.splitlines()[layout.skip : layout.skip + ENOUGH_LINES]]
         rows = [row for row in rows if len(row) == layout.width]
         times = [row[layout.columns[0]] for row in rows]
         custom: TimeUnit = "s" if any(mark in time for time in times for mark in ".eE") else "us"

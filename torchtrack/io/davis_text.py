@@ -22,7 +22,7 @@ from torchtrack.io.digits import digits, whole_numbers
 from torchtrack.io.plausibility import EVENTS, settled_unit, whole_microseconds
 from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.seconds import parse_time
-from torchtrack.io.text_file import Readable, TextFile, whole_lines
+from torchtrack.io.text_file import ENOUGH_LINES, Readable, TextFile, whole_lines
 from torchtrack.io.text_words import as_numbers, parse_whole, settled_polarity
 
 DAVIS240C_SIZE = (240, 180)
@@ -60,7 +60,7 @@ class DavisTextEvents(TextFile):
             for name, value in zip(("width", "height"), DAVIS240C_SIZE, strict=True):
                 object.__setattr__(self, name, value)
         head = self._head()
-        rows = [words for line in whole_lines(head).splitlines() if len(words := line.partition("#")[0].split()) == 4]
+        rows = [words for line in whole_lines(head).splitlines()[:ENOUGH_LINES] if len(words := line.partition("#")[0].split()) == 4]
         settled_polarity([words[3] for words in rows], self.choices.polarity, Problems(str(self.path), strict=False))
         object.__setattr__(self, "unit", _unit(head, self.choices, Problems(str(self.path), strict=True)))
 
@@ -101,7 +101,7 @@ def looks_like_davis_text(head: bytes) -> bool:
 def _unit(head: bytes, choices: ReadingConfig, problems: Problems) -> TimeUnit:
     """The unit of the times: seconds, where nobody says another and they can be. Raises over a first line that is no event."""
     times: list[str] = []
-    for number, line in enumerate(whole_lines(head).encode().split(b"\n"), start=1):
+    for number, line in enumerate(whole_lines(head).encode().split(b"\n")[:ENOUGH_LINES], start=1):
         words = line.partition(b"#")[0].split()
         if words:
             if not times:

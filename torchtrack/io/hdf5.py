@@ -34,7 +34,7 @@ from torchtrack.io.extras import optional
 from torchtrack.io.hdf5_storage import check_array, check_link
 from torchtrack.io.hdf5_streams import Hdf5Stream, streams_of
 from torchtrack.io.one_of_several import chosen_stream
-from torchtrack.io.plausibility import settled_unit, whole_microseconds
+from torchtrack.io.plausibility import ENOUGH_TIMES, settled_unit, whole_microseconds
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _PLACES = ("CD/events", "events", "prophesee/left", "davis/left/events", "t_offset", "ms_to_idx", "resolution")
@@ -119,7 +119,7 @@ class Hdf5Events(EventFile):
         # Whole µs, by the custom of data sets that have these tables.
         is_dsec = times.dtype.kind in "iu" and any(_beside(file, stream.group, name) is not None for name in ("ms_to_idx", "t_offset"))
         told = self.choices.time_unit or said or stream.unit or ("us" if is_dsec else None)
-        return settled_unit(times[:PART_EVENTS], "us" if times.dtype.kind in "iu" else "s", told, f"'{self.path}'")
+        return settled_unit(times[:ENOUGH_TIMES], "us" if times.dtype.kind in "iu" else "s", told, f"'{self.path}'")
 
     def _read(self, max_events: int) -> Iterator[Columns]:
         with open_hdf5(self.path) as file:

@@ -23,7 +23,7 @@ from torchtrack.io.event_arrays import EventArrays, event_sets
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.event_source import PART_EVENTS
 from torchtrack.io.one_of_several import chosen_stream
-from torchtrack.io.plausibility import EVENTS, settled_unit, whole_microseconds
+from torchtrack.io.plausibility import ENOUGH_TIMES, EVENTS, settled_unit, whole_microseconds
 from torchtrack.io.zip_archive import ZIP_MAGIC, damage_reported, open_archive
 from torchtrack.limits import check_limit
 
@@ -165,7 +165,7 @@ class NpzEvents(EventFile):
             for member, key, name in zip(members, chosen.names, _EVENT_KEYS, strict=True):
                 _check_event_member(member, key, members[0].shape, name, told is not None)
             count = members[0].shape[0]
-            unit = settled_unit(members[0].read(min(count, PART_EVENTS)), "us", told, f"'{self.path}'")
+            unit = settled_unit(members[0].read(min(count, ENOUGH_TIMES)), "us", told, f"'{self.path}'")
         for field_name, value in (("count", count), ("keys", chosen.names), ("unit", unit)):
             object.__setattr__(self, field_name, value)
 

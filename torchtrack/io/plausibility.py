@@ -21,6 +21,8 @@ _LATEST_S = 2.0**32
 # Of so many numbers at least a few would have decimals if they were seconds.
 _FEWEST_WHOLE = 4
 _GROUPS = 10
+# So many of the first times are looked at: enough for a rate, and little beside the reading.
+ENOUGH_TIMES = 16_000
 # Of fewer steps in time, the rate is chance.
 _FEWEST_STEPS = 40
 
@@ -103,7 +105,7 @@ def settled_unit(numbers: np.ndarray, custom: TimeUnit, told: TimeUnit | None, s
     """
     if told is not None:
         return told
-    found = TimeNumbers.of(numbers, timed.fewest)
+    found = TimeNumbers.of(numbers[:ENOUGH_TIMES], timed.fewest)
     if found is None or (fault := _fault(found, custom, timed)) is None:
         return custom
     shown = ", ".join(f"{number:.10g}" for number in found.shown)

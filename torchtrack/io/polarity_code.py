@@ -45,7 +45,7 @@ class PolarityCode:
         if isinstance(self.choice, int):
             polarity = events.polarity == self.choice
         else:
-            polarity = brighter(events.polarity, self.problems.source, f" {_CHOOSE}{_hint(events.polarity)}")
+            polarity = brighter(events.polarity, self.problems.source, _advice)
             polarity = ~polarity if self.choice == "inverted" else polarity
         return replace(events, polarity=polarity)
 
@@ -80,9 +80,9 @@ def _tell_alike(count: int, are_brighter: bool, source: str) -> None:
     warnings.warn(message, TorchtrackWarning, stacklevel=3)
 
 
-def _hint(values: np.ndarray) -> str:
-    """What a code that tools are known to write by mistake is likely to mean."""
+def _advice(values: np.ndarray) -> str:
+    """How to say what a code means, and what one that tools are known to write by mistake is likely to mean."""
     found = set(np.unique(values).tolist())
     if found == {1, 255}:
-        return " 255 is -1 stored without a sign, so that is probably 1."
-    return " Here that is probably 2." if found == {1, 2} else ""
+        return f" {_CHOOSE} 255 is -1 stored without a sign, so that is probably 1."
+    return f" {_CHOOSE}{' Here that is probably 2.' if found == {1, 2} else ''}"

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchtrack.config.events import TimeUnit
 from torchtrack.errors import PoseError, TorchtrackWarning
 from torchtrack.io.pose_times import pose_times_us
-from torchtrack.io.trajectory import Trajectory, read_tum, trajectory_of
+from torchtrack.io.trajectory import Trajectory, check_lines, read_tum, trajectory_of
 from torchtrack.io.whole_text import read_text_file, shown
 
 _POSITION, _QUATERNION = ("tx", "ty", "tz"), ("qx", "qy", "qz", "qw")
@@ -70,6 +70,8 @@ def read_trajectory(
     """
     path = Path(path)
     text = read_text_file(path, "trajectory file", "pose_file_bytes", PoseError)
+    if not text.lstrip().startswith("{"):
+        check_lines(text, path)
     wanted = _Wanted(name, frame_us, time_unit)
     try:
         if text.lstrip().startswith("{"):

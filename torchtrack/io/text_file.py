@@ -13,6 +13,8 @@ from torchtrack.io.event_file import EventFile
 from torchtrack.io.zip_archive import damage_reported, is_zip, open_archive
 
 HEAD_BYTES = 1 << 16
+# So many of the first lines are looked at before a file is read.
+ENOUGH_LINES = 1000
 _UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _SUFFIXES = (".txt", ".csv", ".tsv")
 

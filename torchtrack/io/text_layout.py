@@ -25,6 +25,8 @@ _POLARITIES = {"0", "1", "-1", "+1"} | _SWITCH
 _TXYP, _XYPT = (0, 1, 2, 3), (3, 0, 1, 2)
 # Of fewer lines, the order of columns is not told from their numbers.
 _FEWEST_LINES = 20
+# No more of them are looked at.
+_MOST_ROWS = 1000
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def find_layout(head: str, source: str) -> TextLayout | None:
         return None
     before = lines[:first]
     separator = (_separator(lines[first]) if first is not None else None) or ","
-    rows = [words for line in lines[len(before) :] if (words := split(_COMMENT.split(line, maxsplit=1)[0], separator))]
+    rows = [words for line in lines[len(before) : len(before) + _MOST_ROWS] if (words := split(_COMMENT.split(line, maxsplit=1)[0], separator))]
     names = next((found for line in reversed(before) if (found := _names(line, separator)) is not None), None)
     width = len(rows[0]) if rows else len(names or ())
     size, skip = _size(before), len(before)

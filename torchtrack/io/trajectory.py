@@ -25,6 +25,8 @@ _AT_REST_DEG, _AT_REST_M = 1.0, 0.005
 _LARGEST_TURN_DEG, _TURN_US = 90.0, 20_000
 # Beyond its ends a trajectory holds for its usual interval, and no longer than this.
 _LONGEST_SLACK_US = 100_000
+# A file may have so many lines more than poses: comments, names of columns.
+_LINES_OF_HEADER = 1000
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,7 @@ def read_tum(path: str | os.PathLike[str], time_unit: TimeUnit | None = None) ->
     """
     path = Path(path)
     text = read_text_file(path, "trajectory file", "pose_file_bytes", PoseError)
+    check_lines(text, path)
     times: list[str] = []
     rows: list[list[float]] = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -153,6 +156,15 @@ def read_tum(path: str | os.PathLike[str], time_unit: TimeUnit | None = None) ->
         return trajectory_of(pose_times_us(times, time_unit), rows)
     except PoseError as error:
         raise PoseError(f"{path}: {error}") from error
+
+
+def check_lines(text: str, path: Path) -> None:
+    """Refuse a file of more lines than poses are read, before any of them is.
+
+    Raises:
+        LimitError: if it has more.
+    """
+    check_limit("poses", max(text.count("\n") - _LINES_OF_HEADER, 0), path)
 
 
 def trajectory_of(t_us: list[int], rows: list[list[float]]) -> Trajectory:

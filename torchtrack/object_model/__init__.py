@@ -4,7 +4,13 @@ A model is read once, checked, and turned into plain tensors in metres in the ob
 
 ==================  ===========================================================================
 ``surface.py``      meshes welded by position, with texture coordinates and colours per corner
-``loading.py``      PLY, OBJ, STL, GLB and OFF through trimesh; units; textures that are missing
+``loading.py``      PLY, OBJ, STL, GLB and OFF through trimesh; units; files and origins that cannot be used
+``gltf.py``         checks before trimesh reads a glTF file, and what it would misread made plain (``gltf_accessors.py``)
+``obj.py``          the same for OBJ and its material libraries
+``ply.py``          the same for PLY
+``stl_off.py``      the same for STL and OFF
+``side_files.py``   files beside a model, by the names that tools give them
+``textures.py``     images of any kind as 8-bit RGB; textures that are lost are told
 ``winding.py``      faces turned to the outside
 ``mesh_edges.py``   the mesh edges that can ever be a contour
 ``texture_edges.py``  edges of a printed texture, carried to the surface through its UV map

@@ -1,6 +1,7 @@
 """Mesh files through trimesh, in metres, with what is wrong with them said plainly."""
 
 import io
+import logging
 import struct
 import warnings
 from collections.abc import Iterable
@@ -31,6 +32,9 @@ _READER_ERRORS: tuple[type[Exception], ...] = (
     *(ValueError, TypeError, LookupError, AttributeError, NameError, AssertionError, ArithmeticError, OSError, EOFError, SyntaxError),
     *(NotImplementedError, RecursionError, MemoryError, BufferError, DeprecationWarning, struct.error),
 )
+
+# trimesh logs what it survives, with tracebacks, which Python prints where no logging is set up.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def check_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
@@ -121,8 +125,11 @@ def mesh_parts(mesh: "trimesh.Trimesh | trimesh.Scene | Iterable[trimesh.Trimesh
     Raises:
         ModelError: if a face names a vertex that is not there.
     """
-    with np.errstate(all="ignore"):
-        pieces: list[Any] = [mesh] if isinstance(mesh, trimesh.Trimesh) else mesh.dump() if isinstance(mesh, trimesh.Scene) else list(mesh)
+    try:
+        with np.errstate(all="ignore"):
+            pieces: list[Any] = [mesh] if isinstance(mesh, trimesh.Trimesh) else mesh.dump() if isinstance(mesh, trimesh.Scene) else list(mesh)
+    except _READER_ERRORS as error:
+        raise ModelError(f"the parts of '{name}' cannot be put in their places ({error}): it is damaged, or not 3D. Export it again.") from error
     parts = [piece for piece in pieces if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     for part in parts:
         _check_corners(part, name)

@@ -81,9 +81,14 @@ class ObjectModel:
             ModelError: if it cannot be read, is empty, not finite, or of a size that no tracked object has.
         """
         path = check_file(path, tuple(dict.fromkeys(MESH_SUFFIXES + POLYLINE_SUFFIXES)))
-        if path.suffix.lower() == ".json" or (path.suffix.lower() == ".obj" and has_obj_lines(path)):
-            return cls.from_polylines(path, name=name, unit=unit)
-        return cls.from_mesh(load_parts(path), name=name or path.stem, unit=unit, settings=settings)
+        try:
+            if path.suffix.lower() == ".json" or (path.suffix.lower() == ".obj" and has_obj_lines(path)):
+                return cls.from_polylines(path, name=name, unit=unit)
+            return cls.from_mesh(load_parts(path), name=name or path.stem, unit=unit, settings=settings)
+        except ModelError as error:
+            if str(path) in str(error):
+                raise
+            raise ModelError(f"the object model '{path}' cannot be used: {error}") from error
 
     @classmethod
     def from_mesh(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtrack.errors import ModelError
+from torchtrack.errors import ModelError, TorchtrackError
 from torchtrack.limits import check_limit
 from torchtrack.object_model.side_files import MeshText, SideFiles
 
@@ -71,7 +71,12 @@ def read_ply(path: Path) -> MeshText:
     if header.is_ascii:
         _check_rows(path, data, header)
     else:
-        data = _with_even_faces(path, data, header)
+        try:
+            data = _with_even_faces(path, data, header)
+        except TorchtrackError:
+            raise
+        except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
+            raise _damaged(path, f"its tables do not fit its header ({error})") from error
     images = {"": header.texture} if header.texture else {}
     return MeshText(data, "ply", SideFiles(path), tuple(images.values()), images)
 

@@ -44,7 +44,7 @@ def set_material_image(mesh: trimesh.Trimesh, image: Image.Image | None) -> None
 def has_uv(mesh: trimesh.Trimesh) -> bool:
     """Whether every vertex has texture coordinates."""
     uv = getattr(mesh.visual, "uv", None)
-    return uv is not None and len(uv) == len(mesh.vertices)
+    return uv is not None and np.shape(uv) == (len(mesh.vertices), 2)
 
 
 def texture_image(mesh: trimesh.Trimesh) -> Image.Image | None:
