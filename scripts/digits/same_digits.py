@@ -97,8 +97,8 @@ class Tracking:
         """What a run gave, once it is done."""
         # One line for each run that is stored.
         if self.process.stdout is None or not self.process.stdout.readline():
-            self.process.wait()
-            raise SystemExit(f"same_digits: the run failed with the torchtrack {self.name}:\n{self.errors.read_text()[-4000:]}")
+            status = self.process.wait()
+            raise SystemExit(f"same_digits: run {number} failed with the torchtrack {self.name}, exit {status}:\n{self.errors.read_text()[-4000:]}")
         path = self.outputs / f"{number}.pt"
         windows: list[dict[str, torch.Tensor]] = torch.load(path)
         path.unlink()
