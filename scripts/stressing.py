@@ -13,8 +13,9 @@ import torchtrack
 from torchtrack.bench.scene import Scene, simulated
 from torchtrack.config.presets import preset
 from torchtrack.config.tracker import WindowConfig
+from torchtrack.core.events import EventBatch
+from torchtrack.core.windows import LONGEST_SILENCE_US
 from torchtrack.errors import TorchtrackWarning
-from torchtrack.events import LONGEST_SILENCE_US, EventBatch
 from torchtrack.io.problems import Problems
 from torchtrack.quality import Status
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from tracked_boxes import tensors_of
 
-from torchtrack.kernels.switch import kernels
+from torchtrack.core.dispatch import kernels
 
 ROUNDINGS = {torch.float32: 2e-4, torch.float64: 1e-9}
 

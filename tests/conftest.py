@@ -70,7 +70,7 @@ def dtype(request) -> torch.dtype:
 def way(request):
     """Kernels, where there are any, and PyTorch's operations: that of this test."""
     # Not at the top: what it imports must find the hook in place.
-    from torchtrack.kernels import switch
+    from torchtrack.core import dispatch
 
-    with switch.kernels(wanted=request.param):
+    with dispatch.kernels(wanted=request.param):
         yield

@@ -7,13 +7,13 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchtrack.camera import Camera, project
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours
-from torchtrack.events import EventBatch
-from torchtrack.image_motion import MovingObjects
+from torchtrack.core.camera import Camera, project
+from torchtrack.core.events import EventBatch
+from torchtrack.core.image_velocity import MovingObjects
+from torchtrack.core.lie import rotation_angle_deg, se3_exp, so3_exp, transform_points
 from torchtrack.io import Trajectory
-from torchtrack.lie import rotation_angle_deg, se3_exp, so3_exp, transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import Observations
 

@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import torch
 
-from torchtrack.events import EventBatch, concatenate
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.io import EventSource
 
 SIZE = {"width": 64, "height": 48}

@@ -6,10 +6,10 @@ import torch
 import trimesh
 from helpers import _crossings, generator, pose
 
-from torchtrack.camera import Camera, project
-from torchtrack.events import EventBatch
+from torchtrack.core.camera import Camera, project
+from torchtrack.core.events import EventBatch
+from torchtrack.core.lie import so3_exp, transform_points
 from torchtrack.io import Trajectory
-from torchtrack.lie import so3_exp, transform_points
 from torchtrack.object_model import ObjectModel
 
 PLATE_CAMERA = Camera(fx=450.0, fy=450.0, cx=159.5, cy=119.5, width=320, height=240)

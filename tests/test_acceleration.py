@@ -12,9 +12,9 @@ from tracked_boxes import WINDOW_US, follow, started, windows
 from torchtrack import Tracker
 from torchtrack.config.presets import preset
 from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig, SolverConfig, TrackerConfig
-from torchtrack.events import EventBatch
-from torchtrack.image_motion import MovingObjects
-from torchtrack.lie import so3_exp
+from torchtrack.core.events import EventBatch
+from torchtrack.core.image_velocity import MovingObjects
+from torchtrack.core.lie import so3_exp
 from torchtrack.motion import (
     Acceleration,
     acceleration_counts,

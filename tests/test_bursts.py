@@ -6,7 +6,7 @@ from helpers import generator, seen, upright_line
 from test_matching import nearest
 
 from torchtrack.bursts import LONG_AGO_US, no_bursts, update_bursts, without_tail
-from torchtrack.events import EventBatch, PaddedEvents, concatenate, pad_streams
+from torchtrack.core.events import EventBatch, PaddedEvents, concatenate, pad_streams
 
 LONGEST_US = 10_000
 

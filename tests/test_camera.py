@@ -7,18 +7,9 @@ import torch
 from helpers import generator
 from torch.autograd import gradcheck
 
-from torchtrack.camera import (
-    MIN_DEPTH_M,
-    Camera,
-    distort,
-    distortion_table,
-    project,
-    stack_tables,
-    undistort,
-    undistortion_table,
-)
+from torchtrack.core.camera import MIN_DEPTH_M, Camera, distort, distortion_table, project, stack_tables, undistort, undistortion_table
+from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import CalibrationError, LimitError, TorchtrackWarning
-from torchtrack.limits import Limits, limits
 
 PINHOLE = Camera(612.3, 610.9, 318.2, 241.7, 640, 480)
 LENSES = {
@@ -288,6 +279,6 @@ def test_tables_larger_than_the_limit_are_refused_before_they_are_made():
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_tables_do_not_depend_on_the_bands_that_they_are_made_in(camera, monkeypatch):
     whole = undistortion_table(camera), distortion_table(camera, 3)
-    monkeypatch.setattr("torchtrack.camera._BAND_PIXELS", 5000)
+    monkeypatch.setattr("torchtrack.core.camera._BAND_PIXELS", 5000)
     assert torch.equal(undistortion_table(camera), whole[0])
     assert torch.equal(distortion_table(camera, 3), whole[1])

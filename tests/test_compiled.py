@@ -13,12 +13,13 @@ import torch
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, tensors_of, windows
 
-from torchtrack import Tracker, compiled, readback
+from torchtrack import Tracker, compiled
 from torchtrack.config.run import RunConfig
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import LearningConfig, ModelTrustConfig, TrackerConfig
+from torchtrack.core import host_sync
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import ConfigError
-from torchtrack.events import EventBatch, concatenate
 from torchtrack.runner import run
 from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
 
@@ -55,7 +56,7 @@ class Graphs:
     def _reading_nothing(function):
         def graph(*args):
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(readback, "read_at_once", lambda values: False)
+                patch.setattr(host_sync, "read_at_once", lambda values: False)
                 return function(*args)
 
         return graph

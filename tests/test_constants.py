@@ -2,7 +2,7 @@
 
 import torch
 
-from torchtrack.constants import constant
+from torchtrack.core.constants import constant
 
 
 def test_a_constant_that_was_made_within_a_transform_can_be_used_outside():

@@ -8,12 +8,12 @@ import torch
 import trimesh
 from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, generator, pose, random_pose
 
-from torchtrack import readback
-from torchtrack.camera import project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourKind, ContourModel, group_by_model
 from torchtrack.contours import image_normals, mesh_contours, reproject, select_ranked, take_points
-from torchtrack.lie import transform_points
+from torchtrack.core import host_sync
+from torchtrack.core.camera import project
+from torchtrack.core.lie import transform_points
 from torchtrack.object_model import ObjectModel
 
 CONFIG = ContourConfig(remove_hidden=False)
@@ -241,7 +241,7 @@ def test_there_are_places_for_all_texture_that_looks_at_a_camera(monkeypatch):
     """On a GPU, it cannot be counted first: with as many places as there can be need of, nothing is left out."""
     model, T = cube_with_prints(), random_pose(20)
     counted = contours_of(model, T)
-    monkeypatch.setattr(readback, "read_at_once", lambda values: False)
+    monkeypatch.setattr(host_sync, "read_at_once", lambda values: False)
     bounded = contours_of(model, T)
     assert bounded.mask.shape[1] < CONFIG.max_edge_points + len(model.texture_points)
     for number in range(len(T)):

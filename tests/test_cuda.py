@@ -8,10 +8,11 @@ from helpers import bevelled_model, box_model, pose_errors
 from host_reads import host_reads
 from tracked_boxes import SCENES, follow
 
-from torchtrack import Tracker, readback
+from torchtrack import Tracker
 from torchtrack.compiled import CompiledStep
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
+from torchtrack.core import host_sync
 from torchtrack.quality import Status
 
 COUNT = 8
@@ -146,7 +147,7 @@ def test_what_does_not_wait_is_not_found(mode):
 @pytest.mark.parametrize("config", [None, SEARCHED], ids=["steady", "searched"])
 def test_a_step_reads_nothing_back(monkeypatch, scene, config):
     """On the CPU, where it can be watched, as it is done on a GPU; but for what is asked for early and looked at late."""
-    monkeypatch.setattr(readback, "read_at_once", lambda values: False)
+    monkeypatch.setattr(host_sync, "read_at_once", lambda values: False)
     tracker, state, ready = set_up(scene, torch.device("cpu"), config)
     with torch.inference_mode():
         state, _ = follow(tracker, state, ready[:-1])
@@ -162,8 +163,8 @@ def test_the_ways_of_a_gpu_lead_to_the_poses_of_the_cpu(monkeypatch, scene):
     found = []
     for as_on_gpu in (False, True):
         tracker, state, ready = set_up(scene, torch.device("cpu"))
-        monkeypatch.setattr(readback, "on_gpu", lambda values, answer=as_on_gpu: answer)
-        monkeypatch.setattr(readback, "read_at_once", lambda values, answer=as_on_gpu: not answer)
+        monkeypatch.setattr(host_sync, "on_gpu", lambda values, answer=as_on_gpu: answer)
+        monkeypatch.setattr(host_sync, "read_at_once", lambda values, answer=as_on_gpu: not answer)
         _, results = follow(tracker, state, ready)
         found.append(torch.stack([result.T_cam_obj for result in results]))
     degrees, millimetres = pose_errors(found[1], found[0])
@@ -175,11 +176,11 @@ def test_the_ways_of_a_gpu_lead_to_the_poses_of_the_cpu(monkeypatch, scene):
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_steady_step_asks_for_nothing(monkeypatch, scene, model):
     """A CUDA graph cannot hold so much as an answer that is waited for."""
-    monkeypatch.setattr(readback, "read_at_once", lambda values: False)
+    monkeypatch.setattr(host_sync, "read_at_once", lambda values: False)
     tracker, state, ready = set_up(scene, torch.device("cpu"), model=model)
     with torch.inference_mode():
         state, _ = follow(tracker, state, ready[:-1])
-        monkeypatch.setattr(readback.Answer, "to", None)
+        monkeypatch.setattr(host_sync.Answer, "to", None)
         with host_reads() as found:
             tracker.steady_step(state, *ready[-1])
     assert found == []

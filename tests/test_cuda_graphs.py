@@ -9,10 +9,11 @@ import torch
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import follow, moving_box, windows
 
-from torchtrack import Tracker, compiled, cuda_graphs, readback
+from torchtrack import Tracker, compiled, cuda_graphs
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
+from torchtrack.core import host_sync
+from torchtrack.core.events import concatenate
 from torchtrack.cuda_graphs import CudaGraphs
-from torchtrack.events import concatenate
 from torchtrack.state import each_tensor
 
 COUNT = 12
@@ -119,7 +120,7 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
             # As on a GPU: there is a graph, and nothing is read back within it.
             def advance_as_there(*args, tracker=tracker, learns):
                 with pytest.MonkeyPatch.context() as patch:
-                    patch.setattr(readback, "read_at_once", lambda values: False)
+                    patch.setattr(host_sync, "read_at_once", lambda values: False)
                     return tracker.steady_advance(*args, learns=learns)
 
             tracker.graphs._compiles = True
@@ -148,7 +149,7 @@ def test_with_a_weigher_of_ones_own_graphs_have_to_be_asked_for(monkeypatch):
     plain, judged = (Tracker([box_model()], SMALL_CAMERA, weigher=weigher).graphs for weigher in (None, torch.nn.Identity()))
     t_us = torch.zeros(1, dtype=torch.int64)
     assert not plain._are_for(t_us)
-    monkeypatch.setattr(readback, "on_gpu", lambda values: True)
+    monkeypatch.setattr(host_sync, "on_gpu", lambda values: True)
     assert plain._are_for(t_us)
     assert not judged._are_for(t_us)
     assert Tracker([bevelled_model()], SMALL_CAMERA).graphs._are_for(t_us)

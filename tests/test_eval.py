@@ -9,6 +9,7 @@ from helpers import random_pose
 from tiny_sequence import write_tiny_sequence
 
 from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
+from torchtrack.core.lie import se3_interpolate, so3_exp
 from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
 from torchtrack.eval.evaluate import evaluate, measure
 from torchtrack.eval.metrics import PoseErrors, pose_errors, summarise
@@ -16,7 +17,6 @@ from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table
 from torchtrack.io import Trajectory
 from torchtrack.io.convert import convert
-from torchtrack.lie import se3_interpolate, so3_exp
 from torchtrack.sinks.summary import finite
 
 KEYS = (

@@ -9,8 +9,9 @@ from helpers import random_events
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchtrack.core.events import EventBatch, check_events, concatenate, pad_streams
+from torchtrack.core.windows import EventWindow, windows_by_count, windows_by_time
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch, EventWindow, check_events, concatenate, pad_streams, windows_by_count, windows_by_time
 
 # The same examples in every run, however busy the machine is.
 REPEATABLE = settings(deadline=None, derandomize=True)

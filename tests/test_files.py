@@ -2,10 +2,10 @@ import os
 
 import pytest
 
+from torchtrack.core.files import check_is_file, is_file, naming, read_bytes
+from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import EventDataError, LimitError, MissingExtraError, MissingFileError
-from torchtrack.files import check_is_file, is_file, naming, read_bytes
 from torchtrack.io import open_events
-from torchtrack.limits import Limits, limits
 
 
 def test_what_is_no_file_is_told_as_what_it_is(tmp_path):

@@ -5,7 +5,7 @@ import torch
 from first_calls import CHECKED_CALLS
 from jaxtyping import TypeCheckError
 
-from torchtrack.lie import so3_exp
+from torchtrack.core.lie import so3_exp
 
 
 # Twice: what one test used up is there again for the next.

@@ -10,10 +10,10 @@ import pytest
 from helpers import random_events
 from io_files import SIZE, save_npz, save_text
 
+from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import EventDataError, LimitError
 from torchtrack.io import open_events
 from torchtrack.io.columns import shifted
-from torchtrack.limits import Limits, limits
 
 
 def hdf5(path, **arrays):

@@ -4,9 +4,9 @@ import pytest
 import torch
 from helpers import SMALL_CAMERA, generator, random_twist
 
-from torchtrack.camera import MIN_DEPTH_M, project
-from torchtrack.image_motion import object_plane_velocity, pixel_velocity
-from torchtrack.lie import retract_about, transform_points
+from torchtrack.core.camera import MIN_DEPTH_M, project
+from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
+from torchtrack.core.lie import retract_about, transform_points
 
 CENTRES_M = ((0.05, -0.02, 0.5), (0.0, 0.1, 0.8), (-0.2, 0.0, 0.3))
 

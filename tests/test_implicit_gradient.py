@@ -10,8 +10,8 @@ from test_pose_solver_window import windowed
 from torch.autograd import gradcheck
 
 from torchtrack.config.tracker import SolverConfig
+from torchtrack.core.lie import cayley, move_about, retract_about, se3_exp
 from torchtrack.implicit_gradient import newton_step, with_gradient
-from torchtrack.lie import cayley, move_about, retract_about, se3_exp
 from torchtrack.pose_problem import PoseProblem
 from torchtrack.pose_solver import robust_cost, solve_pose
 

@@ -9,7 +9,7 @@ from torchtrack.bench.io import HEIGHT, TARGETS, WIDTH, measure, synthetic, writ
 from torchtrack.bench.results import Report, Result, as_markdown, machine
 from torchtrack.bench.setup import Setup
 from torchtrack.cli import main
-from torchtrack.events import concatenate
+from torchtrack.core.events import concatenate
 from torchtrack.io import open_events
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
 from torchtrack.errors import CalibrationError, MissingFileError
 from torchtrack.io import read_calibration
 

@@ -9,8 +9,8 @@ from helpers import random_events
 from io_files import SIZE, assert_same, everything, save_npz
 
 from torchtrack.config.events import ReadingConfig
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError, TorchtrackWarning
-from torchtrack.events import EventBatch, concatenate
 from torchtrack.io import open_events
 from torchtrack.io.polarity_code import told_if_alike
 

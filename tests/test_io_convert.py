@@ -13,8 +13,8 @@ from io_files import assert_same, everything
 from tiny_sequence import write_tiny_sequence
 
 from torchtrack.cli import main
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError, UnknownFormatError
-from torchtrack.events import EventBatch
 from torchtrack.io import open_events, read_sequence
 from torchtrack.io.convert import WRITERS, convert
 from torchtrack.io.writers.base import EventWriter

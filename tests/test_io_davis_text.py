@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from io_files import SIZE, assert_same, everything, peak_bytes, save_text
 
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch
 from torchtrack.io import davis_text, open_events
 
 # The same examples in every run, however busy the machine is.

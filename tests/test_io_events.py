@@ -8,8 +8,8 @@ import pytest
 from helpers import random_events
 from io_files import SIZE, assert_same, everything, save_npz, save_text
 
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
-from torchtrack.events import EventBatch, concatenate
 from torchtrack.io import DavisTextEvents, EventSource, NpzEvents, davis_text, open_events
 
 # ---- recordings

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from io_files import assert_same, everything, save_npz
 from tiny_sequence import write_tiny_sequence
 
-from torchtrack.camera import Camera, project
 from torchtrack.config.events import EventsConfig
 from torchtrack.config.run import RunConfig
+from torchtrack.core.camera import Camera, project
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch, concatenate
 from torchtrack.io import open_events
 from torchtrack.io.filters import (
     BackgroundFilter,

@@ -9,11 +9,11 @@ import pytest
 import torch
 from helpers import generator
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
+from torchtrack.core.lie import quaternion_from_rotation, se3_exp
+from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import CalibrationError, LimitError, MissingFileError, PoseError, TorchtrackWarning
 from torchtrack.io import Trajectory, read_calibration, read_trajectory, write_tum
-from torchtrack.lie import quaternion_from_rotation, se3_exp
-from torchtrack.limits import Limits, limits
 
 EXPECTED = Camera(500.0, 510.0, 320.5, 240.25, 640, 480, "plumb_bob", (-0.1, 0.01, 0.001, -0.002, 0.0))
 

@@ -5,8 +5,8 @@ import pytest
 from helpers import random_events
 from io_files import SIZE, assert_same, everything, save_npz
 
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError, MissingExtraError, TorchtrackWarning, UnknownFormatError
-from torchtrack.events import EventBatch
 from torchtrack.io import extras, open_events
 from torchtrack.io.columns import Columns
 from torchtrack.io.problems import Problem

@@ -7,8 +7,8 @@ from helpers import random_events
 from io_files import SIZE, assert_same, everything
 from tiny_sequence import CAMERA
 
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError, UnknownFormatError
-from torchtrack.events import EventBatch
 from torchtrack.io import open_events
 from torchtrack.io.container import ContainerWriter
 from torchtrack.io.hdf5 import Hdf5Events

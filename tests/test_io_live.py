@@ -18,8 +18,9 @@ from tiny_sequence import CAMERA, write_tiny_sequence
 
 from torchtrack.config.events import is_live
 from torchtrack.config.run import RunConfig
+from torchtrack.core.events import EventBatch, concatenate
+from torchtrack.core.windows import EventWindow
 from torchtrack.errors import ConfigError, EventDataError, MissingExtraError
-from torchtrack.events import EventBatch, EventWindow, concatenate
 from torchtrack.io import extras, read_sequence
 from torchtrack.io.keep_up import KeepUp
 from torchtrack.io.live import DvSource, Evk4Source, StreamSource, open_live

@@ -6,8 +6,8 @@ import pytest
 from io_files import everything, save_npz, save_text
 from tiny_sequence import write_tiny_sequence
 
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError, TorchtrackWarning
-from torchtrack.events import EventBatch, concatenate
 from torchtrack.io import open_events, read_sequence
 from torchtrack.io.columns import Columns, join
 from torchtrack.io.mending import Mender, mended_batches

@@ -7,8 +7,8 @@ import pytest
 from helpers import random_events
 from io_files import SIZE, assert_same, everything, peak_bytes, save_npz, save_text
 
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError, UnknownFormatError
-from torchtrack.events import EventBatch
 from torchtrack.io import NpzEvents, open_events
 
 

@@ -6,8 +6,8 @@ from helpers import random_events
 from io_files import SIZE, assert_same, everything
 
 from torchtrack.config.events import ReadingConfig
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError, TorchtrackWarning, UnknownFormatError
-from torchtrack.events import EventBatch
 from torchtrack.io import open_events
 from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.ros_messages import MessageDecoder

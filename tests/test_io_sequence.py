@@ -10,9 +10,9 @@ from helpers import random_events, random_pose
 from io_files import everything
 from PIL import Image
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
+from torchtrack.core.events import concatenate
 from torchtrack.errors import CalibrationError, EventDataError, MissingFileError, PoseError, TorchtrackWarning, UnknownFormatError
-from torchtrack.events import concatenate
 from torchtrack.io import Trajectory, read_sequence, write_sequence
 
 CAMERA = Camera(60.0, 61.0, 31.5, 23.5, 64, 48)

@@ -10,10 +10,10 @@ from helpers import random_pose, random_twist
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchtrack.core.lie import se3_exp
 from torchtrack.errors import MissingFileError, PoseError
 from torchtrack.io import Trajectory, read_tum, write_tum
 from torchtrack.io.seconds import format_seconds, parse_seconds
-from torchtrack.lie import se3_exp
 
 # The same examples in every run, however busy the machine is.
 REPEATABLE = settings(deadline=None, derandomize=True)

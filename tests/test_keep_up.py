@@ -11,10 +11,11 @@ from tracked_boxes import windows as cut
 from torchtrack import Tracker
 from torchtrack.config.haste import in_haste
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.events import EventBatch, EventWindow
+from torchtrack.core.events import EventBatch
+from torchtrack.core.lie import rotation_angle_deg
+from torchtrack.core.windows import EventWindow
 from torchtrack.haste import Pace
 from torchtrack.io.keep_up import FEWEST_EVENTS, LONGEST_US, MOST_JOINED, HastyWindow, WaitingWindows
-from torchtrack.lie import rotation_angle_deg
 from torchtrack.quality import Status
 
 CAPACITY = 64

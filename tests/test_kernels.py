@@ -12,15 +12,15 @@ from test_prediction import boxes
 from test_visibility import ball, l_prism
 
 from torchtrack.bursts import LONG_AGO_US, update_bursts
-from torchtrack.camera import undistortion_table
 from torchtrack.config.search import QualityConfig
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contour_model import ContourKind, group_by_model
 from torchtrack.contours import assemble, mesh_contours, reproject
-from torchtrack.events import EventBatch, concatenate, pad_streams
+from torchtrack.core.camera import undistortion_table
+from torchtrack.core.events import EventBatch, concatenate, pad_streams
+from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.hypotheses import mark
-from torchtrack.image_motion import MovingObjects
 from torchtrack.matching import ContourTable, Matches
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel

@@ -9,9 +9,9 @@ from helpers import SMALL_CAMERA, box_model, generator, pose, random_events
 
 from torchtrack import Tracker
 from torchtrack.bursts import LONG_AGO_US
-from torchtrack.camera import Camera
 from torchtrack.contour_index import index_contours
-from torchtrack.events import EventBatch, concatenate
+from torchtrack.core.camera import Camera
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.observations import SharedEvents, WindowEvents, select_events
 from torchtrack.sensor_tiles import NearbyEvents
 

@@ -12,9 +12,9 @@ from torchtrack import Tracker
 from torchtrack.alignment import Fit
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
+from torchtrack.core.lie import retract_about
 from torchtrack.corners import no_corners
 from torchtrack.forecast import forecast
-from torchtrack.lie import retract_about
 from torchtrack.matching import Matches
 from torchtrack.motion import inverse
 from torchtrack.pose_problem import Linearisation

@@ -13,8 +13,8 @@ from torchtrack.baselines import tracker_class
 from torchtrack.config.presets import preset
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core import dispatch
 from torchtrack.errors import EventDataError
-from torchtrack.kernels import switch
 from torchtrack.runner import run, track
 from torchtrack.sensor_tiles import NearbyEvents
 
@@ -111,16 +111,16 @@ def test_settings_that_the_kernel_does_not_know_go_without_it(name):
 
 
 def test_where_gradients_are_recorded_there_are_no_kernels():
-    assert not switch.apply_to(torch.zeros(1))
+    assert not dispatch.apply_to(torch.zeros(1))
     with torch.no_grad():
-        assert switch.apply_to(torch.zeros(1))
+        assert dispatch.apply_to(torch.zeros(1))
 
 
 def test_within_what_does_without_kernels_nothing_asks_for_them():
-    with torch.inference_mode(), switch.kernels(wanted=False), switch.kernels(wanted=True):
-        assert not switch.apply_to(torch.zeros(1))
+    with torch.inference_mode(), dispatch.kernels(wanted=False), dispatch.kernels(wanted=True):
+        assert not dispatch.apply_to(torch.zeros(1))
     with torch.inference_mode():
-        assert switch.apply_to(torch.zeros(1))
+        assert dispatch.apply_to(torch.zeros(1))
 
 
 def test_without_numba_all_is_done_by_pytorch(monkeypatch):
@@ -129,7 +129,7 @@ def test_without_numba_all_is_done_by_pytorch(monkeypatch):
         tracker.kernels = False
         _, expected = tracker.step(state, events, end_us)
         tracker.kernels = True
-        monkeypatch.setattr(switch, "numba_is_installed", lambda: False)
+        monkeypatch.setattr(dispatch, "numba_is_installed", lambda: False)
         _, found = tracker.step(state, events, end_us)
     assert_same(found, expected)
 
@@ -161,7 +161,7 @@ def test_a_neighbour_that_fails_changes_nothing():
 def test_a_stream_is_tracked_by_kernels(monkeypatch):
     """The loop over windows records no gradients."""
     asked = []
-    monkeypatch.setattr(fast_alignment, "applies", lambda config, values: bool(asked.append(switch.apply_to(values))))
+    monkeypatch.setattr(fast_alignment, "applies", lambda config, values: bool(asked.append(dispatch.apply_to(values))))
     trajectory, events = moving_box(pose(), 2)
     tracker = Tracker([box_model()], SMALL_CAMERA)
     assert len(list(track([events], tracker, tracker.init(trajectory.T_cam_obj[:1], 0)))) == 2
@@ -172,7 +172,7 @@ def test_a_stream_is_tracked_by_kernels(monkeypatch):
 @pytest.mark.parametrize("name", ["default", "paper", "line"])
 def test_what_is_compiled_is_compiled_before_the_first_window(name, streams, monkeypatch):
     asked = []
-    monkeypatch.setattr(switch, "numba_is_installed", lambda: not asked.append(name))
+    monkeypatch.setattr(dispatch, "numba_is_installed", lambda: not asked.append(name))
     tracker = tracker_class(name)([box_model()] * len(streams), [SMALL_CAMERA] * (max(streams) + 1), preset(name), streams)
     state = tracker.init(torch.stack([pose()] * len(streams)), 0)
     before = [tensor.clone() for tensor in tensors_of(state)]

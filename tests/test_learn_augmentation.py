@@ -6,10 +6,10 @@ from helpers import generator, random_events, random_pose
 from pydantic import ValidationError
 from tracked_boxes import tensors_of
 
-from torchtrack.events import EventBatch, check_events
+from torchtrack.core.events import EventBatch, check_events
+from torchtrack.core.lie import rotation_angle_deg, se3_exp
 from torchtrack.learn.augmentation import AugmentationConfig, add_noise, augmented, drop_events, flip_polarity, jitter_pose, stretch_time
 from torchtrack.learn.samples import Sample
-from torchtrack.lie import rotation_angle_deg, se3_exp
 
 SIZE = (64, 48)
 

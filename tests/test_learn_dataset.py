@@ -12,14 +12,14 @@ from tracked_boxes import assert_same
 
 from torchtrack import ObjectModel, Tracker, read_sequence
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
+from torchtrack.core.events import concatenate
+from torchtrack.core.lie import rotation_angle_deg, se3_exp
 from torchtrack.errors import EventDataError, MissingFileError
-from torchtrack.events import concatenate
 from torchtrack.io import Sequence, SequenceObject, Trajectory, open_events
 from torchtrack.io.convert import convert
 from torchtrack.learn.augmentation import AugmentationConfig
 from torchtrack.learn.dataset import ClipConfig, SequenceBatches, WindowDataset, WindowStream, opened
 from torchtrack.learn.samples import collate, start_state
-from torchtrack.lie import rotation_angle_deg, se3_exp
 
 # Workers are tested on small machines too, and forked: a fresh process would take seconds to import everything.
 pytestmark = [pytest.mark.filterwarnings("ignore:This DataLoader will create"), pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")]

@@ -8,7 +8,7 @@ from helpers import far_from, generator, random_pose, random_twist, rotation_vec
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck, gradgradcheck
 
-from torchtrack import lie
+from torchtrack.core import lie
 from torchtrack.errors import PoseError
 
 BATCHES = [(), (1,), (5,), (2, 3), (0,)]

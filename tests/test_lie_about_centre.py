@@ -7,7 +7,7 @@ import torch
 from helpers import far_from, generator, random_pose, random_twist, rotation_vectors
 from torch.autograd import gradcheck
 
-from torchtrack import lie
+from torchtrack.core import lie
 
 BATCHES = [(), (1,), (5,), (2, 3), (0,)]
 TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-13}

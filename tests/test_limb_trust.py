@@ -9,8 +9,8 @@ from tracked_boxes import follow, merged, moving_box, tensors_of, windows
 
 from torchtrack import Tracker, preset
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
-from torchtrack.events import concatenate
-from torchtrack.kernels.switch import kernels
+from torchtrack.core.dispatch import kernels
+from torchtrack.core.events import concatenate
 from torchtrack.trust import LimbTrust, TrustNetwork
 from torchtrack.trust_features import limb_features
 

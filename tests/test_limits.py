@@ -3,9 +3,9 @@ import pytest
 from torchtrack.cli import main
 from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
+from torchtrack.core.limits import Limits, check_limit, current_limits, limits
 from torchtrack.errors import LimitError
 from torchtrack.io import open_events, read_trajectory
-from torchtrack.limits import Limits, check_limit, current_limits, limits
 
 
 def test_what_is_too_large_is_refused_with_the_file_the_limit_and_the_setting():

@@ -11,8 +11,8 @@ from torchtrack.config.tracker import ContourConfig, MatchingConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contour_model import ContourKind, group_by_model
 from torchtrack.contours import Contours, mesh_contours, reproject
-from torchtrack.image_motion import MovingObjects, object_plane_velocity
-from torchtrack.lie import retract_about
+from torchtrack.core.image_velocity import MovingObjects, object_plane_velocity
+from torchtrack.core.lie import retract_about
 from torchtrack.matching import ContourTable, both_coordinates, concentration, match_along_flow, match_nearest, on_and_around, patch, patch_sums
 from torchtrack.observations import Observations
 

@@ -7,7 +7,7 @@ import torch
 from helpers import generator, pose
 
 from torchtrack.config.tracker import MotionConfig
-from torchtrack.lie import retract_about, se3_inverse, se3_log, transform_points
+from torchtrack.core.lie import retract_about, se3_inverse, se3_log, transform_points
 from torchtrack.motion import (
     expected_velocity,
     fade,

@@ -8,8 +8,8 @@ import torch
 import trimesh
 from PIL import Image
 
+from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import LimitError, ModelError, TorchtrackWarning
-from torchtrack.limits import Limits, limits
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.obj import image_name
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import LimitError, MissingFileError, ModelError, UnknownFormatError
-from torchtrack.limits import Limits, limits
 from torchtrack.object_model import ObjectModel
 
 SQUARE = [[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0], [0, 0, 0]]

@@ -11,9 +11,9 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
+from torchtrack.core.lie import transform_points
 from torchtrack.errors import ModelError, TorchtrackWarning
 from torchtrack.io import read_sequence
-from torchtrack.lie import transform_points
 from torchtrack.object_model import ModelSettings, ObjectModel
 from torchtrack.object_model.image_edges import image_edges
 from torchtrack.object_model.surface_points import SurfacePoints, thin_out

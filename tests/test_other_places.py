@@ -8,10 +8,10 @@ from helpers import SMALL_CAMERA, box_model, pose, pose_errors, random_pose
 from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, windows
 
 from torchtrack import Tracker
-from torchtrack.camera import project
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
-from torchtrack.lie import difference_about, retract_about, rotation_angle_deg, transform_points
+from torchtrack.core.camera import project
+from torchtrack.core.lie import difference_about, retract_about, rotation_angle_deg, transform_points
 from torchtrack.motion import Acceleration
 from torchtrack.object_model.symmetry import symmetry_planes
 from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchtrack.camera import Camera, distort
+from torchtrack.core.camera import Camera, distort
 from torchtrack.errors import MissingFileError, ModelError, UnknownFormatError
 from torchtrack.object_model import ObjectModel
 from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines

@@ -9,8 +9,8 @@ import pytest
 import torch
 import trimesh
 
-from torchtrack.camera import Camera, distort
 from torchtrack.contours import Contours
+from torchtrack.core.camera import Camera, distort
 from torchtrack.corners import Corners
 from torchtrack.errors import TorchtrackError
 from torchtrack.object_model import ObjectModel

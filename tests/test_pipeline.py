@@ -9,10 +9,10 @@ from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, drifting, edge_event
 
 import torchtrack
 from torchtrack import Tracker, preset
-from torchtrack.camera import Camera, distort
 from torchtrack.config.tracker import MotionConfig, TrackerConfig, WindowConfig
+from torchtrack.core.camera import Camera, distort
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch, concatenate
 from torchtrack.io import read_sequence
 from torchtrack.object_model import ObjectModel
 from torchtrack.quality import Status

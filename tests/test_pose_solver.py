@@ -8,10 +8,10 @@ from helpers import SMALL_CAMERA, generator, perturbed, pose_errors, random_pose
 from torch.autograd import gradcheck
 
 from torchtrack import pose_solver
-from torchtrack.camera import project
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.kernels import switch
-from torchtrack.lie import retract_about, se3_exp, small_difference_about, transform_points
+from torchtrack.core import dispatch
+from torchtrack.core.camera import project
+from torchtrack.core.lie import retract_about, se3_exp, small_difference_about, transform_points
 from torchtrack.pose_problem import PoseProblem
 from torchtrack.pose_solver import pose_jacobian, robust_cost, solve_pose, solve_positive
 from torchtrack.robust_loss import robust_loss, robust_weight
@@ -279,7 +279,7 @@ def before_the_last_step(problem, start, config):
             return Watched(**vars(super().moved(step)))
 
     # Kernels cannot be watched; tests/test_kernels_solver.py has that they go the same way.
-    with pytest.MonkeyPatch.context() as patch, switch.kernels(wanted=False):
+    with pytest.MonkeyPatch.context() as patch, dispatch.kernels(wanted=False):
         patch.setattr(pose_solver, "_Place", Watched)
         solve_pose(problem, start, config)
     return places[-1].pose(problem)

@@ -6,9 +6,9 @@ import pytest
 import torch
 from helpers import SMALL_CAMERA, generator, pose_errors, random_pose
 
-from torchtrack.camera import project
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.lie import retract_about, transform_points
+from torchtrack.core.camera import project
+from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.pose_problem import PoseProblem, WindowTerms
 from torchtrack.pose_solver import robust_cost, solve_pose
 

@@ -9,11 +9,11 @@ from helpers import SMALL_CAMERA, box_model, generator, pose
 from tracked_boxes import started
 
 from torchtrack.alignment import gate_widening
-from torchtrack.camera import project
 from torchtrack.config.tracker import ContourConfig, MatchingConfig, TrackerConfig
 from torchtrack.contour_model import group_by_model
-from torchtrack.image_motion import object_plane_velocity, pixel_velocity
-from torchtrack.lie import retract_about, transform_points
+from torchtrack.core.camera import project
+from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
+from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.prediction import Prediction
 

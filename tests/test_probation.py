@@ -10,7 +10,7 @@ from tracked_boxes import assert_same, started, tracker_of
 
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.events import EventBatch
+from torchtrack.core.events import EventBatch
 from torchtrack.probation import after_probation
 from torchtrack.quality import Status
 

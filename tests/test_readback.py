@@ -7,13 +7,14 @@ import torch
 from helpers import IMAGE_SIZE, box_model, contours_at, generator, random_events
 from tracked_boxes import SCENES, assert_same, follow, started
 
-from torchtrack import Tracker, readback, window_parts
+from torchtrack import Tracker, window_parts
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig, WindowConfig
-from torchtrack.constants import constant
 from torchtrack.contour_index import index_contours
+from torchtrack.core import host_sync
+from torchtrack.core.constants import constant
+from torchtrack.core.events import EventBatch, concatenate, pad_streams
 from torchtrack.corners import detect_corners
-from torchtrack.events import EventBatch, concatenate, pad_streams
 from torchtrack.time_surface import empty_last_event, object_regions, time_surface, update_last_event
 
 COUNT = 6
@@ -24,34 +25,34 @@ STEADY = TrackerConfig(search=SearchConfig(new_share=0))
 @pytest.fixture
 def nothing_is_read(monkeypatch):
     """From its call on, all is done as on a GPU, where values are not read."""
-    return lambda: monkeypatch.setattr(readback, "read_at_once", lambda values: False)
+    return lambda: monkeypatch.setattr(host_sync, "read_at_once", lambda values: False)
 
 
 # ---- answers and constants
 
 
 def test_an_answer_gives_the_values():
-    answer = readback.Answer.to(torch.tensor([7, 18]))
+    answer = host_sync.Answer.to(torch.tensor([7, 18]))
     assert answer.numbers() == [7, 18]
     assert answer.any()
-    assert not readback.Answer.to(torch.zeros(3, dtype=torch.bool)).any()
-    assert not readback.Answer.to(torch.zeros(0, dtype=torch.bool)).any()
+    assert not host_sync.Answer.to(torch.zeros(3, dtype=torch.bool)).any()
+    assert not host_sync.Answer.to(torch.zeros(0, dtype=torch.bool)).any()
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (4,), (2, 3)])
 def test_it_is_certain_that_none_is_true_where_none_is(shape, nothing_is_read):
     nothing = torch.zeros(shape, dtype=torch.bool)
-    assert readback.none_of(nothing)
+    assert host_sync.none_of(nothing)
     if nothing.numel():
         something = nothing.clone()
         something.view(-1)[-1] = True
-        assert not readback.none_of(something)
+        assert not host_sync.none_of(something)
     nothing_is_read()
-    assert not readback.none_of(nothing)
+    assert not host_sync.none_of(nothing)
 
 
 def test_an_answer_is_a_constant():
-    assert not readback.Answer.to(torch.ones(2, requires_grad=True)).on_device.requires_grad
+    assert not host_sync.Answer.to(torch.ones(2, requires_grad=True)).on_device.requires_grad
 
 
 def test_a_constant_is_made_once_for_each_type():

@@ -10,7 +10,7 @@ from tracked_boxes import follow, in_motion, moving_box, started, windows
 from torchtrack import Tracker
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.lie import retract_about
+from torchtrack.core.lie import retract_about
 from torchtrack.quality import Status
 from torchtrack.recovery import _least
 from torchtrack.relocation import LastSeen, anywhere, is_lost, looked_for_anew

@@ -9,8 +9,8 @@ from tracked_boxes import WIDE_CAMERA, merged, moving_box, windows
 
 from torchtrack import Tracker, preset
 from torchtrack.config.tracker import SmoothingConfig, TrackerConfig
-from torchtrack.events import EventWindow
-from torchtrack.lie import retract_about
+from torchtrack.core.lie import retract_about
+from torchtrack.core.windows import EventWindow
 from torchtrack.quality import Status
 from torchtrack.refined_steps import Refinement, refined_steps
 from torchtrack.retraced_steps import Retracer

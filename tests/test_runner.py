@@ -16,10 +16,10 @@ import torchtrack
 from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import WindowConfig
+from torchtrack.core.events import EventBatch
+from torchtrack.core.lie import rotation_angle_deg
 from torchtrack.errors import CalibrationError, ConfigError, EventDataError, MissingFileError, OutputError, PoseError, UnknownFormatError
-from torchtrack.events import EventBatch
 from torchtrack.io import line_file, read_sequence, read_tum
-from torchtrack.lie import rotation_angle_deg
 from torchtrack.runner import run, run_many, track
 from torchtrack.session import Session, open_session
 from torchtrack.stepping import clipped

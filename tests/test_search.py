@@ -11,9 +11,9 @@ from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, poses_of, st
 from torchtrack import Tracker
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.events import concatenate
-from torchtrack.kernels.switch import numba_is_installed
-from torchtrack.lie import retract_about
+from torchtrack.core.dispatch import numba_is_installed
+from torchtrack.core.events import concatenate
+from torchtrack.core.lie import retract_about
 from torchtrack.quality import Status
 from torchtrack.recovery import _least, _search_slipped, _stands, search_wanted
 from torchtrack.relocation import LastSeen

@@ -9,8 +9,8 @@ from helpers import SMALL_CAMERA, box_model, generator, pose, random_events
 from tracked_boxes import WINDOW_US, follow, merged, moving_box, tracker_of, windows
 
 from torchtrack import Tracker
-from torchtrack.camera import Camera, distort, undistortion_table
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
+from torchtrack.core.camera import Camera, distort, undistortion_table
 from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
 
 WIDE = Camera(240.0, 240.0, 320.0, 240.0, 640, 480)

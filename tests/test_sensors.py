@@ -5,9 +5,9 @@ import torch
 from helpers import SMALL_CAMERA, box_model, pose
 
 from torchtrack import Tracker
-from torchtrack.camera import Camera
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
-from torchtrack.events import EventBatch, pad_streams
+from torchtrack.core.camera import Camera
+from torchtrack.core.events import EventBatch, pad_streams
 from torchtrack.time_surface import empty_last_event, update_last_event
 
 BENT = Camera(180.0, 185.0, 70.0, 60.0, 160, 120, "plumb_bob", (-0.3, 0.1, 0.002, -0.001))

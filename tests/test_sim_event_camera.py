@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
+from torchtrack.core.events import concatenate
 from torchtrack.errors import EventDataError
-from torchtrack.events import concatenate
 from torchtrack.sim.event_camera import NEVER_US, EventCamera
 from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
 from torchtrack.errors import MissingExtraError
 from torchtrack.sim.background import BackgroundConfig
 from torchtrack.sim.meshes import make_mesh

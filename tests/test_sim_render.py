@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 import torchtrack.sim
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
 from torchtrack.errors import CalibrationError, ConfigError, MissingExtraError, ModelError, PoseError
 from torchtrack.sim.drawing import Region, merge_regions, sample_offsets
 from torchtrack.sim.meshes import SHAPES, make_mesh

@@ -6,11 +6,11 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from torchtrack.camera import project
 from torchtrack.config.load import load, read_yaml
+from torchtrack.core.camera import project
+from torchtrack.core.lie import transform_points
 from torchtrack.errors import ConfigError, EventDataError, MissingFileError, ModelError, UnknownFormatError
 from torchtrack.io.sequence import read_sequence
-from torchtrack.lie import transform_points
 from torchtrack.sim import BackgroundConfig, CameraConfig, MotionConfig, ObjectConfig, SceneConfig, simulate, write
 from torchtrack.sim.meshes import make_mesh
 from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig

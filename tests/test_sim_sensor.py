@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchtrack.events import concatenate
+from torchtrack.core.events import concatenate
 from torchtrack.sim.event_camera import EventCamera
 from torchtrack.sim.photoreceptor import cutoff_hz, response
 from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig

@@ -5,9 +5,9 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
+from torchtrack.core.lie import check_pose, rotation_angle_deg, se3_exp, so3_log
 from torchtrack.io.trajectory import Trajectory, write_tum
-from torchtrack.lie import check_pose, rotation_angle_deg, se3_exp, so3_log
 from torchtrack.sim.frames import frame_motion, frame_times
 from torchtrack.sim.meshes import make_mesh
 from torchtrack.sim.trajectory import KeyPose, MotionConfig, SinusoidMotion, ground_truth, make_motion, pose_matrix, velocity

@@ -5,11 +5,11 @@ import pytest
 import torch
 import trimesh
 
-from torchtrack.camera import distort
-from torchtrack.events import concatenate
+from torchtrack.core.camera import distort
+from torchtrack.core.events import concatenate
+from torchtrack.core.lie import se3_exp
 from torchtrack.io.container import read_source
 from torchtrack.io.sequence import read_sequence
-from torchtrack.lie import se3_exp
 from torchtrack.sim import BackgroundConfig, CameraConfig, MotionConfig, ObjectConfig, SceneConfig, simulate, write
 from torchtrack.sim.scenes import LightConfig
 from torchtrack.sim.simulation import BACKGROUND, NOISE, render_frames

@@ -5,9 +5,9 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from torchtrack.camera import project
+from torchtrack.core.camera import project
+from torchtrack.core.lie import se3_inverse, transform_points
 from torchtrack.errors import ConfigError
-from torchtrack.lie import se3_inverse, transform_points
 from torchtrack.sim import BackgroundConfig, CameraConfig, MotionConfig, ObjectConfig, SceneConfig
 from torchtrack.sim.scenes import LightConfig
 from torchtrack.sim.trajectory import CameraMotionConfig

@@ -11,16 +11,16 @@ from tiny_sequence import CAMERA, write_tiny_sequence
 from tracked_boxes import moving_box
 
 from torchtrack import Tracker, preset
-from torchtrack.camera import project
 from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import SmoothingConfig, TrackerConfig
+from torchtrack.core.camera import project
+from torchtrack.core.events import EventBatch
+from torchtrack.core.lie import rotation_angle_deg
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch
 from torchtrack.io import read_tum
 from torchtrack.io.columns import Columns
 from torchtrack.io.live import LiveSource
-from torchtrack.lie import rotation_angle_deg
 from torchtrack.runner import run, track
 from torchtrack.session import open_session
 from torchtrack.smoothed_steps import SmoothedObjects, Smoother

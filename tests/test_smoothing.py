@@ -7,7 +7,7 @@ import torch
 from helpers import far_from, generator, random_pose
 
 from torchtrack.config.tracker import MotionConfig
-from torchtrack.lie import difference_about, retract_about
+from torchtrack.core.lie import difference_about, retract_about
 from torchtrack.motion import acceleration_sigma, initial_covariance, predict_covariance
 from torchtrack.smoothing import Filtered, smoothed
 

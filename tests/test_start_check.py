@@ -5,9 +5,9 @@ import pytest
 import torch
 import trimesh
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
+from torchtrack.core.lie import se3_exp
 from torchtrack.errors import PoseError, TorchtrackWarning
-from torchtrack.lie import se3_exp
 from torchtrack.object_model import ObjectModel
 from torchtrack.start_check import check_in_view
 from torchtrack.tracker import Tracker

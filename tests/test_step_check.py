@@ -8,8 +8,8 @@ from helpers import SMALL_CAMERA, box_model, pose, random_events
 from tracked_boxes import tensors_of
 
 from torchtrack import Tracker
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch, concatenate
 from torchtrack.step_check import check_step
 
 

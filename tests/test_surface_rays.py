@@ -5,10 +5,10 @@ import torch
 import trimesh
 from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, generator, pose, random_pose
 
-from torchtrack.camera import project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import group_by_model
-from torchtrack.lie import se3_inverse, transform_points
+from torchtrack.core.camera import project
+from torchtrack.core.lie import se3_inverse, transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.surface_rays import rays_of, surface_points
 

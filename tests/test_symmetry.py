@@ -5,9 +5,9 @@ import torch
 import trimesh
 from helpers import random_pose
 
+from torchtrack.core.lie import se3_exp, so3_exp
 from torchtrack.eval.metrics import pose_errors
 from torchtrack.io import Trajectory
-from torchtrack.lie import se3_exp, so3_exp
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axes, revolution_axis, symmetry_planes, turning_axis
 from torchtrack.sim.curved import vase

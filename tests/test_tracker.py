@@ -19,7 +19,6 @@ from tracked_boxes import (
 )
 
 from torchtrack import Tracker, preset
-from torchtrack.camera import project
 from torchtrack.config.search import QualityConfig, SearchConfig
 from torchtrack.config.tracker import (
     CornerConfig,
@@ -27,9 +26,10 @@ from torchtrack.config.tracker import (
     MotionConfig,
     TrackerConfig,
 )
+from torchtrack.core.camera import project
+from torchtrack.core.events import EventBatch
+from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.errors import ModelError, PoseError
-from torchtrack.events import EventBatch
-from torchtrack.lie import retract_about, transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.quality import Status
 from torchtrack.time_surface import NEVER_US

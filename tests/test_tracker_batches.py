@@ -18,7 +18,7 @@ from tracked_boxes import (
 )
 
 from torchtrack import Tracker
-from torchtrack.events import concatenate
+from torchtrack.core.events import concatenate
 from torchtrack.quality import Status
 
 

@@ -12,8 +12,8 @@ from tracked_boxes import WINDOW_US, follow, moving_box, started, tracker_of, wi
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import MotionConfig, SolverConfig, TrackerConfig
-from torchtrack.events import EventBatch
-from torchtrack.lie import difference_about, retract_about, transform_points
+from torchtrack.core.events import EventBatch
+from torchtrack.core.lie import difference_about, retract_about, transform_points
 from torchtrack.motion import initial_covariance, left_covariance
 from torchtrack.object_model import ObjectModel
 from torchtrack.quality import Status

@@ -12,10 +12,10 @@ from torch.utils.data import DataLoader, Dataset
 from tracked_boxes import assert_same, moving_box, started, windows
 
 from torchtrack import Status, Tracker, TrackerConfig
-from torchtrack.camera import project
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import MatchingConfig, SolverConfig
-from torchtrack.lie import cayley, se3_exp, se3_log, transform_points
+from torchtrack.core.camera import project
+from torchtrack.core.lie import cayley, se3_exp, se3_log, transform_points
 from torchtrack.robust_loss import robust_loss
 
 # One round that converges: its problem is that of the whole window.

@@ -9,7 +9,7 @@ from tracked_boxes import assert_same, follow, moving_box, poses_of, started, wi
 
 from torchtrack import Tracker, window_parts
 from torchtrack.config.tracker import TrackerConfig, WindowConfig
-from torchtrack.events import concatenate
+from torchtrack.core.events import concatenate
 from torchtrack.state import choose_rows
 
 FAST = {"move": (2.0, 1.0, 0.1), "turn": (1.5, -1.0, 2.0)}

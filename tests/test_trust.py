@@ -9,10 +9,10 @@ from torch import nn
 from tracked_boxes import assert_same, merged, moving_box, started, windows
 
 from torchtrack import EventBatch, Tracker, preset
+from torchtrack.core.lie import se3_inverse, se3_log
 from torchtrack.errors import UnknownFormatError
 from torchtrack.learn.labels import true_distance
 from torchtrack.learn.samples import state_velocity
-from torchtrack.lie import se3_inverse, se3_log
 from torchtrack.trust import TrustNetwork
 from torchtrack.trust_features import FEATURES, trust_features
 

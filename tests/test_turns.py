@@ -13,8 +13,8 @@ from tracked_boxes import WINDOW_US, follow, tensors_of, windows
 from torchtrack import Camera, EventBatch, ObjectModel, Tracker
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.events import concatenate
-from torchtrack.lie import rotation_angle_deg, so3_exp, transform_points
+from torchtrack.core.events import concatenate
+from torchtrack.core.lie import rotation_angle_deg, so3_exp, transform_points
 from torchtrack.prediction import Prediction
 from torchtrack.quality import Status
 from torchtrack.turns import TurningAxes, _peaks, may_have_turned

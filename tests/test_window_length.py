@@ -11,8 +11,8 @@ from tiny_sequence import write_tiny_sequence
 from torchtrack import Tracker
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import WindowConfig
-from torchtrack.events import EventBatch
-from torchtrack.lie import se3_exp
+from torchtrack.core.events import EventBatch
+from torchtrack.core.lie import se3_exp
 from torchtrack.quality import Status
 from torchtrack.runner import track
 from torchtrack.session import open_session

@@ -3,8 +3,8 @@
 import pytest
 import yaml
 
-from torchtrack.limits import Limits
-from torchtrack.yaml_text import load_document, load_documents
+from torchtrack.core.limits import Limits
+from torchtrack.core.yaml_text import load_document, load_documents
 
 MULTIPLYING = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 9))
 MERGING = "a0: &a0 {k: 1}\n" + "".join(f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 10)}]}}\n" for n in range(1, 9))

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 import trimesh
 
-from torchtrack.camera import Camera, project
+from torchtrack.core.camera import Camera, project
+from torchtrack.core.lie import se3_exp, so3_exp, transform_points
 from torchtrack.io import Trajectory, write_sequence
-from torchtrack.lie import se3_exp, so3_exp, transform_points
 
 CAMERA = Camera(fx=150.0, fy=150.0, cx=59.5, cy=44.5, width=120, height=90)
 

@@ -8,14 +8,14 @@ from helpers import SMALL_CAMERA, box_model, drifting, edge_events, pose
 
 from torchtrack import Tracker
 from torchtrack.alignment import align, gate_widening, index_for
-from torchtrack.camera import Camera
 from torchtrack.config.tracker import (
     MatchingConfig,
     MotionConfig,
     TrackerConfig,
 )
-from torchtrack.events import concatenate, pad_streams
-from torchtrack.lie import retract_about
+from torchtrack.core.camera import Camera
+from torchtrack.core.events import concatenate, pad_streams
+from torchtrack.core.lie import retract_about
 from torchtrack.observations import select_events
 from torchtrack.search import judge_fit
 

@@ -2,7 +2,7 @@
 
 The pipeline, one file per stage, in data-flow order::
 
-    events         a window of events                         torchtrack.events
+    events         a window of events                         torchtrack.core.events
     time surface   decayed image of last event times          torchtrack.time_surface
     corners        guided filter, Harris, snapped to events   torchtrack.corners
     flow           robust event flow of each corner           torchtrack.flow
@@ -35,10 +35,10 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from torchtrack import errors as errors
-    from torchtrack.camera import Camera as Camera
     from torchtrack.config.presets import preset as preset
     from torchtrack.config.tracker import TrackerConfig as TrackerConfig
-    from torchtrack.events import EventBatch as EventBatch
+    from torchtrack.core.camera import Camera as Camera
+    from torchtrack.core.events import EventBatch as EventBatch
     from torchtrack.io import Trajectory as Trajectory
     from torchtrack.io import open_events as open_events
     from torchtrack.io import read_sequence as read_sequence

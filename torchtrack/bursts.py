@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchtrack.constants import constant
-from torchtrack.events import PaddedEvents
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch
+from torchtrack.core.constants import constant
+from torchtrack.core.events import PaddedEvents
 from torchtrack.kernels.arrays import as_arrays
 
 # Ages (µs) are kept in 16 bits; it does not matter by how much longer ago a burst began.
@@ -45,7 +45,7 @@ def update_bursts(
     Of padding, the second result says nothing.
     """
     # Of longer windows, ages do not tell what began in them.
-    if switch.apply_to(burst_age_us) and bool((elapsed_us < LONG_AGO_US).all()):
+    if dispatch.apply_to(burst_age_us) and bool((elapsed_us < LONG_AGO_US).all()):
         return _update_by_kernel(burst_age_us, elapsed_us, events, longest_us)
     _, _, height, width = burst_age_us.shape
     ages = aged(burst_age_us, elapsed_us)

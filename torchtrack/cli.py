@@ -16,10 +16,10 @@ from torchtrack.cli_io import Bench, Convert, Info, refuse_settings
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load, typed
 from torchtrack.config.settings import CommandLineText
+from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import ConfigError, TorchtrackError
 from torchtrack.exit_codes import ExitCode
 from torchtrack.interrupt import ended_in_good_order
-from torchtrack.limits import Limits, limits
 from torchtrack.standard_streams import flushed, report, take_any_text
 
 

@@ -15,6 +15,7 @@ from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load, read_yaml
 from torchtrack.config.run import RunConfig
 from torchtrack.config.settings import CommandLineText, Settings
+from torchtrack.core.files import naming
 from torchtrack.errors import ConfigError
 from torchtrack.eval.evaluate import evaluate as evaluate_all
 from torchtrack.eval.evaluate import plan, report_of
@@ -24,7 +25,6 @@ from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table, run_headline, run_table
 from torchtrack.executor import TaskFailure
 from torchtrack.exit_codes import ExitCode
-from torchtrack.files import naming
 from torchtrack.io import read_calibration
 from torchtrack.io.atomic import check_other_file
 from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines

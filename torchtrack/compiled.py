@@ -2,7 +2,7 @@
 
 What a step of one object costs is the calls of operations, not what they compute. On a GPU, the part of it in which nothing
 has to be decided is recorded once, and then started as a whole (:mod:`torchtrack.cuda_graphs`). ``torch.compile`` turns it into
-fewer and larger kernels, there and on a CPU. Shapes are those of a GPU (:mod:`torchtrack.readback`), and the number of events
+fewer and larger kernels, there and on a CPU. Shapes are those of a GPU (:mod:`torchtrack.core.host_sync`), and the number of events
 is left open.
 
 Where a window turns out not to be steady, as an object is to be searched for, or is very uncertain, what the graph gave is
@@ -24,13 +24,12 @@ from jaxtyping import Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchtrack import readback
 from torchtrack.bursts import update_bursts
-from torchtrack.constants import cells_within
+from torchtrack.core import dispatch, host_sync
+from torchtrack.core.constants import cells_within
+from torchtrack.core.events import EventBatch, check_on_sensor, pad_streams
 from torchtrack.cuda_graphs import CudaGraphs
 from torchtrack.errors import ConfigError
-from torchtrack.events import EventBatch, check_on_sensor, pad_streams
-from torchtrack.kernels import switch
 from torchtrack.online_learning import due_lessons
 from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.state import S, StepResult, TrackerState, each_tensor
@@ -76,16 +75,16 @@ class CompiledStep:
             return None
         starts = state.learned is not None and state.learned.windows < _FIRST_WINDOWS
         lessons = due_lessons(state, self._tracker.on_surfaces, self._tracker.config)
-        if starts or (lessons is not None and not readback.on_gpu(t_us)):
+        if starts or (lessons is not None and not host_sync.on_gpu(t_us)):
             return None
         with torch.inference_mode():
             # CUDA graphs copy whatever they are given.
-            plain = state if readback.on_gpu(t_us) else each_tensor(_plain, state)
+            plain = state if host_sync.on_gpu(t_us) else each_tensor(_plain, state)
             nearby = self._near(plain, events, t_us) if len(events) > _MANY else NearbyEvents(events)
             if len(nearby.events) < 2:
                 return None
             next_state, result, wrong = self._taken(self._tracker.opened(plain, events), nearby, t_us, lessons)
-            is_wrong = readback.Answer.to(wrong[None])
+            is_wrong = host_sync.Answer.to(wrong[None])
         return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -94,7 +93,7 @@ class CompiledStep:
 
     def _are_for(self, t_us: Tensor) -> bool:
         """Whether there are graphs for windows of that device. A weigher of one's own may do what cannot be recorded: they have to be asked for."""
-        return self._compiles or (readback.on_gpu(t_us) and not self._tracker.shows_all)
+        return self._compiles or (host_sync.on_gpu(t_us) and not self._tracker.shows_all)
 
     def __len__(self) -> int:
         """How many graphs there are."""
@@ -211,7 +210,7 @@ def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
     if nearby.number is not None:
         return NearbyEvents(filled, pad(nearby.number, (0, missing)))
     # Where some may be left out another time, all are numbered. Of several streams none are, nor on a GPU.
-    return NearbyEvents(filled, torch.arange(len(filled)) if streams == 1 and not readback.on_gpu(x) else None)
+    return NearbyEvents(filled, torch.arange(len(filled)) if streams == 1 and not host_sync.on_gpu(x) else None)
 
 
 def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest_us: int) -> tuple[TrackerState, NearbyEvents]:
@@ -220,7 +219,7 @@ def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest
     Not in the graph: where 16 bits are enough, a CPU's compiler takes one pixel at a time.
     """
     streams, most = len(t_us), filled.events.most_of_one
-    if switch.apply_to(t_us):
+    if dispatch.apply_to(t_us):
         # Unlike PyTorch's operations, kernels do not look where they read and write.
         height, width = opened.burst_age_us.shape[-2:]
         check_on_sensor(filled.events, width, height)

@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import lie, quality, readback
+from torchtrack import quality
 from torchtrack.alignment import ANYWHERE, Fit, may_be_anywhere
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours, reproject
+from torchtrack.core import dispatch, host_sync, lie
 from torchtrack.corners import Corners
 from torchtrack.doubt import SMEARED, in_doubt
-from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import ConclusionSettings
 from torchtrack.matching import ON_CONTOUR_PX
@@ -48,7 +48,7 @@ def conclude(
         dt_s: length of the window.
     """
     expected = prediction.acceleration
-    if config.solver.prior and expected is not None and switch.apply_to(dt_s):
+    if config.solver.prior and expected is not None and dispatch.apply_to(dt_s):
         after, covariance, status = _judged_by_kernel(state, prediction, expected, widening, found, dt_s, config)
     else:
         after, covariance, status = _judged(state, prediction, widening, found, dt_s, config)
@@ -60,7 +60,7 @@ def conclude(
 
 def _where_they_are(fit: Fit, T_cam_obj: Float[Tensor, "b 4 4"], failed: Bool[Tensor, "b"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
     """The contours of a fit, of objects that ``failed`` at the poses that they go on from instead."""
-    if readback.none_of(failed):
+    if host_sync.none_of(failed):
         return fit.contours
     fitted = fit.solution.T_cam_obj
     return reproject(fit.contours, torch.where(failed[:, None, None], T_cam_obj.to(fitted.dtype), fitted), intrinsics)

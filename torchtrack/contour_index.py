@@ -14,10 +14,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import readback
-from torchtrack.constants import constant, disc
 from torchtrack.contours import Contours, take_points
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch, host_sync
+from torchtrack.core.constants import constant, disc
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import Cells, IndexSettings
 
@@ -51,7 +50,7 @@ class ContourIndex:
     cell_px: int
     nearest: Int[Tensor, "b p"]
     pixels: Float[Tensor, "b m 2"]
-    radius_px: readback.Answer
+    radius_px: host_sync.Answer
 
     @property
     def cells(self) -> Cells:
@@ -69,7 +68,7 @@ class ContourIndex:
         # Whole cells first: rounded the same way wherever the region begins.
         column, row = pixels.add(0.5 * self.cell_px + _OFF_BORDER_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
         nearest = self.nearest.gather(1, self._flat(column.clamp(0, columns - 1), row.clamp(0, rows - 1))).long()
-        if finely is None or readback.none_of(finely):
+        if finely is None or host_sync.none_of(finely):
             return nearest
         return torch.where(finely[:, None], self._nearest_of_four(pixels), nearest)
 
@@ -105,7 +104,7 @@ class ContourIndex:
 
 
 def index_contours(
-    contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"] | readback.Answer, cell_px: int
+    contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"] | host_sync.Answer, cell_px: int
 ) -> ContourIndex:
     """Index the visible contour points; those far outside the image (height, width) are left out.
 
@@ -117,7 +116,7 @@ def index_contours(
     """
     batch, count, _ = contours.pixels.shape
     answer = _radii(radius_px, contours)
-    if switch.apply_to(contours.pixels):
+    if dispatch.apply_to(contours.pixels):
         return _by_kernel(contours, image_size, answer, cell_px)
     radius, radii_px = answer.on_device, answer.numbers()
     middle = constant((0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)), contours.pixels.dtype, contours.pixels.device)
@@ -127,7 +126,7 @@ def index_contours(
     low = _first_cells(centre, inside, margin)
     local = torch.where(inside[..., None], centre - low[:, None], margin)
     rows, columns = _size(local, image_size, margin, cell_px)
-    if not readback.read_at_once(local):
+    if not host_sync.read_at_once(local):
         # Those that are not inside write, too: not all of them to one cell, where each would wait for the others.
         spread = torch.arange(count, device=local.device) % (columns - 2 * margin) + margin
         local[..., 0] = torch.where(inside, local[..., 0], spread.to(local.dtype))
@@ -139,7 +138,7 @@ def index_contours(
     for reach_px, row, point in _points_by_radius(inside, radius, radii_px):
         # Object by object as far as each needs: one that is looked for far away does not make the others pay.
         u, v = local[row, point].long().unbind(1)
-        cell, at_once = (row * rows + v) * columns + u, _CHUNK if readback.read_at_once(row) else len(row)
+        cell, at_once = (row * rows + v) * columns + u, _CHUNK if host_sync.read_at_once(row) else len(row)
         parts = zip(cell.split(at_once), to_centre[row, point].split(at_once), point.to(dtype).split(at_once), strict=True)
         for of_part in parts:
             _write(keys, of_part, reach_px, cell_px, columns, count)
@@ -148,7 +147,7 @@ def index_contours(
     return ContourIndex(low, (rows, columns), cell_px, nearest, contours.pixels, answer)
 
 
-def _by_kernel(contours: Contours, image_size: tuple[int, int], answer: readback.Answer, cell_px: int) -> ContourIndex:
+def _by_kernel(contours: Contours, image_size: tuple[int, int], answer: host_sync.Answer, cell_px: int) -> ContourIndex:
     """:func:`index_contours`, point by point."""
     # Not at the top: Numba is an extra.
     from torchtrack.kernels import index as kernels
@@ -165,16 +164,16 @@ def _by_kernel(contours: Contours, image_size: tuple[int, int], answer: readback
     return ContourIndex(first, (rows, columns), cell_px, nearest, contours.pixels, answer)
 
 
-def _radii(radius_px: int | Tensor | readback.Answer, contours: Contours) -> readback.Answer:
+def _radii(radius_px: int | Tensor | host_sync.Answer, contours: Contours) -> host_sync.Answer:
     """The radius of each object."""
     if isinstance(radius_px, int):
-        return readback.Answer.of(radius_px, contours.mask[:, 0].long())
-    return radius_px if isinstance(radius_px, readback.Answer) else readback.Answer.to(radius_px)
+        return host_sync.Answer.of(radius_px, contours.mask[:, 0].long())
+    return radius_px if isinstance(radius_px, host_sync.Answer) else host_sync.Answer.to(radius_px)
 
 
 def _first_cells(centre: Float[Tensor, "b m 2"], inside: Bool[Tensor, "b m"], margin: int) -> Float[Tensor, "b 2"]:
     """First cell (column, row) of each object's region, ``margin`` cells before its points."""
-    if readback.read_at_once(centre):
+    if host_sync.read_at_once(centre):
         return torch.where(inside[..., None], centre, torch.inf).amin(1).clamp(max=_FAR_CELLS) - margin
     # What is farther from the image than its radius, less than a margin, is not inside.
     return constant((1 - 2 * margin,) * 2, centre.dtype, centre.device).expand(len(centre), 2)
@@ -182,7 +181,7 @@ def _first_cells(centre: Float[Tensor, "b m 2"], inside: Bool[Tensor, "b m"], ma
 
 def _size(local: Float[Tensor, "b m 2"], image_size: tuple[int, int], margin: int, cell_px: int) -> tuple[int, int]:
     """Rows and columns that hold the cells of all objects' points, with a margin."""
-    if readback.read_at_once(local):
+    if host_sync.read_at_once(local):
         columns, rows = local.amax((0, 1)).tolist()
         return int(rows) + margin + 1, int(columns) + margin + 1
     rows, columns = (ceil((side - 1) / cell_px) + 4 * margin - 1 for side in image_size)
@@ -191,7 +190,7 @@ def _size(local: Float[Tensor, "b m 2"], image_size: tuple[int, int], margin: in
 
 def _points_by_radius(inside: Tensor, radius: Tensor, radii_px: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
     """For each radius, the objects and numbers of the points that are to be found within it; on a GPU, also of those that are not inside."""
-    if readback.read_at_once(inside):
+    if host_sync.read_at_once(inside):
         for reach_px in sorted(set(radii_px)):
             row, point = (inside & (radius == reach_px)[:, None]).nonzero().unbind(1)
             if len(row):
@@ -227,7 +226,7 @@ def _reach(radius_px: int, cell_px: int) -> int:
 
 def _squared_distances(to_centre: Float[Tensor, "p 2"], offsets: Float[Tensor, "d 2"]) -> Float[Tensor, "p d"]:
     """``|c + o|²`` of every ``c`` and every offset ``o``: on a CPU as one matrix product."""
-    if readback.on_gpu(to_centre):
+    if host_sync.on_gpu(to_centre):
         # Which a compiler makes a part of what is done with them.
         x, y = (to_centre[:, None] + offsets).unbind(-1)
         return torch.addcmul(x * x, y, y)

@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import fast_contours, readback
-from torchtrack.camera import MIN_DEPTH_M, project
+from torchtrack import fast_contours
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourKind, ContourModel
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch, host_sync
+from torchtrack.core.camera import MIN_DEPTH_M, project
+from torchtrack.core.lie import affine, transform_points
 from torchtrack.kernels.settings import SamplingSettings
-from torchtrack.lie import affine, transform_points
 
 # Of a model with no more edges than this, all are looked at.
 _FEW_EDGES = 512
@@ -84,7 +84,7 @@ def select_ranked(mask: Bool[Tensor, "b n"], count: int) -> tuple[Int[Tensor, "b
 def take_points(values: Float[Tensor, "b n k"], index: Int[Tensor, "b m"]) -> Float[Tensor, "b m k"]:
     """``values[b, index[b, m]]``.
 
-    In memory the coordinates are rows, before and after, as :func:`torchtrack.lie.transform_points` leaves them.
+    In memory the coordinates are rows, before and after, as :func:`torchtrack.core.lie.transform_points` leaves them.
     """
     return values.transpose(1, 2).gather(2, index[:, None].expand(-1, values.shape[2], -1)).transpose(1, 2)
 
@@ -109,7 +109,7 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     cumulative = lengths.cumsum(-1)
     total = cumulative[:, -1:]
     counts = (total / config.spacing_px).ceil().nan_to_num(0.0).clamp(max=config.max_edge_points)
-    count = max(int(counts.amax()), 1) if readback.read_at_once(counts) else config.max_edge_points
+    count = max(int(counts.amax()), 1) if host_sync.read_at_once(counts) else config.max_edge_points
     number = torch.arange(count, device=lengths.device, dtype=lengths.dtype)
     target = (number + 0.5) / counts.clamp(min=1) * total
     edge = torch.searchsorted(cumulative, target).clamp(max=lengths.shape[1] - 1)[:, None]
@@ -129,7 +129,7 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
 def _places_for(active: Bool[Tensor, "b e"]) -> int:
     """Places for the active edges of each object: of many edges, few are. On a GPU, which would have to be waited for, as many as there may be."""
     edges = active.shape[1]
-    if edges <= _FEW_EDGES or not readback.read_at_once(active):
+    if edges <= _FEW_EDGES or not host_sync.read_at_once(active):
         return min(edges, _MAX_ACTIVE_EDGES)
     return min(max(int(active.sum(1).amax()), 1), _MAX_ACTIVE_EDGES)
 
@@ -160,7 +160,7 @@ def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, 
     if shown is not None:
         facing = facing & shown[:, model.texture_element]
     # On a GPU, which would have to be waited for to know how many there are, there are places for as many as there can be.
-    count = int(facing.sum(1).amax()) if readback.read_at_once(facing) else model.most_texture_facing
+    count = int(facing.sum(1).amax()) if host_sync.read_at_once(facing) else model.most_texture_facing
     chosen, mask = select_ranked(facing, count)
     points, tangents = (values.T[:, chosen].permute(1, 2, 0) for values in (model.texture_points, model.texture_tangents))
     made = points, tangents, torch.full_like(chosen, int(ContourKind.TEXTURE)), mask
@@ -202,7 +202,7 @@ def image_normals(
 
 def reproject(contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
     """The same contour points seen from a pose nearby: normals are kept, which turn far less than points move."""
-    if switch.apply_to(T_cam_obj):
+    if dispatch.apply_to(T_cam_obj):
         points_cam, pixels = fast_contours.projected(contours.points_obj, T_cam_obj, intrinsics)
     else:
         points_cam = transform_points(T_cam_obj, contours.points_obj)
@@ -245,7 +245,7 @@ def mesh_elements(
 
 def _mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
     """Contour points of all objects, in places of their own, before hidden parts are removed."""
-    if shown is None and switch.apply_to(T_cam_obj):
+    if shown is None and dispatch.apply_to(T_cam_obj):
         return fast_contours.mesh_points(models, T_cam_obj, intrinsics, sampling_settings(config))
     if len(models) == 1:
         return _model_contours(models[0], T_cam_obj, intrinsics, config, shown)
@@ -287,7 +287,7 @@ def assemble(
     intrinsics: Float[Tensor, "b 4"],
 ) -> Contours:
     """Contours from points in the object's frame; those behind the camera or without a normal are masked."""
-    if switch.apply_to(points_obj):
+    if dispatch.apply_to(points_obj):
         shown, *seen = fast_contours.shown(points_obj, tangents_obj, mask, T_cam_obj, intrinsics, sampling_settings())
         return Contours(points_obj, tangents_obj, kind, shown, *seen)
     points_cam = transform_points(T_cam_obj, points_obj)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig
-from torchtrack.constants import constant
+from torchtrack.core.constants import constant
 from torchtrack.filters import corner_response
 from torchtrack.time_surface import Regions, at_pixels
 

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.constants import constant
+from torchtrack.core.constants import constant
+from torchtrack.core.host_sync import none_of
 from torchtrack.motion import rim_and_centre
 from torchtrack.prediction import Prediction
-from torchtrack.readback import none_of
 
 # An object is not looked for farther away than it can have drifted in this time (s), nor turned farther than in this.
 _LONGEST_S, _LONGEST_TURN_S = 0.4, 1.0

@@ -53,7 +53,7 @@ class PoseError(TorchtrackError, ValueError):
 
 
 class LimitError(TorchtrackError, ValueError):
-    """A file that asks for more than a stated limit; see :mod:`torchtrack.limits`."""
+    """A file that asks for more than a stated limit; see :mod:`torchtrack.core.limits`."""
 
 
 class OutputError(TorchtrackError, OSError):

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchtrack.constants import constant
+from torchtrack.core.constants import constant
 
 # Pixels around the image that events and contours may lie in.
 BORDER_PX = 2

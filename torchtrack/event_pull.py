@@ -11,10 +11,10 @@ from torch import Tensor
 
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.contours import Contours, reproject
+from torchtrack.core import dispatch
+from torchtrack.core.lie import difference_about
 from torchtrack.event_image import BORDER_PX, look_up
-from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.lie import difference_about
 from torchtrack.motion import inverse
 from torchtrack.pose_problem import PoseProblem
 from torchtrack.pose_solver import solve_pose
@@ -58,7 +58,7 @@ def pulled(
 
 def found(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
     """Where each contour point finds most events along its normal, rather near by, and how much that counts."""
-    if switch.apply_to(image):
+    if dispatch.apply_to(image):
         return _found_by_kernel(outlines, image, reach_px)
     steps_px = torch.linspace(-reach_px, reach_px, _LOOKS, dtype=image.dtype, device=image.device)
     looked_at = outlines.pixels[:, :, None] + steps_px[:, None] * outlines.normals[:, :, None]

@@ -5,8 +5,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.constants import constant
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch
+from torchtrack.core.constants import constant
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import MatchingSettings, RoundSettings
 from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SLOW_PX_S, SMEAR_PX, ContourTable, Matches
@@ -21,7 +21,7 @@ def applies(config: TrackerConfig, values: Tensor) -> bool:
     matching, solver = config.matching, config.solver
     usual = solver.prior and solver.iterations == 1 and solver.loss == "tukey" and not any(config.contours.refresh_rounds)
     nearest = not matching.along_flow and matching.residual == "normal" and not matching.mutual_px
-    return usual and nearest and switch.apply_to(values)
+    return usual and nearest and dispatch.apply_to(values)
 
 
 def align_rounds(

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import FlowConfig
-from torchtrack.constants import disc
+from torchtrack.core.constants import disc
 from torchtrack.corners import Corners
 from torchtrack.time_surface import at_pixels
 

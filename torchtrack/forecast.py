@@ -4,10 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack import lie
-from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch, lie
+from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import ForecastSettings
 from torchtrack.motion import (
@@ -43,7 +42,7 @@ def forecast(
         far_pose: poses in the place of those that are not usable.
     """
     axes_obj = axes_obj if config.motion.spin_fades else None
-    if switch.apply_to(dt_s):
+    if dispatch.apply_to(dt_s):
         return _by_kernel(state, dt_s, objects, axes_obj, far_pose, config)
     motion, covariance = config.motion, state.covariance
     velocity = expected_velocity(state.velocity, dt_s, motion)

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 from torchtrack.config.haste import in_haste
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.events import EventWindow
+from torchtrack.core.windows import EventWindow
 from torchtrack.io.keep_up import HastyWindow
 from torchtrack.quality import Status
 from torchtrack.state import StepResult

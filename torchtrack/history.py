@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from torchtrack.constants import constant
+from torchtrack.core.constants import constant
 from torchtrack.time_surface import at_pixels, by_number
 
 # Pixels this far outside the image still find their place on a distorted sensor (px).

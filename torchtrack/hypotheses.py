@@ -14,12 +14,12 @@ from torch.nn.functional import avg_pool2d, pad
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours, assemble, sampling_settings
+from torchtrack.core import dispatch
+from torchtrack.core.lie import difference_about
 from torchtrack.event_image import BORDER_PX, event_density, look_up
 from torchtrack.event_pull import FAR_PX, NEAR_PX, pulled
 from torchtrack.image_shifts import shifted
-from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.lie import difference_about
 from torchtrack.prediction import Prediction
 from torchtrack.views import outlines_at, thinned
 
@@ -112,7 +112,7 @@ def mark(outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Floa
         image: how many events there are at every pixel, as :mod:`torchtrack.event_image` has it.
     """
     count = len(T_cam_obj)
-    if switch.apply_to(image):
+    if dispatch.apply_to(image):
         return _marked_by_kernel(outlines, T_cam_obj, intrinsics, image)
     points, tangents, kind, mask = (
         values.expand(count, *values.shape[1:]) for values in (outlines.points_obj, outlines.tangents_obj, outlines.kind, outlines.mask)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.constants import disc
+from torchtrack.core.constants import disc
 
 # Cells a side of the square, and those that an object's diameter takes at most.
 _SIDE, _DIAMETER = 256, 240.0

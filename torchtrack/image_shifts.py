@@ -15,7 +15,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.prediction import Prediction
 from torchtrack.views import outlines_by_view
@@ -119,7 +119,7 @@ def _blurred(cells: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
 
 def _peaks(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
     """The highest cells of each map, none of which is close to a higher one, and which they are; of cells that are allowed alone."""
-    if switch.apply_to(fit):
+    if dispatch.apply_to(fit):
         # Not at the top: Numba is an extra.
         from torchtrack.kernels.shifts import peaks
 

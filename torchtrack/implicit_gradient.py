@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack import readback
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.lie import small_difference_about, step_about
+from torchtrack.core import host_sync
+from torchtrack.core.lie import small_difference_about, step_about
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
 from torchtrack.pose_solver import robust_cost, solve_positive
 
@@ -135,7 +135,7 @@ def _counted(problem: PoseProblem) -> PoseProblem:
     """The problem with those observations alone that have a weight, as a constant: the rest neither draws nor bends."""
     counted = problem.weights != 0
     # On a GPU, which would have to be waited for to know how many these are, all of them.
-    most = int(counted.sum(-1).max()) if readback.read_at_once(counted) else counted.shape[1]
+    most = int(counted.sum(-1).max()) if host_sync.read_at_once(counted) else counted.shape[1]
     rows = problem.weights.abs().topk(max(most, 1)).indices
 
     def of_rows(part: PoseProblem | WindowTerms, names: tuple[str, ...]) -> dict[str, Tensor]:

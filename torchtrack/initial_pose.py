@@ -5,9 +5,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.config.run import ObjectConfig, PoseConfig
+from torchtrack.core.lie import check_pose, rotation_from_quaternion
 from torchtrack.errors import ConfigError
 from torchtrack.io import Trajectory, read_trajectory
-from torchtrack.lie import check_pose, rotation_from_quaternion
 
 
 def initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) -> Float[Tensor, "4 4"]:

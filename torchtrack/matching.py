@@ -14,12 +14,12 @@ from torch.linalg import vecdot
 from torchtrack.bursts import without_tail
 from torchtrack.common_error import APART_PX, ASIDE_PX, DEPTH_SHARE, PARALLEL, SORTED_PX2, TOUCHING_PX, mistaken_px2
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.constants import constant, one
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours, take_points
-from torchtrack.image_motion import MovingObjects
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch
+from torchtrack.core.constants import constant, one
+from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import TableSettings
 from torchtrack.observations import Observations
@@ -99,7 +99,7 @@ class ContourTable:
             of_print: whether anything is expected of print.
             close_px: distance from which parallel edges are told apart; 0 for always.
         """
-        if switch.apply_to(contours.pixels):
+        if dispatch.apply_to(contours.pixels):
             return _table_by_kernel(contours, index, polarity, of_print=of_print, close_px=close_px)
         limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
         oriented, expected = limb | crease, (texture & of_print).to(contours.pixels.dtype)

@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchtrack.alignment import usual_index_radius
-from torchtrack.camera import project
 from torchtrack.config.tracker import ModelTrustConfig, TrackerConfig
 from torchtrack.contour_index import ContourIndex, index_contours
 from torchtrack.contour_model import ContourKind, ContourModel
 from torchtrack.contours import Contours, take_points
+from torchtrack.core.camera import project
 from torchtrack.matching import ContourTable, match_nearest, on_and_around
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.prediction import Prediction

@@ -1,6 +1,6 @@
 """How objects are expected to move from one window to the next: a constant velocity, disturbed by accelerations.
 
-Pose and velocity of each object have a joint covariance, in the chart of :func:`torchtrack.lie.retract_about`:
+Pose and velocity of each object have a joint covariance, in the chart of :func:`torchtrack.core.lie.retract_about`:
 ``[rotation, move of the centre, angular velocity, velocity of the centre]``. It is the prediction of an iterated Kalman
 filter: what a window's events say is weighed against it direction by direction, so that what they hold well follows
 them, and what they hardly see (an edge that moves along itself, depth) goes on as it moved before.
@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import MotionConfig
-from torchtrack.factored import solve_factored
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch
+from torchtrack.core.lie import hat
+from torchtrack.core.linalg import solve_factored
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.lie import hat
 
 # A prediction is not let grow less certain than this (rad, and diameters).
 MOST_UNCERTAIN = 0.5
@@ -174,7 +174,7 @@ def inverse(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:
 
     Taken with a unit diagonal: rotations and translations, poses and velocities differ by many orders of magnitude.
     """
-    if switch.apply_to(matrices):
+    if dispatch.apply_to(matrices):
         # Not at the top: Numba is an extra.
         from torchtrack.kernels.filtering import invert
 

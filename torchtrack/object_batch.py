@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.linalg import vecdot
 from torch.nn.functional import pad
 
-from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourKind, ContourModel
 from torchtrack.contours import Contours, assemble, joined, mesh_contours, mesh_elements
+from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.splat import splat_contours
 from torchtrack.visibility import Scene, remove_hidden
 

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import select_ranked, take_points
+from torchtrack.core import dispatch
+from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.corners import Corners
-from torchtrack.image_motion import MovingObjects
-from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 
 _GOLDEN_RATIO = 0.6180339887498949
@@ -146,7 +146,7 @@ def select_events(events: ObjectEvents, index: ContourIndex, objects: MovingObje
     Which of them are taken hangs on each event's own number, not on how many come before it: a pose that is a little
     different takes almost the same events.
     """
-    if switch.apply_to(objects.velocity):
+    if dispatch.apply_to(objects.velocity):
         values, exists = _selected_by_kernel(events, index, objects, count)
     else:
         events = events.rows()

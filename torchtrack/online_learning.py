@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import readback
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core import host_sync
 from torchtrack.model_trust import judge_elements
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import ObjectEvents
@@ -31,15 +31,15 @@ def objects_as_known(
     """
     if state.learned is not None and on_surfaces:
         counting = state.learned.that_count(config.learning)
-        if not readback.none_of(counting.mask):
+        if not host_sync.none_of(counting.mask):
             objects = replace(objects, learned=counting)
     if state.model_trust is not None:
         shown = state.model_trust.of_width(element_groups.shape[1]).shown(element_groups, config.model_trust)
-        if not readback.read_at_once(shown) or not bool(shown.all()):
+        if not host_sync.read_at_once(shown) or not bool(shown.all()):
             objects = replace(objects, shown=shown)
     if config.matching.polarity_memory_s:
         explained = state.score.detach(), state.full_share.detach()
-        if not readback.none_of(is_asked(*explained)):
+        if not host_sync.none_of(is_asked(*explained)):
             objects = replace(objects, polarity=expected_polarity(state.darker_outside, *explained))
     return objects
 
@@ -93,6 +93,6 @@ def due_lessons(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, conf
     learned, trust = state.learned, state.model_trust
     is_judged = trust is not None and trust.due(config.model_trust)
     wanted = None if learned is None or on_surfaces is None else learned.wanted(on_surfaces, config.learning)
-    if is_judged or (wanted is not None and readback.Answer.to(wanted).any()):
+    if is_judged or (wanted is not None and host_sync.Answer.to(wanted).any()):
         return is_judged, wanted is not None
     return None

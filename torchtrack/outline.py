@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from torchtrack.camera import Camera, undistort
+from torchtrack.core.camera import Camera, undistort
 from torchtrack.errors import MissingFileError, ModelError, UnknownFormatError
 from torchtrack.io.atomic import atomic_path
 

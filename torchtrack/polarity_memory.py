@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch
 from torchtrack.kernels.arrays import as_arrays
 
 # Directions that are told apart.
@@ -73,7 +73,7 @@ def remembered(
         dark: 1 where an event says that the outer side is the darker one, -1 the inner one, 0 unknown.
         weights: of the events; zero where nothing is to be learned.
     """
-    if switch.apply_to(dark):
+    if dispatch.apply_to(dark):
         # Not at the top: Numba is an extra.
         from torchtrack.kernels.quality import remember
 

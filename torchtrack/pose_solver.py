@@ -1,7 +1,7 @@
 """From matches to the pose: batched Levenberg-Marquardt on SE(3) (Eq. 12-17). The one solver loop of the package.
 
 The unknown of each object is a rotation about its centre and a move of its centre, in the camera's axes
-(:func:`torchtrack.lie.turned`). The step is ``Δξ = -(JᵀWJ + Λ + λD)⁻¹ (JᵀWr + Λδ)``: the minus signs of the
+(:func:`torchtrack.core.lie.turned`). The step is ``Δξ = -(JᵀWJ + Λ + λD)⁻¹ (JᵀWr + Λδ)``: the minus signs of the
 paper's Eq. 16 and 17 cancel, which cannot be meant.
 """
 
@@ -12,15 +12,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack import readback
-from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.constants import constant
-from torchtrack.factored import solve_factored
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch, host_sync
+from torchtrack.core.camera import MIN_DEPTH_M
+from torchtrack.core.constants import constant
+from torchtrack.core.lie import affine, small_difference_about, turned
+from torchtrack.core.linalg import solve_factored
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import DampingSettings, SolvingSettings
-from torchtrack.lie import affine, small_difference_about, turned
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
 from torchtrack.robust_loss import LOSSES, robust_loss, robust_weight
 
@@ -223,7 +222,7 @@ def solve_pose(
     """
     if from_prior is None:
         from_prior = _from_prior(problem, T_start)
-    if switch.apply_to(T_start):
+    if dispatch.apply_to(T_start):
         return _solved_by_kernel(problem, T_start, config, from_prior)
     rows = _as_rows(problem)
     damping = torch.full_like(problem.scale_px, config.damping)
@@ -283,7 +282,7 @@ def _look(problem: PoseProblem, rows: _Rows, place: _Place, loss: str, *, judged
 
 def _choose(first: Tensor, of_first: Iterable[Tensor], of_second: Iterable[Tensor]) -> Iterable[Tensor]:
     """One of two values for each object."""
-    if readback.read_at_once(first) and bool(first.all()):
+    if host_sync.read_at_once(first) and bool(first.all()):
         # As it mostly is.
         return of_first
     return [torch.where(first.view(-1, *[1] * (a.dim() - 1)), a, b) for a, b in zip(of_first, of_second, strict=True)]

@@ -6,16 +6,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.camera import MIN_DEPTH_M
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contours import Contours, assemble, select_ranked, take_points
-from torchtrack.image_motion import MovingObjects, pixel_velocity
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch
+from torchtrack.core.camera import MIN_DEPTH_M
+from torchtrack.core.constants import once
+from torchtrack.core.image_velocity import MovingObjects, pixel_velocity
+from torchtrack.core.lie import retract_about, step_about, transform_points
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.lie import retract_about, step_about, transform_points
 from torchtrack.motion import Acceleration, inverse
 from torchtrack.object_batch import ObjectBatch, repeat_row
-from torchtrack.once import once
 from torchtrack.pose_solver import pose_jacobian
 
 # Nothing that is tracked is farther away (m).
@@ -99,7 +99,7 @@ class Prediction:
 
     def in_mid_window(self, dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 4 4"]:
         """Poses half a window of length ``dt_s`` earlier; those at its end where they would not be before the camera."""
-        if switch.apply_to(self.T_cam_obj):
+        if dispatch.apply_to(self.T_cam_obj):
             # Not at the top: Numba is an extra.
             from torchtrack.kernels.forecast import in_mid_window
 
@@ -148,7 +148,7 @@ class Prediction:
 
     def sigma_px(self, contours: Contours) -> Float[Tensor, "b"]:
         """Standard deviation of the contours across themselves in the image (px), in the mean over them."""
-        if switch.apply_to(contours.pixels):
+        if dispatch.apply_to(contours.pixels):
             return self._sigma_px_by_kernel(contours)
         # Of the visible points, not of all places: how many there are depends on the other objects.
         chosen, mask = select_ranked(contours.mask, _LOOKED_AT)

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack import readback
 from torchtrack.alignment import may_be_anywhere
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core import host_sync
 from torchtrack.prediction import Prediction
 from torchtrack.quality import Status
 from torchtrack.state import Probation, StepResult, TrackerState
@@ -34,7 +34,7 @@ def after_probation(
         prediction: of the objects, with ``widening`` of their first gates.
     """
     concerned = before.probation.runs | may_be_anywhere(widening)
-    if readback.none_of(concerned):
+    if host_sync.none_of(concerned):
         return state, result
     probation = _begun(before, result, prediction, widening)
     wanted = config.quality.certain_at * before.full_share

@@ -10,14 +10,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.search import QualityConfig
-from torchtrack.constants import constant
 from torchtrack.contours import Contours
-from torchtrack.image_motion import MovingObjects, pixel_velocity
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch
+from torchtrack.core.constants import constant
+from torchtrack.core.host_sync import none_of
+from torchtrack.core.image_velocity import MovingObjects, pixel_velocity
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import QualitySettings
 from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SMEAR_PX, Matches, on_and_around, patch, patch_sums
-from torchtrack.readback import none_of
 
 # A patch explains its contours when this share of the observations near them are on them.
 _LEAST_SHARE = 0.5
@@ -75,7 +75,7 @@ def shares(
     contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: QualityConfig
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """:func:`measured_share` of contours that move with their objects, :func:`gathered_share`, and :func:`directions_apart`."""
-    if not switch.apply_to(contours.pixels):
+    if not dispatch.apply_to(contours.pixels):
         velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
         measured = measured_share(contours, matches, velocity, image_size, config)
         return measured, gathered_share(matches, config), directions_apart(matches)
@@ -164,7 +164,7 @@ def inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
 
 def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
     """Share of an object's contour points that lie in the image; zero without any."""
-    if switch.apply_to(contours.pixels):
+    if dispatch.apply_to(contours.pixels):
         # Not at the top: Numba is an extra.
         from torchtrack.kernels.quality import visible
 

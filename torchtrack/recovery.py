@@ -8,12 +8,12 @@ from torch import Tensor
 
 from torchtrack.alignment import gate_widening
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.host_sync import Answer
 from torchtrack.doubt import Doubt, drifted, less_certain
 from torchtrack.observations import ObjectEvents
 from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
 from torchtrack.prediction import Prediction
 from torchtrack.quality import are_many
-from torchtrack.readback import Answer
 from torchtrack.relocation import LastSeen
 from torchtrack.search import AS_MUCH, Found, is_taken, search, search_around
 from torchtrack.turns import TurningAxes, turns_compared

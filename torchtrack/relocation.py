@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import readback
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core import host_sync
 from torchtrack.doubt import is_due, searches
 from torchtrack.motion import MOST_UNCERTAIN, rim_and_centre
 from torchtrack.object_batch import ObjectBatch
@@ -84,7 +84,7 @@ class LastSeen:
 def is_lost(state: TrackerState, diameter_m: Float[Tensor, "b"], config: TrackerConfig) -> Bool[Tensor, "b"]:
     """Which objects nothing is known of any more but where they were last seen well, which is long ago."""
     unseen = _unseen_for_long(state, config)
-    if readback.none_of(unseen):
+    if host_sync.none_of(unseen):
         return unseen
     sigma = state.covariance.diagonal(dim1=-2, dim2=-1)[:, :6].sqrt()
     turn_rad, move_m = sigma.unflatten(1, (2, 3)).amax(-1).unbind(1)
@@ -104,7 +104,7 @@ def looked_for_anew(
         Those much farther away than then, or nearer; and those that explain much less.
     """
     unseen = _unseen_for_long(state, config)
-    if readback.none_of(unseen):
+    if host_sync.none_of(unseen):
         return unseen, unseen
     due = unseen & is_due(state.t_us, t_us, config.search.doubt_us)[0, objects.stream_index] & ~is_lost(state, objects.diameter_m, config)
     now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.T_last_seen))

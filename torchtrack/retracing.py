@@ -17,7 +17,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.contours import Contours, reproject
-from torchtrack.events import EventBatch, EventWindow
+from torchtrack.core.events import EventBatch
+from torchtrack.core.windows import EventWindow
 from torchtrack.first_state import first_state
 from torchtrack.quality import Status
 from torchtrack.state import StepResult, TrackerState, take_part

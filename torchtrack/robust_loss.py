@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.constants import one
+from torchtrack.core.constants import one
 
 # By these numbers, kernels know them.
 LOSSES = ("none", "huber", "tukey")

@@ -9,8 +9,8 @@ from typing import Any
 
 from torchtrack.config.load import as_yaml
 from torchtrack.config.run import RunConfig
+from torchtrack.core.windows import EventWindow
 from torchtrack.errors import EventDataError, MissingFileError, OutputError, TorchtrackError, UnknownFormatError
-from torchtrack.events import EventWindow
 from torchtrack.interrupt import Interrupt
 from torchtrack.io.atomic import writing
 from torchtrack.io.keep_up import KeepUp

@@ -8,8 +8,9 @@ from pathlib import Path
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.run import RunConfig, TrackingConfig
 from torchtrack.config.tracker import WindowConfig
+from torchtrack.core.events import EventBatch
+from torchtrack.core.limits import limits
 from torchtrack.errors import ConfigError, EventDataError, TorchtrackError
-from torchtrack.events import EventBatch
 from torchtrack.executor import TaskFailure, Tell
 from torchtrack.executor.groups import run_in_groups
 from torchtrack.executor.tasks import without_errors
@@ -19,7 +20,6 @@ from torchtrack.io.event_stream import EventStream
 from torchtrack.io.live import LiveSource
 from torchtrack.io.mending import mended_batches
 from torchtrack.io.problems import Problems
-from torchtrack.limits import limits
 from torchtrack.refined_steps import Refinement, refined_steps
 from torchtrack.run_outputs import RunOutputs
 from torchtrack.session import Session

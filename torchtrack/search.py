@@ -9,15 +9,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import quality, readback
+from torchtrack import quality
 from torchtrack.alignment import Fit, align, index_for
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours
+from torchtrack.core import host_sync
+from torchtrack.core.constants import once
 from torchtrack.doubt import less_certain
 from torchtrack.hypotheses import promising
 from torchtrack.line_ends import running_on
 from torchtrack.observations import ObjectEvents, WindowEvents, select_events
-from torchtrack.once import once
 from torchtrack.pose_problem import Linearisation
 from torchtrack.prediction import Prediction
 
@@ -152,7 +153,7 @@ def search_around(
     by_events = config.search.by_events and wide
     best = _likeliest(_by_events(score, tried.count) if by_events else score, offset, one.covariance[0])
     better = score.index_select(0, best) > asked
-    return found if readback.none_of(better) else replaced(found, number, tried, best, better)
+    return found if host_sync.none_of(better) else replaced(found, number, tried, best, better)
 
 
 def is_taken(number: int, other: Found, found: Found) -> Bool[Tensor, ""]:
@@ -186,9 +187,9 @@ def _less_where_lines_run_on(
     image_size: tuple[int, int],
 ) -> Float[Tensor, "n"]:
     """Scores of poses, less where the lines that explain them are of something larger; of those alone that are ``concerned``, which saves time."""
-    if readback.none_of(concerned):
+    if host_sync.none_of(concerned):
         return score
-    rows = concerned.nonzero()[:, 0] if readback.read_at_once(concerned) else torch.arange(len(score), device=score.device)
+    rows = concerned.nonzero()[:, 0] if host_sync.read_at_once(concerned) else torch.arange(len(score), device=score.device)
     return score.index_copy(0, rows, score[rows] * (1 - running_on(contours.rows(rows), places, image_size)))
 
 

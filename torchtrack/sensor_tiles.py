@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchtrack.camera import MIN_DEPTH_M, project
-from torchtrack.constants import constant
-from torchtrack.events import EventBatch, check_on_sensor
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch
+from torchtrack.core.camera import MIN_DEPTH_M, project
+from torchtrack.core.constants import constant
+from torchtrack.core.events import EventBatch, check_on_sensor
+from torchtrack.core.lie import transform_points
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import TileSettings
-from torchtrack.lie import transform_points
 from torchtrack.prediction import Prediction
 
 # Side of a tile (px, as a power of two).
@@ -73,7 +73,7 @@ class SensorTiles(nn.Module):
 
     def near(self, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
         """Tiles that anything can be seen in, within a window before ``prediction``, that is no farther than a margin from each object."""
-        if switch.apply_to(prediction.velocity):
+        if dispatch.apply_to(prediction.velocity):
             return self._near_by_kernel(prediction, window_s, margin_px)
         objects, (turning, speed_m_s) = prediction.objects, prediction.velocity.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
         turned, moved, *_ = prediction.covariance.diagonal(dim1=-2, dim2=-1).unflatten(1, (4, 3)).amax(-1).sqrt().to(turning.dtype).unbind(1)
@@ -107,7 +107,7 @@ class SensorTiles(nn.Module):
 
     def keep(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> NearbyEvents:
         """The events in tiles near any object."""
-        if switch.apply_to(events.x):
+        if dispatch.apply_to(events.x):
             kept, count = self.numbers_near(events, near)
             kept = kept[:count]
         else:

@@ -10,16 +10,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import readback
 from torchtrack.bursts import LONG_AGO_US, update_bursts
-from torchtrack.camera import Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import Contours
+from torchtrack.core import dispatch, host_sync
+from torchtrack.core.camera import Camera, distortion_table, stack_tables, undistortion_table
+from torchtrack.core.events import EventBatch, PaddedEvents, check_on_sensor, of_streams, pad_streams
 from torchtrack.corners import Corners, detect_corners, no_corners
-from torchtrack.events import EventBatch, PaddedEvents, check_on_sensor, of_streams, pad_streams
 from torchtrack.flow import estimate_flow
 from torchtrack.history import BORDER_PX, History, on_sensor, pixel_numbers
-from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.observations import ObjectEvents, SharedEvents, WindowEvents
 from torchtrack.prediction import Prediction
@@ -68,11 +67,11 @@ class Sensors:
 
     def near_objects(self, events: NearbyEvents, prediction: Prediction, window_s: Float[Tensor, "b"], config: TrackerConfig) -> NearbyEvents:
         """The events that can have to do with the objects. A GPU would have to be waited for: there, all are kept."""
-        if self.tiles is None or not readback.read_at_once(window_s):
+        if self.tiles is None or not host_sync.read_at_once(window_s):
             return events
         near = self.tiles.near(prediction, window_s, farthest_event_px(config))
         # By a kernel, they are chosen where they are seen.
-        return replace(events, near_tiles=near) if switch.apply_to(window_s) else self.tiles.keep(events.events, near)
+        return replace(events, near_tiles=near) if dispatch.apply_to(window_s) else self.tiles.keep(events.events, near)
 
     def window_events(
         self, nearby: NearbyEvents, burst_age_us: Int[Tensor, "s 2 h w"], t_us: Int[Tensor, "s"], elapsed_us: Int[Tensor, "s"], longest_us: int
@@ -92,14 +91,14 @@ class Sensors:
                 return self._chosen_by_kernel(nearby.events, nearby.near_tiles, self.tiles, burst_age_us, t_us, elapsed_us, longest_us)
             nearby = self.tiles.keep(nearby.events, nearby.near_tiles)
         window = pad_streams(nearby.events, len(self.ideal_pixels), t_us)
-        if switch.apply_to(t_us):
+        if dispatch.apply_to(t_us):
             # Unlike PyTorch's operations, kernels do not look where they read and write.
             check_on_sensor(nearby.events, self.image_size[1], self.image_size[0])
         into_burst_us = nearby.into_burst_us
         if into_burst_us is None:
             burst_age_us, into_burst_us = update_bursts(burst_age_us, elapsed_us, window, longest_us)
         plain = nearby.number is None and nearby.of_each is None
-        seen = self._seen_by_kernel(window, into_burst_us) if plain and switch.apply_to(t_us) else self.seen(window, into_burst_us, nearby.number)
+        seen = self._seen_by_kernel(window, into_burst_us) if plain and dispatch.apply_to(t_us) else self.seen(window, into_burst_us, nearby.number)
         return seen if nearby.of_each is None else seen.only(*nearby.of_each), burst_age_us
 
     def seen(self, window: PaddedEvents, into_burst_us: Int[Tensor, "s e"] | None = None, number: Int[Tensor, "e"] | None = None) -> WindowEvents:

@@ -9,12 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.camera import Camera
 from torchtrack.config.events import EventsConfig
 from torchtrack.config.run import CameraConfig, ObjectConfig, RunConfig
+from torchtrack.core.camera import Camera
+from torchtrack.core.events import EventBatch
+from torchtrack.core.files import naming
+from torchtrack.core.limits import check_limit, limits
+from torchtrack.core.windows import EventWindow
 from torchtrack.errors import CalibrationError, ConfigError, EventDataError, TorchtrackWarning
-from torchtrack.events import EventBatch, EventWindow
-from torchtrack.files import naming
 from torchtrack.initial_pose import initial_pose
 from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS
@@ -23,7 +25,6 @@ from torchtrack.io.keep_up import KeepUp
 from torchtrack.io.live import LiveSource, open_live
 from torchtrack.io.polarity_code import told_if_alike
 from torchtrack.io.problems import Problems
-from torchtrack.limits import check_limit, limits
 from torchtrack.object_model import ObjectModel
 from torchtrack.stepping import clipped
 

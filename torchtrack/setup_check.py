@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack import lie
-from torchtrack.camera import MIN_DEPTH_M, Camera
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core import lie
+from torchtrack.core.camera import MIN_DEPTH_M, Camera
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.object_model import ObjectModel
 

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.camera import Camera
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contours import reproject
-from torchtrack.lie import orthonormalise, transform_points
+from torchtrack.core.camera import Camera
+from torchtrack.core.lie import orthonormalise, transform_points
 from torchtrack.motion import left_covariance
 from torchtrack.object_model import ObjectModel
 from torchtrack.smoothing import Filtered, smoothed

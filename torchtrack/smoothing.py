@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import MotionConfig
-from torchtrack.lie import difference_about, retract_about
+from torchtrack.core.lie import difference_about, retract_about
 from torchtrack.motion import inverse, predict_covariance
 from torchtrack.state import TrackerState
 

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.camera import project
-from torchtrack.lie import transform_points
+from torchtrack.core.camera import project
+from torchtrack.core.lie import transform_points
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import WindowEvents
 from torchtrack.state import TrackerState

@@ -8,11 +8,11 @@ from kornia.filters import gaussian_blur2d, spatial_gradient
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
-from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourKind, ContourModel
 from torchtrack.contours import Contours, assemble, select_ranked, take_points
-from torchtrack.lie import transform_points
+from torchtrack.core.camera import MIN_DEPTH_M, project
+from torchtrack.core.lie import transform_points
 
 
 def _close(occupied: Float[Tensor, "b h w"], radius: int) -> Float[Tensor, "b h w"]:

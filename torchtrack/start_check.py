@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.camera import Camera, undistort
+from torchtrack.core.camera import Camera, undistort
+from torchtrack.core.lie import se3_inverse, transform_points
 from torchtrack.errors import PoseError, TorchtrackWarning
-from torchtrack.lie import se3_inverse, transform_points
 from torchtrack.object_model import ObjectModel
 
 # An object of fewer pixels has no contour; one of few is tracked badly.

@@ -5,9 +5,9 @@ from itertools import pairwise
 from jaxtyping import Int
 from torch import Tensor
 
-from torchtrack import readback
+from torchtrack.core import host_sync
+from torchtrack.core.events import EventBatch, of_streams, stream_bounds
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch, of_streams, stream_bounds
 
 
 def check_step(state_us: Int[Tensor, "s"], events: EventBatch, t_end_us: Int[Tensor, "s"]) -> None:
@@ -19,7 +19,7 @@ def check_step(state_us: Int[Tensor, "s"], events: EventBatch, t_end_us: Int[Ten
         state_us: where the window of each stream begins.
         t_end_us: where it ends.
     """
-    if not readback.read_at_once(events.t_us):
+    if not host_sync.read_at_once(events.t_us):
         return
     for stream, (start_us, end_us) in enumerate(zip(state_us.tolist(), t_end_us.tolist(), strict=True)):
         if end_us < start_us:

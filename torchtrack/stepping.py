@@ -9,7 +9,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchtrack.bursts import LONG_AGO_US
-from torchtrack.events import EventBatch, EventWindow, windows_by_count, windows_by_time
+from torchtrack.core.events import EventBatch
+from torchtrack.core.windows import EventWindow, windows_by_count, windows_by_time
 from torchtrack.motion import initial_covariance
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracker import Tracker

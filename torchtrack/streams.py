@@ -14,8 +14,9 @@ import torch
 
 from torchtrack.baselines import tracker_class
 from torchtrack.config.run import TrackingConfig
+from torchtrack.core.events import concatenate
+from torchtrack.core.windows import EventWindow
 from torchtrack.errors import ConfigError, TorchtrackError
-from torchtrack.events import EventWindow, concatenate
 from torchtrack.haste import Pace
 from torchtrack.refined_steps import Refinement
 from torchtrack.session import Session

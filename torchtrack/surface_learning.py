@@ -13,15 +13,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchtrack import readback
-from torchtrack.camera import project
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
-from torchtrack.constants import constant
 from torchtrack.contours import Contours, assemble, joined, take_points
+from torchtrack.core import host_sync
+from torchtrack.core.camera import project
+from torchtrack.core.constants import constant
+from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
+from torchtrack.core.lie import transform_points
 from torchtrack.image_cells import CellGrid, Lines, cell_of, fit_lines, is_near, point_sums, tallied
-from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.learned_contours import LearnedContours, judge_model
-from torchtrack.lie import transform_points
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import ObjectEvents, WindowEvents
 from torchtrack.search import Found
@@ -110,7 +110,7 @@ def learn_after(
     """
     velocity, image_size, any_count = around.contour_velocity, around.objects.image_size, around.objects.learned is not None
     learned = judge_model(learned, found, velocity, image_size, config, any_count=any_count, taken_share=around.taken_share)
-    if wanted is None or readback.none_of(wanted):
+    if wanted is None or host_sync.none_of(wanted):
         return learned
     return learned.but_of(wanted, learn(learned, around, events.rows(), config))
 

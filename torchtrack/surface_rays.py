@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchtrack.contour_model import ContourModel
 from torchtrack.contours import take_points
-from torchtrack.lie import transform_points
+from torchtrack.core.lie import transform_points
 
 # Nothing is met farther away than this (m).
 _FARTHEST_M = 1e4

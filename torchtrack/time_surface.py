@@ -9,11 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchtrack import readback
-from torchtrack.bounds import bounds
-from torchtrack.constants import constant
-from torchtrack.events import EventBatch, check_on_sensor, stream_bounds
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch, host_sync
+from torchtrack.core.constants import constant
+from torchtrack.core.events import EventBatch, check_on_sensor, stream_bounds
+from torchtrack.core.padded import bounds
 from torchtrack.kernels.arrays import as_arrays
 
 # Time of a pixel that never fired: far in the past, and its age still fits int64 microseconds.
@@ -49,7 +48,7 @@ def update_last_event(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -
     Raises:
         EventDataError: if an event is outside the sensor, where kernels are used.
     """
-    if switch.apply_to(last_event_us):
+    if dispatch.apply_to(last_event_us):
         return _update_by_kernel(last_event_us, events)
     streams, height, width = last_event_us.shape
     # In the type of the coordinates, which is narrower than that of an index.
@@ -114,7 +113,7 @@ def object_regions(
     high = torch.where(empty, torch.zeros_like(high), high).ceil().long() + margin_px
     low = torch.div(low, _GRID_PX, rounding_mode="floor") * _GRID_PX
     extent = high - low + 1
-    if readback.read_at_once(extent):
+    if host_sync.read_at_once(extent):
         width, height = (-(-extent.amax(0) // 16) * 16).tolist()
         return Regions(low, extent, (height, width), stream_index)
     height, width = (-(-min(side + 2 * margin_px + _GRID_PX, largest_px) // 16) * 16 for side in sensor_size)

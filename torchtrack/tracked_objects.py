@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from torchtrack.camera import Camera
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_model import ContourModel, group_by_model
+from torchtrack.core.camera import Camera
 from torchtrack.doubt import mirrors, turns
 from torchtrack.model_trust import element_groups
 from torchtrack.object_batch import ObjectBatch

@@ -11,22 +11,21 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor, nn
 
-from torchtrack import readback
 from torchtrack.alignment import align, gate_widening, index_for, index_radius, usual_index_radius
-from torchtrack.camera import Camera
 from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_index import ContourIndex
 from torchtrack.contours import Contours
+from torchtrack.core import dispatch, host_sync
+from torchtrack.core.camera import Camera
+from torchtrack.core.events import EventBatch, pad_streams
 from torchtrack.corners import Corners
 from torchtrack.doubt import Doubt, gathered_when_known, has_strayed, is_adrift, is_due, is_wanted, searches
-from torchtrack.events import EventBatch, pad_streams
 from torchtrack.evidence import Evidence, judged
 from torchtrack.first_state import first_state
 from torchtrack.forecast import forecast
 from torchtrack.history import History
-from torchtrack.kernels import switch
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import ObjectEvents, Observations, corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
@@ -49,7 +48,7 @@ from torchtrack.tracked_objects import TrackedObjects
 from torchtrack.turns import may_have_turned
 from torchtrack.window_parts import of_unknown_motion, to_be_parted
 
-_QUESTIONS = readback.Questions()
+_QUESTIONS = host_sync.Questions()
 
 
 class Tracker(TrackedObjects):
@@ -135,13 +134,13 @@ class Tracker(TrackedObjects):
         """
         t_us = self._window_end(state, events, t_end_us)
         check_step(state.t_us, events, t_us)
-        with torch.autocast(t_us.device.type, enabled=False), switch.kernels(wanted=self.kernels):
+        with torch.autocast(t_us.device.type, enabled=False), dispatch.kernels(wanted=self.kernels):
             steady = self._steady(state, events, t_us)
             if steady is not None:
                 return _counted(steady)
             in_parts = to_be_parted(state, events, t_us, self.objects, self.config)
-            parted = readback.Answer.to(in_parts)
-            if readback.read_at_once(in_parts) and bool(in_parts.all()):
+            parted = host_sync.Answer.to(in_parts)
+            if host_sync.read_at_once(in_parts) and bool(in_parts.all()):
                 return _counted(self._advance_in_parts(state, events, t_us, in_parts))
             done = self._advance(state, events, t_us)
             return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us, in_parts), done) if parted.any() else done)
@@ -157,7 +156,7 @@ class Tracker(TrackedObjects):
         Returns:
             State, result, and whether any of this was called for: then they do not hold, and :meth:`step` is to take the window.
         """
-        t_us, assumptions = self._window_end(state, events, t_end_us), readback.Assumptions()
+        t_us, assumptions = self._window_end(state, events, t_end_us), host_sync.Assumptions()
         with torch.autocast(t_us.device.type, enabled=False):
             assumptions.ask(to_be_parted(state, events, t_us, self.objects, self.config), False)
             done = _counted(self.advance(self.opened(state, events), NearbyEvents(events), t_us, questions=assumptions))
@@ -170,8 +169,8 @@ class Tracker(TrackedObjects):
             state: from :meth:`init`.
         """
         self.graphs.prepare(state)
-        with torch.inference_mode(), switch.kernels(wanted=self.kernels):
-            if switch.apply_to(self.intrinsics):
+        with torch.inference_mode(), dispatch.kernels(wanted=self.kernels):
+            if dispatch.apply_to(self.intrinsics):
                 # Kernels are compiled, or read from the disk, when they are first called: for a window without events.
                 self._advance(state, EventBatch.empty(), state.t_us + 1)
                 if searches(self.config):
@@ -188,7 +187,7 @@ class Tracker(TrackedObjects):
 
     def _near(self, events: NearbyEvents, prediction: Prediction, anew: Tensor, dt_s: Tensor) -> NearbyEvents:
         """Those of the events that can have to do with the objects: with those looked for ``anew``, any; a weigher of one's own is shown all."""
-        if not readback.none_of(anew):
+        if not host_sync.none_of(anew):
             prediction = replace(prediction, covariance=anywhere(prediction.covariance, anew))
         return events if self.shows_all else self.sensors.near_objects(events, prediction, dt_s, self.config)
 
@@ -200,7 +199,7 @@ class Tracker(TrackedObjects):
         self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"], *, learns: bool = False
     ) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
         """:meth:`advance` with nothing to decide; and whether anything was, or windows in parts may be called for."""
-        assumptions = readback.Assumptions()
+        assumptions = host_sync.Assumptions()
         assumptions.ask(of_unknown_motion(state, t_us, self.objects, self.config), False)
         return *self.advance(state, events, t_us, questions=assumptions, learns=learns), assumptions.wrong()
 
@@ -227,7 +226,7 @@ class Tracker(TrackedObjects):
         events: NearbyEvents,
         t_us: Int[Tensor, "s"],
         starting: Tensor | None = None,
-        questions: readback.Questions = _QUESTIONS,
+        questions: host_sync.Questions = _QUESTIONS,
         *,
         learns: bool = True,
     ) -> tuple[TrackerState, StepResult]:
@@ -276,7 +275,7 @@ class Tracker(TrackedObjects):
         if config.search.probation:
             next_state, result = after_probation(state, next_state, result, prediction, widening, config)
         next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self.on_surfaces, learns), config)
-        if config.matching.adaptive_bursts and not readback.none_of(due := is_due(state.t_us, t_us, LOOK_US)):
+        if config.matching.adaptive_bursts and not host_sync.none_of(due := is_due(state.t_us, t_us, LOOK_US)):
             sure = due[0, self.stream_index] & (result.status == int(Status.TRACKING)) & ~found.elsewhere
             late_share = late_share_after(state.late_share, observations, contours, fit.matches, prediction, sure, config.matching)
             next_state = replace(next_state, late_share=late_share)
@@ -317,7 +316,7 @@ class Tracker(TrackedObjects):
         turned = may_have_turned(self.has_turning_axis, state.unseen_s, config) if self.turns else self.has_turning_axis
         return Doubt(*told, self.has_symmetry, state.unseen_s, strayed, turned, *anew)
 
-    def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: readback.Questions) -> TrackerState:
+    def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: host_sync.Questions) -> TrackerState:
         """The state that a window is predicted from: of what is lost for long, where it was last seen well."""
         lost = is_lost(state, self.diameter_m, self.config)
         # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.

@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import softsign
 
-from torchtrack.constants import constant
 from torchtrack.contour_model import ContourKind
 from torchtrack.contours import take_points
+from torchtrack.core import dispatch
+from torchtrack.core.constants import constant
 from torchtrack.evidence import Evidence
 from torchtrack.history import BORDER_PX
-from torchtrack.kernels import switch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import PatchSettings
 from torchtrack.observations import Observations, laid_out
@@ -92,7 +92,7 @@ def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Bool[Tens
 
     Of other observations and other objects they need not be told.
     """
-    if switch.apply_to(evidence.observations.age_s):
+    if dispatch.apply_to(evidence.observations.age_s):
         return _limb_features_by_kernel(evidence)
     features = trust_features(evidence)
     of_limb = features[..., _OF_KIND + int(ContourKind.LIMB)] * features[..., -1] > 0

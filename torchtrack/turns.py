@@ -16,9 +16,9 @@ from torch.nn.functional import max_pool1d, pad
 
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.lie import retract_about
 from torchtrack.event_image import event_density
 from torchtrack.hypotheses import ENOUGH_EVENTS, mark
-from torchtrack.lie import retract_about
 from torchtrack.observations import ObjectEvents, WindowEvents
 from torchtrack.prediction import Prediction
 from torchtrack.search import Found, align_all, replaced

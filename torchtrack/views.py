@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchtrack import readback
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.constants import constant
 from torchtrack.contours import Contours, assemble, select_ranked, take_points
+from torchtrack.core import host_sync
+from torchtrack.core.constants import constant
 from torchtrack.prediction import Prediction
 
 # So many views lie some fifteen degrees apart: contours of a smooth surface hardly wander farther over it between two of them.
@@ -40,7 +40,7 @@ def outlines_by_view(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], 
     camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])[..., 0] - objects.centre_obj
     # The longer a vector, the larger its products, which changes nothing of which of them is the largest.
     view = (camera_obj @ towards.T).argmax(1)
-    if readback.read_at_once(view):
+    if host_sync.read_at_once(view):
         used, view = view.unique(return_inverse=True)
         towards = towards[used]
     outlines = _outlines_from(prediction, towards, config)

@@ -13,16 +13,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import readback
-from torchtrack.bounds import bounds
-from torchtrack.camera import MIN_DEPTH_M, project
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import ContourModel
 from torchtrack.contours import Contours
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch, host_sync
+from torchtrack.core.camera import MIN_DEPTH_M, project
+from torchtrack.core.lie import affine, transform_points
+from torchtrack.core.padded import bounds
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import GridSettings
-from torchtrack.lie import affine, transform_points
 
 # A point this far behind a face's plane is behind it, not on it (diameters).
 _ON_FACE = 2e-3
@@ -75,13 +74,13 @@ def hidden_by_faces(
     limits = torch.nn.functional.pad(-(plane.abs() + tolerance_m[:, None])[..., None], (3, 0))
     tests = torch.cat([torch.cat([sides * turn, away[:, :, None]], 2), limits[..., None]], 3).flatten(1, 2)
     rows = torch.nn.functional.pad(points_cam.transpose(1, 2), (0, 0, 0, 1), value=1.0)
-    at_once = max(_MOST_TESTS // (tests.shape[1] * points_cam.shape[1] + 1), 1) if readback.read_at_once(points_cam) else len(points_cam)
+    at_once = max(_MOST_TESTS // (tests.shape[1] * points_cam.shape[1] + 1), 1) if host_sync.read_at_once(points_cam) else len(points_cam)
     return torch.cat([_hidden_by(*part) for part in zip(tests.split(at_once), rows.split(at_once), strict=True)])
 
 
 def _hidden_by(tests: Float[Tensor, "b t 4"], points: Float[Tensor, "b 4 m"]) -> Bool[Tensor, "b m"]:
     """Which points pass all four tests of one of the triangles: they lie within its edges, and behind its plane by its limit."""
-    if readback.on_gpu(points):
+    if host_sync.on_gpu(points):
         # One test after the other: of the whole product, memory is written and read four times as much, and by a compiler all of it.
         of_each = (affine(test[..., :3], points[:, :3], test[..., 3:]) for test in tests.unflatten(1, (-1, 4)).unbind(2))
         return reduce(torch.minimum, of_each).amax(1) > 0
@@ -91,7 +90,7 @@ def _hidden_by(tests: Float[Tensor, "b t 4"], points: Float[Tensor, "b 4 m"]) ->
 def _hidden_by_self(scene: Scene, contours: Contours) -> Tensor:
     """Points of objects with few faces that these hide."""
     hidden = torch.zeros_like(contours.mask)
-    if switch.apply_to(contours.pixels):
+    if dispatch.apply_to(contours.pixels):
         return _hidden_by_self_by_kernel(scene, contours, hidden)
     for model in scene.models:
         if len(model.triangles):
@@ -123,7 +122,7 @@ def _hidden_by_self_by_kernel(scene: Scene, contours: Contours, hidden: Tensor) 
 
 def _places_in_use(mask: Bool[Tensor, "b m"]) -> int:
     """How many places there are up to the last one with a point: others have more contours. On a GPU, which would have to be waited for, all."""
-    if not readback.read_at_once(mask):
+    if not host_sync.read_at_once(mask):
         return mask.shape[1]
     used = mask.any(0).nonzero()
     return int(used[-1]) + 1 if len(used) else 0
@@ -153,7 +152,7 @@ class DepthGrid:
     @classmethod
     def around(cls, scene: Scene, pixels: Float[Tensor, "b m 2"], mask: Bool[Tensor, "b m"], cell_px: int) -> "DepthGrid":
         """What is asked for at some pixels, and a cell beside them; on a GPU, where sizes cannot hang on values, the whole image."""
-        if not readback.read_at_once(mask):
+        if not host_sync.read_at_once(mask):
             return cls.whole(scene, cell_px)
         streams, (low, high) = scene.stream_index[:, None].expand(-1, 2), bounds(pixels, mask)
         none = pixels.new_full((scene.image_shape[0], 2), torch.inf)
@@ -202,7 +201,7 @@ def _samples(model: ContourModel, drawn: Tensor | None, scene: Scene, cell_px: i
     """
     members, points = model.members if drawn is None else model.members[drawn[model.members]], model.surface_points
     halvings = _halvings(model, members, scene, cell_px)
-    if not readback.read_at_once(halvings):
+    if not host_sync.read_at_once(halvings):
         number = torch.arange(len(points), device=points.device)
         yield members, points, number & ((1 << halvings) - 1)[:, None] == 0
         return
@@ -227,15 +226,15 @@ def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -
     """
     exact, cell_px = _tested_exactly(scene), config.depth_cell_px
     drawn = ~exact[:, 0] | _beside_others(scene, contours, cell_px)
-    if readback.none_of(drawn):
+    if host_sync.none_of(drawn):
         return torch.zeros_like(contours.mask)
-    if switch.apply_to(contours.pixels):
+    if dispatch.apply_to(contours.pixels):
         return _hidden_in_buffer_by_kernel(scene, contours, drawn, exact[:, 0], config)
     _, height, width = scene.image_shape
     u, v = contours.pixels.unbind(-1)
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     grid = DepthGrid.around(scene, contours.pixels, contours.mask & inside, cell_px)
-    depth_m, owner = depth_buffer(scene, grid, drawn if readback.read_at_once(drawn) else None)
+    depth_m, owner = depth_buffer(scene, grid, drawn if host_sync.read_at_once(drawn) else None)
     sides = torch.stack([contours.pixels + side * contours.normals for side in (0, -cell_px, cell_px)], 1)
     cell = grid.cell(sides, scene.stream_index)
     other = owner.take(cell) != torch.arange(len(drawn), device=drawn.device)[:, None, None]

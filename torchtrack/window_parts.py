@@ -8,8 +8,8 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.events import EventBatch, stream_bounds
-from torchtrack.kernels import switch
+from torchtrack.core import dispatch
+from torchtrack.core.events import EventBatch, stream_bounds
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.speed_limit import unknown_speed
@@ -48,7 +48,7 @@ def of_unknown_motion(state: TrackerState, t_us: Int[Tensor, "s"], objects: Obje
     window = config.window
     if window.parts == 1 or not config.solver.prior:
         return torch.zeros_like(objects.stream_index, dtype=torch.bool)
-    if switch.apply_to(state.covariance):
+    if dispatch.apply_to(state.covariance):
         return _of_unknown_motion_by_kernel(state, t_us, objects, config)
     window_s = ((t_us - state.t_us) * 1e-6)[objects.stream_index]
     unknown_m_s = unknown_speed(state.covariance, objects.diameter_m).to(objects.intrinsics.dtype)

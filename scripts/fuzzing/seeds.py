@@ -21,8 +21,8 @@ from PIL import Image
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from torchtrack.camera import Camera
-from torchtrack.events import EventBatch
+from torchtrack.core.camera import Camera
+from torchtrack.core.events import EventBatch
 from torchtrack.io import Trajectory, write_sequence, write_tum
 from torchtrack.io.convert import WRITERS, convert
 

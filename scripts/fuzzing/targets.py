@@ -5,13 +5,13 @@ from pathlib import Path
 
 import torch
 
-from torchtrack.camera import undistortion_table
 from torchtrack.config.demo import DemoConfig
 from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.config.load import as_yaml, load
 from torchtrack.config.run import RunConfig
+from torchtrack.core.camera import undistortion_table
+from torchtrack.core.files import naming
 from torchtrack.eval.evaluate import plan
-from torchtrack.files import naming
 from torchtrack.io import is_sequence, open_events, read_calibration, read_sequence, read_trajectory
 from torchtrack.object_model import ObjectModel
 from torchtrack.session import open_session

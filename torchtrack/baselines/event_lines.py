@@ -11,16 +11,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import lie, quality
+from torchtrack import quality
 from torchtrack.baselines.straight_edges import straight_edges_only, too_curved
-from torchtrack.camera import MIN_DEPTH_M, Camera
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.contour_index import index_contours
 from torchtrack.contours import Contours, reproject, select_ranked, take_points
+from torchtrack.core import lie
+from torchtrack.core.camera import MIN_DEPTH_M, Camera
+from torchtrack.core.events import EventBatch, pad_streams
+from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.corners import no_corners
 from torchtrack.errors import ModelError
-from torchtrack.events import EventBatch, pad_streams
-from torchtrack.image_motion import object_plane_velocity, pixel_velocity
 from torchtrack.matching import Matches
 from torchtrack.motion import left_covariance
 from torchtrack.object_model import ObjectModel

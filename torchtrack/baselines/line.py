@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.baselines.event_lines import EventLineTracker
-from torchtrack.events import EventBatch
+from torchtrack.core.events import EventBatch
 from torchtrack.pose_problem import Linearisation
 from torchtrack.pose_solver import solve_positive
 from torchtrack.state import StepResult, TrackerState

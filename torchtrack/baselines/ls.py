@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchtrack import lie
 from torchtrack.baselines.event_lines import EventLineTracker
-from torchtrack.events import EventBatch
+from torchtrack.core import lie
+from torchtrack.core.events import EventBatch
 from torchtrack.motion import inverse
 from torchtrack.state import StepResult, TrackerState
 

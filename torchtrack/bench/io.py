@@ -14,8 +14,8 @@ import numpy as np
 
 from torchtrack.bench.results import Report, Result
 from torchtrack.bench.setup import Setup
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import MissingExtraError
-from torchtrack.events import EventBatch
 from torchtrack.io.convert import WRITERS
 from torchtrack.io.formats import open_events
 

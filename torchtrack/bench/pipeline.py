@@ -7,8 +7,8 @@ import numpy as np
 from torchtrack.bench.results import Report, Result, time_result
 from torchtrack.bench.scene import HD, SHAPES, Scene, read, shapes_of, simulated, started, with_events_outside
 from torchtrack.bench.setup import Setup
-from torchtrack.events import EventBatch
-from torchtrack.kernels.switch import numba_is_installed
+from torchtrack.core.dispatch import numba_is_installed
+from torchtrack.core.events import EventBatch
 from torchtrack.stepping import cut_windows, steps
 from torchtrack.window_length import WindowLength
 

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from torchtrack.bench.plots import Plot, draw
+from torchtrack.core.dispatch import numba_is_installed
 from torchtrack.errors import ConfigError, MissingFileError
 from torchtrack.io.atomic import atomic_path
-from torchtrack.kernels.switch import numba_is_installed
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.bench.clock import Clock
-from torchtrack.camera import Camera, project
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.camera import Camera, project
+from torchtrack.core.events import EventBatch, concatenate
+from torchtrack.core.lie import rotation_angle_deg, transform_points
 from torchtrack.errors import ConfigError
-from torchtrack.events import EventBatch, concatenate
 from torchtrack.io import Trajectory
-from torchtrack.lie import rotation_angle_deg, transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.quality import Status
 from torchtrack.session import open_session

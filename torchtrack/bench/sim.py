@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from torchtrack.bench.results import Report, Result
 from torchtrack.bench.setup import Setup
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
 from torchtrack.errors import MissingExtraError
 from torchtrack.sim.drawing import merge_regions
 from torchtrack.sim.event_camera import EventCamera

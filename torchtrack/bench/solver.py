@@ -8,9 +8,9 @@ from torch import Tensor
 from torchtrack.bench.plots import Plot
 from torchtrack.bench.results import Report, time_result
 from torchtrack.bench.setup import Setup
-from torchtrack.camera import Camera, project
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.lie import retract_about, rotation_angle_deg, so3_exp, transform_points
+from torchtrack.core.camera import Camera, project
+from torchtrack.core.lie import retract_about, rotation_angle_deg, so3_exp, transform_points
 from torchtrack.pose_problem import PoseProblem
 from torchtrack.pose_solver import solve_pose
 

@@ -5,7 +5,7 @@ import torch
 from torchtrack.bench.results import Report, Result, time_result
 from torchtrack.bench.setup import Setup
 from torchtrack.config.tracker import SurfaceConfig
-from torchtrack.events import EventBatch
+from torchtrack.core.events import EventBatch
 from torchtrack.time_surface import Regions, empty_last_event, time_surface, update_last_event
 
 # Width, height and events of a window: at 4 and 20 Mev/s, and many at once.

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from torchtrack.config.run import Models, OverlayConfig, TrackingConfig
 from torchtrack.config.settings import ConfigPath
-from torchtrack.limits import Limits, current_limits
+from torchtrack.core.limits import Limits, current_limits
 
 
 class DemoConfig(TrackingConfig):

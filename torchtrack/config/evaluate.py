@@ -8,7 +8,7 @@ from pydantic import Field, StringConstraints, model_validator
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.run import Models, TrackingConfig
 from torchtrack.config.settings import ConfigPath, Settings
-from torchtrack.limits import Limits, current_limits
+from torchtrack.core.limits import Limits, current_limits
 
 Label = Annotated[str, StringConstraints(pattern=r"^[\w-]+$")]
 CellName = Annotated[str, StringConstraints(pattern=r"^\d\d( [a-z]+)?$")]

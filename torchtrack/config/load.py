@@ -13,9 +13,9 @@ from pydantic import BaseModel, ValidationError
 from torchtrack.config.explain import explained
 from torchtrack.config.merge import merged, nested
 from torchtrack.config.settings import CommandLineText, Settings
+from torchtrack.core.files import is_file, read_bytes
+from torchtrack.core.yaml_text import load_document
 from torchtrack.errors import ConfigError, MissingFileError
-from torchtrack.files import is_file, read_bytes
-from torchtrack.yaml_text import load_document
 
 S = TypeVar("S", bound=BaseModel)
 

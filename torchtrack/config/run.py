@@ -5,14 +5,14 @@ from typing import Any, Literal, get_args
 
 from pydantic import Field, model_validator
 
-from torchtrack.camera import DistortionModel
 from torchtrack.config.events import EventsConfig, EventSourcePath, TimeUnit
 from torchtrack.config.merge import merged
 from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.lie import quaternion_problem
-from torchtrack.limits import Limits, current_limits
+from torchtrack.core.camera import DistortionModel
+from torchtrack.core.lie import quaternion_problem
+from torchtrack.core.limits import Limits, current_limits
 
 Models = Literal["textured", "geometry"]
 Row = tuple[float, float, float, float]

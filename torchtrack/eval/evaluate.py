@@ -8,6 +8,8 @@ from pathlib import Path
 from torchtrack.baselines import unsuitable
 from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
 from torchtrack.config.run import RunConfig
+from torchtrack.core.limits import limits as file_limits
+from torchtrack.core.windows import EventWindow
 from torchtrack.errors import EventDataError
 from torchtrack.eval.compact import compact_report
 from torchtrack.eval.grid import Report
@@ -16,12 +18,10 @@ from torchtrack.eval.metrics import PoseErrors, summarise
 from torchtrack.eval.paper import check_cells, paper_report
 from torchtrack.eval.results import Evaluation, Failure, NotApplicable, ObjectResult, write_results
 from torchtrack.eval.sources import cell_sequences, find_sequences
-from torchtrack.events import EventWindow
 from torchtrack.executor import TaskFailure, Tell
 from torchtrack.executor.groups import run_in_groups
 from torchtrack.executor.tasks import without_errors
 from torchtrack.io.atomic import check_writable
-from torchtrack.limits import limits as file_limits
 from torchtrack.quality import Status
 from torchtrack.session import open_session
 from torchtrack.sim.suite import Told

@@ -16,12 +16,12 @@ from numpy import ndarray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchtrack.camera import project, undistortion_table
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_model import group_by_model
 from torchtrack.contours import Contours, mesh_contours
+from torchtrack.core.camera import project, undistortion_table
+from torchtrack.core.lie import transform_points
 from torchtrack.errors import EventDataError
-from torchtrack.lie import transform_points
 from torchtrack.session import Session
 
 # Latencies that are tried first, µs.

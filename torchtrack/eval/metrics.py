@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchtrack.core.lie import rotation_angle_deg
 from torchtrack.io import Trajectory
-from torchtrack.lie import rotation_angle_deg
 from torchtrack.object_model.symmetry import RevolutionAxis
 
 

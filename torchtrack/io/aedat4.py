@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
+from torchtrack.core.limits import current_limits
 from torchtrack.errors import EventDataError, UnknownFormatError
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_file import EventFile
@@ -22,7 +23,6 @@ from torchtrack.io.extras import optional
 from torchtrack.io.flatbuffer import field_offset, root_table, vector, whole
 from torchtrack.io.one_of_several import chosen_stream
 from torchtrack.io.problems import Problem
-from torchtrack.limits import current_limits
 
 AEDAT4_MAGIC = b"#!AER-DAT4.0\r\n"
 _EVENT = np.dtype({"names": ["t", "x", "y", "on"], "formats": ["<i8", "<i2", "<i2", "u1"], "offsets": [0, 8, 10, 12], "itemsize": 16})

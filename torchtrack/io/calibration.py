@@ -26,7 +26,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from torchtrack.camera import Camera, DistortionModel
+from torchtrack.core.camera import Camera, DistortionModel
 from torchtrack.errors import CalibrationError, TorchtrackWarning
 from torchtrack.io.calibration_numbers import Given, agreed_size
 from torchtrack.io.foreign_calibration import foreign_camera, load_calibration_text
@@ -37,7 +37,7 @@ _FORMS = "expected 'fx fy cx cy k1 k2 p1 p2 k3', or YAML with fx, fy, cx, cy, wi
 
 
 class _CalibrationFile(BaseModel):
-    """The YAML form; what the numbers may be is checked by :class:`torchtrack.camera.Camera`."""
+    """The YAML form; what the numbers may be is checked by :class:`torchtrack.core.camera.Camera`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from torchtrack.camera import DistortionModel
+from torchtrack.core.camera import DistortionModel
 from torchtrack.errors import CalibrationError
 
 _SIZE = ("image_size", "resolution", "img_size", "imageSize", "cameraResolution", "sensor_size")

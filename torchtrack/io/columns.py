@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch
 
 
 @dataclass(frozen=True)

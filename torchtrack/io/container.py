@@ -28,10 +28,10 @@ import h5py
 import numpy as np
 import torch
 
-from torchtrack.camera import Camera
 from torchtrack.config.events import ReadingConfig
+from torchtrack.core.camera import Camera
+from torchtrack.core.files import is_file
 from torchtrack.errors import CalibrationError, EventDataError, PoseError
-from torchtrack.files import is_file
 from torchtrack.io.event_file import DEFAULT_CHOICES
 from torchtrack.io.hdf5 import HDF5_MAGIC, Hdf5Events, open_hdf5
 from torchtrack.io.hdf5_storage import check_link, check_whole

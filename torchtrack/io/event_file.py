@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import ClassVar
 
 from torchtrack.config.events import ReadingConfig
+from torchtrack.core.events import EventBatch
+from torchtrack.core.files import check_is_file, naming
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch
-from torchtrack.files import check_is_file, naming
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
 from torchtrack.io.event_stream import EventStream

@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
+from torchtrack.core.events import EventBatch
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch
-from torchtrack.limits import check_limit
 
 DEFAULT_CHUNK_EVENTS = 500_000
 # Readers that may choose read about so many events at a time: what is made of them stays in the processor's cache.

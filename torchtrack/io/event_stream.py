@@ -4,8 +4,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from torchtrack.core.events import EventBatch
+from torchtrack.core.windows import EventWindow, windows_by_count, windows_by_time
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch, EventWindow, windows_by_count, windows_by_time
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, EventSource
 from torchtrack.io.info import EventInfo, summarise
 

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
+from torchtrack.core.yaml_text import LimitedLoader, load_documents
 from torchtrack.errors import CalibrationError, TorchtrackWarning
 from torchtrack.io.calibration_cameras import cameras_of, chosen
 from torchtrack.io.calibration_numbers import Given, agreed_size, first_of, numbers, size_of
 from torchtrack.io.lens_model import lens
-from torchtrack.yaml_text import LimitedLoader, load_documents
 
 _MATRIX = ("camera_matrix", "cameraMatrix", "K", "k", "intrinsic_matrix", "intrinsics", "projection_parameters")
 _DISTORTION = ("distortion_coefficients", "distortion_coeffs", "distCoeffs", "D", "d", "dist_coeffs", "distortion", "distortion_parameters")

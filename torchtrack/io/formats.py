@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import cast
 
 from torchtrack.config.events import ReadingConfig
+from torchtrack.core.files import check_is_file, is_file
 from torchtrack.errors import UnknownFormatError
-from torchtrack.files import check_is_file, is_file
 from torchtrack.io.aedat4 import AEDAT4_MAGIC, Aedat4File
 from torchtrack.io.csv_text import CsvFile
 from torchtrack.io.dat import DatFile

@@ -24,8 +24,8 @@ import h5py
 import numpy as np
 
 from torchtrack.config.events import TimeUnit
+from torchtrack.core.files import check_is_file
 from torchtrack.errors import EventDataError, TorchtrackError, UnknownFormatError
-from torchtrack.files import check_is_file
 from torchtrack.io.column_names import unit_of
 from torchtrack.io.columns import Columns, shifted
 from torchtrack.io.event_file import EventFile

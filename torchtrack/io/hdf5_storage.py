@@ -8,8 +8,8 @@ from pathlib import Path
 
 import h5py
 
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import EventDataError
-from torchtrack.limits import check_limit
 
 # Less is read at once anyhow.
 _SMALL_BYTES = 1 << 20

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from torchtrack.events import EventBatch
+from torchtrack.core.events import EventBatch
 from torchtrack.io.event_source import EventSource
 
 _PEAK_SPAN_US = 10_000

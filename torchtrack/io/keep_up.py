@@ -13,7 +13,8 @@ from dataclasses import replace
 
 import torch
 
-from torchtrack.events import EventBatch, EventWindow, concatenate
+from torchtrack.core.events import EventBatch, concatenate
+from torchtrack.core.windows import EventWindow
 
 MOST_JOINED = 12
 """So many windows are tracked as one at most, while fewer than may wait do."""

@@ -31,7 +31,7 @@ _SAY_AT_THE_END = (
 
 
 def lens(content: Mapping[str, Any], coefficients: list[float], given: Given) -> tuple[str, tuple[float, ...]]:
-    """Model and coefficients as :class:`torchtrack.camera.Camera` has them; zeros at the end are left out where they are too many.
+    """Model and coefficients as :class:`torchtrack.core.camera.Camera` has them; zeros at the end are left out where they are too many.
 
     Raises:
         CalibrationError: if keys disagree, a model is not known, or its coefficients do not fit it.

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
 from torchtrack.io.event_stream import EventStream

@@ -16,8 +16,8 @@ from itertools import chain
 
 import numpy as np
 
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch
 from torchtrack.io.columns import Columns, join, shifted
 from torchtrack.io.lateness import Arrivals, Recent, merged
 from torchtrack.io.problems import ClockChange, Problem, Problems

@@ -17,6 +17,7 @@ from typing import ClassVar, cast
 import numpy as np
 
 from torchtrack.config.events import TimeUnit
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import EventDataError, UnknownFormatError
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_arrays import EventArrays, event_sets
@@ -25,7 +26,6 @@ from torchtrack.io.event_source import PART_EVENTS
 from torchtrack.io.one_of_several import chosen_stream
 from torchtrack.io.plausibility import ENOUGH_TIMES, EVENTS, settled_unit, whole_microseconds
 from torchtrack.io.zip_archive import ZIP_MAGIC, damage_reported, open_archive
-from torchtrack.limits import check_limit
 
 __all__ = ["ZIP_MAGIC", "NpzEvents", "keys_of", "open_archive", "read_array"]
 

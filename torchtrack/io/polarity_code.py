@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 
+from torchtrack.core.events import EventBatch
+from torchtrack.core.polarity import brighter, known_codes, shown_values
 from torchtrack.errors import TorchtrackWarning
-from torchtrack.events import EventBatch
 from torchtrack.io.columns import Columns
 from torchtrack.io.problems import Problem, Problems
-from torchtrack.polarity import brighter, known_codes, shown_values
 
 PolarityChoice = Literal["auto", "inverted"] | int
 _CHOOSE = "Set events.polarity (--polarity) to the value that means brighter."

@@ -12,8 +12,9 @@ from typing import Any, ClassVar
 
 import yaml
 
+from torchtrack.core.files import check_is_file, read_bytes
+from torchtrack.core.yaml_text import load_document
 from torchtrack.errors import EventDataError, TorchtrackError, TorchtrackWarning, UnknownFormatError
-from torchtrack.files import check_is_file, read_bytes
 from torchtrack.io.columns import Columns
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.extras import optional
@@ -21,7 +22,6 @@ from torchtrack.io.one_of_several import chosen_stream
 from torchtrack.io.problems import Problems
 from torchtrack.io.ros_compression import bounded_decompression, take_over_messages
 from torchtrack.io.ros_messages import ARRAYS, PACKETS, MessageDecoder
-from torchtrack.yaml_text import load_document
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
 _KINDS = {

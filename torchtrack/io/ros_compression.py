@@ -9,8 +9,8 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
+from torchtrack.core.limits import current_limits
 from torchtrack.errors import EventDataError
-from torchtrack.limits import current_limits
 
 
 def bounded_decompression() -> tuple[type[Exception], ...]:

@@ -26,10 +26,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchtrack.camera import Camera
 from torchtrack.config.events import ReadingConfig
+from torchtrack.core.camera import Camera
+from torchtrack.core.files import is_file, naming
 from torchtrack.errors import CalibrationError, EventDataError, MissingFileError, PoseError
-from torchtrack.files import is_file, naming
 from torchtrack.io.container import is_container, read_container
 from torchtrack.io.event_file import DEFAULT_CHOICES
 from torchtrack.io.npz import NpzEvents, keys_of, open_archive, read_array

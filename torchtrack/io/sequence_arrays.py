@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
 from torchtrack.errors import PoseError
 from torchtrack.io.sequence_types import Sequence
 from torchtrack.io.trajectory import Trajectory

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
 from torchtrack.io.event_source import EventSource
 from torchtrack.io.trajectory import Trajectory
 

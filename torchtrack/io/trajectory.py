@@ -10,13 +10,20 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.events import TimeUnit
+from torchtrack.core.lie import (
+    check_pose,
+    quaternion_from_rotation,
+    quaternion_problem,
+    rotation_angle_deg,
+    rotation_from_quaternion,
+    se3_interpolate,
+)
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import PoseError
 from torchtrack.io.atomic import atomic_path
 from torchtrack.io.pose_times import pose_times_us
 from torchtrack.io.seconds import format_seconds
 from torchtrack.io.whole_text import read_text_file
-from torchtrack.lie import check_pose, quaternion_from_rotation, quaternion_problem, rotation_angle_deg, rotation_from_quaternion, se3_interpolate
-from torchtrack.limits import check_limit
 
 # Between poses further apart than this in time, what moves may have gone any way. At rest is what moves by less than a measurement errs.
 _LONGEST_GAP_US = 500_000

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from torchtrack.core.files import read_bytes
 from torchtrack.errors import TorchtrackError
-from torchtrack.files import read_bytes
 
 
 def shown(error: Exception) -> str:
@@ -17,7 +17,7 @@ def read_text_file(path: Path, what: str, limit: str, kind: type[TorchtrackError
     Args:
         path: the file.
         what: what is expected to be in it, for messages.
-        limit: the limit of its size, a field of :class:`torchtrack.limits.Limits`.
+        limit: the limit of its size, a field of :class:`torchtrack.core.limits.Limits`.
         kind: the error for what cannot be read.
 
     Raises:

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from torchtrack.core.files import check_is_file
 from torchtrack.errors import EventDataError, TorchtrackError, UnknownFormatError
-from torchtrack.files import check_is_file
 
 ZIP_MAGIC = b"PK\x03\x04"
 # What zipfile is known to raise over damaged bytes.

@@ -157,7 +157,7 @@ def _in_doubt(b: int, found: Array, full_share: float, settings: ConclusionSetti
 
 @kernel()
 def _orthonormalise(T: Array, exact: Array) -> None:
-    """A pose whose rotation is exact again: :func:`torchtrack.lie.orthonormalise`."""
+    """A pose whose rotation is exact again: :func:`torchtrack.core.lie.orthonormalise`."""
     square = np.zeros((3, 3))
     for j in range(3):
         for k in range(3):

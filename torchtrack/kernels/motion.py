@@ -1,4 +1,4 @@
-"""Points of a moving object in the image: :class:`torchtrack.image_motion.MovingObjects`, one point at a time."""
+"""Points of a moving object in the image: :class:`torchtrack.core.image_velocity.MovingObjects`, one point at a time."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from torchtrack.kernels.compiler import FAST, Array, kernel
 
 Numbers = tuple[float, ...]
 
-# As torchtrack.camera.MIN_DEPTH_M: with it, this would be no foundation.
+# As torchtrack.core.camera.MIN_DEPTH_M: with it, this would be no foundation.
 _MIN_DEPTH_M = 1e-3
 
 
@@ -69,7 +69,7 @@ def across(motion: Numbers, x: float, y: float, z: float, inverse: float, intrin
 
 @kernel(fastmath=FAST)
 def at_depth(motion: Numbers, depth_m: float, u: float, v: float, intrinsics: Numbers) -> tuple[float, float]:
-    """Image velocity (px/s) that a pixel would have at a depth: :func:`torchtrack.image_motion.object_plane_velocity`."""
+    """Image velocity (px/s) that a pixel would have at a depth: :func:`torchtrack.core.image_velocity.object_plane_velocity`."""
     x, y, inverse = (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], inverse_depth(depth_m)
     moving_z = motion[0] * y - motion[1] * x + motion[5] * inverse
     moving_x = motion[1] - motion[2] * y + motion[3] * inverse
@@ -92,7 +92,7 @@ def depth_of(T_cam_obj: Array, centre_obj: Array) -> float:
 
 @kernel(fastmath=FAST)
 def turn(rotation: Array, phi: Array, into: Array) -> None:
-    """Turn a rotation by Cayley's map: :func:`torchtrack.lie.turned`."""
+    """Turn a rotation by Cayley's map: :func:`torchtrack.core.lie.turned`."""
     a, b, c = 0.5 * phi[0], 0.5 * phi[1], 0.5 * phi[2]
     factor = 8.0 / (4.0 + phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
     for k in range(3):

@@ -9,9 +9,9 @@ from pydantic import Field, field_validator
 from torch import Generator
 
 from torchtrack.config.settings import Settings
-from torchtrack.events import EventBatch, concatenate
+from torchtrack.core.events import EventBatch, concatenate
+from torchtrack.core.lie import se3_exp, se3_inverse
 from torchtrack.learn.samples import Sample
-from torchtrack.lie import se3_exp, se3_inverse
 
 _Range = tuple[float, float]
 

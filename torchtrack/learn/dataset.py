@@ -17,12 +17,13 @@ from pydantic import Field
 from torch.utils.data import Dataset, IterableDataset, Sampler, get_worker_info
 
 from torchtrack.config.settings import Settings
+from torchtrack.core.events import EventBatch, concatenate
+from torchtrack.core.lie import se3_inverse, se3_log
+from torchtrack.core.windows import windows_by_time
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch, concatenate, windows_by_time
 from torchtrack.io import Sequence, Trajectory, read_sequence
 from torchtrack.learn.augmentation import AugmentationConfig, augmented
 from torchtrack.learn.samples import Sample
-from torchtrack.lie import se3_inverse, se3_log
 from torchtrack.stepping import clipped
 
 Source = str | os.PathLike[str] | Sequence

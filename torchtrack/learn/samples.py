@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchtrack.events import EventBatch, concatenate
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.first_state import first_state
 from torchtrack.motion import initial_covariance
 from torchtrack.setup_check import check_poses

@@ -16,12 +16,12 @@ from torchtrack.config.presets import preset
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.settings import Settings
 from torchtrack.config.tracker import TrackerConfig, WindowConfig
+from torchtrack.core.lie import difference_about
 from torchtrack.evidence import Evidence
 from torchtrack.learn.augmentation import AugmentationConfig
 from torchtrack.learn.dataset import ClipConfig, SequenceBatches, WindowDataset
 from torchtrack.learn.labels import true_distance
 from torchtrack.learn.samples import Batch, collate, start_state, state_velocity
-from torchtrack.lie import difference_about
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracker import Tracker
 from torchtrack.trust import TrustNetwork

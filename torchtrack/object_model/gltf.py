@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import ModelError, TorchtrackError
-from torchtrack.limits import check_limit
 from torchtrack.object_model.gltf_accessors import GltfContent, Tree, at
 from torchtrack.object_model.notices import tell
 from torchtrack.object_model.side_files import MeshText, SideFiles

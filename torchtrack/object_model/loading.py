@@ -12,8 +12,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import MissingFileError, ModelError, UnknownFormatError
-from torchtrack.limits import check_limit
 from torchtrack.object_model.gltf import read_gltf
 from torchtrack.object_model.notices import tell
 from torchtrack.object_model.obj import check_indices, read_obj

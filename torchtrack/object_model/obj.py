@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import ModelError
-from torchtrack.limits import check_limit
 from torchtrack.object_model.notices import tell
 from torchtrack.object_model.side_files import MeshText, SideFiles, find_beside
 

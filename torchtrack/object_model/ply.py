@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import ModelError, TorchtrackError
-from torchtrack.limits import check_limit
 from torchtrack.object_model.side_files import MeshText, SideFiles
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import LimitError, ModelError
-from torchtrack.limits import check_limit
 from torchtrack.object_model.loading import check_file
 from torchtrack.object_model.obj import joined_lines
 

@@ -12,7 +12,7 @@ from urllib.parse import unquote
 
 from trimesh.resolvers import Resolver
 
-from torchtrack.limits import check_limit
+from torchtrack.core.limits import check_limit
 
 
 class SideFiles(Resolver):

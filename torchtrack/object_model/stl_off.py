@@ -4,8 +4,8 @@ from pathlib import Path
 
 from trimesh.util import comment_strip
 
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import ModelError
-from torchtrack.limits import check_limit
 from torchtrack.object_model.notices import tell
 from torchtrack.object_model.side_files import MeshText, SideFiles
 

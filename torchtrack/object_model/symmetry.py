@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchtrack.lie import quaternion_from_rotation, so3_exp
+from torchtrack.core.lie import quaternion_from_rotation, so3_exp
 from torchtrack.object_model.model import ObjectModel
 
 # A turn by one radian may move the surface along its normals by this share of its distance from the axis: what a circle

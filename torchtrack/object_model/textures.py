@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from torchtrack.limits import check_limit
+from torchtrack.core.limits import check_limit
 from torchtrack.object_model.notices import tell
 from torchtrack.object_model.side_files import MeshText
 

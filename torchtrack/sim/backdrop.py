@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
 
 Rays = Float[ndarray, "h w 3"]
 Texels = Float[ndarray, "h w 2"]

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import Field
 
-from torchtrack.camera import Camera
 from torchtrack.config.settings import ConfigPath, Settings
+from torchtrack.core.camera import Camera
 from torchtrack.errors import MissingFileError, UnknownFormatError
 from torchtrack.sim.backdrop import Backdrop, Placement, at_infinity, on_sensor, on_wall
 from torchtrack.sim.render import plain_background

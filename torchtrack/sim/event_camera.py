@@ -37,8 +37,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch
 from torchtrack.sim.fired import Fired, concatenate_fired, read_out
 from torchtrack.sim.noise import HotPixels, rested, shot_noise
 from torchtrack.sim.photoreceptor import cutoff_hz, response

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from torchtrack.camera import Camera, distort, undistortion_table
+from torchtrack.core.camera import Camera, distort, undistortion_table
 from torchtrack.sim.drawing import Region, merge_regions
 from torchtrack.sim.render import Frame, RenderConfig, Renderer, Scenery, blurred
 from torchtrack.sim.surface import Parts

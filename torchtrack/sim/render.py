@@ -6,7 +6,7 @@
     renderer = Renderer(objects, Camera(600, 600, 319.5, 239.5, 640, 480), plain_background(640, 480, 0.2))
     frame = renderer.render(T_cam_obj)        # [objects, 4, 4] -> frame.luminance [480, 640], linear in light
 
-Conventions of :mod:`torchtrack.camera`: pixel ``i`` gathers the light between ``i - 0.5`` and ``i + 0.5``. Luminance is
+Conventions of :mod:`torchtrack.core.camera`: pixel ``i`` gathers the light between ``i - 0.5`` and ``i + 0.5``. Luminance is
 linear in light: 1 is a white surface that faces the light. Lens distortion is not drawn: images are ideal.
 
 Samples lie in a canonical multi-jittered arrangement (Chiu, Shirley & Wang 1994; Kensler 2013): ``n x n`` samples fall into
@@ -25,8 +25,8 @@ from numpy import ndarray
 from pydantic import Field
 from torch import Tensor
 
-from torchtrack.camera import Camera
 from torchtrack.config.settings import Settings
+from torchtrack.core.camera import Camera
 from torchtrack.errors import CalibrationError, MissingExtraError, ModelError, PoseError
 from torchtrack.sim.drawing import Drawer, Light, Region, merge_regions
 from torchtrack.sim.surface import Parts, merge_objects

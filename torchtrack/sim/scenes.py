@@ -6,11 +6,11 @@ import numpy as np
 import trimesh
 from pydantic import Field, model_validator
 
-from torchtrack.camera import Camera, DistortionModel
 from torchtrack.config.merge import merged
 from torchtrack.config.settings import ConfigPath, Settings
+from torchtrack.core.camera import Camera, DistortionModel
+from torchtrack.core.limits import Limits, current_limits
 from torchtrack.io.calibration import read_calibration
-from torchtrack.limits import Limits, current_limits
 from torchtrack.object_model.loading import checked_scale, load_parts
 from torchtrack.sim.background import BackgroundConfig
 from torchtrack.sim.meshes import make_mesh

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from torchtrack.camera import Camera
-from torchtrack.events import EventBatch, concatenate
+from torchtrack.core.camera import Camera
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.io.trajectory import Trajectory
 from torchtrack.sim.drawing import merge_regions
 from torchtrack.sim.event_camera import EventCamera

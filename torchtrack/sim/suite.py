@@ -19,11 +19,11 @@ from pydantic import Field
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load, read_yaml
 from torchtrack.config.settings import Settings
+from torchtrack.core.limits import limits
 from torchtrack.errors import ConfigError, MissingFileError, TorchtrackError
 from torchtrack.executor import TaskFailure, Tell, run_tasks
 from torchtrack.io.atomic import check_writable
 from torchtrack.io.sequence import read_sequence
-from torchtrack.limits import limits
 from torchtrack.sim.output import check_output, write
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import Progress, simulate

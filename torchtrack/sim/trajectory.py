@@ -29,8 +29,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from torchtrack import lie
 from torchtrack.config.settings import ConfigPath, Settings
+from torchtrack.core import lie
 from torchtrack.io.trajectory import Trajectory, read_tum
 
 Vector = tuple[float, float, float]

@@ -18,8 +18,8 @@ from numpy import ndarray
 from pydantic import Field, model_validator
 
 from torchtrack.config.settings import ConfigPath, Settings
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
-from torchtrack.events import EventBatch, concatenate
 from torchtrack.io.atomic import atomic_path, check_writable
 from torchtrack.sim.event_camera import EventCamera
 from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig

@@ -11,8 +11,8 @@ from numpy import ndarray
 from scipy.spatial import QhullError
 from torch import Tensor
 
-from torchtrack import lie
-from torchtrack.camera import MIN_DEPTH_M, Camera, project
+from torchtrack.core import lie
+from torchtrack.core.camera import MIN_DEPTH_M, Camera, project
 from torchtrack.errors import ConfigError
 from torchtrack.sim.lens import ideal_camera
 from torchtrack.sim.render import Scenery

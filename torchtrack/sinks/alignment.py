@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchtrack.camera import undistortion_table
 from torchtrack.contours import reproject
+from torchtrack.core.camera import undistortion_table
 from torchtrack.eval.alignment import alignment
 from torchtrack.session import Session
 from torchtrack.stepping import Step

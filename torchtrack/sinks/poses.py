@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 
+from torchtrack.core.lie import quaternion_from_rotation
 from torchtrack.io.line_file import LineFile
 from torchtrack.io.seconds import format_seconds
-from torchtrack.lie import quaternion_from_rotation
 from torchtrack.quality import Status
 from torchtrack.sinks.folder import POSES
 from torchtrack.sinks.record import Record

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchtrack.core.lie import so3_log
 from torchtrack.eval.metrics import PoseErrors, pose_errors
 from torchtrack.io import Trajectory
-from torchtrack.lie import so3_log
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axis
 from torchtrack.quality import Status

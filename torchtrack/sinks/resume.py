@@ -10,9 +10,9 @@ import torch
 
 from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
+from torchtrack.core.lie import rotation_from_quaternion
 from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
 from torchtrack.io.atomic import writing
-from torchtrack.lie import rotation_from_quaternion
 from torchtrack.quality import Status
 from torchtrack.sinks.folder import CONFIG, POSES, ended
 from torchtrack.sinks.poses import COLUMNS, tum_path

@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from torchtrack.camera import MIN_DEPTH_M, Camera, distort, project
-from torchtrack.lie import transform_points
+from torchtrack.core.camera import MIN_DEPTH_M, Camera, distort, project
+from torchtrack.core.lie import transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.quality import Status
 from torchtrack.state import StepResult

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchtrack.bench.peers.comparison import Comparison, Work
 from torchtrack.bench.surface import WINDOW_US, random_events
 from torchtrack.config.tracker import SurfaceConfig
-from torchtrack.events import EventBatch
+from torchtrack.core.events import EventBatch
 from torchtrack.time_surface import Regions, empty_last_event, time_surface, update_last_event
 
 WIDTH, HEIGHT, EVENTS = 640, 480, 100_000

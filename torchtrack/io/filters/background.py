@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch, concatenate
 from torchtrack.io.filters.stage import Stage
 
 _NEIGHBOURS = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dx, dy) != (0, 0)]

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from torchtrack.camera import Camera
+from torchtrack.core.camera import Camera
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch
 from torchtrack.io.filters.stage import Stage
 
 

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from torchtrack.events import EventBatch
+from torchtrack.core.events import EventBatch
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, EventSource
 from torchtrack.io.event_stream import EventStream, LaterStream
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError
-from torchtrack.events import EventBatch
 from torchtrack.io.columns import Columns
 from torchtrack.io.problems import Problems
 from torchtrack.io.soundness import check_order, inside

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import MissingExtraError, MissingFileError, OutputError, TorchtrackError
-from torchtrack.limits import check_limit
 
 
 def is_file(path: Path) -> bool:

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.camera import MIN_DEPTH_M
-from torchtrack.lie import affine, hat, transform_points
+from torchtrack.core.camera import MIN_DEPTH_M
+from torchtrack.core.lie import affine, hat, transform_points
 
 
 def pixel_velocity(

@@ -3,13 +3,16 @@
 On a GPU, making a tensor of Python numbers waits until all that was asked of it before is done.
 """
 
+from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 Numbers = tuple[Any, ...]
+
+
 """Numbers, or rows of them."""
 
 
@@ -47,3 +50,26 @@ def _cells(radius: float | int) -> Numbers:
 def one(like: Tensor) -> Tensor:
     """A single 1 of the type and on the device of ``like``: what is added to a tensor takes a third of what a Python number does."""
     return constant((1.0,), like.dtype, like.device)
+
+
+T = TypeVar("T")
+
+
+class _Once(Generic[T]):
+    """A method as an attribute, computed once: the library's ``cached_property`` without its lock, which no compiled graph can hold."""
+
+    def __init__(self, compute: Callable[[Any], T]) -> None:
+        self._compute = compute
+        self.__doc__ = compute.__doc__
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, instance: Any, owner: type) -> T:
+        value = self._compute(instance)
+        # From now on it is found there first.
+        instance.__dict__[self._name] = value
+        return value
+
+
+once = _Once

@@ -9,14 +9,14 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from torchtrack import readback
+from torchtrack.core import host_sync
 
 _WANTED: ContextVar[bool] = ContextVar("kernels are wanted", default=True)
 
 
 def apply_to(values: Tensor) -> bool:
     """Whether kernels may compute with tensors like this one: on the CPU, where no gradients are recorded, and Numba is installed."""
-    return readback.read_at_once(values) and not torch.is_grad_enabled() and _WANTED.get() and numba_is_installed()
+    return host_sync.read_at_once(values) and not torch.is_grad_enabled() and _WANTED.get() and numba_is_installed()
 
 
 @cache

@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.camera_check import as_coefficients, check_lens, check_tangential, checked_matrix
+from torchtrack.core.camera_check import as_coefficients, check_lens, check_tangential, checked_matrix
+from torchtrack.core.limits import check_limit
 from torchtrack.errors import CalibrationError
-from torchtrack.limits import check_limit
 
 DistortionModel = Literal["none", "plumb_bob", "fisheye"]
 

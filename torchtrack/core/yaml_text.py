@@ -1,7 +1,7 @@
 """YAML of people and tools, read so that no text costs more than it should, and every fault is a ``yaml.YAMLError``.
 
 Beyond what ``yaml.SafeLoader`` checks, this refuses: a key that is given twice, a value that holds itself, more nesting or more
-values than :mod:`torchtrack.limits` allow (an alias counts as what it stands for, so that aliases of aliases cannot multiply), and
+values than :mod:`torchtrack.core.limits` allow (an alias counts as what it stands for, so that aliases of aliases cannot multiply), and
 texts that cannot be encoded. A scalar that looks like a date or a number, but is none, is told with its place.
 """
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from torchtrack.limits import current_limits
+from torchtrack.core.limits import current_limits
 
 # What the constructors of the library raise for scalars that their patterns let through, such as 2001-99-99.
 _BAD_SCALAR = (ValueError, OverflowError, KeyError, AttributeError, TypeError)

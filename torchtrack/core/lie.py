@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack import readback
-from torchtrack.constants import constant
+from torchtrack.core import host_sync
+from torchtrack.core.constants import constant
 from torchtrack.errors import PoseError
 
 # Below this squared angle the Taylor series are exact to float64 rounding (next terms are O(θ⁶)).
@@ -155,7 +155,7 @@ def affine(matrix: Float[Tensor, "b r 3"], rows: Float[Tensor, "b 3 n"], offset:
     On a CPU it is one operation, which takes a third of the time for the few points of one object. On a GPU, libraries take several times
     as long for products this thin as three sums do, which a compiler makes a part of what comes before and after.
     """
-    if not readback.on_gpu(rows):
+    if not host_sync.on_gpu(rows):
         return torch.bmm(matrix, rows) if offset is None else torch.baddbmm(offset, matrix, rows)
     first = matrix[..., :1] * rows[:, :1] if offset is None else torch.addcmul(offset, matrix[..., :1], rows[:, :1])
     return torch.addcmul(torch.addcmul(first, matrix[..., 1:2], rows[:, 1:2]), matrix[..., 2:], rows[:, 2:])
