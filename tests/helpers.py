@@ -7,7 +7,6 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours
 from torchtrack.core.camera import Camera, project
 from torchtrack.core.events import EventBatch
@@ -15,6 +14,7 @@ from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.lie import rotation_angle_deg, se3_exp, so3_exp, transform_points
 from torchtrack.io import Trajectory
 from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.observations import Observations
 
 

@@ -15,7 +15,6 @@ from torchtrack.bursts import LONG_AGO_US, update_bursts
 from torchtrack.config.search import QualityConfig
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.contour_index import index_contours
-from torchtrack.contour_model import ContourKind, group_by_model
 from torchtrack.contours import assemble, mesh_contours, reproject
 from torchtrack.core.camera import undistortion_table
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
@@ -24,6 +23,7 @@ from torchtrack.hypotheses import mark
 from torchtrack.matching import ContourTable, Matches
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.contour_source import ContourKind, group_by_model
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.polarity_memory import remembered
 from torchtrack.prediction import Prediction

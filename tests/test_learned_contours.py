@@ -11,10 +11,10 @@ from tracked_boxes import assert_same, follow, merged, moving_box, poses_of, win
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import ContourConfig, LearningConfig, TrackerConfig
-from torchtrack.contour_model import ContourKind
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg
 from torchtrack.learned_contours import LearnedContours
+from torchtrack.object_model.contour_source import ContourKind
 
 COUNT = 24
 OFF = TrackerConfig(learning=LearningConfig(points=0))

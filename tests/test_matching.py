@@ -9,11 +9,11 @@ from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator,
 
 from torchtrack.config.tracker import ContourConfig, MatchingConfig
 from torchtrack.contour_index import index_contours
-from torchtrack.contour_model import ContourKind, group_by_model
 from torchtrack.contours import Contours, mesh_contours, reproject
 from torchtrack.core.image_velocity import MovingObjects, object_plane_velocity
 from torchtrack.core.lie import retract_about
 from torchtrack.matching import ContourTable, both_coordinates, concentration, match_along_flow, match_nearest, on_and_around, patch, patch_sums
+from torchtrack.object_model.contour_source import ContourKind, group_by_model
 from torchtrack.observations import Observations
 
 

@@ -13,9 +13,9 @@ from torchtrack import Tracker
 from torchtrack.config.presets import preset
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.contour_index import index_contours
-from torchtrack.contour_model import ContourKind
 from torchtrack.matching import ContourTable, match_nearest
 from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.online_learning import objects_as_known
 from torchtrack.polarity_memory import expected_polarity, is_asked, is_seen_well, nothing_remembered, octant, remembered
 from torchtrack.quality import Status, explained_share

@@ -10,11 +10,11 @@ from tracked_boxes import started
 
 from torchtrack.alignment import gate_widening
 from torchtrack.config.tracker import ContourConfig, MatchingConfig, TrackerConfig
-from torchtrack.contour_model import group_by_model
 from torchtrack.core.camera import project
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.object_batch import ObjectBatch
+from torchtrack.object_model.contour_source import group_by_model
 from torchtrack.prediction import Prediction
 
 CONTOURS = ContourConfig()

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from torchtrack.config.search import QualityConfig
-from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours
 from torchtrack.matching import Matches
+from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.quality import Status, explained_share, gathered_share, holding_on, judge, needed_share, partly_hidden, trust, visible_share
 
 IMAGE_SIZE = (150, 200)

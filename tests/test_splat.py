@@ -10,10 +10,10 @@ from helpers import SMALL_CAMERA, box_model, generator, pose, random_pose
 from scipy.spatial import ConvexHull
 
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contour_model import ContourKind, group_by_model
 from torchtrack.core.camera import project
 from torchtrack.core.lie import transform_points
 from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.contour_source import ContourKind, group_by_model
 from torchtrack.splat import boundary_points, splat_contours
 
 CONFIG = ContourConfig(source="splat")

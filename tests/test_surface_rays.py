@@ -6,10 +6,10 @@ import trimesh
 from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, generator, pose, random_pose
 
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contour_model import group_by_model
 from torchtrack.core.camera import project
 from torchtrack.core.lie import se3_inverse, transform_points
 from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.contour_source import group_by_model
 from torchtrack.surface_rays import rays_of, surface_points
 
 INTRINSICS = SMALL_CAMERA.intrinsics(torch.float64)[None]

@@ -8,10 +8,10 @@ from helpers import SMALL_CAMERA, box_model, pose, random_pose
 
 from torchtrack import visibility
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contour_model import group_by_model
 from torchtrack.contours import mesh_contours
 from torchtrack.core.camera import Camera
 from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.contour_source import group_by_model
 from torchtrack.quality import visible_share
 from torchtrack.visibility import DepthGrid, Scene, depth_buffer, hidden_by_faces, remove_hidden
 

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from torchtrack import fast_contours
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contour_model import ContourKind, ContourModel
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.lie import affine, transform_points
 from torchtrack.kernels.settings import SamplingSettings
+from torchtrack.object_model.contour_source import ContourKind, ContourModel
 
 # Of a model with no more edges than this, all are looked at.
 _FEW_EDGES = 512
@@ -238,7 +238,7 @@ def mesh_elements(
     config: ContourConfig,
     shown: Bool[Tensor, "b k"],
 ) -> tuple[Contours, Int[Tensor, "b m"]]:
-    """:func:`mesh_contours`, and the element of the model that each point is on (:mod:`torchtrack.contour_model`)."""
+    """:func:`mesh_contours`, and the element of the model that each point is on (:mod:`torchtrack.object_model.contour_source`)."""
     points, tangents, kind, mask, element = _mesh_points(models, T_cam_obj, intrinsics, config, shown)
     return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics), element
 

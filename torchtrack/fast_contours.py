@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.contour_model import ContourModel
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import SamplingSettings
+from torchtrack.object_model.contour_source import ContourModel
 
 # What of a model its contour points are sampled from, beside the faces.
 _SAMPLED_FROM = ("is_crease", "is_segment", "edges", "texture_points", "texture_tangents", "texture_normals")

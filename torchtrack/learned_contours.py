@@ -16,9 +16,9 @@ from torch import Tensor
 
 from torchtrack import quality
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
-from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours
 from torchtrack.object_batch import LearnedPoints
+from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.search import Found
 
 # The model's share that is assumed at first, how fast it follows, and how much more of it ends the need of learned contours.

@@ -15,13 +15,13 @@ from torchtrack.bursts import without_tail
 from torchtrack.common_error import APART_PX, ASIDE_PX, DEPTH_SHARE, PARALLEL, SORTED_PX2, TOUCHING_PX, mistaken_px2
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.contour_index import ContourIndex
-from torchtrack.contour_model import ContourKind
 from torchtrack.contours import Contours, take_points
 from torchtrack.core import dispatch
 from torchtrack.core.constants import constant, one
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import TableSettings
+from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.observations import Observations
 from torchtrack.polarity_memory import octant
 

@@ -16,10 +16,10 @@ from torch.nn.functional import pad
 from torchtrack.alignment import usual_index_radius
 from torchtrack.config.tracker import ModelTrustConfig, TrackerConfig
 from torchtrack.contour_index import ContourIndex, index_contours
-from torchtrack.contour_model import ContourKind, ContourModel
 from torchtrack.contours import Contours, take_points
 from torchtrack.core.camera import project
 from torchtrack.matching import ContourTable, match_nearest, on_and_around
+from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.prediction import Prediction
 from torchtrack.quality import inside
@@ -40,7 +40,7 @@ _LEAST_WAY_PX = 0.3
 
 @dataclass(frozen=True)
 class ModelTrust:
-    """What was seen of each element of each object's model (see :mod:`torchtrack.contour_model`).
+    """What was seen of each element of each object's model (see :mod:`torchtrack.object_model.contour_source`).
 
     Args:
         explained: observations on it.

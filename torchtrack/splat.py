@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contour_model import ContourKind, ContourModel
 from torchtrack.contours import Contours, assemble, select_ranked, take_points
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.lie import transform_points
+from torchtrack.object_model.contour_source import ContourKind, ContourModel
 
 
 def _close(occupied: Float[Tensor, "b h w"], radius: int) -> Float[Tensor, "b h w"]:

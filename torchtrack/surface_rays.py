@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.contour_model import ContourModel
 from torchtrack.contours import take_points
 from torchtrack.core.lie import transform_points
+from torchtrack.object_model.contour_source import ContourModel
 
 # Nothing is met farther away than this (m).
 _FARTHEST_M = 1e4

@@ -7,12 +7,12 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contour_model import ContourModel, group_by_model
 from torchtrack.core.camera import Camera
 from torchtrack.doubt import mirrors, turns
 from torchtrack.model_trust import element_groups
 from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.contour_source import ContourModel, group_by_model
 from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, stacked, symmetry_planes, turning_axis
 from torchtrack.other_places import SymmetryPlanes
 from torchtrack.prediction import far_pose

@@ -10,9 +10,9 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.contour_model import ContourModel
 from torchtrack.errors import UnknownFormatError
 from torchtrack.evidence import Evidence
+from torchtrack.object_model.contour_source import ContourModel
 from torchtrack.trust_features import FEATURES, limb_features, trust_features
 
 _SHIPPED = "learned.safetensors"

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import softsign
 
-from torchtrack.contour_model import ContourKind
 from torchtrack.contours import take_points
 from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
@@ -23,6 +22,7 @@ from torchtrack.evidence import Evidence
 from torchtrack.history import BORDER_PX
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import PatchSettings
+from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.observations import Observations, laid_out
 
 # Where the patch is sampled: across the contour and along it (px). Negative is behind the moving edge.

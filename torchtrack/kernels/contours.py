@@ -37,7 +37,7 @@ def sample(
 
     Args:
         members: numbers of the objects.
-        edge_ends, face_normals, face_offsets, is_crease, is_segment, edges: of the model's edges, as :class:`torchtrack.contour_model.ContourModel`
+        edge_ends, face_normals, face_offsets, is_crease, is_segment, edges: of the model's edges, as :class:`torchtrack.object_model.contour_source.ContourModel`
             has them, but for those of faces, ``[2, 3, e]`` and ``[2, e]``; so are those of texture.
         sampled, kind: ``[b, SAMPLED, n]`` and ``[b, n]``, with room enough; filled as far as ``counts [b]`` says.
     """
