@@ -7,7 +7,6 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchtrack.contours import Contours
 from torchtrack.core.camera import Camera, project
 from torchtrack.core.events import EventBatch
 from torchtrack.core.image_velocity import MovingObjects
@@ -16,6 +15,7 @@ from torchtrack.io import Trajectory
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.observations import Observations
+from torchtrack.tracking.contours.points import Contours
 
 
 def generator(seed: int = 0) -> torch.Generator:

@@ -10,11 +10,11 @@ from torchtrack import Tracker, preset
 from torchtrack.baselines import LeastSquaresTracker, LineTracker, tracker_class, unsuitable
 from torchtrack.baselines.event_lines import nearest_lines
 from torchtrack.baselines.line import corrected, predicted_covariance
-from torchtrack.contours import Contours
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.object_model import ObjectModel
 from torchtrack.pose_problem import Linearisation
 from torchtrack.quality import Status
+from torchtrack.tracking.contours.points import Contours
 
 COUNT = 8
 

@@ -11,11 +11,11 @@ from tracked_boxes import in_motion
 from torchtrack.alignment import align, gate_widening, index_for
 from torchtrack.common_error import SORTED_PX2, mistaken_px2, told_by_each
 from torchtrack.config.tracker import MatchingConfig, SolverConfig, TrackerConfig
-from torchtrack.contour_index import index_contours
-from torchtrack.contours import joined
 from torchtrack.matching import ContourTable, match_nearest
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.observations import join, select_events
+from torchtrack.tracking.contours.index import index_contours
+from torchtrack.tracking.contours.points import joined
 
 WITHOUT = TrackerConfig(solver=SolverConfig(common_px=0.0))
 

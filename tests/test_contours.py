@@ -9,12 +9,13 @@ import trimesh
 from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, generator, pose, random_pose
 
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import image_normals, mesh_contours, reproject, select_ranked, take_points
 from torchtrack.core import host_sync
 from torchtrack.core.camera import project
 from torchtrack.core.lie import transform_points
+from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, ContourModel, group_by_model
+from torchtrack.tracking.contours.points import image_normals, mesh_contours, reproject
 
 CONFIG = ContourConfig(remove_hidden=False)
 INTRINSICS = SMALL_CAMERA.intrinsics(torch.float64)

@@ -14,14 +14,11 @@ from test_visibility import ball, l_prism
 from torchtrack.bursts import LONG_AGO_US, update_bursts
 from torchtrack.config.search import QualityConfig
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contour_index import index_contours
-from torchtrack.contours import assemble, mesh_contours, reproject
 from torchtrack.core.camera import undistortion_table
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.hypotheses import mark
 from torchtrack.matching import ContourTable, Matches
-from torchtrack.object_batch import ObjectBatch
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
 from torchtrack.observations import WindowEvents, select_events
@@ -29,7 +26,10 @@ from torchtrack.polarity_memory import remembered
 from torchtrack.prediction import Prediction
 from torchtrack.quality import shares
 from torchtrack.sensor_tiles import SensorTiles
-from torchtrack.visibility import Scene, remove_hidden
+from torchtrack.tracking.contours.index import index_contours
+from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.contours.points import assemble, mesh_contours, reproject
+from torchtrack.tracking.contours.visibility import Scene, remove_hidden
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}

@@ -6,8 +6,8 @@ from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
 from pydantic import ValidationError
 
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.contour_index import index_contours
 from torchtrack.matching import ContourTable, match_nearest, mutual_agreement, patch, patch_sums
+from torchtrack.tracking.contours.index import index_contours
 
 
 def agreement(offsets, *, matched=True, place=50.0, spread_px=0.7, dtype=torch.float64):

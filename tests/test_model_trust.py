@@ -10,10 +10,10 @@ from tracked_boxes import assert_same, follow, moving_box, poses_of, windows
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import ContourConfig, MatchingConfig, ModelTrustConfig, TrackerConfig
-from torchtrack.contours import mesh_elements
 from torchtrack.model_trust import ModelTrust
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.state import joined, take_part
+from torchtrack.tracking.contours.points import mesh_elements
 
 COUNT = 30
 OFF, CONFIG = TrackerConfig(), ModelTrustConfig(least_share=0.5)

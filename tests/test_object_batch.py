@@ -6,7 +6,7 @@ from helpers import SMALL_CAMERA, box_model, pose
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.object_batch import repeat_row
+from torchtrack.tracking.contours.objects import repeat_row
 
 CONTOURS = ContourConfig()
 SPLAT = ContourConfig(source="splat", texture=False, creases=False)

@@ -4,8 +4,8 @@ import pytest
 import torch
 from helpers import IMAGE_SIZE, contours_at, generator, moving_objects, seen, upright_line
 
-from torchtrack.contour_index import index_contours
 from torchtrack.observations import WindowEvents, join, select_events
+from torchtrack.tracking.contours.index import index_contours
 
 # Events of a window, and those near a contour among them.
 EVENTS, NEAR = 6000, 4000

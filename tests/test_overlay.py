@@ -9,7 +9,6 @@ import pytest
 import torch
 import trimesh
 
-from torchtrack.contours import Contours
 from torchtrack.core.camera import Camera, distort
 from torchtrack.corners import Corners
 from torchtrack.errors import TorchtrackError
@@ -17,6 +16,7 @@ from torchtrack.object_model import ObjectModel
 from torchtrack.quality import Status
 from torchtrack.state import StepResult
 from torchtrack.time_surface import empty_last_event
+from torchtrack.tracking.contours.points import Contours
 from torchtrack.viz import OverlayObject, OverlayWriter, draw_overlay, overlay_objects, save_still
 
 CAMERA = Camera(200.0, 200.0, 119.5, 89.5, 240, 180)

@@ -12,7 +12,6 @@ from tracked_boxes import WINDOW_US, follow, started
 from torchtrack import Tracker
 from torchtrack.config.presets import preset
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
-from torchtrack.contour_index import index_contours
 from torchtrack.matching import ContourTable, match_nearest
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind
@@ -21,6 +20,7 @@ from torchtrack.polarity_memory import expected_polarity, is_asked, is_seen_well
 from torchtrack.quality import Status, explained_share
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import simulate
+from torchtrack.tracking.contours.index import index_contours
 
 OFF = TrackerConfig(matching=MatchingConfig(polarity_memory_s=0.0))
 RIGHT = 5  # the octant of (1, 0)

@@ -10,12 +10,12 @@ from tracked_boxes import SCENES, assert_same, follow, started
 from torchtrack import Tracker, window_parts
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig, WindowConfig
-from torchtrack.contour_index import index_contours
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
 from torchtrack.corners import detect_corners
 from torchtrack.time_surface import empty_last_event, object_regions, time_surface, update_last_event
+from torchtrack.tracking.contours.index import index_contours
 
 COUNT = 6
 # In their first windows boxes are searched for as new ones, once in a while: not in all windows.

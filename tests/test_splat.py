@@ -14,7 +14,7 @@ from torchtrack.core.camera import project
 from torchtrack.core.lie import transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
-from torchtrack.splat import boundary_points, splat_contours
+from torchtrack.tracking.contours.splat import boundary_points, splat_contours
 
 CONFIG = ContourConfig(source="splat")
 INTRINSICS = SMALL_CAMERA.intrinsics(torch.float64)

@@ -10,7 +10,7 @@ from torchtrack.core.camera import project
 from torchtrack.core.lie import se3_inverse, transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import group_by_model
-from torchtrack.surface_rays import rays_of, surface_points
+from torchtrack.tracking.contours.surface_rays import rays_of, surface_points
 
 INTRINSICS = SMALL_CAMERA.intrinsics(torch.float64)[None]
 

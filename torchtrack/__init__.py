@@ -6,7 +6,7 @@ The pipeline, one file per stage, in data-flow order::
     time surface   decayed image of last event times          torchtrack.time_surface
     corners        guided filter, Harris, snapped to events   torchtrack.corners
     flow           robust event flow of each corner           torchtrack.flow
-    contours       visible 3D contours at the predicted pose  torchtrack.contours
+    contours       visible 3D contours at the predicted pose  torchtrack.tracking.contours.points
     observations   corners and recent events of each object   torchtrack.observations
     matching       observations to contours                   torchtrack.matching
     pose solver    Levenberg-Marquardt on SE(3)               torchtrack.pose_solver

@@ -10,17 +10,17 @@ from torch.nn.functional import pad
 from torchtrack import fast_alignment
 from torchtrack.common_error import told_by_each
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
-from torchtrack.contour_index import ContourIndex, index_contours
-from torchtrack.contours import Contours, reproject
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import Answer
 from torchtrack.implicit_gradient import with_gradient
 from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
-from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import Observations
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
 from torchtrack.pose_solver import solve_pose
 from torchtrack.prediction import Prediction
+from torchtrack.tracking.contours.index import ContourIndex, index_contours
+from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.contours.points import Contours, reproject
 
 # The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).
 _INDEX_MARGIN_PX = 2

@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.linalg import vecdot
 
-from torchtrack.contour_index import ContourIndex
-from torchtrack.contours import Contours, take_points
 from torchtrack.core.constants import constant, one
+from torchtrack.core.padded import take_points
+from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.contours.points import Contours
 
 # Where an edge is looked for beside another (px): found as far as twice that.
 ASIDE_PX = 2.0

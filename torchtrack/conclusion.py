@@ -9,7 +9,6 @@ from torch import Tensor
 from torchtrack import quality
 from torchtrack.alignment import ANYWHERE, Fit, may_be_anywhere
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contours import Contours, reproject
 from torchtrack.core import dispatch, host_sync, lie
 from torchtrack.corners import Corners
 from torchtrack.doubt import SMEARED, in_doubt
@@ -21,6 +20,7 @@ from torchtrack.polarity_memory import is_seen_well, remembered
 from torchtrack.prediction import Prediction
 from torchtrack.search import Found
 from torchtrack.state import StepResult, TrackerState
+from torchtrack.tracking.contours.points import Contours, reproject
 
 # Share of a new window in the usual quality.
 _USUAL_GAIN = 0.1

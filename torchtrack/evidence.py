@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchtrack.contour_index import ContourIndex
-from torchtrack.contours import Contours
 from torchtrack.history import History
 from torchtrack.observations import ObjectEvents, Observations, WindowEvents
 from torchtrack.prediction import Prediction
+from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.contours.points import Contours
 
 
 @dataclass(frozen=True)

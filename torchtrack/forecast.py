@@ -19,9 +19,9 @@ from torchtrack.motion import (
     with_dropped,
     without_spin,
 )
-from torchtrack.object_batch import ObjectBatch
 from torchtrack.prediction import MAX_DEPTH_M, Prediction, before_camera
 from torchtrack.state import TrackerState
+from torchtrack.tracking.contours.objects import ObjectBatch
 
 
 def forecast(

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from torchtrack import quality
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
-from torchtrack.contours import Contours
-from torchtrack.object_batch import LearnedPoints
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.search import Found
+from torchtrack.tracking.contours.objects import LearnedPoints
+from torchtrack.tracking.contours.points import Contours
 
 # The model's share that is assumed at first, how fast it follows, and how much more of it ends the need of learned contours.
 _FIRST_SHARE, _SHARE_GAIN, _MORE_SHARE = 0.7, 0.2, 0.2

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from torchtrack.contours import Contours, select_ranked, take_points
+from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.event_image import event_density, look_up
+from torchtrack.tracking.contours.points import Contours
 
 # Contour points that are looked at, at most.
 _POINTS = 256

@@ -1,6 +1,6 @@
 """Association of corners and events with contours, with gates, and moved to the window's end.
 
-Many observations look their nearest contour point up in an index (:mod:`torchtrack.contour_index`); corners may search
+Many observations look their nearest contour point up in an index (:mod:`torchtrack.tracking.contours.index`); corners may search
 along their flow, as the paper does.
 """
 
@@ -14,16 +14,17 @@ from torch.linalg import vecdot
 from torchtrack.bursts import without_tail
 from torchtrack.common_error import APART_PX, ASIDE_PX, DEPTH_SHARE, PARALLEL, SORTED_PX2, TOUCHING_PX, mistaken_px2
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.contour_index import ContourIndex
-from torchtrack.contours import Contours, take_points
 from torchtrack.core import dispatch
 from torchtrack.core.constants import constant, one
 from torchtrack.core.image_velocity import MovingObjects
+from torchtrack.core.padded import take_points
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import TableSettings
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.observations import Observations
 from torchtrack.polarity_memory import octant
+from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.contours.points import Contours
 
 # An edge this parallel to the flow (|n·f| below) is not crossed by it.
 _MIN_CROSSING = 0.3

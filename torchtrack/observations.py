@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.contour_index import ContourIndex
-from torchtrack.contours import select_ranked, take_points
 from torchtrack.core import dispatch
 from torchtrack.core.image_velocity import MovingObjects
+from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.corners import Corners
 from torchtrack.kernels.arrays import as_arrays
+from torchtrack.tracking.contours.index import ContourIndex
 
 _GOLDEN_RATIO = 0.6180339887498949
 # Lots are drawn for a little less than what there is room for, as their number varies.

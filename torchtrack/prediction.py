@@ -7,16 +7,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import Contours, assemble, select_ranked, take_points
 from torchtrack.core import dispatch
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.constants import once
 from torchtrack.core.image_velocity import MovingObjects, pixel_velocity
 from torchtrack.core.lie import retract_about, step_about, transform_points
+from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.motion import Acceleration, inverse
-from torchtrack.object_batch import ObjectBatch, repeat_row
 from torchtrack.pose_solver import pose_jacobian
+from torchtrack.tracking.contours.objects import ObjectBatch, repeat_row
+from torchtrack.tracking.contours.points import Contours, assemble
 
 # Nothing that is tracked is farther away (m).
 MAX_DEPTH_M = 1e4

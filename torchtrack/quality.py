@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.search import QualityConfig
-from torchtrack.contours import Contours
 from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import none_of
@@ -18,6 +17,7 @@ from torchtrack.core.image_velocity import MovingObjects, pixel_velocity
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import QualitySettings
 from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SMEAR_PX, Matches, on_and_around, patch, patch_sums
+from torchtrack.tracking.contours.points import Contours
 
 # A patch explains its contours when this share of the observations near them are on them.
 _LEAST_SHARE = 0.5

@@ -15,9 +15,9 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.doubt import is_due, searches
 from torchtrack.motion import MOST_UNCERTAIN, rim_and_centre
-from torchtrack.object_batch import ObjectBatch
 from torchtrack.prediction import Prediction
 from torchtrack.state import TrackerState
+from torchtrack.tracking.contours.objects import ObjectBatch
 
 # A prediction that is so uncertain, as a share of the most that predictions become, tells nothing any more.
 _NOTHING_KNOWN = 0.8

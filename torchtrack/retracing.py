@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.contours import Contours, reproject
 from torchtrack.core.events import EventBatch
 from torchtrack.core.windows import EventWindow
 from torchtrack.first_state import first_state
@@ -24,6 +23,7 @@ from torchtrack.quality import Status
 from torchtrack.state import StepResult, TrackerState, take_part
 from torchtrack.stepping import Step
 from torchtrack.tracker import Tracker
+from torchtrack.tracking.contours.points import Contours, reproject
 
 # An object that was lost for longer is hidden, and not followed any farther (s).
 _HIDDEN_S = 0.01

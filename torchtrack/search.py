@@ -12,7 +12,6 @@ from torch import Tensor
 from torchtrack import quality
 from torchtrack.alignment import Fit, align, index_for
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contours import Contours
 from torchtrack.core import host_sync
 from torchtrack.core.constants import once
 from torchtrack.doubt import less_certain
@@ -21,6 +20,7 @@ from torchtrack.line_ends import running_on
 from torchtrack.observations import ObjectEvents, WindowEvents, select_events
 from torchtrack.pose_problem import Linearisation
 from torchtrack.prediction import Prediction
+from torchtrack.tracking.contours.points import Contours
 
 # Shares that differ by less are the same: which of them is larger is chance.
 AS_MUCH = 0.02

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchtrack.bursts import LONG_AGO_US, update_bursts
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contours import Contours
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.core.events import EventBatch, PaddedEvents, check_on_sensor, of_streams, pad_streams
@@ -24,6 +23,7 @@ from torchtrack.observations import ObjectEvents, SharedEvents, WindowEvents
 from torchtrack.prediction import Prediction
 from torchtrack.sensor_tiles import TILE_BITS, NearbyEvents, SensorTiles
 from torchtrack.time_surface import at_pixels, object_regions, time_surface
+from torchtrack.tracking.contours.points import Contours
 
 # Poses that a search draws lie within this many of its least standard deviations.
 _DRAWN_SIGMAS = 4.0

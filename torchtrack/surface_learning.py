@@ -14,18 +14,19 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
-from torchtrack.contours import Contours, assemble, joined, take_points
 from torchtrack.core import host_sync
 from torchtrack.core.camera import project
 from torchtrack.core.constants import constant
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.lie import transform_points
+from torchtrack.core.padded import take_points
 from torchtrack.image_cells import CellGrid, Lines, cell_of, fit_lines, is_near, point_sums, tallied
 from torchtrack.learned_contours import LearnedContours, judge_model
-from torchtrack.object_batch import ObjectBatch
 from torchtrack.observations import ObjectEvents, WindowEvents
 from torchtrack.search import Found
-from torchtrack.surface_rays import surface_points
+from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.contours.points import Contours, assemble, joined
+from torchtrack.tracking.contours.surface_rays import surface_points
 
 # Older events are left out where the object has since moved by more than this (px).
 _LONGEST_WAY_PX = 4.0

@@ -15,8 +15,6 @@ from torchtrack.alignment import align, gate_widening, index_for, index_radius, 
 from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contour_index import ContourIndex
-from torchtrack.contours import Contours
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, pad_streams
@@ -45,6 +43,8 @@ from torchtrack.state import StepResult, TrackerState, choose_rows
 from torchtrack.step_check import check_step
 from torchtrack.time_surface import update_last_event
 from torchtrack.tracked_objects import TrackedObjects
+from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.contours.points import Contours
 from torchtrack.turns import may_have_turned
 from torchtrack.window_parts import of_unknown_motion, to_be_parted
 

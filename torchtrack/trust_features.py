@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import softsign
 
-from torchtrack.contours import take_points
 from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
+from torchtrack.core.padded import take_points
 from torchtrack.evidence import Evidence
 from torchtrack.history import BORDER_PX
 from torchtrack.kernels.arrays import as_arrays

@@ -7,10 +7,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contours import Contours, assemble, select_ranked, take_points
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
+from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.prediction import Prediction
+from torchtrack.tracking.contours.points import Contours, assemble
 
 # So many views lie some fifteen degrees apart: contours of a smooth surface hardly wander farther over it between two of them.
 _VIEWS = 200

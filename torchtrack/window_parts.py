@@ -11,9 +11,9 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.core.events import EventBatch, stream_bounds
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.object_batch import ObjectBatch
 from torchtrack.speed_limit import unknown_speed
 from torchtrack.state import TrackerState
+from torchtrack.tracking.contours.objects import ObjectBatch
 
 # Fewer events than this do not make a part of a window.
 _EVENTS_OF_A_PART = 400

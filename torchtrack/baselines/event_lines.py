@@ -14,12 +14,11 @@ from torch import Tensor
 from torchtrack import quality
 from torchtrack.baselines.straight_edges import straight_edges_only, too_curved
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.contour_index import index_contours
-from torchtrack.contours import Contours, reproject, select_ranked, take_points
 from torchtrack.core import lie
 from torchtrack.core.camera import MIN_DEPTH_M, Camera
 from torchtrack.core.events import EventBatch, pad_streams
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
+from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.corners import no_corners
 from torchtrack.errors import ModelError
 from torchtrack.matching import Matches
@@ -30,6 +29,8 @@ from torchtrack.pose_solver import solve_pose
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.time_surface import update_last_event
 from torchtrack.tracker import Tracker
+from torchtrack.tracking.contours.index import index_contours
+from torchtrack.tracking.contours.points import Contours, reproject
 
 # Contour points lie so far apart at most that an event on a line is within this of one of its points (px).
 _POINT_SPACING_PX = 6.0

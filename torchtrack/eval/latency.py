@@ -17,12 +17,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import Contours, mesh_contours
 from torchtrack.core.camera import project, undistortion_table
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import EventDataError
 from torchtrack.object_model.contour_source import group_by_model
 from torchtrack.session import Session
+from torchtrack.tracking.contours.points import Contours, mesh_contours
 
 # Latencies that are tried first, µs.
 _GRID_US = np.arange(-10_000, 50_001, 1500)

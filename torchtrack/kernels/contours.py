@@ -1,4 +1,4 @@
-"""Contour points of a mesh, and where they show: :func:`torchtrack.contours.mesh_contours` and ``assemble``, object by object."""
+"""Contour points of a mesh, and where they show: :func:`torchtrack.tracking.contours.points.mesh_contours` and ``assemble``, object by object."""
 
 import numpy as np
 
@@ -229,7 +229,7 @@ def show(
 
 @kernel(fastmath=FAST)
 def normal_of(across_x: float, across_y: float, inverse: float, of_lens: Numbers) -> tuple[float, float, float]:
-    """Unit normal of a projected tangent, and how long the tangent is there (px/m): :func:`torchtrack.contours.image_normals`.
+    """Unit normal of a projected tangent, and how long the tangent is there (px/m): :func:`torchtrack.tracking.contours.points.image_normals`.
 
     Args:
         across_x, across_y: the tangent across the line of sight.

@@ -1,4 +1,4 @@
-"""Making an index of nearest contour points: :func:`torchtrack.contour_index.index_contours`, point by point."""
+"""Making an index of nearest contour points: :func:`torchtrack.tracking.contours.index.index_contours`, point by point."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Looking up the nearest contour point in an index: :meth:`torchtrack.contour_index.ContourIndex.look_up`, one place at a time."""
+"""Looking up the nearest contour point in an index: :meth:`torchtrack.tracking.contours.index.ContourIndex.look_up`, one place at a time."""
 
 import numpy as np
 

@@ -79,7 +79,7 @@ class SolvingSettings(NamedTuple):
 
 
 class IndexSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.index` goes by: constants of :mod:`torchtrack.contour_index`, and the image.
+    """What :mod:`torchtrack.kernels.index` goes by: constants of :mod:`torchtrack.tracking.contours.index`, and the image.
 
     Args:
         middle_u, middle_v: of the image (px).
@@ -147,7 +147,7 @@ class GridSettings(NamedTuple):
 
 
 class SamplingSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.contours` goes by: settings, and constants of :mod:`torchtrack.contours`.
+    """What :mod:`torchtrack.kernels.contours` goes by: settings, and constants of :mod:`torchtrack.tracking.contours.points`.
 
     Args:
         occluding: whether edges between a front and a back face are contours.

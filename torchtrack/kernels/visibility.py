@@ -1,4 +1,4 @@
-"""Hidden contour points: :func:`torchtrack.visibility.hidden_by_faces` and the depth buffer there, object by object."""
+"""Hidden contour points: :func:`torchtrack.tracking.contours.visibility.hidden_by_faces` and the depth buffer there, object by object."""
 
 import numpy as np
 
@@ -92,7 +92,7 @@ def _cell(u: float, v: float, first: Numbers, rows_before: int, grid: GridSettin
 
 @kernel()
 def around(pixels: Array, mask: Array, stream_index: Array, cell_px: float, height: int, width: int, first: Array) -> tuple[int, int]:
-    """Rows and columns of depth buffers that hold what is asked for: :meth:`torchtrack.visibility.DepthGrid.around`.
+    """Rows and columns of depth buffers that hold what is asked for: :meth:`torchtrack.tracking.contours.visibility.DepthGrid.around`.
 
     Args:
         pixels, mask: ``[b, 2, m]`` and ``[b, m]``.
@@ -121,7 +121,7 @@ def around(pixels: Array, mask: Array, stream_index: Array, cell_px: float, heig
 
 @kernel()
 def _every(samples: int, T_cam_obj: Array, intrinsics: Array, diameter_m: float, grid: GridSettings) -> int:
-    """The so manieth surface sample of an object that is taken, a power of two: :func:`torchtrack.visibility.depth_buffer` halves them so."""
+    """The so manieth surface sample of an object that is taken, a power of two: :func:`torchtrack.tracking.contours.visibility.depth_buffer` halves them so."""
     size_cells = diameter_m * intrinsics[0] / max(T_cam_obj[2, 3], grid.least_depth_m) / grid.side_px
     spare, every = samples / max(grid.samples_per_cell * size_cells * size_cells, 1.0), 1
     while 2 * every <= spare:

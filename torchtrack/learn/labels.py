@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.alignment import index_for
-from torchtrack.contours import take_points
+from torchtrack.core.padded import take_points
 from torchtrack.evidence import Evidence
 from torchtrack.prediction import Prediction
 from torchtrack.tracker import Tracker

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchtrack.contours import reproject
 from torchtrack.core.camera import undistortion_table
 from torchtrack.eval.alignment import alignment
 from torchtrack.session import Session
 from torchtrack.stepping import Step
+from torchtrack.tracking.contours.points import reproject
 
 
 class AlignmentRecord:

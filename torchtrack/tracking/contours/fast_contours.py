@@ -1,4 +1,4 @@
-"""Contour points by kernels: what :mod:`torchtrack.contours` samples from meshes, and shows at a pose."""
+"""Contour points by kernels: what :mod:`torchtrack.tracking.contours.points` samples from meshes, and shows at a pose."""
 
 from collections.abc import Sequence
 

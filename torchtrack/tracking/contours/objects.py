@@ -11,11 +11,11 @@ from torch.linalg import vecdot
 from torch.nn.functional import pad
 
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import Contours, assemble, joined, mesh_contours, mesh_elements
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
-from torchtrack.splat import splat_contours
-from torchtrack.visibility import Scene, remove_hidden
+from torchtrack.tracking.contours.points import Contours, assemble, joined, mesh_contours, mesh_elements
+from torchtrack.tracking.contours.splat import splat_contours
+from torchtrack.tracking.contours.visibility import Scene, remove_hidden
 
 
 @dataclass(frozen=True)

@@ -11,24 +11,35 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import fast_contours
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.lie import affine, transform_points
+from torchtrack.core.padded import select_ranked
 from torchtrack.kernels.settings import SamplingSettings
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
+from torchtrack.tracking.contours import fast_contours
 
 # Of a model with no more edges than this, all are looked at.
 _FEW_EDGES = 512
+
+
 # Active edges beyond this many are thinned evenly before they are projected.
 _MAX_ACTIVE_EDGES = 8192
+
+
 # Tangents that the image shows shorter than this (px/m) have no direction in it.
 _MIN_PX_PER_M = 1e-3
+
+
 # Texture seen at a grazing angle (cosine below this) is foreshortened beyond use. What fires and is left out draws what is beside it.
 _MIN_TEXTURE_COSINE = 0.02
+
+
 # To show what was sampled takes no setting: made once, as making them takes longer than a kernel does.
 _TO_SHOW = ContourConfig()
+
+
 # Points and tangents (object frame), kinds and mask; where it was said which elements are shown, the element of each as well.
 _Points = tuple[Tensor, ...]
 
@@ -66,27 +77,6 @@ class Contours:
     def widened(self, count: int) -> "Contours":
         """The same with at least ``count`` places for the points of each object."""
         return Contours(*(_widened(value, count) for value in vars(self).values()))
-
-
-def select_ranked(mask: Bool[Tensor, "b n"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
-    """Indices of ``count`` true entries of each row, spread evenly over them, and which of these exist.
-
-    Deterministic, of static shape, and independent of the other rows.
-    """
-    cumulative = mask.cumsum(-1)
-    total = cumulative[:, -1:]
-    step = torch.arange(count, device=mask.device, dtype=torch.float64)
-    rank = (step * (total.double() / max(count, 1)).clamp(min=1)).long() + 1
-    index = torch.searchsorted(cumulative, rank)
-    return index.clamp(max=mask.shape[1] - 1), rank <= total
-
-
-def take_points(values: Float[Tensor, "b n k"], index: Int[Tensor, "b m"]) -> Float[Tensor, "b m k"]:
-    """``values[b, index[b, m]]``.
-
-    In memory the coordinates are rows, before and after, as :func:`torchtrack.core.lie.transform_points` leaves them.
-    """
-    return values.transpose(1, 2).gather(2, index[:, None].expand(-1, values.shape[2], -1)).transpose(1, 2)
 
 
 def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:

@@ -14,11 +14,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.contours import Contours, take_points
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.constants import constant, disc
+from torchtrack.core.padded import take_points
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import Cells, IndexSettings
+from torchtrack.tracking.contours.points import Contours
 
 # Squared distances are compared in these fractions of a pixel².
 _DISTANCE_STEPS = 16

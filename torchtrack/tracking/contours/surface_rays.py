@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.contours import take_points
 from torchtrack.core.lie import transform_points
+from torchtrack.core.padded import take_points
 from torchtrack.object_model.contour_source import ContourModel
 
 # Nothing is met farther away than this (m).

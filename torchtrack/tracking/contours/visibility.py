@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import Contours
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.lie import affine, transform_points
@@ -22,6 +21,7 @@ from torchtrack.core.padded import bounds
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import GridSettings
 from torchtrack.object_model.contour_source import ContourModel
+from torchtrack.tracking.contours.points import Contours
 
 # A point this far behind a face's plane is behind it, not on it (diameters).
 _ON_FACE = 2e-3

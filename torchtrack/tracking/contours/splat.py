@@ -9,10 +9,11 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.contours import Contours, assemble, select_ranked, take_points
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.lie import transform_points
+from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
+from torchtrack.tracking.contours.points import Contours, assemble
 
 
 def _close(occupied: Float[Tensor, "b h w"], radius: int) -> Float[Tensor, "b h w"]:

@@ -1,0 +1,1 @@
+"""The pipeline, a folder a stage, in the order of the data."""

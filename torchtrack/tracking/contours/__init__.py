@@ -1,0 +1,1 @@
+"""From a pose to the visible contours of an object."""
