@@ -15,18 +15,18 @@ from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.lie import so3_exp
-from torchtrack.motion import (
+from torchtrack.core.linalg import inverse
+from torchtrack.quality import Status
+from torchtrack.sim.trajectory import Trajectory
+from torchtrack.tracking.motion.model import (
     Acceleration,
     acceleration_counts,
     acceleration_sigma,
     carried_on,
     found_acceleration,
-    inverse,
     predict_covariance,
     window_acceleration,
 )
-from torchtrack.quality import Status
-from torchtrack.sim.trajectory import Trajectory
 
 DT_S = 0.005
 # Exact events, though few of them: corners are observed as well. Nothing is common to their errors.

@@ -23,13 +23,13 @@ from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
 from torchtrack.observations import WindowEvents, select_events
 from torchtrack.polarity_memory import remembered
-from torchtrack.prediction import Prediction
 from torchtrack.quality import shares
 from torchtrack.sensor_tiles import SensorTiles
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import assemble, mesh_contours, reproject
 from torchtrack.tracking.contours.visibility import Scene, remove_hidden
+from torchtrack.tracking.motion.prediction import Prediction
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}

@@ -13,14 +13,14 @@ from torchtrack.alignment import Fit
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
+from torchtrack.core.linalg import inverse
 from torchtrack.corners import no_corners
-from torchtrack.forecast import forecast
 from torchtrack.matching import Matches
-from torchtrack.motion import inverse
 from torchtrack.pose_problem import Linearisation
 from torchtrack.quality import Status
 from torchtrack.search import Found
 from torchtrack.state import Probation
+from torchtrack.tracking.motion.predict import forecast
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}

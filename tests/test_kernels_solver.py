@@ -10,7 +10,7 @@ from test_pose_solver import LOSSES, cast, far_off, perturbed, problem_at
 from test_pose_solver_window import windowed
 
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.pose_solver import solve_pose
+from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 TOLERANCE = {torch.float32: 1e-3, torch.float64: 1e-8}

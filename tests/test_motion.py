@@ -8,11 +8,11 @@ from helpers import generator, pose
 
 from torchtrack.config.tracker import MotionConfig
 from torchtrack.core.lie import retract_about, se3_inverse, se3_log, transform_points
-from torchtrack.motion import (
+from torchtrack.core.linalg import inverse
+from torchtrack.tracking.motion.model import (
     expected_velocity,
     fade,
     initial_covariance,
-    inverse,
     left_covariance,
     predict_covariance,
     with_dropped,

@@ -7,14 +7,15 @@ import torch
 from helpers import SMALL_CAMERA, generator, perturbed, pose_errors, random_pose, random_twist
 from torch.autograd import gradcheck
 
-from torchtrack import pose_solver
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core import dispatch
 from torchtrack.core.camera import project
+from torchtrack.core.image_velocity import pose_jacobian
 from torchtrack.core.lie import retract_about, se3_exp, small_difference_about, transform_points
+from torchtrack.core.linalg import solve_positive
 from torchtrack.pose_problem import PoseProblem
-from torchtrack.pose_solver import pose_jacobian, robust_cost, solve_pose, solve_positive
 from torchtrack.robust_loss import robust_loss, robust_weight
+from torchtrack.tracking.estimation.levenberg_marquardt import _Place, robust_cost, solve_pose
 
 pytestmark = pytest.mark.usefixtures("way")
 LOSSES = ["tukey", "huber", "none"]
@@ -273,7 +274,7 @@ def before_the_last_step(problem, start, config):
     """The pose that the solver's last step, which nothing judges, is taken from."""
     places = []
 
-    class Watched(pose_solver._Place):
+    class Watched(_Place):
         def moved(self, step):
             places.append(self)
             return Watched(**vars(super().moved(step)))

@@ -10,7 +10,7 @@ from torchtrack.config.tracker import SolverConfig
 from torchtrack.core.camera import project
 from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.pose_problem import PoseProblem, WindowTerms
-from torchtrack.pose_solver import robust_cost, solve_pose
+from torchtrack.tracking.estimation.levenberg_marquardt import robust_cost, solve_pose
 
 pytestmark = pytest.mark.usefixtures("way")
 THOROUGH = SolverConfig(iterations=20)

@@ -14,8 +14,8 @@ from torchtrack.core.camera import project
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.object_model.contour_source import group_by_model
-from torchtrack.prediction import Prediction
 from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.motion.prediction import Prediction
 
 CONTOURS = ContourConfig()
 CENTRE_OBJ = torch.tensor([0.01, -0.02, 0.005], dtype=torch.float64)

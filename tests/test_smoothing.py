@@ -8,8 +8,8 @@ from helpers import far_from, generator, random_pose
 
 from torchtrack.config.tracker import MotionConfig
 from torchtrack.core.lie import difference_about, retract_about
-from torchtrack.motion import acceleration_sigma, initial_covariance, predict_covariance
-from torchtrack.smoothing import Filtered, smoothed
+from torchtrack.tracking.motion.model import acceleration_sigma, initial_covariance, predict_covariance
+from torchtrack.tracking.motion.smoother import Filtered, smoothed
 
 CONFIG, DIAMETER_M, NOISE_M, WINDOWS = MotionConfig(initial_speed_m_s=0.2), 0.2, 1e-3, 12
 OBSERVED = torch.eye(12, dtype=torch.float64)[:6]

@@ -9,7 +9,7 @@ The pipeline, one file per stage, in data-flow order::
     contours       visible 3D contours at the predicted pose  torchtrack.tracking.contours.points
     observations   corners and recent events of each object   torchtrack.observations
     matching       observations to contours                   torchtrack.matching
-    pose solver    Levenberg-Marquardt on SE(3)               torchtrack.pose_solver
+    pose solver    Levenberg-Marquardt on SE(3)               torchtrack.tracking.estimation.levenberg_marquardt
     alignment      rounds of matching and solving             torchtrack.alignment
     quality        status, covariance, explained contour      torchtrack.quality
     tracker        all of it: state and window in, pose out   torchtrack.tracker

@@ -16,11 +16,11 @@ from torchtrack.implicit_gradient import with_gradient
 from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
 from torchtrack.observations import Observations
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
-from torchtrack.pose_solver import solve_pose
-from torchtrack.prediction import Prediction
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject
+from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
+from torchtrack.tracking.motion.prediction import Prediction
 
 # The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).
 _INDEX_MARGIN_PX = 2

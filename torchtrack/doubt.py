@@ -16,8 +16,8 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import none_of
-from torchtrack.motion import rim_and_centre
-from torchtrack.prediction import Prediction
+from torchtrack.tracking.motion.model import rim_and_centre
+from torchtrack.tracking.motion.prediction import Prediction
 
 # An object is not looked for farther away than it can have drifted in this time (s), nor turned farther than in this.
 _LONGEST_S, _LONGEST_TURN_S = 0.4, 1.0

@@ -12,13 +12,13 @@ from torch import Tensor
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core import dispatch
 from torchtrack.core.lie import difference_about
+from torchtrack.core.linalg import inverse
 from torchtrack.event_image import BORDER_PX, look_up
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.motion import inverse
 from torchtrack.pose_problem import PoseProblem
-from torchtrack.pose_solver import solve_pose
-from torchtrack.prediction import Prediction
 from torchtrack.tracking.contours.points import Contours, reproject
+from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
+from torchtrack.tracking.motion.prediction import Prediction
 
 # How far contour points look (px), a step of the solver each: of poses far off, and of those that were pulled nearer.
 FAR_PX, NEAR_PX = (12.0, 8.4, 5.9), (7.2, 5.0, 3.5)

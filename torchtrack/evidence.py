@@ -7,9 +7,9 @@ from torch import Tensor, nn
 
 from torchtrack.history import History
 from torchtrack.observations import ObjectEvents, Observations, WindowEvents
-from torchtrack.prediction import Prediction
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.motion.prediction import Prediction
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from torchtrack.kernels.settings import MatchingSettings, RoundSettings
 from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SLOW_PX_S, SMEAR_PX, ContourTable, Matches
 from torchtrack.observations import Observations
 from torchtrack.pose_problem import Linearisation
-from torchtrack.pose_solver import damping_settings
-from torchtrack.prediction import Prediction
+from torchtrack.tracking.estimation.levenberg_marquardt import damping_settings
+from torchtrack.tracking.motion.prediction import Prediction
 
 
 def applies(config: TrackerConfig, values: Tensor) -> bool:

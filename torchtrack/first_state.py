@@ -7,12 +7,12 @@ from torch import Tensor
 from torchtrack.bursts import no_bursts
 from torchtrack.learned_contours import LearnedContours
 from torchtrack.model_trust import ModelTrust
-from torchtrack.motion import initial_covariance
 from torchtrack.polarity_memory import nothing_remembered
 from torchtrack.slow_circuits import unknown_circuits
 from torchtrack.state import Probation, TrackerState
 from torchtrack.time_surface import empty_last_event
 from torchtrack.tracked_objects import TrackedObjects
+from torchtrack.tracking.motion.model import initial_covariance
 
 
 def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us: Int[Tensor, "s"]) -> TrackerState:

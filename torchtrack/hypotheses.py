@@ -19,8 +19,8 @@ from torchtrack.event_image import BORDER_PX, event_density, look_up
 from torchtrack.event_pull import FAR_PX, NEAR_PX, pulled
 from torchtrack.image_shifts import shifted
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.prediction import Prediction
 from torchtrack.tracking.contours.points import Contours, assemble, sampling_settings
+from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.views import outlines_at, thinned
 
 # Events beside a contour are counted this far from it (px), and more than this many of them in one place say no more.

@@ -16,8 +16,8 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.prediction import Prediction
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.views import outlines_by_view
 
 # Cells a side of the square in which events and outlines are compared.

@@ -16,8 +16,9 @@ from torch import Tensor
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core import host_sync
 from torchtrack.core.lie import small_difference_about, step_about
+from torchtrack.core.linalg import solve_positive
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
-from torchtrack.pose_solver import robust_cost, solve_positive
+from torchtrack.tracking.estimation.levenberg_marquardt import robust_cost
 
 # Relative rounding of a cost in float64, with room for the length of its sum.
 _ROUNDING = 1e-12
@@ -45,7 +46,7 @@ def with_gradient(problem: PoseProblem, solution: Linearisation, config: SolverC
 
     Args:
         problem: whose tensors may require gradients; its ``prior_information`` and ``weights`` too.
-        solution: of :func:`torchtrack.pose_solver.solve_pose`.
+        solution: of :func:`torchtrack.tracking.estimation.levenberg_marquardt.solve_pose`.
         config: of the solver.
     """
     if not torch.is_grad_enabled() or not any(value.requires_grad for value in _tensors_of(problem)):

@@ -20,10 +20,10 @@ from torchtrack.core.padded import take_points
 from torchtrack.matching import ContourTable, match_nearest, on_and_around
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.observations import WindowEvents, select_events
-from torchtrack.prediction import Prediction
 from torchtrack.quality import inside
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.motion.prediction import Prediction
 
 # So many observations of its kind speak for an element before any of its own do; and of a kind, so many that are on it.
 _PRIOR, _PRIOR_OF_KIND = 10.0, 200.0

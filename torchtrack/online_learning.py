@@ -10,12 +10,12 @@ from torchtrack.core import host_sync
 from torchtrack.model_trust import judge_elements
 from torchtrack.observations import ObjectEvents
 from torchtrack.polarity_memory import expected_polarity, is_asked
-from torchtrack.prediction import Prediction
 from torchtrack.quality import Status
 from torchtrack.search import Found
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.surface_learning import Surroundings, learn_after
 from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.motion.prediction import Prediction
 
 
 def objects_as_known(

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchtrack.prediction import Prediction
+from torchtrack.tracking.motion.prediction import Prediction
 
 
 @dataclass(frozen=True)

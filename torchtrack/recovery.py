@@ -12,10 +12,10 @@ from torchtrack.core.host_sync import Answer
 from torchtrack.doubt import Doubt, drifted, less_certain
 from torchtrack.observations import ObjectEvents
 from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
-from torchtrack.prediction import Prediction
 from torchtrack.quality import are_many
 from torchtrack.relocation import LastSeen
 from torchtrack.search import AS_MUCH, Found, is_taken, search, search_around
+from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.turns import TurningAxes, turns_compared
 
 # What explains so many times as many events as a pose far off in depth is no smaller thing that chance explains.

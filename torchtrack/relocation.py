@@ -14,10 +14,10 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.doubt import is_due, searches
-from torchtrack.motion import MOST_UNCERTAIN, rim_and_centre
-from torchtrack.prediction import Prediction
 from torchtrack.state import TrackerState
 from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.motion.model import MOST_UNCERTAIN, rim_and_centre
+from torchtrack.tracking.motion.prediction import Prediction
 
 # A prediction that is so uncertain, as a share of the most that predictions become, tells nothing any more.
 _NOTHING_KNOWN = 0.8
@@ -37,7 +37,7 @@ class LastSeen:
 
     Args:
         T_cam_obj: their poses when they were last seen well (float64).
-        covariance: of pose and velocity, in the chart of :mod:`torchtrack.motion` (float64).
+        covariance: of pose and velocity, in the chart of :mod:`torchtrack.tracking.motion.model` (float64).
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]

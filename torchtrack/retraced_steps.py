@@ -10,9 +10,9 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.quality import Status
 from torchtrack.retracing import Gap, retraced
 from torchtrack.smoothed_steps import SmoothedObjects
-from torchtrack.smoothing import Filtered, goes_on
 from torchtrack.stepping import Step
 from torchtrack.tracker import Tracker
+from torchtrack.tracking.motion.smoother import Filtered, goes_on
 
 # Where objects were lost and found is looked at for so many windows at a time.
 _AT_ONCE = 10

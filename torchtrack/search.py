@@ -19,8 +19,8 @@ from torchtrack.hypotheses import promising
 from torchtrack.line_ends import running_on
 from torchtrack.observations import ObjectEvents, WindowEvents, select_events
 from torchtrack.pose_problem import Linearisation
-from torchtrack.prediction import Prediction
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.motion.prediction import Prediction
 
 # Shares that differ by less are the same: which of them is larger is chance.
 AS_MUCH = 0.02

@@ -18,7 +18,7 @@ from torchtrack.core.events import EventBatch, check_on_sensor
 from torchtrack.core.lie import transform_points
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import TileSettings
-from torchtrack.prediction import Prediction
+from torchtrack.tracking.motion.prediction import Prediction
 
 # Side of a tile (px, as a power of two).
 TILE_BITS = 3

@@ -20,10 +20,10 @@ from torchtrack.flow import estimate_flow
 from torchtrack.history import BORDER_PX, History, on_sensor, pixel_numbers
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.observations import ObjectEvents, SharedEvents, WindowEvents
-from torchtrack.prediction import Prediction
 from torchtrack.sensor_tiles import TILE_BITS, NearbyEvents, SensorTiles
 from torchtrack.time_surface import at_pixels, object_regions, time_surface
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.motion.prediction import Prediction
 
 # Poses that a search draws lie within this many of its least standard deviations.
 _DRAWN_SIGMAS = 4.0

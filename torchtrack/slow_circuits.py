@@ -16,8 +16,8 @@ from torch.linalg import vecdot
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.matching import Matches, on_and_around
 from torchtrack.observations import Observations
-from torchtrack.prediction import Prediction
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.motion.prediction import Prediction
 
 # An event is late once its edge has moved on by this much since the first of its burst (px). Of an edge that hardly comes farther
 # while a burst lasts, nothing is told.

@@ -11,11 +11,11 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import Camera
 from torchtrack.core.lie import orthonormalise, transform_points
-from torchtrack.motion import left_covariance
 from torchtrack.object_model import ObjectModel
-from torchtrack.smoothing import Filtered, smoothed
 from torchtrack.stepping import Step
 from torchtrack.tracking.contours.points import reproject
+from torchtrack.tracking.motion.model import left_covariance
+from torchtrack.tracking.motion.smoother import Filtered, smoothed
 
 
 @dataclass(frozen=True)

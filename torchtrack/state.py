@@ -43,7 +43,7 @@ class TrackerState:
         T_cam_obj: pose of each object at its stream's ``t_us`` (float64).
         velocity: rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s).
         acceleration: how they changed in the last window (rad/s², m/s²).
-        covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.motion`.
+        covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.tracking.motion.model`.
         score: of the last window, :attr:`torchtrack.search.Found.score`.
         usual_score: its running mean.
         full_share: of the moving contour, what events explain when the object is seen well: rises as fast, but falls slowly.

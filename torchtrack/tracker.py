@@ -22,12 +22,10 @@ from torchtrack.corners import Corners
 from torchtrack.doubt import Doubt, gathered_when_known, has_strayed, is_adrift, is_due, is_wanted, searches
 from torchtrack.evidence import Evidence, judged
 from torchtrack.first_state import first_state
-from torchtrack.forecast import forecast
 from torchtrack.history import History
 from torchtrack.object_model import ObjectModel
 from torchtrack.observations import ObjectEvents, Observations, corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
-from torchtrack.prediction import Prediction
 from torchtrack.probation import after_probation
 from torchtrack.quality import Status, asked_apart
 from torchtrack.recovery import search_wanted
@@ -45,6 +43,8 @@ from torchtrack.time_surface import update_last_event
 from torchtrack.tracked_objects import TrackedObjects
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.motion.predict import forecast
+from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.turns import may_have_turned
 from torchtrack.window_parts import of_unknown_motion, to_be_parted
 

@@ -20,8 +20,8 @@ from torchtrack.core.lie import retract_about
 from torchtrack.event_image import event_density
 from torchtrack.hypotheses import ENOUGH_EVENTS, mark
 from torchtrack.observations import ObjectEvents, WindowEvents
-from torchtrack.prediction import Prediction
 from torchtrack.search import Found, align_all, replaced
+from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.views import thinned
 
 # Turns that are compared, and how many of them are the same: three degrees apart, and twelve.

@@ -10,8 +10,8 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.padded import select_ranked, take_points
-from torchtrack.prediction import Prediction
 from torchtrack.tracking.contours.points import Contours, assemble
+from torchtrack.tracking.motion.prediction import Prediction
 
 # So many views lie some fifteen degrees apart: contours of a smooth surface hardly wander farther over it between two of them.
 _VIEWS = 200

@@ -22,15 +22,15 @@ from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.corners import no_corners
 from torchtrack.errors import ModelError
 from torchtrack.matching import Matches
-from torchtrack.motion import left_covariance
 from torchtrack.object_model import ObjectModel
 from torchtrack.pose_problem import Linearisation, PoseProblem
-from torchtrack.pose_solver import solve_pose
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.time_surface import update_last_event
 from torchtrack.tracker import Tracker
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import Contours, reproject
+from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
+from torchtrack.tracking.motion.model import left_covariance
 
 # Contour points lie so far apart at most that an event on a line is within this of one of its points (px).
 _POINT_SPACING_PX = 6.0

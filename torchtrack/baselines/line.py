@@ -19,8 +19,8 @@ from torch import Tensor
 
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.core.events import EventBatch
+from torchtrack.core.linalg import solve_positive
 from torchtrack.pose_problem import Linearisation
-from torchtrack.pose_solver import solve_positive
 from torchtrack.state import StepResult, TrackerState
 
 # Deviation of the distance between an event and its line (px): much is common to the events of a line, so it is not small.

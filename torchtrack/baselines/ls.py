@@ -7,7 +7,7 @@ from torch import Tensor
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.core import lie
 from torchtrack.core.events import EventBatch
-from torchtrack.motion import inverse
+from torchtrack.core.linalg import inverse
 from torchtrack.state import StepResult, TrackerState
 
 # Share of a new window in the velocity.

@@ -12,7 +12,7 @@ from torchtrack.config.tracker import SolverConfig
 from torchtrack.core.camera import Camera, project
 from torchtrack.core.lie import retract_about, rotation_angle_deg, so3_exp, transform_points
 from torchtrack.pose_problem import PoseProblem
-from torchtrack.pose_solver import solve_pose
+from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 
 # Poses at once, and the targets on one thread of a CPU (ms).
 TARGETS_MS = {1: 2.0, 8: 3.0, 32: None, 128: 18.0, 1024: 140.0}

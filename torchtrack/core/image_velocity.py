@@ -77,3 +77,16 @@ def object_plane_velocity(
     ray = (pixels.transpose(1, 2) - intrinsics[:, 2:, None]) / intrinsics[:, :2, None]
     moving = torch.baddbmm(turning[:, :, 2:] + drift / centre_cam[:, 2:, None].clamp(min=MIN_DEPTH_M), turning[:, :, :2], ray)
     return _across_the_ray(ray, moving, intrinsics)
+
+
+def pose_jacobian(arms: Float[Tensor, "b 3 n"], gradient: tuple[Float[Tensor, "b n"], ...]) -> Float[Tensor, "b 6 n"]:
+    """Columns ``[(P - c) × g, g]`` with ``g = dπᵀ n``: the paper's Eq. 15 as one vector product, about the object's centre.
+
+    Args:
+        arms: from the centre to the points, in the camera's axes: ``P - c``.
+        gradient: ``g``, by component.
+    """
+    # By component: the library's vector product takes five times as long.
+    (ax, ay, az), (gx, gy, gz) = arms.unbind(1), gradient
+    turning = (torch.addcmul(p * q, r, s, value=-1) for p, q, r, s in ((ay, gz, az, gy), (az, gx, ax, gz), (ax, gy, ay, gx)))
+    return torch.stack([*turning, gx, gy, gz], 1)

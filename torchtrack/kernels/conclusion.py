@@ -206,7 +206,7 @@ def _update(
 
 @kernel()
 def _accelerate(trusted: float, dt: float, information: Array, offset: Array, expected: Array, variance: Array, acceleration: Array) -> None:
-    """The likeliest acceleration, as far as it is to be trusted: :func:`torchtrack.motion.found_acceleration`."""
+    """The likeliest acceleration, as far as it is to be trusted: :func:`torchtrack.tracking.motion.model.found_acceleration`."""
     total = 0.0
     for j in range(6):
         of_pose, of_velocity = 0.0, 0.0
@@ -221,7 +221,7 @@ def _accelerate(trusted: float, dt: float, information: Array, offset: Array, ex
 
 @kernel()
 def _to_left(covariance: Array, centre_cam: Array, left: Array) -> None:
-    """Covariance of the left perturbation of a pose: :func:`torchtrack.motion.left_covariance`."""
+    """Covariance of the left perturbation of a pose: :func:`torchtrack.tracking.motion.model.left_covariance`."""
     left[:] = covariance[:6, :6]
     if not is_finite(left):
         return

@@ -1,4 +1,4 @@
-"""Small matrices of the filter: functions of :mod:`torchtrack.motion`, object by object."""
+"""Small matrices of the filter: functions of :mod:`torchtrack.tracking.motion.model`, object by object."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Where objects are expected at a window's end: :mod:`torchtrack.forecast`, object by object."""
+"""Where objects are expected at a window's end: :mod:`torchtrack.tracking.motion.predict`, object by object."""
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def _expected_velocity(velocity: Array, dt: float, settings: ForecastSettings, b
 
 @kernel()
 def _without_spin(T_cam_obj: Array, axis_obj: Array, dt: float, settings: ForecastSettings, velocity: Array, covariance: Array) -> None:
-    """The spin about an axis of revolution dies away: :func:`torchtrack.motion.without_spin`, in place."""
+    """The spin about an axis of revolution dies away: :func:`torchtrack.tracking.motion.model.without_spin`, in place."""
     lost, axis = 1.0 - np.exp(-dt / settings.coast_s), np.zeros(3)
     for j in range(3):
         for k in range(3):
@@ -98,7 +98,7 @@ def _drop(axis: Array, share: float, values: Array) -> None:
 
 @kernel()
 def _acceleration_sigma(velocity: Array, diameter_m: float, settings: ForecastSettings) -> tuple[float, float]:
-    """Standard deviations of angular acceleration and of that of the centre: :func:`torchtrack.motion.acceleration_sigma`."""
+    """Standard deviations of angular acceleration and of that of the centre: :func:`torchtrack.tracking.motion.model.acceleration_sigma`."""
     turning = np.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
     moving = np.sqrt(velocity[3] ** 2 + velocity[4] ** 2 + velocity[5] ** 2)
     of_rim = settings.acceleration_rate_hz * (moving + 0.5 * diameter_m * turning) + settings.acceleration_floor_m_s2
@@ -109,7 +109,7 @@ def _acceleration_sigma(velocity: Array, diameter_m: float, settings: ForecastSe
 def _predict(
     covariance: Array, rotation_sigma: float, move_sigma: float, dt: float, diameter_m: float, most_uncertain: float, predicted: Array
 ) -> None:
-    """Covariance of pose and velocity after a while: :func:`torchtrack.motion.predict_covariance`.
+    """Covariance of pose and velocity after a while: :func:`torchtrack.tracking.motion.model.predict_covariance`.
 
     Args:
         covariance: ``[12, 12]``.
@@ -167,7 +167,7 @@ def _step(T_cam_obj: Array, centre_obj: Array, moved: Array, least_depth_m: floa
 def in_mid_window(
     T_cam_obj: Array, velocity: Array, dt_s: Array, centre_obj: Array, least_depth_m: float, most_depth_m: float, middle: Array
 ) -> None:
-    """Where objects were half a window earlier: :meth:`torchtrack.prediction.Prediction.in_mid_window`, object by object.
+    """Where objects were half a window earlier: :meth:`torchtrack.tracking.motion.prediction.Prediction.in_mid_window`, object by object.
 
     Args:
         T_cam_obj, velocity, dt_s, centre_obj: ``[b, 4, 4]``, ``[b, 6]``, ``[b]`` and ``[b, 3]``.

@@ -139,7 +139,7 @@ def octant(u: float, v: float) -> int:
 def variance_across(
     points_cam: Array, normals: Array, mask: Array, covariance: Array, centre_cam: Array, intrinsics: Array, most: int, variance: Array
 ) -> None:
-    """Mean variance of contours across themselves in the image (px²): of :meth:`torchtrack.prediction.Prediction.sigma_px`.
+    """Mean variance of contours across themselves in the image (px²): of :meth:`torchtrack.tracking.motion.prediction.Prediction.sigma_px`.
 
     Args:
         points_cam, normals, mask: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, m]``.
@@ -165,7 +165,7 @@ def variance_across(
 
 @kernel(fastmath=FAST)
 def _gradient(point_cam: Array, normal: Array, centre_cam: Array, intrinsics: Array, row: Array) -> None:
-    """How a point moves along its normal in the image with the pose: :func:`torchtrack.pose_solver.pose_jacobian`."""
+    """How a point moves along its normal in the image with the pose: :func:`torchtrack.core.image_velocity.pose_jacobian`."""
     inverse = inverse_depth(point_cam[2])
     gx, gy = normal[0] * intrinsics[0] * inverse, normal[1] * intrinsics[1] * inverse
     gz = -(gx * point_cam[0] + gy * point_cam[1]) * inverse

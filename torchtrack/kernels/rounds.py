@@ -1,6 +1,6 @@
 """The rounds of matching and solving of :func:`torchtrack.alignment.align`, object by object.
 
-One Gauss-Newton step a round, as :func:`torchtrack.pose_solver.solve_pose` takes with one iteration, Tukey's loss and a prior.
+One Gauss-Newton step a round, as :func:`torchtrack.tracking.estimation.levenberg_marquardt.solve_pose` takes with one iteration, Tukey's loss and a prior.
 """
 
 import numpy as np

@@ -42,14 +42,14 @@ class MatchingSettings(NamedTuple):
 
 
 class RoundSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.rounds` goes by beside that: settings, and constants of :mod:`torchtrack.pose_solver`."""
+    """What :mod:`torchtrack.kernels.rounds` goes by beside that: settings, and constants of :mod:`torchtrack.tracking.estimation.levenberg_marquardt`."""
 
     compensated: bool
     velocity_in_window: bool
 
 
 class DampingSettings(NamedTuple):
-    """How a Hessian is damped along its diagonal, as :mod:`torchtrack.pose_solver` does.
+    """How a Hessian is damped along its diagonal, as :mod:`torchtrack.tracking.estimation.levenberg_marquardt` does.
 
     Args:
         damping: share of each entry, at first.
@@ -202,7 +202,7 @@ class QualitySettings(NamedTuple):
 
 
 class ForecastSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.forecast` goes by: settings, and constants of :mod:`torchtrack.motion` and ``prediction``.
+    """What :mod:`torchtrack.kernels.forecast` goes by: settings, and constants of :mod:`torchtrack.tracking.motion.model` and ``prediction``.
 
     Args:
         holds: whether objects are expected to stay where they are.

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt of :func:`torchtrack.pose_solver.solve_pose`, object by object, and the parts of a step that rounds share."""
+"""Levenberg-Marquardt of :func:`torchtrack.tracking.estimation.levenberg_marquardt.solve_pose`, object by object, and the parts of a step that rounds share."""
 
 import numpy as np
 
@@ -113,7 +113,7 @@ def _look(
 def row_of(
     pose: Numbers, x: float, y: float, z: float, centre: Numbers, intrinsics: Numbers, nu: float, nv: float, there: float
 ) -> tuple[Numbers, float]:
-    """The Jacobian of a residual by the pose, and the residual: :func:`torchtrack.pose_solver.pose_jacobian`.
+    """The Jacobian of a residual by the pose, and the residual: :func:`torchtrack.core.image_velocity.pose_jacobian`.
 
     Args:
         x, y, z: the point from the object's centre, in the object's axes.

@@ -7,8 +7,8 @@ from torch import Tensor
 from torchtrack.alignment import index_for
 from torchtrack.core.padded import take_points
 from torchtrack.evidence import Evidence
-from torchtrack.prediction import Prediction
 from torchtrack.tracker import Tracker
+from torchtrack.tracking.motion.prediction import Prediction
 
 
 def true_distance(tracker: Tracker, evidence: Evidence, T_cam_obj: Float[Tensor, "b 4 4"], velocity: Float[Tensor, "b 6"]) -> Float[Tensor, "b n"]:

@@ -24,7 +24,7 @@ from torchtrack.bench.plots import Plot
 from torchtrack.bench.results import Result
 from torchtrack.bench.solver import CAMERA, ITERATIONS, poses_of_points
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.pose_solver import solve_pose
+from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 
 COUNTS = (1, 8, 32, 128, 1024)
 # A peer that would take longer than this for one run is not measured at this size (s).

@@ -9,15 +9,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.constants import constant
+from torchtrack.core.image_velocity import pose_jacobian
 from torchtrack.core.lie import affine, small_difference_about, turned
-from torchtrack.core.linalg import solve_factored
+from torchtrack.core.linalg import solve_factored, solve_positive
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import DampingSettings, SolvingSettings
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
@@ -25,8 +26,12 @@ from torchtrack.robust_loss import LOSSES, robust_loss, robust_weight
 
 # Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
 _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
+
+
 # What is added to a Hessian's diagonal beside its damping: so much, and this share of its largest entry.
 _LEAST_DIAGONAL, _LEAST_SHARE = 1e-12, 1e-9
+
+
 # A cost, which is a long sum, is known to this many units of rounding.
 _ROUNDINGS = 8
 
@@ -78,19 +83,6 @@ class _Place:
         """The pose as a matrix."""
         translation = torch.baddbmm(self.centre_cam, self.rotation, problem.centre_obj[..., None], alpha=-1)
         return torch.cat([torch.cat([self.rotation, translation], 2), problem.T_prior[:, 3:]], 1)
-
-
-def pose_jacobian(arms: Float[Tensor, "b 3 n"], gradient: tuple[Float[Tensor, "b n"], ...]) -> Float[Tensor, "b 6 n"]:
-    """Columns ``[(P - c) × g, g]`` with ``g = dπᵀ n``: the paper's Eq. 15 as one vector product, about the object's centre.
-
-    Args:
-        arms: from the centre to the points, in the camera's axes: ``P - c``.
-        gradient: ``g``, by component.
-    """
-    # By component: the library's vector product takes five times as long.
-    (ax, ay, az), (gx, gy, gz) = arms.unbind(1), gradient
-    turning = (torch.addcmul(p * q, r, s, value=-1) for p, q, r, s in ((ay, gz, az, gy), (az, gx, ax, gz), (ax, gy, ay, gx)))
-    return torch.stack([*turning, gx, gy, gz], 1)
 
 
 @dataclass(frozen=True)
@@ -153,23 +145,6 @@ def _normal_equations(problem: PoseProblem, seen: _Seen, robust: Tensor, pull: T
     # The residuals are the last row: both in one product.
     product = torch.bmm(seen.rows * (robust * problem.weights)[:, None], seen.rows.transpose(1, 2))[:, :unknowns]
     return pull + product[..., unknowns], problem.prior_information + product[..., :unknowns]
-
-
-def solve_positive(matrix: Float[Tensor, "b n n"], right: Float[Tensor, "b n k"]) -> tuple[Float[Tensor, "b n k"], Bool[Tensor, "b"]]:
-    """Solve with symmetric positive definite matrices; where one is not, zero and False.
-
-    Where gradients are recorded, the matrix is made sane and solved with again: masking alone would leave gradients that
-    are not finite.
-    """
-    factor, info = torch.linalg.cholesky_ex(matrix)
-    solution = solve_factored(right, factor)
-    # A sum is finite only where every entry is.
-    good = (info == 0) & (solution.sum((-1, -2)).abs() < torch.inf)
-    if solution.requires_grad:
-        eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-        factor = torch.linalg.cholesky_ex(torch.where(good[:, None, None], matrix, eye)).L
-        solution = solve_factored(torch.where(good[:, None, None], right, 0), factor)
-    return torch.where(good[:, None, None], solution, 0), good
 
 
 def _least_share(hessian: Tensor) -> float:

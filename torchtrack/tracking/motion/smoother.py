@@ -13,8 +13,9 @@ from torch import Tensor
 
 from torchtrack.config.tracker import MotionConfig
 from torchtrack.core.lie import difference_about, retract_about
-from torchtrack.motion import inverse, predict_covariance
+from torchtrack.core.linalg import inverse
 from torchtrack.state import TrackerState
+from torchtrack.tracking.motion.model import predict_covariance
 
 # Squared distance (12 degrees of freedom) from what was to be expected above which an object was found in another place: what
 # came before is not dragged there. Of what the filter holds for possible, 2 in 100 million are farther.
@@ -29,7 +30,7 @@ class Filtered:
         t_us: ends of the windows, ascending (µs).
         T_cam_obj: poses.
         velocity: rotation, and velocity of the centre (rad/s, m/s).
-        covariance: of pose and velocity, in the chart of :mod:`torchtrack.motion`.
+        covariance: of pose and velocity, in the chart of :mod:`torchtrack.tracking.motion.model`.
     """
 
     t_us: Int[Tensor, "n"]

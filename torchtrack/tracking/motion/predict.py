@@ -9,7 +9,9 @@ from torchtrack.core import dispatch, lie
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import ForecastSettings
-from torchtrack.motion import (
+from torchtrack.state import TrackerState
+from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.motion.model import (
     MOST_UNCERTAIN,
     STEEPNESS,
     Acceleration,
@@ -19,9 +21,7 @@ from torchtrack.motion import (
     with_dropped,
     without_spin,
 )
-from torchtrack.prediction import MAX_DEPTH_M, Prediction, before_camera
-from torchtrack.state import TrackerState
-from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.motion.prediction import MAX_DEPTH_M, Prediction, before_camera
 
 
 def forecast(

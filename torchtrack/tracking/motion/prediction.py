@@ -10,14 +10,14 @@ from torchtrack.config.tracker import ContourConfig
 from torchtrack.core import dispatch
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.constants import once
-from torchtrack.core.image_velocity import MovingObjects, pixel_velocity
+from torchtrack.core.image_velocity import MovingObjects, pixel_velocity, pose_jacobian
 from torchtrack.core.lie import retract_about, step_about, transform_points
+from torchtrack.core.linalg import inverse
 from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.motion import Acceleration, inverse
-from torchtrack.pose_solver import pose_jacobian
 from torchtrack.tracking.contours.objects import ObjectBatch, repeat_row
 from torchtrack.tracking.contours.points import Contours, assemble
+from torchtrack.tracking.motion.model import Acceleration
 
 # Nothing that is tracked is farther away (m).
 MAX_DEPTH_M = 1e4
@@ -34,7 +34,7 @@ class Prediction:
         T_cam_obj: predicted pose; some pose in view where the predicted one is not usable.
         usable: which predictions are finite poses before the camera.
         velocity: rotation and velocity of the centre (rad/s, m/s).
-        covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.motion`.
+        covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.tracking.motion.model`.
         acceleration: how the velocity, which is that at the window's end, comes about; none where it is taken to be the same all along.
     """
 

@@ -14,13 +14,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import MotionConfig
-from torchtrack.core import dispatch
 from torchtrack.core.lie import hat
-from torchtrack.core.linalg import solve_factored
-from torchtrack.kernels.arrays import as_arrays
 
 # A prediction is not let grow less certain than this (rad, and diameters).
 MOST_UNCERTAIN = 0.5
+
+
 # How sharply accelerations that count are told from those that do not.
 STEEPNESS = 4
 
@@ -167,26 +166,6 @@ def acceleration_sigma(velocity: Float[Tensor, "b 6"], diameter_m: Float[Tensor,
     """Standard deviation of an acceleration from the expected one (rad/s², m/s²)."""
     rim_m_s = velocity[:, 3:].norm(dim=-1, keepdim=True) + 0.5 * diameter_m * velocity[:, :3].norm(dim=-1, keepdim=True)
     return rim_and_centre(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m)
-
-
-def inverse(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:
-    """Inverse of symmetric positive definite matrices; infinite on the diagonal where one is not.
-
-    Taken with a unit diagonal: rotations and translations, poses and velocities differ by many orders of magnitude.
-    """
-    if dispatch.apply_to(matrices):
-        # Not at the top: Numba is an extra.
-        from torchtrack.kernels.filtering import invert
-
-        inverses = torch.empty_like(matrices, memory_format=torch.contiguous_format)
-        invert(*as_arrays(matrices, inverses))
-        return inverses
-    scale = matrices.diagonal(dim1=-2, dim2=-1).clamp(min=1e-30).rsqrt()
-    scales = scale[:, :, None] * scale[:, None]
-    factor, info = torch.linalg.cholesky_ex(matrices * scales)
-    good, unknown = (info == 0)[:, None, None], torch.full_like(scale, torch.inf).diag_embed()
-    eye = torch.eye(matrices.shape[-1], dtype=matrices.dtype, device=matrices.device).expand_as(matrices)
-    return torch.where(good, solve_factored(eye, torch.where(good, factor, eye)) * scales, unknown)
 
 
 def left_covariance(covariance: Float[Tensor, "b 6 6"], centre_cam: Float[Tensor, "b 3"]) -> Float[Tensor, "b 6 6"]:

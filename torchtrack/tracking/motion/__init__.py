@@ -1,0 +1,1 @@
+"""The motion model of the Kalman filter, and what it predicts."""
