@@ -14,7 +14,7 @@ from torchtrack.core.lie import rotation_angle_deg, se3_exp, so3_exp, transform_
 from torchtrack.io import Trajectory
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.observations import Observations
+from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.points import Contours
 
 

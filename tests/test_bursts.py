@@ -5,8 +5,8 @@ import torch
 from helpers import generator, seen, upright_line
 from test_matching import nearest
 
-from torchtrack.bursts import LONG_AGO_US, no_bursts, update_bursts, without_tail
 from torchtrack.core.events import EventBatch, PaddedEvents, concatenate, pad_streams
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US, no_bursts, update_bursts, without_tail
 
 LONGEST_US = 10_000
 

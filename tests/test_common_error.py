@@ -13,7 +13,7 @@ from torchtrack.common_error import SORTED_PX2, mistaken_px2, told_by_each
 from torchtrack.config.tracker import MatchingConfig, SolverConfig, TrackerConfig
 from torchtrack.matching import ContourTable, match_nearest
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.observations import join, select_events
+from torchtrack.tracking.association.observations import join, select_events
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import joined
 

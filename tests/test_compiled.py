@@ -21,7 +21,7 @@ from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import ConfigError
 from torchtrack.runner import run
-from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
+from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 
 # Something is learned from every third window.
 LEARNING = TrackerConfig(learning=LearningConfig(first_windows=0, every=3, up_to_share=1.0))

@@ -5,9 +5,9 @@ import torch
 from helpers import generator, random_events
 
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig
-from torchtrack.corners import detect_corners, no_corners, select_corners, snap_to_newest
-from torchtrack.filters import corner_response
-from torchtrack.time_surface import NEVER_US, Regions, empty_last_event, object_regions, time_surface, update_last_event
+from torchtrack.tracking.frontend.corners import detect_corners, no_corners, select_corners, snap_to_newest
+from torchtrack.tracking.frontend.filters import corner_response
+from torchtrack.tracking.frontend.time_surface import NEVER_US, Regions, empty_last_event, object_regions, time_surface, update_last_event
 
 SURFACE = SurfaceConfig()
 FILTER_PX = SURFACE.filter_size_px

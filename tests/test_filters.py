@@ -8,7 +8,7 @@ from kornia.filters import guided_blur
 from pydantic import ValidationError
 
 from torchtrack.config.tracker import SurfaceConfig
-from torchtrack.filters import corner_response, separable_filter, sliced_guided_filter, sliced_harris
+from torchtrack.tracking.frontend.filters import corner_response, separable_filter, sliced_guided_filter, sliced_harris
 
 SHAPES = [(1, 16, 16), (1, 32, 32), (3, 64, 96), (9, 40, 33)]
 # Of the largest value.

@@ -8,9 +8,9 @@ import torch
 from helpers import generator
 
 from torchtrack.config.tracker import FlowConfig
-from torchtrack.corners import Corners
-from torchtrack.flow import estimate_flow, irls_flow, newest_events_around
-from torchtrack.time_surface import empty_last_event
+from torchtrack.tracking.frontend.corners import Corners
+from torchtrack.tracking.frontend.flow import estimate_flow, irls_flow, newest_events_around
+from torchtrack.tracking.frontend.time_surface import empty_last_event
 
 NOW_US = 50_000_000
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}

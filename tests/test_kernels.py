@@ -11,7 +11,6 @@ from test_common_error import two_depths
 from test_prediction import boxes
 from test_visibility import ball, l_prism
 
-from torchtrack.bursts import LONG_AGO_US, update_bursts
 from torchtrack.config.search import QualityConfig
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import undistortion_table
@@ -21,14 +20,16 @@ from torchtrack.hypotheses import mark
 from torchtrack.matching import ContourTable, Matches
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
-from torchtrack.observations import WindowEvents, select_events
 from torchtrack.polarity_memory import remembered
 from torchtrack.quality import shares
-from torchtrack.sensor_tiles import SensorTiles
+from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import assemble, mesh_contours, reproject
 from torchtrack.tracking.contours.visibility import Scene, remove_hidden
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
+from torchtrack.tracking.frontend.tiles import SensorTiles
+from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")

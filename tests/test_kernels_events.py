@@ -8,12 +8,13 @@ from both_ways import both_ways
 from helpers import SMALL_CAMERA, box_model, generator, pose, random_events
 
 from torchtrack import Tracker
-from torchtrack.bursts import LONG_AGO_US
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, concatenate
-from torchtrack.observations import SharedEvents, WindowEvents, select_events
-from torchtrack.sensor_tiles import NearbyEvents
+from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.index import index_contours
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US
+from torchtrack.tracking.frontend.tiles import NearbyEvents
+from torchtrack.tracking.frontend.window_events import SharedEvents, WindowEvents
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 BENT_CAMERA = replace(SMALL_CAMERA, distortion_model="plumb_bob", distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))

@@ -14,12 +14,12 @@ from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.core.linalg import inverse
-from torchtrack.corners import no_corners
 from torchtrack.matching import Matches
 from torchtrack.pose_problem import Linearisation
 from torchtrack.quality import Status
 from torchtrack.search import Found
 from torchtrack.state import Probation
+from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.motion.predict import forecast
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")

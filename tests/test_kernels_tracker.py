@@ -16,7 +16,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.errors import EventDataError
 from torchtrack.runner import run, track
-from torchtrack.sensor_tiles import NearbyEvents
+from torchtrack.tracking.frontend.tiles import NearbyEvents
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 

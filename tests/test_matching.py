@@ -12,7 +12,7 @@ from torchtrack.core.image_velocity import MovingObjects, object_plane_velocity
 from torchtrack.core.lie import retract_about
 from torchtrack.matching import ContourTable, both_coordinates, concentration, match_along_flow, match_nearest, on_and_around, patch, patch_sums
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
-from torchtrack.observations import Observations
+from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import Contours, mesh_contours, reproject
 

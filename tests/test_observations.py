@@ -4,8 +4,9 @@ import pytest
 import torch
 from helpers import IMAGE_SIZE, contours_at, generator, moving_objects, seen, upright_line
 
-from torchtrack.observations import WindowEvents, join, select_events
+from torchtrack.tracking.association.observations import join, select_events
 from torchtrack.tracking.contours.index import index_contours
+from torchtrack.tracking.frontend.window_events import WindowEvents
 
 # Events of a window, and those near a contour among them.
 EVENTS, NEAR = 6000, 4000

@@ -13,9 +13,9 @@ from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
-from torchtrack.corners import detect_corners
-from torchtrack.time_surface import empty_last_event, object_regions, time_surface, update_last_event
 from torchtrack.tracking.contours.index import index_contours
+from torchtrack.tracking.frontend.corners import detect_corners
+from torchtrack.tracking.frontend.time_surface import empty_last_event, object_regions, time_surface, update_last_event
 
 COUNT = 6
 # In their first windows boxes are searched for as new ones, once in a while: not in all windows.

@@ -11,7 +11,7 @@ from tracked_boxes import WINDOW_US, follow, merged, moving_box, tracker_of, win
 from torchtrack import Tracker
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.camera import Camera, distort, undistortion_table
-from torchtrack.sensor_tiles import NearbyEvents, SensorTiles
+from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 
 WIDE = Camera(240.0, 240.0, 320.0, 240.0, 640, 480)
 ODD = Camera(240.0, 240.0, 100.0, 70.0, 201, 143, "plumb_bob", (-0.3, 0.1, 0.0, 0.0))

@@ -8,7 +8,7 @@ from torchtrack import Tracker
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, pad_streams
-from torchtrack.time_surface import empty_last_event, update_last_event
+from torchtrack.tracking.frontend.time_surface import empty_last_event, update_last_event
 
 BENT = Camera(180.0, 185.0, 70.0, 60.0, 160, 120, "plumb_bob", (-0.3, 0.1, 0.002, -0.001))
 NOW_US = torch.tensor([5000, 9000])

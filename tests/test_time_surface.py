@@ -8,7 +8,7 @@ from helpers import generator, random_events
 
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError
-from torchtrack.time_surface import NEVER_US, Regions, empty_last_event, object_regions, time_surface, update_last_event
+from torchtrack.tracking.frontend.time_surface import NEVER_US, Regions, empty_last_event, object_regions, time_surface, update_last_event
 
 TAU_S = 0.01
 

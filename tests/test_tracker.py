@@ -32,7 +32,7 @@ from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.object_model import ObjectModel
 from torchtrack.quality import Status
-from torchtrack.time_surface import NEVER_US
+from torchtrack.tracking.frontend.time_surface import NEVER_US
 
 # ---- bad set-ups
 

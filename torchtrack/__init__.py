@@ -3,11 +3,11 @@
 The pipeline, one file per stage, in data-flow order::
 
     events         a window of events                         torchtrack.core.events
-    time surface   decayed image of last event times          torchtrack.time_surface
-    corners        guided filter, Harris, snapped to events   torchtrack.corners
-    flow           robust event flow of each corner           torchtrack.flow
+    time surface   decayed image of last event times          torchtrack.tracking.frontend.time_surface
+    corners        guided filter, Harris, snapped to events   torchtrack.tracking.frontend.corners
+    flow           robust event flow of each corner           torchtrack.tracking.frontend.flow
     contours       visible 3D contours at the predicted pose  torchtrack.tracking.contours.points
-    observations   corners and recent events of each object   torchtrack.observations
+    observations   corners and recent events of each object   torchtrack.tracking.association.observations
     matching       observations to contours                   torchtrack.matching
     pose solver    Levenberg-Marquardt on SE(3)               torchtrack.tracking.estimation.levenberg_marquardt
     alignment      rounds of matching and solving             torchtrack.alignment

@@ -14,8 +14,8 @@ from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import Answer
 from torchtrack.implicit_gradient import with_gradient
 from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
-from torchtrack.observations import Observations
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
+from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject

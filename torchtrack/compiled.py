@@ -24,15 +24,15 @@ from jaxtyping import Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchtrack.bursts import update_bursts
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.constants import cells_within
 from torchtrack.core.events import EventBatch, check_on_sensor, pad_streams
 from torchtrack.cuda_graphs import CudaGraphs
 from torchtrack.errors import ConfigError
 from torchtrack.online_learning import due_lessons
-from torchtrack.sensor_tiles import NearbyEvents
 from torchtrack.state import S, StepResult, TrackerState, each_tensor
+from torchtrack.tracking.frontend.bursts import update_bursts
+from torchtrack.tracking.frontend.tiles import NearbyEvents
 
 if TYPE_CHECKING:
     from torchtrack.tracker import Tracker

@@ -11,7 +11,6 @@ from torchtrack.alignment import ANYWHERE, Fit, may_be_anywhere
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync, lie
 from torchtrack.core.linalg import inverse
-from torchtrack.corners import Corners
 from torchtrack.doubt import SMEARED, in_doubt
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import ConclusionSettings
@@ -20,6 +19,7 @@ from torchtrack.polarity_memory import is_seen_well, remembered
 from torchtrack.search import Found
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracking.contours.points import Contours, reproject
+from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import Acceleration, fade, found_acceleration, left_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
 

@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchtrack.history import History
-from torchtrack.observations import ObjectEvents, Observations, WindowEvents
+from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.frontend.history import History
+from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 
 

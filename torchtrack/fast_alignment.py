@@ -10,8 +10,8 @@ from torchtrack.core.constants import constant
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import MatchingSettings, RoundSettings
 from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SLOW_PX_S, SMEAR_PX, ContourTable, Matches
-from torchtrack.observations import Observations
 from torchtrack.pose_problem import Linearisation
+from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.estimation.levenberg_marquardt import damping_settings
 from torchtrack.tracking.motion.prediction import Prediction
 

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.linalg import vecdot
 
-from torchtrack.bursts import without_tail
 from torchtrack.common_error import APART_PX, ASIDE_PX, DEPTH_SHARE, PARALLEL, SORTED_PX2, TOUCHING_PX, mistaken_px2
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.core import dispatch
@@ -21,10 +20,11 @@ from torchtrack.core.padded import take_points
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import TableSettings
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.observations import Observations
 from torchtrack.polarity_memory import octant
+from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.frontend.bursts import without_tail
 
 # An edge this parallel to the flow (|n·f| below) is not crossed by it.
 _MIN_CROSSING = 0.3

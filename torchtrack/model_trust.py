@@ -19,10 +19,11 @@ from torchtrack.core.camera import project
 from torchtrack.core.padded import take_points
 from torchtrack.matching import ContourTable, match_nearest, on_and_around
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
-from torchtrack.observations import WindowEvents, select_events
 from torchtrack.quality import inside
+from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 
 # So many observations of its kind speak for an element before any of its own do; and of a kind, so many that are on it.

@@ -17,9 +17,10 @@ from torchtrack.core.constants import once
 from torchtrack.doubt import less_certain
 from torchtrack.hypotheses import promising
 from torchtrack.line_ends import running_on
-from torchtrack.observations import ObjectEvents, WindowEvents, select_events
 from torchtrack.pose_problem import Linearisation
+from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 
 # Shares that differ by less are the same: which of them is larger is chance.

@@ -15,7 +15,7 @@ from torch.linalg import vecdot
 
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.matching import Matches, on_and_around
-from torchtrack.observations import Observations
+from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.motion.prediction import Prediction
 

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from torchtrack.core.camera import project
 from torchtrack.core.lie import transform_points
-from torchtrack.observations import WindowEvents
 from torchtrack.state import TrackerState
 from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.frontend.window_events import WindowEvents
 
 # A shorter way need not show at all: a pixel fires only once an edge has passed far enough over it (px).
 _LEAST_WAY_PX = 0.6

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.corners import Corners
 from torchtrack.learned_contours import LearnedContours
 from torchtrack.model_trust import ModelTrust
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.frontend.corners import Corners
 
 
 @dataclass(frozen=True)

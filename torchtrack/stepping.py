@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchtrack.bursts import LONG_AGO_US
 from torchtrack.core.events import EventBatch
 from torchtrack.core.windows import EventWindow, windows_by_count, windows_by_time
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracker import Tracker
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US
 from torchtrack.tracking.motion.model import initial_covariance
 from torchtrack.window_length import WindowLength, tell_lengths
 

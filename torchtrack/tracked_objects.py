@@ -14,10 +14,10 @@ from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourModel, group_by_model
 from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, stacked, symmetry_planes, turning_axis
 from torchtrack.other_places import SymmetryPlanes
-from torchtrack.sensor_tiles import SensorTiles
-from torchtrack.sensors import Sensors, sensor_tables
 from torchtrack.setup_check import check_setup
 from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
+from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.motion.prediction import far_pose
 from torchtrack.trust import LimbTrust, TrustNetwork, shipped_weigher
 from torchtrack.turns import TurningAxes

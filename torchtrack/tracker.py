@@ -18,31 +18,32 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, pad_streams
-from torchtrack.corners import Corners
 from torchtrack.doubt import Doubt, gathered_when_known, has_strayed, is_adrift, is_due, is_wanted, searches
 from torchtrack.evidence import Evidence, judged
 from torchtrack.first_state import first_state
-from torchtrack.history import History
 from torchtrack.object_model import ObjectModel
-from torchtrack.observations import ObjectEvents, Observations, corner_observations, join, select_events
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.probation import after_probation
 from torchtrack.quality import Status, asked_apart
 from torchtrack.recovery import search_wanted
 from torchtrack.relocation import LastSeen, anywhere, is_lost, looked_for_anew
 from torchtrack.search import explained_at_rest, judge_fit, rehearse
-from torchtrack.sensor_tiles import NearbyEvents
-from torchtrack.sensors import farthest_event_px
 from torchtrack.setup_check import check_poses
 from torchtrack.slow_circuits import LOOK_US, dated, late_share_after
 from torchtrack.speed_limit import held_back
 from torchtrack.start_check import check_in_view
 from torchtrack.state import StepResult, TrackerState, choose_rows
 from torchtrack.step_check import check_step
-from torchtrack.time_surface import update_last_event
 from torchtrack.tracked_objects import TrackedObjects
+from torchtrack.tracking.association.observations import Observations, corner_observations, join, select_events
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.frontend.corners import Corners
+from torchtrack.tracking.frontend.history import History
+from torchtrack.tracking.frontend.sensors import farthest_event_px
+from torchtrack.tracking.frontend.tiles import NearbyEvents
+from torchtrack.tracking.frontend.time_surface import update_last_event
+from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.predict import forecast
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.turns import may_have_turned

@@ -19,11 +19,12 @@ from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
 from torchtrack.core.padded import take_points
 from torchtrack.evidence import Evidence
-from torchtrack.history import BORDER_PX
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import PatchSettings
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.observations import Observations, laid_out
+from torchtrack.tracking.association.observations import Observations
+from torchtrack.tracking.frontend.history import BORDER_PX
+from torchtrack.tracking.frontend.window_events import laid_out
 
 # Where the patch is sampled: across the contour and along it (px). Negative is behind the moving edge.
 _ACROSS_PX, _ALONG_PX = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0), (-2.0, 0.0, 2.0)

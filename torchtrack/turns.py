@@ -19,8 +19,8 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.event_image import event_density
 from torchtrack.hypotheses import ENOUGH_EVENTS, mark
-from torchtrack.observations import ObjectEvents, WindowEvents
 from torchtrack.search import Found, align_all, replaced
+from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.views import thinned
 

@@ -19,17 +19,17 @@ from torchtrack.core.camera import MIN_DEPTH_M, Camera
 from torchtrack.core.events import EventBatch, pad_streams
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.padded import select_ranked, take_points
-from torchtrack.corners import no_corners
 from torchtrack.errors import ModelError
 from torchtrack.matching import Matches
 from torchtrack.object_model import ObjectModel
 from torchtrack.pose_problem import Linearisation, PoseProblem
 from torchtrack.state import StepResult, TrackerState
-from torchtrack.time_surface import update_last_event
 from torchtrack.tracker import Tracker
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
+from torchtrack.tracking.frontend.corners import no_corners
+from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.motion.model import left_covariance
 
 # Contour points lie so far apart at most that an event on a line is within this of one of its points (px).

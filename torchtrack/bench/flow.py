@@ -7,9 +7,9 @@ from torch import Tensor
 from torchtrack.bench.results import Report, time_result
 from torchtrack.bench.setup import Setup
 from torchtrack.config.tracker import FlowConfig
-from torchtrack.corners import Corners
-from torchtrack.flow import estimate_flow
-from torchtrack.time_surface import NEVER_US
+from torchtrack.tracking.frontend.corners import Corners
+from torchtrack.tracking.frontend.flow import estimate_flow
+from torchtrack.tracking.frontend.time_surface import NEVER_US
 
 # Corners in all, of objects of 32 each, which is what the preset takes.
 CORNERS = (32, 256, 2048)

@@ -6,7 +6,7 @@ from torchtrack.bench.results import Report, Result, time_result
 from torchtrack.bench.setup import Setup
 from torchtrack.config.tracker import SurfaceConfig
 from torchtrack.core.events import EventBatch
-from torchtrack.time_surface import Regions, empty_last_event, time_surface, update_last_event
+from torchtrack.tracking.frontend.time_surface import Regions, empty_last_event, time_surface, update_last_event
 
 # Width, height and events of a window: at 4 and 20 Mev/s, and many at once.
 WINDOWS = ((640, 480, 20_000), (640, 480, 100_000), (1280, 720, 100_000), (640, 480, 1_000_000))

@@ -1,4 +1,4 @@
-"""From a window's events to what each object sees of them: :mod:`torchtrack.sensor_tiles`, ``bursts`` and ``sensors``, event by event."""
+"""From a window's events to what each object sees of them: :mod:`torchtrack.tracking.frontend.tiles`, ``bursts`` and ``sensors``, event by event."""
 
 import numpy as np
 
@@ -28,7 +28,7 @@ def near_tiles(
     tiles: TileSettings,
     near: Array,
 ) -> None:
-    """Tiles that anything can be seen in that is near an object: :meth:`torchtrack.sensor_tiles.SensorTiles.near`.
+    """Tiles that anything can be seen in that is near an object: :meth:`torchtrack.tracking.frontend.tiles.SensorTiles.near`.
 
     Args:
         middle, reach_px: ``[t, 2]`` and ``[t]``.
@@ -245,7 +245,7 @@ def update_bursts(
 
 @kernel()
 def _age(before: Array, elapsed: int, most: int, ages: Array) -> None:
-    """All ages some time later: :func:`torchtrack.bursts.aged`."""
+    """All ages some time later: :func:`torchtrack.tracking.frontend.bursts.aged`."""
     for i in range(len(before)):
         ages[i] = min(before[i], most) + elapsed
 

@@ -1,4 +1,4 @@
-"""Choosing the events that are observed: :func:`torchtrack.observations.select_events`, object by object."""
+"""Choosing the events that are observed: :func:`torchtrack.tracking.association.observations.select_events`, object by object."""
 
 import numpy as np
 

@@ -56,7 +56,7 @@ def describe(
         points_cam, normals, kind: ``[b, 3, m]``, ``[b, 2, m]`` and ``[b, m]`` of contour points; ``nearest_of_cell [b, p]`` and
             ``first [b, 2]`` are their index.
         velocity, centre_cam, intrinsics: of each object.
-        sensor_numbers, stream_index, last_event_us, t_us: of a :class:`torchtrack.history.History`.
+        sensor_numbers, stream_index, last_event_us, t_us: of a :class:`torchtrack.tracking.frontend.history.History`.
         features: ``[r, n, f]``, filled; with zeros where there is nothing to describe.
         is_limb: ``[b, n]``, false so far: which these are.
     """
@@ -164,7 +164,7 @@ def _find_places(u: float, v: float, nu: float, nv: float, across_px: Array, alo
 
 @kernel(fastmath=FAST)
 def _find_pixels(u: float, v: float, nu: float, nv: float, across_px: Array, height: int, width: int, places: Array) -> None:
-    """Rows of a table of sensor pixels for places across the contour, several at once: as :func:`torchtrack.history.on_sensor` finds them."""
+    """Rows of a table of sensor pixels for places across the contour, several at once: as :func:`torchtrack.tracking.frontend.history.on_sensor` finds them."""
     kind = across_px.dtype.type
     u, v, nu, nv, right, bottom = kind(u), kind(v), kind(nu), kind(nv), kind(width - 1), kind(height - 1)
     for k in range(len(places)):

@@ -11,8 +11,8 @@ from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.first_state import first_state
 from torchtrack.setup_check import check_poses
 from torchtrack.state import TrackerState
-from torchtrack.time_surface import update_last_event
 from torchtrack.tracker import Tracker
+from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.motion.model import initial_covariance
 
 

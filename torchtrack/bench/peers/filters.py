@@ -14,8 +14,8 @@ from numpy import ndarray
 from torchtrack.bench.peers.comparison import Comparison, Work
 from torchtrack.bench.surface import WINDOW_US, random_events
 from torchtrack.config.tracker import SurfaceConfig
-from torchtrack.filters import sliced_guided_filter, sliced_harris
-from torchtrack.time_surface import Regions, empty_last_event, time_surface, update_last_event
+from torchtrack.tracking.frontend.filters import sliced_guided_filter, sliced_harris
+from torchtrack.tracking.frontend.time_surface import Regions, empty_last_event, time_surface, update_last_event
 
 # Width and height: an object's region, and the whole sensor.
 SIZES = ((208, 208), (640, 480))

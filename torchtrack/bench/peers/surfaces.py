@@ -11,7 +11,7 @@ from torchtrack.bench.peers.comparison import Comparison, Work
 from torchtrack.bench.surface import WINDOW_US, random_events
 from torchtrack.config.tracker import SurfaceConfig
 from torchtrack.core.events import EventBatch
-from torchtrack.time_surface import Regions, empty_last_event, time_surface, update_last_event
+from torchtrack.tracking.frontend.time_surface import Regions, empty_last_event, time_surface, update_last_event
 
 WIDTH, HEIGHT, EVENTS = 640, 480, 100_000
 _TAU_S = SurfaceConfig().tau_s

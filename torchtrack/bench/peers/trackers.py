@@ -20,7 +20,7 @@ from torchtrack.bench.results import time_result
 from torchtrack.bench.scene import Scene, simulated, started
 from torchtrack.config.tracker import SurfaceConfig
 from torchtrack.sim.meshes import make_mesh
-from torchtrack.time_surface import Regions, empty_last_event, time_surface, update_last_event
+from torchtrack.tracking.frontend.time_surface import Regions, empty_last_event, time_surface, update_last_event
 
 SHAPE = "lbracket"
 _WINDOW_US = 5000

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torchtrack.config.tracker import FlowConfig
 from torchtrack.core.constants import disc
-from torchtrack.corners import Corners
-from torchtrack.time_surface import at_pixels
+from torchtrack.tracking.frontend.corners import Corners
+from torchtrack.tracking.frontend.time_surface import at_pixels
 
 # Floor of the residual's scale (px): events sit on whole pixels, so no smaller scale means anything.
 _MIN_SCALE_PX = 0.3

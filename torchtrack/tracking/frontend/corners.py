@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig
 from torchtrack.core.constants import constant
-from torchtrack.filters import corner_response
-from torchtrack.time_surface import Regions, at_pixels
+from torchtrack.tracking.frontend.filters import corner_response
+from torchtrack.tracking.frontend.time_surface import Regions, at_pixels
 
 # Sobel, Harris window and local maximum reach this far into a region from its border (px), beside the guided filter.
 _RESPONSE_REACH_PX = 6

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchtrack.core.constants import constant
-from torchtrack.time_surface import at_pixels, by_number
+from torchtrack.tracking.frontend.time_surface import at_pixels, by_number
 
 # Pixels this far outside the image still find their place on a distorted sensor (px).
 BORDER_PX = 64

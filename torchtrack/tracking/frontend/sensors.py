@@ -10,19 +10,19 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.bursts import LONG_AGO_US, update_bursts
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.core.events import EventBatch, PaddedEvents, check_on_sensor, of_streams, pad_streams
-from torchtrack.corners import Corners, detect_corners, no_corners
-from torchtrack.flow import estimate_flow
-from torchtrack.history import BORDER_PX, History, on_sensor, pixel_numbers
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.observations import ObjectEvents, SharedEvents, WindowEvents
-from torchtrack.sensor_tiles import TILE_BITS, NearbyEvents, SensorTiles
-from torchtrack.time_surface import at_pixels, object_regions, time_surface
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
+from torchtrack.tracking.frontend.corners import Corners, detect_corners, no_corners
+from torchtrack.tracking.frontend.flow import estimate_flow
+from torchtrack.tracking.frontend.history import BORDER_PX, History, on_sensor, pixel_numbers
+from torchtrack.tracking.frontend.tiles import TILE_BITS, NearbyEvents, SensorTiles
+from torchtrack.tracking.frontend.time_surface import at_pixels, object_regions, time_surface
+from torchtrack.tracking.frontend.window_events import ObjectEvents, SharedEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 
 # Poses that a search draws lie within this many of its least standard deviations.

@@ -1,0 +1,102 @@
+"""What is matched with contours: recent events near them, and corners where there are any."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchtrack.core import dispatch
+from torchtrack.core.image_velocity import MovingObjects
+from torchtrack.core.padded import take_points
+from torchtrack.kernels.arrays import as_arrays
+from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.frontend.corners import Corners
+from torchtrack.tracking.frontend.window_events import GOLDEN_RATIO, ObjectEvents, laid_out
+
+# Lots are drawn for a little less than what there is room for, as their number varies.
+_FILL = 0.95
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What was seen, padded: corners and events.
+
+    Args:
+        pixels: ideal pixels at the time of the event.
+        age_s: time from the event to the window's end (s).
+        into_burst_s: time from the first event of its burst to the event (s); zero where there is none.
+        polarity: +1 where the pixel got brighter, -1 where darker, 0 where unknown.
+        mask: which entries exist.
+        flow: velocity (px/s); zero where there is none.
+        has_flow: where the flow is known.
+        trust: how far each entry is to be believed, 0 to 1, where something was there to tell it.
+    """
+
+    pixels: Float[Tensor, "b n 2"]
+    age_s: Float[Tensor, "b n"]
+    into_burst_s: Float[Tensor, "b n"]
+    polarity: Float[Tensor, "b n"]
+    mask: Bool[Tensor, "b n"]
+    flow: Float[Tensor, "b n 2"]
+    has_flow: Bool[Tensor, "b n"]
+    trust: Float[Tensor, "b n"] | None = None
+
+
+def corner_observations(corners: Corners) -> Observations:
+    """The corners as observations; their polarity is not known."""
+    unknown = torch.zeros_like(corners.age_s)
+    return Observations(corners.pixels, corners.age_s, unknown, unknown, corners.mask, corners.flow, corners.has_flow)
+
+
+def select_events(events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int) -> Observations:
+    """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time.
+
+    Which of them are taken hangs on each event's own number, not on how many come before it: a pose that is a little
+    different takes almost the same events.
+    """
+    if dispatch.apply_to(objects.velocity):
+        values, exists = _selected_by_kernel(events, index, objects, count)
+    else:
+        events = events.rows()
+        pixels, mask = events.pixels, events.mask
+        near = mask & (index.look_up(torch.addcmul(pixels, objects.plane_velocity(pixels), events.age_s[..., None])) >= 0)
+        total = near.sum(-1, keepdim=True)
+        share = torch.where(total > count, _FILL * count / total, 1.0)
+        chosen, exists = events.draw(near, share, count)
+        rows = [pixels.transpose(1, 2), events.age_s[:, None], events.into_burst_s[:, None], events.polarity[:, None]]
+        values = take_points(torch.cat(rows, 1).transpose(1, 2), chosen)
+    flow = torch.zeros_like(values[..., :2])
+    return Observations(values[..., :2], values[..., 2], values[..., 3], values[..., 4], exists, flow, torch.zeros_like(exists))
+
+
+def _selected_by_kernel(
+    events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int
+) -> tuple[Float[Tensor, "b c 5"], Bool[Tensor, "b c"]]:
+    """What is told of the events that :func:`select_events` takes, and which there are, event by event."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels.selection import select
+
+    rows, own, counts = laid_out(events)
+    number = torch.arange(rows.mask.shape[1]).expand(len(rows.mask), -1) if rows.number is None else rows.number
+    batch = len(objects.velocity)
+    chosen, exists = rows.pixels.new_empty(batch, 5, count), torch.empty(batch, count, dtype=torch.bool)
+    seen = as_arrays(*rows.pixels.unbind(-1), rows.age_s, rows.into_burst_s, rows.polarity, rows.mask, number, own, counts)
+    moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics, index.nearest, index.first)
+    select(*seen, *moving, index.cells, _FILL, GOLDEN_RATIO, chosen.numpy(), exists.numpy())
+    return chosen.transpose(1, 2), exists
+
+
+def join(first: Observations, second: Observations) -> Observations:
+    """Observations of both, for each object; none has been judged yet."""
+    if first.mask.shape[1] == 0:
+        return second
+    names = [name for name in vars(first) if name != "trust"]
+    return Observations(*(_one_after_the_other(getattr(first, name), getattr(second, name)) for name in names))
+
+
+def _one_after_the_other(first: Tensor, second: Tensor) -> Tensor:
+    """Both, along the second dimension; in memory, coordinates are rows."""
+    if first.dim() == 2:
+        return torch.cat([first, second], 1)
+    return torch.cat([first.transpose(1, 2), second.transpose(1, 2)], 2).transpose(1, 2)
