@@ -17,12 +17,13 @@ from torchtrack.core.camera import undistortion_table
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.hypotheses import mark
-from torchtrack.matching import ContourTable, Matches
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
-from torchtrack.polarity_memory import remembered
 from torchtrack.quality import shares
+from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.nearest import ContourTable
 from torchtrack.tracking.association.observations import select_events
+from torchtrack.tracking.association.polarity import remembered
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import assemble, mesh_contours, reproject

@@ -14,11 +14,11 @@ from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.core.linalg import inverse
-from torchtrack.matching import Matches
 from torchtrack.pose_problem import Linearisation
 from torchtrack.quality import Status
 from torchtrack.search import Found
 from torchtrack.state import Probation
+from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.motion.predict import forecast
 

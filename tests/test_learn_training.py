@@ -11,7 +11,7 @@ from tiny_sequence import write_tiny_sequence
 from torchtrack.learn.augmentation import AugmentationConfig
 from torchtrack.learn.dataset import ClipConfig
 from torchtrack.learn.training import Trainer, TrainingConfig
-from torchtrack.trust import TrustNetwork
+from torchtrack.tracking.association.weighting_network import TrustNetwork
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "train_weights.py"
 SMALL = TrainingConfig(

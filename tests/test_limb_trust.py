@@ -11,8 +11,8 @@ from torchtrack import Tracker, preset
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.core.dispatch import kernels
 from torchtrack.core.events import concatenate
-from torchtrack.trust import LimbTrust, TrustNetwork
-from torchtrack.trust_features import limb_features
+from torchtrack.tracking.association.weighting_features import limb_features
+from torchtrack.tracking.association.weighting_network import LimbTrust, TrustNetwork
 
 BOX, SMOOTH = box_model(), bevelled_model()
 COUNT = 6

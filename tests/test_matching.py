@@ -10,9 +10,12 @@ from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator,
 from torchtrack.config.tracker import ContourConfig, MatchingConfig
 from torchtrack.core.image_velocity import MovingObjects, object_plane_velocity
 from torchtrack.core.lie import retract_about
-from torchtrack.matching import ContourTable, both_coordinates, concentration, match_along_flow, match_nearest, on_and_around, patch, patch_sums
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
+from torchtrack.tracking.association.along_flow import match_along_flow
+from torchtrack.tracking.association.matches import both_coordinates
+from torchtrack.tracking.association.nearest import ContourTable, match_nearest
 from torchtrack.tracking.association.observations import Observations
+from torchtrack.tracking.association.weights import concentration, on_and_around, patch, patch_sums
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import Contours, mesh_contours, reproject
 

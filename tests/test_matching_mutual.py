@@ -6,7 +6,8 @@ from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
 from pydantic import ValidationError
 
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.matching import ContourTable, match_nearest, mutual_agreement, patch, patch_sums
+from torchtrack.tracking.association.nearest import ContourTable, match_nearest
+from torchtrack.tracking.association.weights import mutual_agreement, patch, patch_sums
 from torchtrack.tracking.contours.index import index_contours
 
 

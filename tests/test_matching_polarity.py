@@ -5,8 +5,9 @@ import torch
 from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
 
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.matching import ContourTable, match_nearest, on_and_around, patch, patch_sums, polarity_agreement
 from torchtrack.object_model.contour_source import ContourKind
+from torchtrack.tracking.association.nearest import ContourTable, match_nearest
+from torchtrack.tracking.association.weights import on_and_around, patch, patch_sums, polarity_agreement
 from torchtrack.tracking.contours.index import index_contours
 
 CONFIG = MatchingConfig(polarity_gain=1.5, least_agreement=0.05)

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from torchtrack.config.search import QualityConfig
-from torchtrack.matching import Matches
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.quality import Status, explained_share, gathered_share, holding_on, judge, needed_share, partly_hidden, trust, visible_share
+from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.contours.points import Contours
 
 IMAGE_SIZE = (150, 200)

@@ -13,8 +13,8 @@ from torchtrack.core.lie import se3_inverse, se3_log
 from torchtrack.errors import UnknownFormatError
 from torchtrack.learn.labels import true_distance
 from torchtrack.learn.samples import state_velocity
-from torchtrack.trust import TrustNetwork
-from torchtrack.trust_features import FEATURES, trust_features
+from torchtrack.tracking.association.weighting_features import FEATURES, trust_features
+from torchtrack.tracking.association.weighting_network import TrustNetwork
 
 
 class Watching(nn.Module):

@@ -8,7 +8,7 @@ The pipeline, one file per stage, in data-flow order::
     flow           robust event flow of each corner           torchtrack.tracking.frontend.flow
     contours       visible 3D contours at the predicted pose  torchtrack.tracking.contours.points
     observations   corners and recent events of each object   torchtrack.tracking.association.observations
-    matching       observations to contours                   torchtrack.matching
+    matching       observations to contours                   torchtrack.tracking.association.weights
     pose solver    Levenberg-Marquardt on SE(3)               torchtrack.tracking.estimation.levenberg_marquardt
     alignment      rounds of matching and solving             torchtrack.alignment
     quality        status, covariance, explained contour      torchtrack.quality

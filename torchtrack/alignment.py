@@ -8,14 +8,16 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchtrack import fast_alignment
-from torchtrack.common_error import told_by_each
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import Answer
 from torchtrack.implicit_gradient import with_gradient
-from torchtrack.matching import ContourTable, Matches, both_coordinates, match_along_flow, match_nearest
 from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
+from torchtrack.tracking.association.along_flow import match_along_flow
+from torchtrack.tracking.association.matches import Matches, both_coordinates
+from torchtrack.tracking.association.nearest import ContourTable, match_nearest
 from torchtrack.tracking.association.observations import Observations
+from torchtrack.tracking.association.weights import told_by_each
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject

@@ -14,10 +14,10 @@ from torchtrack.core.linalg import inverse
 from torchtrack.doubt import SMEARED, in_doubt
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import ConclusionSettings
-from torchtrack.matching import ON_CONTOUR_PX
-from torchtrack.polarity_memory import is_seen_well, remembered
 from torchtrack.search import Found
 from torchtrack.state import StepResult, TrackerState
+from torchtrack.tracking.association.polarity import is_seen_well, remembered
+from torchtrack.tracking.association.weights import ON_CONTOUR_PX
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import Acceleration, fade, found_acceleration, left_covariance, with_dropped

@@ -9,9 +9,11 @@ from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import MatchingSettings, RoundSettings
-from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SLOW_PX_S, SMEAR_PX, ContourTable, Matches
 from torchtrack.pose_problem import Linearisation
+from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.nearest import ContourTable
 from torchtrack.tracking.association.observations import Observations
+from torchtrack.tracking.association.weights import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SLOW_PX_S, SMEAR_PX
 from torchtrack.tracking.estimation.levenberg_marquardt import damping_settings
 from torchtrack.tracking.motion.prediction import Prediction
 
@@ -70,7 +72,7 @@ def align_rounds(
 
 
 def _matching_settings(config: TrackerConfig) -> MatchingSettings:
-    """What a kernel goes by that matches as :func:`torchtrack.matching.match_nearest` does."""
+    """What a kernel goes by that matches as :func:`torchtrack.tracking.association.nearest.match_nearest` does."""
     matching = config.matching
     return MatchingSettings(
         burst_px=matching.burst_px,

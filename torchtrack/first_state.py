@@ -6,10 +6,10 @@ from torch import Tensor
 
 from torchtrack.learned_contours import LearnedContours
 from torchtrack.model_trust import ModelTrust
-from torchtrack.polarity_memory import nothing_remembered
 from torchtrack.slow_circuits import unknown_circuits
 from torchtrack.state import Probation, TrackerState
 from torchtrack.tracked_objects import TrackedObjects
+from torchtrack.tracking.association.polarity import nothing_remembered
 from torchtrack.tracking.frontend.bursts import no_bursts
 from torchtrack.tracking.frontend.time_surface import empty_last_event
 from torchtrack.tracking.motion.model import initial_covariance

@@ -17,10 +17,11 @@ from torchtrack.alignment import usual_index_radius
 from torchtrack.config.tracker import ModelTrustConfig, TrackerConfig
 from torchtrack.core.camera import project
 from torchtrack.core.padded import take_points
-from torchtrack.matching import ContourTable, match_nearest, on_and_around
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.quality import inside
+from torchtrack.tracking.association.nearest import ContourTable, match_nearest
 from torchtrack.tracking.association.observations import select_events
+from torchtrack.tracking.association.weights import on_and_around
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.window_events import WindowEvents

@@ -16,7 +16,8 @@ from torchtrack.core.host_sync import none_of
 from torchtrack.core.image_velocity import MovingObjects, pixel_velocity
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import QualitySettings
-from torchtrack.matching import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SMEAR_PX, Matches, on_and_around, patch, patch_sums
+from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.weights import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SMEAR_PX, on_and_around, patch, patch_sums
 from torchtrack.tracking.contours.points import Contours
 
 # A patch explains its contours when this share of the observations near them are on them.

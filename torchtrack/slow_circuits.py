@@ -14,8 +14,9 @@ from torch import Tensor
 from torch.linalg import vecdot
 
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.matching import Matches, on_and_around
+from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.observations import Observations
+from torchtrack.tracking.association.weights import on_and_around
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.motion.prediction import Prediction
 

@@ -53,7 +53,7 @@ class TrackerState:
         doubted_s: for how long, less the time it was not, the object has been in doubt of being elsewhere (s).
         T_last_seen: pose of each object when it was last seen well (float64).
         unseen_s: how long ago that was (s).
-        darker_outside: which side of each object's contours is the darker one, by the octant that they face: :mod:`torchtrack.polarity_memory`.
+        darker_outside: which side of each object's contours is the darker one, by the octant that they face: :mod:`torchtrack.tracking.association.polarity`.
         late_share: how many of the events on its moving contours come late in their bursts: :mod:`torchtrack.slow_circuits`.
         t_us: end of the last window of each stream (µs).
         last_event_us: time of the newest event of every sensor pixel (µs).

@@ -19,7 +19,6 @@ from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, pad_streams
 from torchtrack.doubt import Doubt, gathered_when_known, has_strayed, is_adrift, is_due, is_wanted, searches
-from torchtrack.evidence import Evidence, judged
 from torchtrack.first_state import first_state
 from torchtrack.object_model import ObjectModel
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
@@ -36,6 +35,7 @@ from torchtrack.state import StepResult, TrackerState, choose_rows
 from torchtrack.step_check import check_step
 from torchtrack.tracked_objects import TrackedObjects
 from torchtrack.tracking.association.observations import Observations, corner_observations, join, select_events
+from torchtrack.tracking.association.weighting_features import Evidence, judged
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.corners import Corners
@@ -61,7 +61,7 @@ class Tracker(TrackedObjects):
         config: settings; the ``default`` preset when not given.
         stream_index: the stream each object is seen in; the first for all when not given.
         dtype: precision of the pipeline; poses are kept in float64.
-        weigher: judges every window's :class:`torchtrack.evidence.Evidence`: how far each observation is to be believed,
+        weigher: judges every window's :class:`torchtrack.tracking.association.weighting_features.Evidence`: how far each observation is to be believed,
             ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
             comes with the package, for what ``matching.learned_trust`` says. Other poses that a search tries are aligned
             without it.

@@ -1,4 +1,4 @@
-"""Matching one object's observations with its contours: :func:`torchtrack.matching.match_nearest`, and what its matches come to weigh."""
+"""Matching one object's observations with its contours: :func:`torchtrack.tracking.association.nearest.match_nearest`, and what its matches come to weigh."""
 
 import numpy as np
 
@@ -28,7 +28,7 @@ def _agreeing(agreement: float, settings: MatchingSettings) -> float:
 
 @kernel()
 def patch(u: float, v: float, bits: int, patches: int) -> int:
-    """The patch of the image that a place lies in: :func:`torchtrack.matching.patch`."""
+    """The patch of the image that a place lies in: :func:`torchtrack.tracking.association.weights.patch`."""
     return ((int(np.floor(v)) >> bits) & (patches - 1)) * patches + ((int(np.floor(u)) >> bits) & (patches - 1))
 
 

@@ -102,7 +102,7 @@ def visible(pixels: Array, mask: Array, height: int, width: int, share: Array) -
 
 @kernel()
 def remember(darker_outside: Array, directions: Array, dark: Array, weights: Array, window_s: Array, memory_s: float, little: float) -> None:
-    """What is remembered of sides with a window more: :func:`torchtrack.polarity_memory.remembered`, in place.
+    """What is remembered of sides with a window more: :func:`torchtrack.tracking.association.polarity.remembered`, in place.
 
     Args:
         darker_outside: ``[b, 8]``.
@@ -131,7 +131,7 @@ def _sides(directions: Array, dark: Array, weights: Array, sums: Array) -> None:
 
 @kernel()
 def octant(u: float, v: float) -> int:
-    """The eighth of the plane that a direction points to: :func:`torchtrack.polarity_memory.octant`."""
+    """The eighth of the plane that a direction points to: :func:`torchtrack.tracking.association.polarity.octant`."""
     return int(u > 0) + 2 * int(v > 0) + 4 * int(abs(u) > abs(v))
 
 

@@ -19,7 +19,7 @@ class Cells(NamedTuple):
 
 
 class MatchingSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.matching` goes by: settings, and constants of :mod:`torchtrack.matching`."""
+    """What :mod:`torchtrack.kernels.matching` goes by: settings, and constants of :mod:`torchtrack.tracking.association.weights`."""
 
     burst_px: float
     dark_shift_px: float
@@ -100,7 +100,7 @@ class IndexSettings(NamedTuple):
 
 
 class TableSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.table` goes by: settings, and constants of :mod:`torchtrack.common_error`.
+    """What :mod:`torchtrack.kernels.table` goes by: settings, and constants of :mod:`torchtrack.tracking.association.weights`.
 
     Args:
         limb, crease, texture: numbers of kinds of contours.
@@ -264,7 +264,7 @@ class ConclusionSettings(NamedTuple):
 
 
 class PatchSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.trust` goes by: constants of :mod:`torchtrack.trust_features`.
+    """What :mod:`torchtrack.kernels.trust` goes by: constants of :mod:`torchtrack.tracking.association.weighting_features`.
 
     Args:
         across_px, along_px: where the patch is sampled.

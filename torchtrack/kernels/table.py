@@ -1,4 +1,4 @@
-"""The table of what observations take from contour points: :meth:`torchtrack.matching.ContourTable.of`, point by point."""
+"""The table of what observations take from contour points: :meth:`torchtrack.tracking.association.nearest.ContourTable.of`, point by point."""
 
 import numpy as np
 
@@ -85,7 +85,7 @@ def _add_mistaken(
     settings: TableSettings,
     table: Array,
 ) -> None:
-    """How far off what is seen on points of edges is, should it be of the edge beside: :func:`torchtrack.common_error.mistaken_px2`."""
+    """How far off what is seen on points of edges is, should it be of the edge beside: :func:`torchtrack.tracking.association.weights.mistaken_px2`."""
     least_m = settings.depth_share * _range(depth_m, mask)
     for i in range(len(mask)):
         if not mask[i] or not table[i, ORIENTED]:

@@ -1,4 +1,4 @@
-"""What describes observations of limbs, one at a time: :func:`torchtrack.trust_features.limb_features`."""
+"""What describes observations of limbs, one at a time: :func:`torchtrack.tracking.association.weighting_features.limb_features`."""
 
 import numpy as np
 

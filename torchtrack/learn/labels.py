@@ -6,8 +6,8 @@ from torch import Tensor
 
 from torchtrack.alignment import index_for
 from torchtrack.core.padded import take_points
-from torchtrack.evidence import Evidence
 from torchtrack.tracker import Tracker
+from torchtrack.tracking.association.weighting_features import Evidence
 from torchtrack.tracking.motion.prediction import Prediction
 
 

@@ -17,15 +17,14 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.settings import Settings
 from torchtrack.config.tracker import TrackerConfig, WindowConfig
 from torchtrack.core.lie import difference_about
-from torchtrack.evidence import Evidence
 from torchtrack.learn.augmentation import AugmentationConfig
 from torchtrack.learn.dataset import ClipConfig, SequenceBatches, WindowDataset
 from torchtrack.learn.labels import true_distance
 from torchtrack.learn.samples import Batch, collate, start_state, state_velocity
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracker import Tracker
-from torchtrack.trust import TrustNetwork
-from torchtrack.trust_features import trust_features
+from torchtrack.tracking.association.weighting_features import Evidence, trust_features
+from torchtrack.tracking.association.weighting_network import TrustNetwork
 
 # The velocity a sample starts with is uncertain by this: as it is in the middle of a motion (m/s).
 _SPEED_SIGMA_M_S = 0.1

@@ -11,15 +11,14 @@ from torch import Tensor, nn
 
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.errors import UnknownFormatError
-from torchtrack.evidence import Evidence
 from torchtrack.object_model.contour_source import ContourModel
-from torchtrack.trust_features import FEATURES, limb_features, trust_features
+from torchtrack.tracking.association.weighting_features import FEATURES, Evidence, limb_features, trust_features
 
 _SHIPPED = "learned.safetensors"
 
 
 class TrustNetwork(nn.Module):
-    """A weigher: believes an observation by the space-time patch of events around it (:mod:`torchtrack.trust_features`).
+    """A weigher: believes an observation by the space-time patch of events around it (:mod:`torchtrack.tracking.association.weighting_features`).
 
     Args:
         hidden: widths of its two hidden layers.

@@ -1,46 +1,103 @@
-"""What tells whether an observation is of the contour near it: its place, and a space-time patch of events around it.
+"""What a weigher sees of a window before it is aligned: all that tells whether an observation is of the contour near it."""
 
-Everything is measured in the frame of the nearest predicted contour: its normal, turned to where the object moves, and
-its tangent. The events of the object's own edges, moved to the window's end with the object, gather on lines along the
-tangent, and the time surface rises along the normal as the edge's speed says; those of occluders, of the background, of
-shading and of noise do neither. How far the observation lies from the contour is not told: the gates and the robust loss
-see to that, and better with every round. Trust that fell with the distance would hold a pose fast that has begun to slip.
-"""
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import softsign
 
 from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
 from torchtrack.core.padded import take_points
-from torchtrack.evidence import Evidence
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import PatchSettings
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.observations import Observations
-from torchtrack.tracking.frontend.history import BORDER_PX
-from torchtrack.tracking.frontend.window_events import laid_out
+from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.frontend.history import BORDER_PX, History
+from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents, laid_out
+from torchtrack.tracking.motion.prediction import Prediction
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One window of every object, at the predicted pose; all constants, as far as gradients go.
+
+    Args:
+        observations: what is to be judged.
+        seen: events of the window; all of them, where a weigher of one's own is to judge.
+        prediction: pose, motion and uncertainty of each object at the window's end.
+        contours: visible contours there.
+        index: which of them is nearest to a pixel.
+        history: the time surface, also of the past before the window.
+    """
+
+    observations: Observations
+    seen: ObjectEvents
+    prediction: Prediction
+    contours: Contours
+    index: ContourIndex
+    history: History
+
+    @property
+    def events(self) -> WindowEvents:
+        """Events of the window, a row for each object."""
+        return self.seen.rows()
+
+    def age_s(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n"]:
+        """Time since the newest event (s) at ideal pixels, rounded to whole ones; huge where there never was any."""
+        return self.history.age_s(pixels)
+
+
+def judged(evidence: Evidence, weigher: nn.Module) -> Observations:
+    """The observations, with how far a weigher believes each of them.
+
+    Raises:
+        ValueError: if the weigher gives something else than one number for each observation.
+    """
+    trust = weigher(evidence)
+    expected = evidence.observations.age_s.shape
+    if trust.shape != expected:
+        raise ValueError(f"a weigher must give one number for each observation, shape {list(expected)}; got {list(trust.shape)}.")
+    return replace(evidence.observations, trust=trust.to(evidence.observations.age_s.dtype))
+
 
 # Where the patch is sampled: across the contour and along it (px). Negative is behind the moving edge.
 _ACROSS_PX, _ALONG_PX = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0), (-2.0, 0.0, 2.0)
+
+
 # What is older than this, in px of the edge's motion, says no more.
 _OLDEST_PX = 6.0
+
+
 # Slower than this (px/s), an edge has no direction that it moves to. Speeds are told in this unit, by their logarithm.
 _SLOW_PX_S, _SPEED_UNIT_PX_S = 10.0, 100.0
+
+
 # Events are counted by pixel, a power of two of them a side: what is that far apart shares a place, and hardly ever fires at once.
 _SIDE = 256
+
+
 # A place beyond this is nowhere (px).
 _FARTHEST_PX = 1e6
+
+
 # Kinds of contours that a model has.
 _KINDS = int(ContourKind.SPLAT) + 1
+
+
 _COUNTS, _SINGLE = 2 * len(_ACROSS_PX) * len(_ALONG_PX), 6
+
+
 _OF_KIND = _COUNTS + len(_ACROSS_PX)
+
+
 FEATURES = _OF_KIND + _KINDS + _SINGLE
+
+
 """How many numbers describe an observation."""
 
 

@@ -1,0 +1,52 @@
+"""What an observation is matched with."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Contour point of each observation.
+
+    Args:
+        contour: index of the contour point; 0 where there is none.
+        mask: which observations are matched.
+        weights: how far each match is to be trusted, 0 to 1.
+        age_s: time from when the contour passed to the window's end (s).
+        points_obj: the contour point in the object's frame (m).
+        targets: ideal pixels of the observations, moved to the window's end.
+        directions: unit directions along which the distance counts.
+        offsets: distance of each observation from its contour along the normal, in px over the widening of the gate.
+        near: which observations have a contour so near that ``offsets`` says something, matched or not.
+        limb: 1 where the contour is the limb of a smooth surface, 0 where not.
+        beside: how many observations are on the contour in the patch of the image that each lies in.
+        mistaken_px2: mean square of how far off each is, should it be of an edge that lies beside its contour (px²).
+        dark: 1 where an event says that the outer side of its contour is the darker one, -1 the inner one; 0 where that is not known.
+        as_expected: how far that is what it is expected to say, 0 to 1.
+    """
+
+    contour: Int[Tensor, "b n"]
+    mask: Bool[Tensor, "b n"]
+    weights: Float[Tensor, "b n"]
+    age_s: Float[Tensor, "b n"]
+    points_obj: Float[Tensor, "b n 3"]
+    targets: Float[Tensor, "b n 2"]
+    directions: Float[Tensor, "b n 2"]
+    offsets: Float[Tensor, "b n"]
+    near: Bool[Tensor, "b n"]
+    limb: Float[Tensor, "b n"]
+    beside: Float[Tensor, "b n"]
+    mistaken_px2: Float[Tensor, "b n"]
+    dark: Float[Tensor, "b n"]
+    as_expected: Float[Tensor, "b n"]
+
+
+def both_coordinates(matches: Matches) -> Matches:
+    """The same matches with the distance in u and in v, as two observations each."""
+    axes = torch.eye(2, dtype=matches.targets.dtype, device=matches.targets.device)
+    directions = torch.cat([axes[axis].expand_as(matches.targets) for axis in range(2)], 1)
+    twice = {name: torch.cat([value, value], 1) for name, value in vars(matches).items()}
+    return Matches(**(twice | {"directions": directions}))

@@ -1,0 +1,140 @@
+"""Association of observations with the nearest contour point, within a gate: the one of the preset ``default``."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.linalg import vecdot
+
+from torchtrack.config.tracker import MatchingConfig
+from torchtrack.core import dispatch
+from torchtrack.core.image_velocity import MovingObjects
+from torchtrack.kernels.arrays import as_arrays
+from torchtrack.kernels.settings import TableSettings
+from torchtrack.object_model.contour_source import ContourKind
+from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.observations import Observations
+from torchtrack.tracking.association.polarity import octant
+from torchtrack.tracking.association.weights import (
+    APART_PX,
+    ASIDE_PX,
+    DEPTH_SHARE,
+    PARALLEL,
+    SORTED_PX2,
+    TOUCHING_PX,
+    agreeing,
+    dark_shift_px,
+    leading_side,
+    match_weights,
+    mistaken_px2,
+    mutual_agreement,
+)
+from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.frontend.bursts import without_tail
+
+
+@dataclass(frozen=True)
+class ContourTable:
+    """What observations take from their contour point, laid out in rows.
+
+    Args:
+        rows: the values of all contour points, laid out so that one selection takes them for all observations.
+        index: the contour point nearest to each place in the image.
+        not_plain: objects of which print or smooth limbs are seen.
+    """
+
+    rows: Float[Tensor, "b k m"]
+    index: ContourIndex
+    not_plain: Bool[Tensor, "b"]
+
+    @classmethod
+    def of(
+        cls, contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_print: bool = True, close_px: float = 0.0
+    ) -> "ContourTable":
+        """The table of contours and their index.
+
+        The normals of the mesh's own edges are oriented: they point outwards. Those of print point to its darker side.
+
+        Args:
+            polarity: expected of the mesh's own edges, by the octant that they face (:func:`torchtrack.tracking.association.polarity.expected_polarity`).
+            of_print: whether anything is expected of print.
+            close_px: distance from which parallel edges are told apart; 0 for always.
+        """
+        if dispatch.apply_to(contours.pixels):
+            return _table_by_kernel(contours, index, polarity, of_print=of_print, close_px=close_px)
+        limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
+        oriented, expected = limb | crease, (texture & of_print).to(contours.pixels.dtype)
+        if polarity is not None:
+            expected = torch.where(oriented, polarity.gather(1, octant(contours.normals)), expected)
+        mistaken = mistaken_px2(contours, index, oriented, crease, close_px) if close_px else torch.zeros_like(expected)
+        marks = torch.stack([limb.to(expected.dtype), oriented.to(expected.dtype), expected, mistaken], -1)
+        values = (contours.points_obj, contours.normals, index.pixels, marks)
+        return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index, ((limb | texture) & contours.mask).any(1))
+
+    def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, ...]:
+        """Of contour points: places on the object, normals, pixels when indexed; limb or not, oriented or not, darker side expected, mistaken."""
+        taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
+        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 4), -1)
+        return points_obj, normals, indexed, *marks.unbind(-1)
+
+
+def _table_by_kernel(contours: Contours, index: ContourIndex, polarity: Tensor | None, *, of_print: bool, close_px: float) -> ContourTable:
+    """:meth:`ContourTable.of`, point by point."""
+    # Not at the top: Numba is an extra.
+    from torchtrack.kernels import table as kernels
+
+    limb, crease, texture = (int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
+    close = ASIDE_PX, PARALLEL, APART_PX, TOUCHING_PX, DEPTH_SHARE, SORTED_PX2
+    settings = TableSettings(limb, crease, texture, of_print, close_px, *close)
+    table, not_plain = contours.points_obj.new_empty(*contours.mask.shape, kernels.COLUMNS), torch.empty_like(contours.mask[:, 0])
+    points, pixels, normals, indexed = (value.transpose(1, 2) for value in (contours.points_obj, contours.pixels, contours.normals, index.pixels))
+    expected = pixels.new_empty(len(table), 0) if polarity is None else polarity
+    given = as_arrays(points, contours.points_cam[..., 2], pixels, normals, contours.kind, contours.mask, indexed, index.nearest, index.first)
+    kernels.fill(*given, index.cells, *as_arrays(expected), settings, table.numpy(), not_plain.numpy())
+    return ContourTable(table.transpose(1, 2), index, not_plain)
+
+
+def match_nearest(
+    observations: Observations,
+    table: ContourTable,
+    place: Float[Tensor, "b n 2"],
+    objects: MovingObjects,
+    gate_px: float,
+    config: MatchingConfig,
+    wider: Float[Tensor, "b"] | None = None,
+    finely: Bool[Tensor, "b"] | None = None,
+) -> tuple[Matches, Float[Tensor, "b n 2"]]:
+    """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
+
+    Args:
+        table: of the contours, as they were indexed at some pose.
+        place: where to look for each observation among the contours as indexed; returned anew for the next round.
+        objects: at the current poses; a velocity of zero switches motion compensation off.
+        wider: by how much the gate, and all that is measured against contours, is wider for each object.
+        finely: objects whose contours are looked up finely; none where not given.
+    """
+    wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
+    found = table.index.look_up(place, finely)
+    points_obj, normals, indexed, limb, oriented, expected, mistaken = table.take(contour := found.clamp(min=0))
+    pixels, velocity, change = objects.show(points_obj)
+    crossing_px_s = vecdot(normals, velocity)
+    dark = observations.polarity * leading_side(crossing_px_s)
+    age_s = without_tail(observations.age_s, observations.into_burst_s, crossing_px_s, config.burst_px)
+    carried = torch.addcmul(observations.pixels, velocity, age_s[..., None])
+    if change is not None:
+        # It had moved less, or more, when it was slower or faster.
+        carried = torch.addcmul(carried, change, age_s[..., None].square(), value=-0.5)
+    targets = torch.addcmul(carried, normals, (dark * dark_shift_px(limb, config))[..., None], value=-1)
+    difference = pixels - targets
+    near = observations.mask & (found >= 0)
+    matched = near & (vecdot(difference, difference) < (gate_px * wider)[:, None].square())
+    offsets = vecdot(difference, normals) / wider[:, None]
+    as_expected, dark = agreeing(dark * expected, config), dark * oriented
+    weights, beside = match_weights(offsets, targets, near, dark, as_expected, config)
+    if config.mutual_px:
+        weights = weights * mutual_agreement(pixels, offsets, matched, config.mutual_px)
+    matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb, beside, mistaken, dark, as_expected)
+    # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
+    return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)
