@@ -8,7 +8,6 @@ import torch
 from helpers import IMAGE_SIZE, contours_at, generator, moving_objects, seen, upright_line
 from tracked_boxes import in_motion
 
-from torchtrack.alignment import align, gate_widening, index_for
 from torchtrack.config.tracker import MatchingConfig, SolverConfig, TrackerConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.nearest import ContourTable, match_nearest
@@ -16,6 +15,7 @@ from torchtrack.tracking.association.observations import join, select_events
 from torchtrack.tracking.association.weights import SORTED_PX2, mistaken_px2, told_by_each
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import joined
+from torchtrack.tracking.estimation.rounds import align, gate_widening, index_for
 
 WITHOUT = TrackerConfig(solver=SolverConfig(common_px=0.0))
 

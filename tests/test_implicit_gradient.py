@@ -11,9 +11,9 @@ from torch.autograd import gradcheck
 
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core.lie import cayley, move_about, retract_about, se3_exp
-from torchtrack.implicit_gradient import newton_step, with_gradient
-from torchtrack.pose_problem import PoseProblem
+from torchtrack.tracking.estimation.implicit_gradient import newton_step, with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import robust_cost, solve_pose
+from torchtrack.tracking.estimation.terms import PoseProblem
 
 # Scales at which residuals of 2 px lie where the loss bends.
 SCALES_PX = {"tukey": 9.0, "huber": 2.5, "none": 1.0}

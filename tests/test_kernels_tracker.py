@@ -8,7 +8,7 @@ from both_ways import ROUNDINGS
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import SCENES, WIDE_CAMERA, assert_same, follow, merged, moving_box, poses_of, started, tensors_of, windows
 
-from torchtrack import Tracker, compiled, fast_alignment
+from torchtrack import Tracker, compiled
 from torchtrack.baselines import tracker_class
 from torchtrack.config.presets import preset
 from torchtrack.config.run import RunConfig
@@ -16,6 +16,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.errors import EventDataError
 from torchtrack.runner import run, track
+from torchtrack.tracking.estimation import fast_rounds
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
@@ -105,9 +106,9 @@ def test_scenes_of_several_objects_and_streams_are_the_same(scene, model):
 @pytest.mark.parametrize("name", ["steps", "mutual", "refreshed", "no prior"])
 def test_settings_that_the_kernel_does_not_know_go_without_it(name):
     with torch.inference_mode():
-        assert fast_alignment.applies(TrackerConfig(), torch.zeros(1))
-        assert not fast_alignment.applies(TrackerConfig.model_validate(SETTINGS[name]), torch.zeros(1))
-        assert not fast_alignment.applies(preset("paper"), torch.zeros(1))
+        assert fast_rounds.applies(TrackerConfig(), torch.zeros(1))
+        assert not fast_rounds.applies(TrackerConfig.model_validate(SETTINGS[name]), torch.zeros(1))
+        assert not fast_rounds.applies(preset("paper"), torch.zeros(1))
 
 
 def test_where_gradients_are_recorded_there_are_no_kernels():
@@ -161,7 +162,7 @@ def test_a_neighbour_that_fails_changes_nothing():
 def test_a_stream_is_tracked_by_kernels(monkeypatch):
     """The loop over windows records no gradients."""
     asked = []
-    monkeypatch.setattr(fast_alignment, "applies", lambda config, values: bool(asked.append(dispatch.apply_to(values))))
+    monkeypatch.setattr(fast_rounds, "applies", lambda config, values: bool(asked.append(dispatch.apply_to(values))))
     trajectory, events = moving_box(pose(), 2)
     tracker = Tracker([box_model()], SMALL_CAMERA)
     assert len(list(track([events], tracker, tracker.init(trajectory.T_cam_obj[:1], 0)))) == 2

@@ -13,9 +13,9 @@ from torchtrack.core.camera import project
 from torchtrack.core.image_velocity import pose_jacobian
 from torchtrack.core.lie import retract_about, se3_exp, small_difference_about, transform_points
 from torchtrack.core.linalg import solve_positive
-from torchtrack.pose_problem import PoseProblem
-from torchtrack.robust_loss import robust_loss, robust_weight
 from torchtrack.tracking.estimation.levenberg_marquardt import _Place, robust_cost, solve_pose
+from torchtrack.tracking.estimation.robust_loss import robust_loss, robust_weight
+from torchtrack.tracking.estimation.terms import PoseProblem
 
 pytestmark = pytest.mark.usefixtures("way")
 LOSSES = ["tukey", "huber", "none"]

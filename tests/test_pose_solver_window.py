@@ -9,8 +9,8 @@ from helpers import SMALL_CAMERA, generator, pose_errors, random_pose
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core.camera import project
 from torchtrack.core.lie import retract_about, transform_points
-from torchtrack.pose_problem import PoseProblem, WindowTerms
 from torchtrack.tracking.estimation.levenberg_marquardt import robust_cost, solve_pose
+from torchtrack.tracking.estimation.terms import PoseProblem, WindowTerms
 
 pytestmark = pytest.mark.usefixtures("way")
 THOROUGH = SolverConfig(iterations=20)

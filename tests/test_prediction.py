@@ -8,13 +8,13 @@ import torch
 from helpers import SMALL_CAMERA, box_model, generator, pose
 from tracked_boxes import started
 
-from torchtrack.alignment import gate_widening
 from torchtrack.config.tracker import ContourConfig, MatchingConfig, TrackerConfig
 from torchtrack.core.camera import project
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.object_model.contour_source import group_by_model
 from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.estimation.rounds import gate_widening
 from torchtrack.tracking.motion.prediction import Prediction
 
 CONTOURS = ContourConfig()

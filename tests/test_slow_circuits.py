@@ -6,10 +6,10 @@ import pytest
 import torch
 from tracked_boxes import in_motion, poses_of, started
 
-from torchtrack.alignment import gate_widening, index_for
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.slow_circuits import dated, late_share_after, slowness, unknown_circuits
 from torchtrack.tracking.association.observations import select_events
+from torchtrack.tracking.estimation.rounds import gate_widening, index_for
 
 # Bursts so long that what moves as the boxes of these tests do comes far enough.
 LONG = MatchingConfig(adaptive_bursts=True, burst_us=30_000)

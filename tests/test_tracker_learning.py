@@ -16,7 +16,7 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import MatchingConfig, SolverConfig
 from torchtrack.core.camera import project
 from torchtrack.core.lie import cayley, se3_exp, se3_log, transform_points
-from torchtrack.robust_loss import robust_loss
+from torchtrack.tracking.estimation.robust_loss import robust_loss
 
 # One round that converges: its problem is that of the whole window.
 ONE_ROUND = TrackerConfig(

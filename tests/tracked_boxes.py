@@ -7,7 +7,6 @@ import torch
 from helpers import SMALL_CAMERA, box_model, drifting, edge_events, pose
 
 from torchtrack import Tracker
-from torchtrack.alignment import align, gate_widening, index_for
 from torchtrack.config.tracker import (
     MatchingConfig,
     MotionConfig,
@@ -18,6 +17,7 @@ from torchtrack.core.events import concatenate, pad_streams
 from torchtrack.core.lie import retract_about
 from torchtrack.search import judge_fit
 from torchtrack.tracking.association.observations import select_events
+from torchtrack.tracking.estimation.rounds import align, gate_widening, index_for
 
 WINDOW_US = 5_000
 WIDE_CAMERA = Camera(fx=250.0, fy=250.0, cx=159.5, cy=74.5, width=320, height=150)

@@ -10,7 +10,7 @@ The pipeline, one file per stage, in data-flow order::
     observations   corners and recent events of each object   torchtrack.tracking.association.observations
     matching       observations to contours                   torchtrack.tracking.association.weights
     pose solver    Levenberg-Marquardt on SE(3)               torchtrack.tracking.estimation.levenberg_marquardt
-    alignment      rounds of matching and solving             torchtrack.alignment
+    alignment      rounds of matching and solving             torchtrack.tracking.estimation.rounds
     quality        status, covariance, explained contour      torchtrack.quality
     tracker        all of it: state and window in, pose out   torchtrack.tracker
     runner         a whole recording: source, tracker, sinks  torchtrack.runner

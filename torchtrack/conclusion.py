@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import quality
-from torchtrack.alignment import ANYWHERE, Fit, may_be_anywhere
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync, lie
 from torchtrack.core.linalg import inverse
@@ -19,6 +18,7 @@ from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracking.association.polarity import is_seen_well, remembered
 from torchtrack.tracking.association.weights import ON_CONTOUR_PX
 from torchtrack.tracking.contours.points import Contours, reproject
+from torchtrack.tracking.estimation.rounds import ANYWHERE, Fit, may_be_anywhere
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import Acceleration, fade, found_acceleration, left_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction

@@ -15,9 +15,9 @@ from torchtrack.core.lie import difference_about
 from torchtrack.core.linalg import inverse
 from torchtrack.event_image import BORDER_PX, look_up
 from torchtrack.kernels.arrays import as_arrays
-from torchtrack.pose_problem import PoseProblem
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
+from torchtrack.tracking.estimation.terms import PoseProblem
 from torchtrack.tracking.motion.prediction import Prediction
 
 # How far contour points look (px), a step of the solver each: of poses far off, and of those that were pulled nearer.

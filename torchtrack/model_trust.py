@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchtrack.alignment import usual_index_radius
 from torchtrack.config.tracker import ModelTrustConfig, TrackerConfig
 from torchtrack.core.camera import project
 from torchtrack.core.padded import take_points
@@ -24,6 +23,7 @@ from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.association.weights import on_and_around
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.estimation.rounds import usual_index_radius
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 

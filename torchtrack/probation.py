@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.alignment import may_be_anywhere
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.quality import Status
 from torchtrack.state import Probation, StepResult, TrackerState
+from torchtrack.tracking.estimation.rounds import may_be_anywhere
 from torchtrack.tracking.motion.prediction import Prediction
 
 # A window speaks for a find by its share of what is wanted, as far as it is more than this.

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.alignment import gate_widening
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.host_sync import Answer
 from torchtrack.doubt import Doubt, drifted, less_certain
@@ -14,6 +13,7 @@ from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
 from torchtrack.quality import are_many
 from torchtrack.relocation import LastSeen
 from torchtrack.search import AS_MUCH, Found, is_taken, search, search_around
+from torchtrack.tracking.estimation.rounds import gate_widening
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.turns import TurningAxes, turns_compared

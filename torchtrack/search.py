@@ -10,16 +10,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack import quality
-from torchtrack.alignment import Fit, align, index_for
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import once
 from torchtrack.doubt import less_certain
 from torchtrack.hypotheses import promising
 from torchtrack.line_ends import running_on
-from torchtrack.pose_problem import Linearisation
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.estimation.rounds import Fit, align, index_for
+from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor, nn
 
-from torchtrack.alignment import align, gate_widening, index_for, index_radius, usual_index_radius
 from torchtrack.compiled import CompiledStep
 from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
@@ -38,6 +37,7 @@ from torchtrack.tracking.association.observations import Observations, corner_ob
 from torchtrack.tracking.association.weighting_features import Evidence, judged
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.estimation.rounds import align, gate_widening, index_for, index_radius, usual_index_radius
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.history import History
 from torchtrack.tracking.frontend.sensors import farthest_event_px

@@ -20,8 +20,8 @@ from torch import Tensor
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.core.events import EventBatch
 from torchtrack.core.linalg import solve_positive
-from torchtrack.pose_problem import Linearisation
 from torchtrack.state import StepResult, TrackerState
+from torchtrack.tracking.estimation.terms import Linearisation
 
 # Deviation of the distance between an event and its line (px): much is common to the events of a line, so it is not small.
 _EVENT_PX = 4.0

@@ -11,8 +11,8 @@ from torchtrack.bench.setup import Setup
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core.camera import Camera, project
 from torchtrack.core.lie import retract_about, rotation_angle_deg, so3_exp, transform_points
-from torchtrack.pose_problem import PoseProblem
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
+from torchtrack.tracking.estimation.terms import PoseProblem
 
 # Poses at once, and the targets on one thread of a CPU (ms).
 TARGETS_MS = {1: 2.0, 8: 3.0, 32: None, 128: 18.0, 1024: 140.0}

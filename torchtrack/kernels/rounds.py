@@ -1,4 +1,4 @@
-"""The rounds of matching and solving of :func:`torchtrack.alignment.align`, object by object.
+"""The rounds of matching and solving of :func:`torchtrack.tracking.estimation.rounds.align`, object by object.
 
 One Gauss-Newton step a round, as :func:`torchtrack.tracking.estimation.levenberg_marquardt.solve_pose` takes with one iteration, Tukey's loss and a prior.
 """

@@ -34,7 +34,7 @@ def solve_poses(
     gradient: Array,
     hessian: Array,
 ) -> None:
-    """Solve each problem: :class:`torchtrack.pose_problem.PoseProblem` by its fields.
+    """Solve each problem: :class:`torchtrack.tracking.estimation.terms.PoseProblem` by its fields.
 
     Args:
         age_s, outward, velocity, rate_hz: of what is unknown beside the pose; not read where there is nothing.
@@ -130,7 +130,7 @@ def row_of(
 
 @kernel(fastmath=FAST)
 def robustly(residual: float, scale_px: float, loss: int) -> tuple[float, float]:
-    """Weight and loss of a residual: :mod:`torchtrack.robust_loss`, of none (0), Huber (1) and Tukey (2)."""
+    """Weight and loss of a residual: :mod:`torchtrack.tracking.estimation.robust_loss`, of none (0), Huber (1) and Tukey (2)."""
     size = abs(residual)
     if loss == 0 or (loss == 1 and size <= scale_px):
         return 1.0, 0.5 * residual * residual

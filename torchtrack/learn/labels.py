@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.alignment import index_for
 from torchtrack.core.padded import take_points
 from torchtrack.tracker import Tracker
 from torchtrack.tracking.association.weighting_features import Evidence
+from torchtrack.tracking.estimation.rounds import index_for
 from torchtrack.tracking.motion.prediction import Prediction
 
 

@@ -21,8 +21,8 @@ from torchtrack.core.lie import affine, small_difference_about, turned
 from torchtrack.core.linalg import solve_factored, solve_positive
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import DampingSettings, SolvingSettings
-from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
-from torchtrack.robust_loss import LOSSES, robust_loss, robust_weight
+from torchtrack.tracking.estimation.robust_loss import LOSSES, robust_loss, robust_weight
+from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, WindowTerms
 
 # Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
 _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
@@ -187,7 +187,7 @@ def solve_pose(
     neighbours are not affected. The last step is not judged: what comes after it, another round of matches or the test of
     the pose's quality, does so with more than the cost.
 
-    Nothing is recorded: :mod:`torchtrack.implicit_gradient` gives gradients of the solution.
+    Nothing is recorded: :mod:`torchtrack.tracking.estimation.implicit_gradient` gives gradients of the solution.
 
     Args:
         from_prior: offset of ``T_start`` from the prior's pose, where it is known.

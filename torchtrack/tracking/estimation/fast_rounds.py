@@ -9,12 +9,12 @@ from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import MatchingSettings, RoundSettings
-from torchtrack.pose_problem import Linearisation
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.nearest import ContourTable
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.weights import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SLOW_PX_S, SMEAR_PX
 from torchtrack.tracking.estimation.levenberg_marquardt import damping_settings
+from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.motion.prediction import Prediction
 
 
@@ -37,7 +37,7 @@ def align_rounds(
     finely: Bool[Tensor, "b"],
     config: TrackerConfig,
 ) -> tuple[Linearisation, Matches]:
-    """The solution and the matches of the last round: what :func:`torchtrack.alignment.align` does in its loop.
+    """The solution and the matches of the last round: what :func:`torchtrack.tracking.estimation.rounds.align` does in its loop.
 
     Args:
         prediction: what the prior draws to.

@@ -7,12 +7,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchtrack import fast_alignment
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import Answer
-from torchtrack.implicit_gradient import with_gradient
-from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
 from torchtrack.tracking.association.along_flow import match_along_flow
 from torchtrack.tracking.association.matches import Matches, both_coordinates
 from torchtrack.tracking.association.nearest import ContourTable, match_nearest
@@ -21,7 +18,10 @@ from torchtrack.tracking.association.weights import told_by_each
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject
+from torchtrack.tracking.estimation import fast_rounds
+from torchtrack.tracking.estimation.implicit_gradient import with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
+from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, WindowTerms
 from torchtrack.tracking.motion.prediction import Prediction
 
 # The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).
@@ -106,10 +106,8 @@ def align(
     table = _table(contours, index, objects, matching)
     finely = _looked_up_finely(objects, begin, table, widening, matching)
     narrowing = _narrowing(widening, len(matching.gates_px))
-    if fast_alignment.applies(config, offset):
-        solution, matches = fast_alignment.align_rounds(
-            prediction, begin.T_cam_obj, offset, information, table, observations, narrowing, finely, config
-        )
+    if fast_rounds.applies(config, offset):
+        solution, matches = fast_rounds.align_rounds(prediction, begin.T_cam_obj, offset, information, table, observations, narrowing, finely, config)
         return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
     place = _first_place(begin, observations, config)
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, narrowing, strict=True)):

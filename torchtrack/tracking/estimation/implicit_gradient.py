@@ -17,8 +17,8 @@ from torchtrack.config.tracker import SolverConfig
 from torchtrack.core import host_sync
 from torchtrack.core.lie import small_difference_about, step_about
 from torchtrack.core.linalg import solve_positive
-from torchtrack.pose_problem import Linearisation, PoseProblem, WindowTerms
 from torchtrack.tracking.estimation.levenberg_marquardt import robust_cost
+from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, WindowTerms
 
 # Relative rounding of a cost in float64, with room for the length of its sum.
 _ROUNDING = 1e-12
