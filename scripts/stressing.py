@@ -17,7 +17,7 @@ from torchtrack.core.events import EventBatch
 from torchtrack.core.windows import LONGEST_SILENCE_US
 from torchtrack.errors import TorchtrackWarning
 from torchtrack.io.problems import Problems
-from torchtrack.quality import Status
+from torchtrack.tracking.validation.status import Status
 
 PACKET_US, WINDOW_US, HOUR_US = 2_000, 5_000, 3_600_000_000
 # Every so many packets: late, twice, clock back by 0.1 s, by 1000 s, a gap of 50 ms, an hour forward, a burst of noise, a wild time.

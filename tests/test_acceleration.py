@@ -16,7 +16,6 @@ from torchtrack.core.events import EventBatch
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.lie import so3_exp
 from torchtrack.core.linalg import inverse
-from torchtrack.quality import Status
 from torchtrack.sim.trajectory import Trajectory
 from torchtrack.tracking.motion.model import (
     Acceleration,
@@ -27,6 +26,7 @@ from torchtrack.tracking.motion.model import (
     predict_covariance,
     window_acceleration,
 )
+from torchtrack.tracking.validation.status import Status
 
 DT_S = 0.005
 # Exact events, though few of them: corners are observed as well. Nothing is common to their errors.

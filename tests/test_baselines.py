@@ -12,9 +12,9 @@ from torchtrack.baselines.event_lines import nearest_lines
 from torchtrack.baselines.line import corrected, predicted_covariance
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.object_model import ObjectModel
-from torchtrack.quality import Status
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.terms import Linearisation
+from torchtrack.tracking.validation.status import Status
 
 COUNT = 8
 

@@ -13,7 +13,7 @@ from torchtrack.compiled import CompiledStep
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
 from torchtrack.core import host_sync
-from torchtrack.quality import Status
+from torchtrack.tracking.validation.status import Status
 
 COUNT = 8
 # All objects are searched for in all windows.

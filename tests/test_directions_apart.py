@@ -9,7 +9,8 @@ from tracked_boxes import started
 
 from torchtrack.config.search import QualityConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.quality import PARALLEL_AFTER_S, Status, asked_apart, directions_apart, held_all_ways
+from torchtrack.tracking.validation.measures import PARALLEL_AFTER_S, asked_apart, directions_apart, held_all_ways
+from torchtrack.tracking.validation.status import Status
 
 CONFIG = QualityConfig()
 

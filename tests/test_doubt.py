@@ -13,7 +13,7 @@ from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
 from torchtrack.doubt import Doubt, drifted, gathered_when_known, has_strayed, in_doubt, is_adrift, is_due, is_wanted, less_certain
-from torchtrack.quality import Status
+from torchtrack.tracking.validation.status import Status
 
 # The box fires few events: with corners beside them, enough is observed of one that slipped to say more than that it is too little.
 # Polarities of these events are drawn by lot: there is nothing to remember of them.

@@ -16,7 +16,7 @@ from torchtrack.core.lie import rotation_angle_deg
 from torchtrack.core.windows import EventWindow
 from torchtrack.haste import Pace
 from torchtrack.io.keep_up import FEWEST_EVENTS, LONGEST_US, MOST_JOINED, HastyWindow, WaitingWindows
-from torchtrack.quality import Status
+from torchtrack.tracking.validation.status import Status
 
 CAPACITY = 64
 

@@ -19,7 +19,6 @@ from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.hypotheses import mark
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
-from torchtrack.quality import shares
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.nearest import ContourTable
 from torchtrack.tracking.association.observations import select_events
@@ -32,6 +31,7 @@ from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
 from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.validation.measures import shares
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}

@@ -13,14 +13,14 @@ from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.core.linalg import inverse
-from torchtrack.quality import Status
-from torchtrack.search import Found
 from torchtrack.state import Probation
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.motion.predict import forecast
+from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.status import Status
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from torchtrack.line_ends import running_on
-from torchtrack.search import _less_where_lines_run_on
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.relocalization.acceptance import less_where_lines_run_on
 
 IMAGE_SIZE = (240, 320)
 TOP_LEFT, SIDE_PX = (100.0, 80.0), 60
@@ -105,7 +105,7 @@ def test_scores_of_poses_that_are_not_concerned_stay(concerned):
     along, _, places = both()
     together = along.rows(torch.tensor([0, 0]))
     score, asked = torch.tensor([0.9, 0.8]), torch.tensor(concerned)
-    less = _less_where_lines_run_on(score, asked, together, places, IMAGE_SIZE)
+    less = less_where_lines_run_on(score, asked, together, places, IMAGE_SIZE)
     share = running_on(together, places, IMAGE_SIZE)
     assert float(share.min()) > 0.5
     torch.testing.assert_close(less, torch.where(asked, score * (1 - share), score))

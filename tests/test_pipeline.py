@@ -15,8 +15,8 @@ from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError
 from torchtrack.io import read_sequence
 from torchtrack.object_model import ObjectModel
-from torchtrack.quality import Status
 from torchtrack.runner import track
+from torchtrack.tracking.validation.status import Status
 
 MOTIONS = {
     "mixed": ((0.5, 0.6, 0.1), {}),

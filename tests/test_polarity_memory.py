@@ -15,12 +15,13 @@ from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.online_learning import objects_as_known
-from torchtrack.quality import Status, explained_share
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import simulate
 from torchtrack.tracking.association.nearest import ContourTable, match_nearest
 from torchtrack.tracking.association.polarity import expected_polarity, is_asked, is_seen_well, nothing_remembered, octant, remembered
 from torchtrack.tracking.contours.index import index_contours
+from torchtrack.tracking.validation.measures import explained_share
+from torchtrack.tracking.validation.status import Status
 
 OFF = TrackerConfig(matching=MatchingConfig(polarity_memory_s=0.0))
 RIGHT = 5  # the octant of (1, 0)

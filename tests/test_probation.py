@@ -12,7 +12,7 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.probation import after_probation
-from torchtrack.quality import Status
+from torchtrack.tracking.validation.status import Status
 
 FULL_SHARE = 0.8
 WIDE, TIGHT = 3.0, 1.0

@@ -7,9 +7,10 @@ import torch
 
 from torchtrack.config.search import QualityConfig
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.quality import Status, explained_share, gathered_share, holding_on, judge, needed_share, partly_hidden, trust, visible_share
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.validation.measures import explained_share, gathered_share, visible_share
+from torchtrack.tracking.validation.status import Status, holding_on, judge, needed_share, partly_hidden, trust
 
 IMAGE_SIZE = (150, 200)
 CONFIG = QualityConfig()

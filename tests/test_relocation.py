@@ -11,11 +11,11 @@ from torchtrack import Tracker
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.lie import retract_about
-from torchtrack.quality import Status
 from torchtrack.recovery import _least
 from torchtrack.relocation import LastSeen, anywhere, is_lost, looked_for_anew
-from torchtrack.search import _by_events
 from torchtrack.state import joined
+from torchtrack.tracking.relocalization.acceptance import scored_by_events
+from torchtrack.tracking.validation.status import Status
 
 CONFIG = TrackerConfig()
 # A fifth of the image's diagonal.
@@ -118,8 +118,8 @@ def test_an_object_that_may_be_anywhere_has_a_covariance_without_bounds_of_its_o
 
 def test_small_poses_that_few_events_explain_are_worth_less():
     score, count = torch.tensor([0.9, 0.8, 0.0]), torch.tensor([100, 900, 2000])
-    assert _by_events(score, count).tolist() == pytest.approx([0.3, 0.8, 0.0])
-    assert _by_events(torch.zeros(3), count).tolist() == [0.0, 0.0, 0.0]
+    assert scored_by_events(score, count).tolist() == pytest.approx([0.3, 0.8, 0.0])
+    assert scored_by_events(torch.zeros(3), count).tolist() == [0.0, 0.0, 0.0]
 
 
 def asked_anew(off_in_depth, little):

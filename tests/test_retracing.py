@@ -11,13 +11,13 @@ from torchtrack import Tracker, preset
 from torchtrack.config.tracker import SmoothingConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.core.windows import EventWindow
-from torchtrack.quality import Status
 from torchtrack.refined_steps import Refinement, refined_steps
 from torchtrack.retraced_steps import Retracer
 from torchtrack.retracing import Gap, _in_reverse, retraced
 from torchtrack.runner import track
 from torchtrack.smoothed_steps import SmoothedObjects
 from torchtrack.stepping import Step
+from torchtrack.tracking.validation.status import Status
 
 COUNT, FIRST, SEEN = 24, 8, 20
 # Off by some 5 degrees and 4 mm.

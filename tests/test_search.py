@@ -14,10 +14,12 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import numba_is_installed
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
-from torchtrack.quality import Status
 from torchtrack.recovery import _least, _search_slipped, _stands, search_wanted
 from torchtrack.relocation import LastSeen
-from torchtrack.search import _is_likely, _likeliest, align_all, explained_at_rest, rehearse, search
+from torchtrack.tracking.relocalization.acceptance import is_likely, likeliest
+from torchtrack.tracking.relocalization.refine import align_all, rehearse, search
+from torchtrack.tracking.validation.scored_fit import explained_at_rest
+from torchtrack.tracking.validation.status import Status
 
 SEARCHED = TrackerConfig()
 UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
@@ -91,7 +93,9 @@ def test_a_box_is_found_again_half_a_quarter_turn_off_about_any_axis(axis):
 
 def test_the_best_poses_are_aligned_again_where_hardly_anything_is_known_and_nowhere_else(monkeypatch):
     counts = []
-    monkeypatch.setattr("torchtrack.search.align_all", lambda copies, *told: counts.append(len(told[0])) or align_all(copies, *told))
+    monkeypatch.setattr(
+        "torchtrack.tracking.relocalization.refine.align_all", lambda copies, *told: counts.append(len(told[0])) or align_all(copies, *told)
+    )
     tracker, prediction, seen, found, _ = in_motion(displaced=DISPLACED)
     for sigma_px in (8.0, 30.0):
         search(0, prediction, sigma_px, LEAST, seen, found, tracker.config)
@@ -111,18 +115,18 @@ def test_of_poses_that_explain_as_much_the_most_expected_is_taken():
     from_prior = torch.zeros(4, 13)
     from_prior[:, 1] = torch.tensor([0.5, 0.01, 0.0, 0.3])
     share, covariance = torch.tensor([0.9, 0.89, 0.6, 0.885]), 1e-2 * torch.eye(12, dtype=torch.float64)
-    assert _likeliest(share, from_prior, covariance).tolist() == [1]
-    assert _likeliest(share, from_prior.index_fill(0, torch.tensor([1]), torch.nan), covariance).tolist() == [3]
-    assert _likeliest(torch.tensor([0.9, 0.8, 0.6, 0.0]), from_prior, covariance).tolist() == [0]
+    assert likeliest(share, from_prior, covariance).tolist() == [1]
+    assert likeliest(share, from_prior.index_fill(0, torch.tensor([1]), torch.nan), covariance).tolist() == [3]
+    assert likeliest(torch.tensor([0.9, 0.8, 0.6, 0.0]), from_prior, covariance).tolist() == [0]
 
 
 def test_what_a_prediction_does_not_allow_is_not_likely():
     """In standard deviations; what is not a number is none."""
     offsets = torch.zeros(5, 13)
     offsets[1, 0], offsets[2, 0], offsets[3, :6], offsets[4, 2] = 0.4, 0.42, 0.18, torch.nan
-    assert _is_likely(offsets, 1e-2 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True, False, False, False]
+    assert is_likely(offsets, 1e-2 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True, False, False, False]
     wide = torch.full((1, 13), 5.0)
-    assert _is_likely(torch.cat([offsets[:1], wide]), 25.0 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True]
+    assert is_likely(torch.cat([offsets[:1], wide]), 25.0 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True]
 
 
 def test_what_is_no_better_by_the_margin_is_left():

@@ -31,8 +31,8 @@ from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.object_model import ObjectModel
-from torchtrack.quality import Status
 from torchtrack.tracking.frontend.time_surface import NEVER_US
+from torchtrack.tracking.validation.status import Status
 
 # ---- bad set-ups
 

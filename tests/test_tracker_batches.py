@@ -19,7 +19,7 @@ from tracked_boxes import (
 
 from torchtrack import Tracker
 from torchtrack.core.events import concatenate
-from torchtrack.quality import Status
+from torchtrack.tracking.validation.status import Status
 
 
 @cache

@@ -15,8 +15,8 @@ from torchtrack.config.tracker import MotionConfig, SolverConfig, TrackerConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import difference_about, retract_about, transform_points
 from torchtrack.object_model import ObjectModel
-from torchtrack.quality import Status
 from torchtrack.tracking.motion.model import initial_covariance, left_covariance
+from torchtrack.tracking.validation.status import Status
 
 
 def sigmas(state):

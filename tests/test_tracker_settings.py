@@ -19,7 +19,7 @@ from torchtrack.config.tracker import (
     SurfaceConfig,
     TrackerConfig,
 )
-from torchtrack.quality import Status
+from torchtrack.tracking.validation.status import Status
 
 # ---- precision, devices, saved settings
 

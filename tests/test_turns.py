@@ -15,8 +15,8 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg, so3_exp, transform_points
-from torchtrack.quality import Status
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.validation.status import Status
 from torchtrack.turns import TurningAxes, _peaks, may_have_turned
 
 CAMERA = Camera(fx=400.0, fy=400.0, cx=159.5, cy=119.5, width=320, height=240)

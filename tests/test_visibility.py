@@ -10,10 +10,10 @@ from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import Camera
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import group_by_model
-from torchtrack.quality import visible_share
 from torchtrack.tracking.contours import visibility
 from torchtrack.tracking.contours.points import mesh_contours
 from torchtrack.tracking.contours.visibility import DepthGrid, Scene, depth_buffer, hidden_by_faces, remove_hidden
+from torchtrack.tracking.validation.measures import visible_share
 
 CONFIG = ContourConfig()
 LARGE_CAMERA = Camera(fx=600.0, fy=600.0, cx=319.5, cy=239.5, width=640, height=480)

@@ -15,9 +15,9 @@ from torchtrack.config.tracker import (
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import concatenate, pad_streams
 from torchtrack.core.lie import retract_about
-from torchtrack.search import judge_fit
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.estimation.rounds import align, gate_widening, index_for
+from torchtrack.tracking.validation.scored_fit import judge_fit
 
 WINDOW_US = 5_000
 WIDE_CAMERA = Camera(fx=250.0, fy=250.0, cx=159.5, cy=74.5, width=320, height=150)

@@ -11,7 +11,7 @@ The pipeline, one file per stage, in data-flow order::
     matching       observations to contours                   torchtrack.tracking.association.weights
     pose solver    Levenberg-Marquardt on SE(3)               torchtrack.tracking.estimation.levenberg_marquardt
     alignment      rounds of matching and solving             torchtrack.tracking.estimation.rounds
-    quality        status, covariance, explained contour      torchtrack.quality
+    quality        status, covariance, explained contour      torchtrack.tracking.validation.measures
     tracker        all of it: state and window in, pose out   torchtrack.tracker
     runner         a whole recording: source, tracker, sinks  torchtrack.runner
 
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
     from torchtrack.io import open_events as open_events
     from torchtrack.io import read_sequence as read_sequence
     from torchtrack.object_model import ObjectModel as ObjectModel
-    from torchtrack.quality import Status as Status
     from torchtrack.runner import track as track
     from torchtrack.state import StepResult as StepResult
     from torchtrack.state import TrackerState as TrackerState
     from torchtrack.tracker import Tracker as Tracker
+    from torchtrack.tracking.validation.status import Status as Status
 
 _HOME = {
     "Camera": "camera",

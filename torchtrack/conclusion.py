@@ -6,14 +6,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import quality
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync, lie
 from torchtrack.core.linalg import inverse
 from torchtrack.doubt import SMEARED, in_doubt
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import ConclusionSettings
-from torchtrack.search import Found
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracking.association.polarity import is_seen_well, remembered
 from torchtrack.tracking.association.weights import ON_CONTOUR_PX
@@ -22,6 +20,19 @@ from torchtrack.tracking.estimation.rounds import ANYWHERE, Fit, may_be_anywhere
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import Acceleration, fade, found_acceleration, left_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.validation.measures import visible_share
+from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.status import (
+    HIDDEN_FROM,
+    HIDDEN_FULLY,
+    HIDDEN_LEAST,
+    HIDDEN_TIMES,
+    Status,
+    holding_on,
+    judge,
+    partly_hidden,
+    trust,
+)
 
 # Share of a new window in the usual quality.
 _USUAL_GAIN = 0.1
@@ -53,7 +64,7 @@ def conclude(
         after, covariance, status = _judged_by_kernel(state, prediction, expected, widening, found, dt_s, config)
     else:
         after, covariance, status = _judged(state, prediction, widening, found, dt_s, config)
-    contours = _where_they_are(found.fit, after.T_cam_obj, status >= int(quality.Status.LOST), prediction.objects.intrinsics)
+    contours = _where_they_are(found.fit, after.T_cam_obj, status >= int(Status.LOST), prediction.objects.intrinsics)
     result = StepResult(state.t_us, after.T_cam_obj, covariance, status, found.share, contours, corners, found.count)
     sides = _darker_outside(state, found, status, dt_s, config)
     return replace(after, score=found.score, darker_outside=sides, full_apart=_full_apart(state, after, found)), result
@@ -76,27 +87,27 @@ def _judged(
 ) -> _Judgement:
     """What every object's pose is worth, and where it goes on from there: arguments as those of :func:`conclude`."""
     objects, share, solution = prediction.objects, found.share, found.fit.solution
-    in_view = quality.visible_share(found.fit.contours, objects.image_size)
+    in_view = visible_share(found.fit.contours, objects.image_size)
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     step = solution.from_prior[:, :6] * ~(found.elsewhere & may_be_anywhere(widening))[:, None]
-    hidden = quality.partly_hidden(found.gathered, found.full_gathered, found.count, found.elsewhere, config.quality)
-    asked_less = torch.where(quality.holding_on(found.count, found.elsewhere, config.quality), 1, hidden)
-    status = quality.judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening, asked_less)
-    status = torch.where(prediction.usable, status, int(quality.Status.DIVERGED))
-    failed = status >= int(quality.Status.LOST)
+    hidden = partly_hidden(found.gathered, found.full_gathered, found.count, found.elsewhere, config.quality)
+    asked_less = torch.where(holding_on(found.count, found.elsewhere, config.quality), 1, hidden)
+    status = judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening, asked_less)
+    status = torch.where(prediction.usable, status, int(Status.DIVERGED))
+    failed = status >= int(Status.LOST)
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
-    trusted = torch.where(failed, 0, torch.maximum(hidden, quality.trust(share, config.quality, state.full_share, widening)))
+    trusted = torch.where(failed, 0, torch.maximum(hidden, trust(share, config.quality, state.full_share, widening)))
     doubted = ~failed & in_doubt(found.score, state.full_share, found.gathered, found.full_gathered, config.search)
     unsure = doubted | (~failed & found.turn_unclear)
-    status = torch.where(unsure, status.clamp(min=int(quality.Status.UNCERTAIN)), status)
+    status = torch.where(unsure, status.clamp(min=int(Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
     # Of an object that is partly hidden too little is seen to tell.
     seen_well = ~failed & (share >= config.quality.certain_at * state.full_share)
     acceleration = _acceleration(prediction, found, torch.where(seen_well, trusted, 0), dt_s)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
-    certain = (share >= _CERTAIN * state.full_share) & (status == int(quality.Status.TRACKING))
+    certain = (share >= _CERTAIN * state.full_share) & (status == int(Status.TRACKING))
     certain &= (found.count >= _CERTAIN_COUNT * state.full_count) | (not config.search.by_events)
     usual_score, full_share, full_gathered, full_count = _usual(state, found, failed)
     after = replace(
@@ -131,7 +142,7 @@ def _judged_by_kernel(
     from torchtrack.kernels import conclusion as kernels
 
     objects, solution, batch = prediction.objects, found.fit.solution, len(dt_s)
-    in_view = quality.visible_share(found.fit.contours, objects.image_size)
+    in_view = visible_share(found.fit.contours, objects.image_size)
     told = torch.stack([found.share, found.score, found.gathered, found.full_gathered, in_view, widening])
     remembered = torch.stack([state.usual_score, state.full_share, state.full_gathered, state.full_count, state.doubted_s, state.unseen_s])
     T_last_seen = state.T_last_seen.clone(memory_format=torch.contiguous_format)
@@ -172,10 +183,10 @@ def _settings(config: TrackerConfig) -> ConclusionSettings:
         caught_above=config.quality.caught_above,
         certain_at=config.quality.certain_at,
         partly_hidden=config.quality.partly_hidden,
-        hidden_from=quality.HIDDEN_FROM,
-        hidden_fully=quality.HIDDEN_FULLY,
-        hidden_least=quality.HIDDEN_LEAST,
-        hidden_observations=quality.HIDDEN_TIMES * config.quality.min_observations,
+        hidden_from=HIDDEN_FROM,
+        hidden_fully=HIDDEN_FULLY,
+        hidden_least=HIDDEN_LEAST,
+        hidden_observations=HIDDEN_TIMES * config.quality.min_observations,
         holds_on=config.quality.holds_on,
         min_observations=config.quality.min_observations,
         min_visible_share=config.quality.min_visible_share,
@@ -200,7 +211,7 @@ def _darker_outside(
         return state.darker_outside
     matches = found.fit.matches
     # What a search found stands on other matches than these.
-    known = (status == int(quality.Status.TRACKING)) & is_seen_well(found.share, state.full_share) & ~found.elsewhere
+    known = (status == int(Status.TRACKING)) & is_seen_well(found.share, state.full_share) & ~found.elsewhere
     # Chosen, not multiplied: what is not a number would stay.
     weights = torch.where(known[:, None] & (matches.offsets.abs() < ON_CONTOUR_PX), matches.weights, 0)
     return remembered(state.darker_outside, matches.directions, matches.dark, weights, dt_s, config.matching.polarity_memory_s)

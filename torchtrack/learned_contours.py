@@ -14,12 +14,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import quality
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.search import Found
 from torchtrack.tracking.contours.objects import LearnedPoints
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.validation.measures import measured_share
+from torchtrack.tracking.validation.scored_fit import Found
 
 # The model's share that is assumed at first, how fast it follows, and how much more of it ends the need of learned contours.
 _FIRST_SHARE, _SHARE_GAIN, _MORE_SHARE = 0.7, 0.2, 0.2
@@ -122,7 +122,7 @@ def _share_of_own(found: Found, velocity: Float[Tensor, "b m 2"], image_size: tu
     contours, matches = found.fit.contours, found.fit.matches
     own = contours.kind != int(ContourKind.LEARNED)
     matches = replace(matches, near=matches.near & own.gather(1, matches.contour))
-    return quality.measured_share(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config.quality)
+    return measured_share(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config.quality)
 
 
 def _in_motion(contours: Contours, velocity: Float[Tensor, "b m 2"]) -> Bool[Tensor, "b"]:

@@ -17,7 +17,6 @@ from torchtrack.config.tracker import ModelTrustConfig, TrackerConfig
 from torchtrack.core.camera import project
 from torchtrack.core.padded import take_points
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
-from torchtrack.quality import inside
 from torchtrack.tracking.association.nearest import ContourTable, match_nearest
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.association.weights import on_and_around
@@ -26,6 +25,7 @@ from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.rounds import usual_index_radius
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.validation.measures import inside
 
 # So many observations of its kind speak for an element before any of its own do; and of a kind, so many that are on it.
 _PRIOR, _PRIOR_OF_KIND = 10.0, 200.0

@@ -10,12 +10,14 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.host_sync import Answer
 from torchtrack.doubt import Doubt, drifted, less_certain
 from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
-from torchtrack.quality import are_many
 from torchtrack.relocation import LastSeen
-from torchtrack.search import AS_MUCH, Found, is_taken, search, search_around
 from torchtrack.tracking.estimation.rounds import gate_widening
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.acceptance import AS_MUCH, is_taken
+from torchtrack.tracking.relocalization.refine import search, search_around
+from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.status import are_many
 from torchtrack.turns import TurningAxes, turns_compared
 
 # What explains so many times as many events as a pose far off in depth is no smaller thing that chance explains.

@@ -44,12 +44,12 @@ class TrackerState:
         velocity: rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s).
         acceleration: how they changed in the last window (rad/s², m/s²).
         covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.tracking.motion.model`.
-        score: of the last window, :attr:`torchtrack.search.Found.score`.
+        score: of the last window, :attr:`torchtrack.tracking.validation.scored_fit.Found.score`.
         usual_score: its running mean.
         full_share: of the moving contour, what events explain when the object is seen well: rises as fast, but falls slowly.
         full_gathered: the same of how far events near its contours are on them.
         full_count: matched observations when the object is seen well, likewise.
-        full_apart: how far apart the directions of contours with events on them are then (:func:`torchtrack.quality.directions_apart`).
+        full_apart: how far apart the directions of contours with events on them are then (:func:`torchtrack.tracking.validation.measures.directions_apart`).
         doubted_s: for how long, less the time it was not, the object has been in doubt of being elsewhere (s).
         T_last_seen: pose of each object when it was last seen well (float64).
         unseen_s: how long ago that was (s).
@@ -108,7 +108,7 @@ class StepResult:
         t_us: end of the window of each stream (µs).
         T_cam_obj: pose of each object at that time (float64).
         covariance: of the left perturbation ``[φ, ρ]`` of each pose (rad, m), with all that earlier windows told.
-        status: :class:`torchtrack.quality.Status` of each object.
+        status: :class:`torchtrack.tracking.validation.status.Status` of each object.
         quality: share of the moving contour that events explain.
         contours: visible contours at the pose.
         corners: corners and their flow, where the settings ask for any.

@@ -22,11 +22,11 @@ from torchtrack.core.lie import transform_points
 from torchtrack.core.padded import take_points
 from torchtrack.image_cells import CellGrid, Lines, cell_of, fit_lines, is_near, point_sums, tallied
 from torchtrack.learned_contours import LearnedContours, judge_model
-from torchtrack.search import Found
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, assemble, joined
 from torchtrack.tracking.contours.surface_rays import surface_points
 from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
+from torchtrack.tracking.validation.scored_fit import Found
 
 # Older events are left out where the object has since moved by more than this (px).
 _LONGEST_WAY_PX = 4.0

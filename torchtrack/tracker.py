@@ -22,10 +22,8 @@ from torchtrack.first_state import first_state
 from torchtrack.object_model import ObjectModel
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
 from torchtrack.probation import after_probation
-from torchtrack.quality import Status, asked_apart
 from torchtrack.recovery import search_wanted
 from torchtrack.relocation import LastSeen, anywhere, is_lost, looked_for_anew
-from torchtrack.search import explained_at_rest, judge_fit, rehearse
 from torchtrack.setup_check import check_poses
 from torchtrack.slow_circuits import LOOK_US, dated, late_share_after
 from torchtrack.speed_limit import held_back
@@ -46,6 +44,10 @@ from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.predict import forecast
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.refine import rehearse
+from torchtrack.tracking.validation.measures import asked_apart
+from torchtrack.tracking.validation.scored_fit import explained_at_rest, judge_fit
+from torchtrack.tracking.validation.status import Status
 from torchtrack.turns import may_have_turned
 from torchtrack.window_parts import of_unknown_motion, to_be_parted
 

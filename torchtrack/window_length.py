@@ -12,10 +12,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import WindowConfig
-from torchtrack.quality import Status
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracker import Tracker
 from torchtrack.tracking.contours.points import reproject
+from torchtrack.tracking.validation.status import Status
 
 # Contours slower than this (px/s) would take longer than any window.
 _STILL_PX_S = 1e-3

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack import quality
 from torchtrack.baselines.straight_edges import straight_edges_only, too_curved
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import lie
@@ -31,6 +30,8 @@ from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem
 from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.motion.model import left_covariance
+from torchtrack.tracking.validation.measures import explained_share, visible_share
+from torchtrack.tracking.validation.status import Status, judge
 
 # Contour points lie so far apart at most that an event on a line is within this of one of its points (px).
 _POINT_SPACING_PX = 6.0
@@ -214,11 +215,11 @@ class EventLineTracker(Tracker):
     ) -> tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]]:
         """Status and quality of each object, and which poses are taken."""
         settings = self.config.quality
-        share = quality.explained_share(contours, matches, self._contour_velocity(window, contours), self.image_size, settings)
+        share = explained_share(contours, matches, self._contour_velocity(window, contours), self.image_size, settings)
         step = lie.small_difference_about(window.T_start, solution.T_cam_obj, self.centre_obj)
-        in_view = quality.visible_share(contours, self.image_size)
-        status = quality.judge(share, matches.mask.sum(-1), in_view, step, self.diameter_m, settings)
-        return status, share, status < int(quality.Status.TOO_FEW_EVENTS)
+        in_view = visible_share(contours, self.image_size)
+        status = judge(share, matches.mask.sum(-1), in_view, step, self.diameter_m, settings)
+        return status, share, status < int(Status.TOO_FEW_EVENTS)
 
     def _close(
         self,

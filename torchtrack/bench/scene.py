@@ -24,13 +24,13 @@ from torchtrack.core.lie import rotation_angle_deg, transform_points
 from torchtrack.errors import ConfigError
 from torchtrack.io import Trajectory
 from torchtrack.object_model import ObjectModel
-from torchtrack.quality import Status
 from torchtrack.session import open_session
 from torchtrack.sim import SceneConfig, simulate
 from torchtrack.sim.meshes import make_mesh
 from torchtrack.state import StepResult, TrackerState
 from torchtrack.stepping import clipped
 from torchtrack.tracker import Tracker
+from torchtrack.tracking.validation.status import Status
 
 SHAPES = ("lbracket", "cube", "satellite", "robot")
 """Creases alone; print alone, nearly; both; a dense mesh."""

@@ -22,13 +22,13 @@ from torchtrack.executor import TaskFailure, Tell
 from torchtrack.executor.groups import run_in_groups
 from torchtrack.executor.tasks import without_errors
 from torchtrack.io.atomic import check_writable
-from torchtrack.quality import Status
 from torchtrack.session import open_session
 from torchtrack.sim.suite import Told
 from torchtrack.sinks.record import ObjectRecord, Record
 from torchtrack.stepping import Step, cut_windows
 from torchtrack.streams import follow
 from torchtrack.threads import threads
+from torchtrack.tracking.validation.status import Status
 from torchtrack.window_length import WindowLength
 
 

@@ -7,7 +7,7 @@ from torchtrack.kernels.filtering import inverse
 from torchtrack.kernels.motion import centre_of, is_finite
 from torchtrack.kernels.settings import ConclusionSettings
 
-# As torchtrack.quality.Status.
+# As torchtrack.tracking.validation.status.Status.
 TRACKING, UNCERTAIN, LOST, TOO_FEW_EVENTS, OUT_OF_VIEW, DIVERGED = range(6)
 # What is remembered of each object as a number, before a window and after it.
 USUAL_SCORE, FULL_SHARE, FULL_GATHERED, FULL_COUNT, DOUBTED_S, UNSEEN_S = range(6)
@@ -16,7 +16,7 @@ REMEMBERED = 6
 SHARE, SCORE, GATHERED, USUALLY_GATHERED, IN_VIEW, WIDENING = range(6)
 FOUND = 6
 _UNKNOWNS = 13
-# As torchtrack.quality.trust has it.
+# As torchtrack.tracking.validation.status.trust has it.
 _LEAST_RANGE = 1e-6
 
 
@@ -105,9 +105,9 @@ def _judge(
     diameter_m: float,
     settings: ConclusionSettings,
 ) -> int:
-    """The status of an object: :func:`torchtrack.quality.judge`."""
+    """The status of an object: :func:`torchtrack.tracking.validation.status.judge`."""
     widening, share, status = found[WIDENING, b], found[SHARE, b], TRACKING
-    # As torchtrack.quality.holding_on has it.
+    # As torchtrack.tracking.validation.status.holding_on has it.
     if settings.holds_on and not elsewhere[b] and matched[b] >= settings.hidden_observations:
         hidden = 1.0
     wider, turned, moved = _clamped(widening - 1.0, 0.0, 1.0) * (1.0 - hidden), 0.0, 0.0
@@ -132,7 +132,7 @@ def _judge(
 
 @kernel()
 def _hidden(b: int, elsewhere: Array, matched: Array, found: Array, settings: ConclusionSettings) -> float:
-    """How far a pose counts as that of an object that is partly hidden: :func:`torchtrack.quality.partly_hidden`."""
+    """How far a pose counts as that of an object that is partly hidden: :func:`torchtrack.tracking.validation.status.partly_hidden`."""
     usual = found[USUALLY_GATHERED, b]
     if not settings.partly_hidden or elsewhere[b] or not usual > settings.hidden_least or matched[b] < settings.hidden_observations:
         return 0.0
@@ -143,7 +143,7 @@ def _hidden(b: int, elsewhere: Array, matched: Array, found: Array, settings: Co
 
 @kernel()
 def _trust(share: float, full_share: float, widening: float, settings: ConclusionSettings) -> float:
-    """How far a pose counts against the prediction: :func:`torchtrack.quality.trust`."""
+    """How far a pose counts against the prediction: :func:`torchtrack.tracking.validation.status.trust`."""
     full = max(settings.uncertain_below, settings.certain_at * full_share * _clamped(widening - 1.0, 0.0, 1.0))
     return _clamped((share - settings.lost_below) / max(full - settings.lost_below, _LEAST_RANGE), 0.0, 1.0)
 

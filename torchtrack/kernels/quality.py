@@ -1,4 +1,4 @@
-"""What events explain of an object's contours, and how they gather on them: shares of :mod:`torchtrack.quality`, object by object."""
+"""What events explain of an object's contours, and how they gather on them: shares of :mod:`torchtrack.tracking.validation.measures`, object by object."""
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def shares(
         velocity: ``[b, 6]``, about ``centre_cam [b, 3]``.
         targets, directions, offsets, is_near, as_expected: of matches: ``[b, 2, n]`` and ``[b, n]``.
         measured, gathered: ``[b]``, filled; not a number where too little is there to tell.
-        apart: ``[b]``, filled: :func:`torchtrack.quality.directions_apart`.
+        apart: ``[b]``, filled: :func:`torchtrack.tracking.validation.measures.directions_apart`.
     """
     counts = np.empty((settings.patches**2, 2))
     for b in range(len(mask)):
@@ -90,7 +90,7 @@ def _apart(directions: Array, offsets: Array, is_near: Array, on_contour_px: flo
 
 @kernel(fastmath=FAST)
 def visible(pixels: Array, mask: Array, height: int, width: int, share: Array) -> None:
-    """Share of contour points in the image: :func:`torchtrack.quality.visible_share`, of ``pixels [b, 2, m]`` and ``mask [b, m]``."""
+    """Share of contour points in the image: :func:`torchtrack.tracking.validation.measures.visible_share`, of ``pixels [b, 2, m]`` and ``mask [b, m]``."""
     for b in range(len(mask)):
         total = seen = 0
         for i in range(mask.shape[1]):

@@ -185,7 +185,7 @@ class TileSettings(NamedTuple):
 
 
 class QualitySettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.quality` goes by: settings, the image, and constants of :mod:`torchtrack.quality` and ``matching``."""
+    """What :mod:`torchtrack.kernels.quality` goes by: settings, the image, and constants of :mod:`torchtrack.tracking.validation.measures` and ``matching``."""
 
     height: int
     width: int
@@ -230,7 +230,7 @@ class ConclusionSettings(NamedTuple):
     Args:
         holds: whether what failed stays where it was.
         anywhere: widening of the first gate from which an object may be anywhere.
-        hidden_from, hidden_fully, hidden_least, hidden_observations: what :func:`torchtrack.quality.partly_hidden` goes by.
+        hidden_from, hidden_fully, hidden_least, hidden_observations: what :func:`torchtrack.tracking.validation.status.partly_hidden` goes by.
         holds_on: whether poses by so many observations that go on from those before are not asked for more.
         smeared: events that gather less than this share of how far they usually do are smeared.
         usual_gain, fall_gain: share of a new window in what is usual, and in what is seen well where it is less.

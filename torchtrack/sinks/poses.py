@@ -9,10 +9,10 @@ from pathlib import Path
 from torchtrack.core.lie import quaternion_from_rotation
 from torchtrack.io.line_file import LineFile
 from torchtrack.io.seconds import format_seconds
-from torchtrack.quality import Status
 from torchtrack.sinks.folder import POSES
 from torchtrack.sinks.record import Record
 from torchtrack.stepping import Step
+from torchtrack.tracking.validation.status import Status
 
 COLUMNS = (
     *("t_us", "label", "tx", "ty", "tz", "qx", "qy", "qz", "qw"),

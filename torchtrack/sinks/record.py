@@ -14,9 +14,9 @@ from torchtrack.eval.metrics import PoseErrors, pose_errors
 from torchtrack.io import Trajectory
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axis
-from torchtrack.quality import Status
 from torchtrack.sinks.silences import Silences
 from torchtrack.stepping import Step
+from torchtrack.tracking.validation.status import Status
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Earlier:
     Args:
         t_us: ``[n]``, ends of the windows.
         T_cam_obj: poses of all objects.
-        status: :class:`torchtrack.quality.Status` of each.
+        status: :class:`torchtrack.tracking.validation.status.Status` of each.
         quality: of each.
     """
 

@@ -13,10 +13,10 @@ from torchtrack.config.run import RunConfig
 from torchtrack.core.lie import rotation_from_quaternion
 from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
 from torchtrack.io.atomic import writing
-from torchtrack.quality import Status
 from torchtrack.sinks.folder import CONFIG, POSES, ended
 from torchtrack.sinks.poses import COLUMNS, tum_path
 from torchtrack.sinks.record import Earlier
+from torchtrack.tracking.validation.status import Status
 
 # Settings that say where results go and how fast they are had, not what they are.
 _MAY_DIFFER = {"output", "overlay", "threads", "device", "kernels", "compiled", "limits"}

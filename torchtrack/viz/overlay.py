@@ -19,8 +19,8 @@ from torch import Tensor
 from torchtrack.core.camera import MIN_DEPTH_M, Camera, distort, project
 from torchtrack.core.lie import transform_points
 from torchtrack.object_model import ObjectModel
-from torchtrack.quality import Status
 from torchtrack.state import StepResult
+from torchtrack.tracking.validation.status import Status
 
 # Sensors are enlarged by a whole number until they are at least this wide.
 _LEAST_WIDTH_PX = 900

@@ -3,15 +3,12 @@
 The residual does not tell: a slip onto a parallel edge has a small one.
 """
 
-from enum import IntEnum
-
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.config.search import QualityConfig
 from torchtrack.core import dispatch
-from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import none_of
 from torchtrack.core.image_velocity import MovingObjects, pixel_velocity
 from torchtrack.kernels.arrays import as_arrays
@@ -22,29 +19,22 @@ from torchtrack.tracking.contours.points import Contours
 
 # A patch explains its contours when this share of the observations near them are on them.
 _LEAST_SHARE = 0.5
+
+
 # Fewer moving contour points than this say nothing.
 _MIN_MOVING_POINTS = 16
-# What gathers no more than this share of how far it does when an object is seen well says nothing for a pose; from the other one on, all.
-HIDDEN_FROM, HIDDEN_FULLY = 0.8, 0.95
-# It says nothing of objects on which less gathers even then, nor by fewer observations than so many times the least.
-HIDDEN_LEAST, HIDDEN_TIMES = 0.5, 4
+
+
 # What has not been seen well for so long may not be held by parallel lines alone; after so much more, hardly anything is asked (s).
 PARALLEL_AFTER_S, _ASKED_S = 0.05, 1.0
+
+
 # Directions that lie no farther apart than this share of what is asked say nothing for a pose; from the other one on, all.
 _PARALLEL_FROM, _PARALLEL_TO = 0.1, 0.33
+
+
 # How far around a contour observations are that should gather on it (px).
 _AROUND_PX = 5.0
-
-
-class Status(IntEnum):
-    """What a pose is worth, in the order of gravity."""
-
-    TRACKING = 0
-    UNCERTAIN = 1
-    LOST = 2
-    TOO_FEW_EVENTS = 3
-    OUT_OF_VIEW = 4
-    DIVERGED = 5
 
 
 def explained_share(
@@ -174,92 +164,3 @@ def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tens
         return share
     seen = contours.mask & inside(contours.pixels, image_size)
     return seen.sum(-1) / contours.mask.sum(-1).clamp(min=1)
-
-
-def needed_share(widening: Float[Tensor, "b"], config: QualityConfig, hidden: Float[Tensor, "b"] | None = None) -> Float[Tensor, "b"]:
-    """The explained share below which an object is lost: the more places it was looked for in, the more is asked of a find.
-
-    No more than of any, as far as it is ``hidden``, as :func:`partly_hidden` has it.
-    """
-    wider = (widening - 1).clamp(0, 1)
-    if hidden is not None:
-        wider = wider * (1 - hidden)
-    return config.lost_below + (max(config.caught_above, config.lost_below) - config.lost_below) * wider
-
-
-def partly_hidden(
-    gathered: Float[Tensor, "b"], full_gathered: Float[Tensor, "b"], count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: QualityConfig
-) -> Float[Tensor, "b"]:
-    """How far a pose counts, 0 to 1, by events that gather on its contours as they do when the object is seen well, however few these are.
-
-    Of an object that is partly hidden little is explained, but what is seen of it gathers as ever. Were it believed the less,
-    it would be expected in ever more places, lost, and hidden parts or not, it would be tracked no more. What a search found
-    is the best of many poses: on one of them, events gather by chance.
-
-    Args:
-        gathered: share of the events near the contours that are on them; not a number where it does not tell.
-        full_gathered: the same of when the object is seen well; zero where that is not known.
-        count: matched observations.
-        elsewhere: objects that a search found.
-    """
-    ramp = (gathered / full_gathered.clamp(min=1e-6) - HIDDEN_FROM) / (HIDDEN_FULLY - HIDDEN_FROM)
-    # Written so that what is not a number counts for nothing.
-    tells = (ramp > 0) & ~elsewhere & (full_gathered > HIDDEN_LEAST) & are_many(count, config)
-    return torch.where(tells & config.partly_hidden, ramp.clamp(max=1), 0)
-
-
-def are_many(count: Int[Tensor, "b"], config: QualityConfig) -> Bool[Tensor, "b"]:
-    """Whether observations are so many that they tell of an object of which little is explained."""
-    return count >= HIDDEN_TIMES * config.min_observations
-
-
-def holding_on(count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: QualityConfig) -> Bool[Tensor, "b"]:
-    """Which poses go on from the one before by many events: what little is explained of an object that is hidden ever more is still it.
-
-    Given up, it would coast away from where it is, and be looked for among the edges of what hides it. Arguments are those of
-    :func:`partly_hidden`.
-    """
-    return ~elsewhere & are_many(count, config) & config.holds_on
-
-
-def trust(
-    share: Float[Tensor, "b"], config: QualityConfig, full_share: Float[Tensor, "b"] | None = None, widening: Float[Tensor, "b"] | None = None
-) -> Float[Tensor, "b"]:
-    """How far a pose that was found counts against the prediction: nothing where it is lost, fully once it is certain.
-
-    Of an object that was looked for in many places (``widening``) near to its full share is asked: chance explains some.
-    """
-    full = torch.full_like(share, config.uncertain_below)
-    if full_share is not None and widening is not None:
-        full = torch.maximum(full, config.certain_at * full_share * (widening - 1).clamp(0, 1))
-    return ((share - config.lost_below) / (full - config.lost_below).clamp(min=1e-6)).clamp(0, 1)
-
-
-def judge(
-    quality: Float[Tensor, "b"],
-    observation_count: Int[Tensor, "b"],
-    in_view: Float[Tensor, "b"],
-    step_from_prediction: Float[Tensor, "b 6"],
-    diameters_m: Float[Tensor, "b"],
-    config: QualityConfig,
-    widening: Float[Tensor, "b"] | None = None,
-    hidden: Float[Tensor, "b"] | None = None,
-) -> Int[Tensor, "b"]:
-    """The :class:`Status` of each object, the gravest reason first.
-
-    ``widening`` is of each object's first gate: an uncertain one may be found so much farther away. ``hidden`` is from
-    :func:`partly_hidden`.
-    """
-    widening = torch.ones_like(quality) if widening is None else widening
-    turned, moved = (step_from_prediction.unflatten(1, (2, 3)).norm(dim=-1) / widening[:, None]).unbind(1)
-    reasons: dict[Status, Bool[Tensor, "b"]] = {
-        Status.UNCERTAIN: quality < config.uncertain_below,
-        Status.LOST: quality < needed_share(widening, config, hidden),
-        Status.TOO_FEW_EVENTS: observation_count < config.min_observations,
-        Status.OUT_OF_VIEW: in_view < config.min_visible_share,
-        # Written so that what is not a number has diverged.
-        Status.DIVERGED: ~((turned < config.max_step_rotation_rad) & (moved < config.max_step_translation * diameters_m)),
-    }
-    # Statuses are in the order of their gravity.
-    numbers = constant(tuple((int(status),) for status in reasons), torch.int64, quality.device)
-    return (torch.stack(list(reasons.values())) * numbers).amax(0)

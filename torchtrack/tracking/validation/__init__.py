@@ -1,0 +1,1 @@
+"""Whether a pose is right: measures, scores and statuses."""
