@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import generator
 
-from torchtrack.image_cells import CellGrid, fit_lines, is_near, point_sums, tallied
+from torchtrack.tracking.adaptation.cell_grid import CellGrid, fit_lines, is_near, point_sums, tallied
 
 MIDDLE = torch.tensor([[[320.0, 240.0]]], dtype=torch.float64)
 

@@ -13,8 +13,8 @@ from torchtrack import Tracker
 from torchtrack.config.tracker import ContourConfig, LearningConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg
-from torchtrack.learned_contours import LearnedContours
 from torchtrack.object_model.contour_source import ContourKind
+from torchtrack.tracking.adaptation.learned_contours import LearnedContours
 
 COUNT = 24
 OFF = TrackerConfig(learning=LearningConfig(points=0))

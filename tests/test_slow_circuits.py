@@ -7,7 +7,7 @@ import torch
 from tracked_boxes import in_motion, poses_of, started
 
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
-from torchtrack.slow_circuits import dated, late_share_after, slowness, unknown_circuits
+from torchtrack.tracking.adaptation.pixel_latency import dated, late_share_after, slowness, unknown_circuits
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.estimation.rounds import gate_widening, index_for
 

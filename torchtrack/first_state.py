@@ -4,11 +4,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchtrack.learned_contours import LearnedContours
 from torchtrack.model_trust import ModelTrust
-from torchtrack.slow_circuits import unknown_circuits
 from torchtrack.state import Probation, TrackerState
 from torchtrack.tracked_objects import TrackedObjects
+from torchtrack.tracking.adaptation.learned_contours import LearnedContours
+from torchtrack.tracking.adaptation.pixel_latency import unknown_circuits
 from torchtrack.tracking.association.polarity import nothing_remembered
 from torchtrack.tracking.frontend.bursts import no_bursts
 from torchtrack.tracking.frontend.time_surface import empty_last_event

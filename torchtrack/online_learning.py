@@ -9,7 +9,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.model_trust import judge_elements
 from torchtrack.state import StepResult, TrackerState
-from torchtrack.surface_learning import Surroundings, learn_after
+from torchtrack.tracking.adaptation.surface_learning import Surroundings, learn_after
 from torchtrack.tracking.association.polarity import expected_polarity, is_asked
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.window_events import ObjectEvents

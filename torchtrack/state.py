@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.learned_contours import LearnedContours
 from torchtrack.model_trust import ModelTrust
+from torchtrack.tracking.adaptation.learned_contours import LearnedContours
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.corners import Corners
 
@@ -54,7 +54,7 @@ class TrackerState:
         T_last_seen: pose of each object when it was last seen well (float64).
         unseen_s: how long ago that was (s).
         darker_outside: which side of each object's contours is the darker one, by the octant that they face: :mod:`torchtrack.tracking.association.polarity`.
-        late_share: how many of the events on its moving contours come late in their bursts: :mod:`torchtrack.slow_circuits`.
+        late_share: how many of the events on its moving contours come late in their bursts: :mod:`torchtrack.tracking.adaptation.pixel_latency`.
         t_us: end of the last window of each stream (µs).
         last_event_us: time of the newest event of every sensor pixel (µs).
         burst_age_us: how long ago the newest burst of every sensor pixel and polarity began (µs).

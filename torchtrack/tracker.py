@@ -25,12 +25,12 @@ from torchtrack.probation import after_probation
 from torchtrack.recovery import search_wanted
 from torchtrack.relocation import LastSeen, anywhere, is_lost, looked_for_anew
 from torchtrack.setup_check import check_poses
-from torchtrack.slow_circuits import LOOK_US, dated, late_share_after
 from torchtrack.speed_limit import held_back
 from torchtrack.start_check import check_in_view
 from torchtrack.state import StepResult, TrackerState, choose_rows
 from torchtrack.step_check import check_step
 from torchtrack.tracked_objects import TrackedObjects
+from torchtrack.tracking.adaptation.pixel_latency import LOOK_US, dated, late_share_after
 from torchtrack.tracking.association.observations import Observations, corner_observations, join, select_events
 from torchtrack.tracking.association.weighting_features import Evidence, judged
 from torchtrack.tracking.contours.index import ContourIndex

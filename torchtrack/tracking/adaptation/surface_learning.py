@@ -20,8 +20,8 @@ from torchtrack.core.constants import constant
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.lie import transform_points
 from torchtrack.core.padded import take_points
-from torchtrack.image_cells import CellGrid, Lines, cell_of, fit_lines, is_near, point_sums, tallied
-from torchtrack.learned_contours import LearnedContours, judge_model
+from torchtrack.tracking.adaptation.cell_grid import CellGrid, Lines, cell_of, fit_lines, is_near, point_sums, tallied
+from torchtrack.tracking.adaptation.learned_contours import LearnedContours, judge_model
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, assemble, joined
 from torchtrack.tracking.contours.surface_rays import surface_points
