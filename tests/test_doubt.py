@@ -12,7 +12,8 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
-from torchtrack.doubt import Doubt, drifted, gathered_when_known, has_strayed, in_doubt, is_adrift, is_due, is_wanted, less_certain
+from torchtrack.tracking.relocalization.last_seen import drifted, less_certain
+from torchtrack.tracking.relocalization.triggers import Doubt, gathered_when_known, has_strayed, in_doubt, is_adrift, is_due, is_wanted
 from torchtrack.tracking.validation.status import Status
 
 # The box fires few events: with corners beside them, enough is observed of one that slipped to say more than that it is too little.

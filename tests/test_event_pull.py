@@ -8,9 +8,9 @@ from torch.nn.functional import avg_pool2d
 from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.event_image import event_density
-from torchtrack.event_pull import FAR_PX, NEAR_PX, found, pulled
-from torchtrack.views import outlines_at
+from torchtrack.tracking.relocalization.edge_search import FAR_PX, NEAR_PX, found, pulled
+from torchtrack.tracking.relocalization.event_image import event_density
+from torchtrack.tracking.relocalization.view_sphere import outlines_at
 
 IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
 LOOSE = torch.diag(torch.tensor([0.3] * 3 + [0.05] * 3, dtype=torch.float64).square())

@@ -7,9 +7,9 @@ from tracked_boxes import in_motion
 
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.event_image import event_density
-from torchtrack.hypotheses import draw_offsets, mark, promising
-from torchtrack.views import outlines_at, thinned
+from torchtrack.tracking.relocalization.event_image import event_density
+from torchtrack.tracking.relocalization.hypotheses import draw_offsets, mark, promising
+from torchtrack.tracking.relocalization.view_sphere import outlines_at, thinned
 
 IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
 

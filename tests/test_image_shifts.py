@@ -8,8 +8,8 @@ from tracked_boxes import in_motion
 
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.image_shifts import _peaks, shifted
-from torchtrack.views import outlines_at
+from torchtrack.tracking.relocalization.correlation import _peaks, shifted
+from torchtrack.tracking.relocalization.view_sphere import outlines_at
 
 CONFIG = TrackerConfig(search=SearchConfig(kept=12))
 

@@ -16,7 +16,6 @@ from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import undistortion_table
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
 from torchtrack.core.image_velocity import MovingObjects
-from torchtrack.hypotheses import mark
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
 from torchtrack.tracking.association.matches import Matches
@@ -31,6 +30,7 @@ from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
 from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.hypotheses import mark
 from torchtrack.tracking.validation.measures import shares
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")

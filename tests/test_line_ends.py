@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchtrack.line_ends import running_on
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.relocalization.acceptance import less_where_lines_run_on
+from torchtrack.tracking.relocalization.line_ends import running_on
 
 IMAGE_SIZE = (240, 320)
 TOP_LEFT, SIDE_PX = (100.0, 80.0), 60

@@ -13,9 +13,10 @@ from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.camera import project
 from torchtrack.core.lie import difference_about, retract_about, rotation_angle_deg, transform_points
 from torchtrack.object_model.symmetry import symmetry_planes
-from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
 from torchtrack.tracking.motion.model import Acceleration
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.last_seen import as_last_seen
+from torchtrack.tracking.relocalization.symmetric import SymmetryPlanes, mirrored
 from torchtrack.tracking.validation.status import Status
 
 MIDDLE = torch.tensor([0.01, -0.02, 0.005], dtype=torch.float64)

@@ -11,7 +11,7 @@ from tracked_boxes import assert_same, started, tracker_of
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import EventBatch
-from torchtrack.probation import after_probation
+from torchtrack.tracking.relocalization.tentative import after_probation
 from torchtrack.tracking.validation.status import Status
 
 FULL_SHARE = 0.8

@@ -14,10 +14,10 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import numba_is_installed
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
-from torchtrack.recovery import _least, _search_slipped, _stands, search_wanted
-from torchtrack.relocation import LastSeen
 from torchtrack.tracking.relocalization.acceptance import is_likely, likeliest
+from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.refine import align_all, rehearse, search
+from torchtrack.tracking.relocalization.relocalize import _least, _search_slipped, _stands, search_wanted
 from torchtrack.tracking.validation.scored_fit import explained_at_rest
 from torchtrack.tracking.validation.status import Status
 
@@ -208,8 +208,10 @@ def test_what_stands_is_looked_for_as_if_it_had_slipped_and_gives_way_to_far_mor
     _, prediction, seen, _, _ = in_motion()
     looked = {}
     for stands in (True, False):
-        monkeypatch.setattr("torchtrack.recovery._stands", lambda *_, stands=stands: torch.tensor([stands]))
-        monkeypatch.setattr("torchtrack.recovery.search", lambda *args, stands=stands: looked.setdefault(stands, args[2]) and args[5])
+        monkeypatch.setattr("torchtrack.tracking.relocalization.relocalize._stands", lambda *_, stands=stands: torch.tensor([stands]))
+        monkeypatch.setattr(
+            "torchtrack.tracking.relocalization.relocalize.search", lambda *args, stands=stands: looked.setdefault(stands, args[2]) and args[5]
+        )
         last_seen = LastSeen(prediction.T_cam_obj.double(), prediction.covariance)
         told = replace(doubt, unseen_s=torch.zeros(1), has_symmetry=torch.tensor([False]))
         search_wanted(prediction, told, seen, found, torch.ones(1), tracker.config, last_seen, tracker.planes, tracker.axes)
@@ -288,14 +290,20 @@ def test_what_slipped_goes_on_as_certain_as_if_it_had_been_predicted():
 @pytest.mark.parametrize("config", [UNSEARCHED, SEARCHED.model_copy(update={"solver": SEARCHED.solver.model_copy(update={"prior": False})})])
 def test_without_hypotheses_or_a_prior_nothing_is_searched_for(config, monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.recovery.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr(
+        "torchtrack.tracking.relocalization.relocalize.search",
+        lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found,
+    )
     displaced_runs(config, 100.0, count=2)
     assert searched == []
 
 
 def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.recovery.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr(
+        "torchtrack.tracking.relocalization.relocalize.search",
+        lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found,
+    )
     _, events = moving_box(pose(), 10)
     # As a new object it would be, once in a while.
     tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(new_share=0)))
@@ -329,7 +337,10 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
 @pytest.mark.parametrize(("count", "times"), [(0, 0), (29, 0), (200, 1)])
 def test_without_enough_events_there_is_nothing_to_search_in(count, times, monkeypatch):
     searched = []
-    monkeypatch.setattr("torchtrack.recovery.search", lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found)
+    monkeypatch.setattr(
+        "torchtrack.tracking.relocalization.relocalize.search",
+        lambda number, prediction, sigma, least, seen, found, config: searched.append(number) or found,
+    )
     tracker, state, _, _, _ = started(config=TrackerConfig(search=SearchConfig(interval_us=0, new_share=0)))
     noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
     after, result = tracker.step(replace(state, covariance=1e3 * state.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)

@@ -16,8 +16,8 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg, so3_exp, transform_points
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.axis_rotation import TurningAxes, _peaks, may_have_turned
 from torchtrack.tracking.validation.status import Status
-from torchtrack.turns import TurningAxes, _peaks, may_have_turned
 
 CAMERA = Camera(fx=400.0, fy=400.0, cx=159.5, cy=119.5, width=320, height=240)
 COUNT = 24
@@ -116,7 +116,7 @@ def test_while_the_handle_is_hidden_nothing_is_told():
 
 
 def test_what_was_seen_all_the_time_is_not_looked_at(monkeypatch):
-    monkeypatch.setattr("torchtrack.recovery.turns_compared", lambda *args: pytest.fail("looked at"))
+    monkeypatch.setattr("torchtrack.tracking.relocalization.relocalize.turns_compared", lambda *args: pytest.fail("looked at"))
     state, _, _ = after_a_while(unseen_s=0.0)
     assert float(state.unseen_s) == 0
 

@@ -6,7 +6,7 @@ from helpers import generator
 from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.views import outlines_at, outlines_by_view, thinned, view_directions
+from torchtrack.tracking.relocalization.view_sphere import outlines_at, outlines_by_view, thinned, view_directions
 
 
 def test_directions_are_spread_evenly_over_the_sphere():

@@ -9,7 +9,6 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync, lie
 from torchtrack.core.linalg import inverse
-from torchtrack.doubt import SMEARED, in_doubt
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import ConclusionSettings
 from torchtrack.state import StepResult, TrackerState
@@ -20,6 +19,7 @@ from torchtrack.tracking.estimation.rounds import ANYWHERE, Fit, may_be_anywhere
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import Acceleration, fade, found_acceleration, left_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.triggers import SMEARED, in_doubt
 from torchtrack.tracking.validation.measures import visible_share
 from torchtrack.tracking.validation.scored_fit import Found
 from torchtrack.tracking.validation.status import (

@@ -8,19 +8,19 @@ from torch.nn.functional import pad
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import Camera
-from torchtrack.doubt import mirrors, turns
 from torchtrack.model_trust import element_groups
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourModel, group_by_model
 from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, stacked, symmetry_planes, turning_axis
-from torchtrack.other_places import SymmetryPlanes
 from torchtrack.setup_check import check_setup
 from torchtrack.tracking.association.weighting_network import LimbTrust, TrustNetwork, shipped_weigher
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
 from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.motion.prediction import far_pose
-from torchtrack.turns import TurningAxes
+from torchtrack.tracking.relocalization.axis_rotation import TurningAxes
+from torchtrack.tracking.relocalization.symmetric import SymmetryPlanes
+from torchtrack.tracking.relocalization.triggers import mirrors, turns
 
 
 class TrackedObjects(nn.Module):

@@ -17,13 +17,9 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, pad_streams
-from torchtrack.doubt import Doubt, gathered_when_known, has_strayed, is_adrift, is_due, is_wanted, searches
 from torchtrack.first_state import first_state
 from torchtrack.object_model import ObjectModel
 from torchtrack.online_learning import Lesson, learned_after, objects_as_known
-from torchtrack.probation import after_probation
-from torchtrack.recovery import search_wanted
-from torchtrack.relocation import LastSeen, anywhere, is_lost, looked_for_anew
 from torchtrack.setup_check import check_poses
 from torchtrack.speed_limit import held_back
 from torchtrack.start_check import check_in_view
@@ -44,11 +40,25 @@ from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.predict import forecast
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.axis_rotation import may_have_turned
+from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere
 from torchtrack.tracking.relocalization.refine import rehearse
+from torchtrack.tracking.relocalization.relocalize import search_wanted
+from torchtrack.tracking.relocalization.tentative import after_probation
+from torchtrack.tracking.relocalization.triggers import (
+    Doubt,
+    gathered_when_known,
+    has_strayed,
+    is_adrift,
+    is_due,
+    is_lost,
+    is_wanted,
+    looked_for_anew,
+    searches,
+)
 from torchtrack.tracking.validation.measures import asked_apart
 from torchtrack.tracking.validation.scored_fit import explained_at_rest, judge_fit
 from torchtrack.tracking.validation.status import Status
-from torchtrack.turns import may_have_turned
 from torchtrack.window_parts import of_unknown_motion, to_be_parted
 
 _QUESTIONS = host_sync.Questions()

@@ -150,7 +150,7 @@ def _trust(share: float, full_share: float, widening: float, settings: Conclusio
 
 @kernel()
 def _in_doubt(b: int, found: Array, full_share: float, settings: ConclusionSettings) -> bool:
-    """Whether an object may be elsewhere: :func:`torchtrack.doubt.in_doubt`."""
+    """Whether an object may be elsewhere: :func:`torchtrack.tracking.relocalization.triggers.in_doubt`."""
     smeared = found[GATHERED, b] < settings.smeared * found[USUALLY_GATHERED, b]
     return smeared and found[SCORE, b] < settings.doubted_below * full_share
 

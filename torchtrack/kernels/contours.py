@@ -253,7 +253,7 @@ def mark(
     beside_px: float,
     marks: Array,
 ) -> None:
-    """How much denser events are on contours at some poses than beside them: :func:`torchtrack.hypotheses.mark`.
+    """How much denser events are on contours at some poses than beside them: :func:`torchtrack.tracking.relocalization.hypotheses.mark`.
 
     Args:
         points_obj, tangents_obj, mask: ``[n, 3, m]`` and ``[n, m]`` of each pose; or one row for all.
@@ -281,7 +281,7 @@ def mark(
 
 @kernel(fastmath=FAST)
 def at(image: Array, width: float, height: float, u: float, v: float, border_px: int) -> float:
-    """What an image with its border, row by row, has at a pixel: :func:`torchtrack.event_image.look_up`."""
+    """What an image with its border, row by row, has at a pixel: :func:`torchtrack.tracking.relocalization.event_image.look_up`."""
     column, row = np.rint(u) + border_px, np.rint(v) + border_px
     # What is not a number is looked up at the first pixel. No branch, of which a processor would guess many wrong.
     column, row = min(column if column >= 0 else 0.0, width - 1.0), min(row if row >= 0 else 0.0, height - 1.0)

@@ -1,4 +1,4 @@
-"""Where contour points find events along their normals: :func:`torchtrack.event_pull.found`, point by point."""
+"""Where contour points find events along their normals: :func:`torchtrack.tracking.relocalization.edge_search.found`, point by point."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The shifts at which outlines fit best: of :mod:`torchtrack.image_shifts`, cell by cell."""
+"""The shifts at which outlines fit best: of :mod:`torchtrack.tracking.relocalization.correlation`, cell by cell."""
 
 import numpy as np
 

@@ -5,8 +5,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.core import host_sync
-from torchtrack.line_ends import running_on
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.relocalization.line_ends import running_on
 from torchtrack.tracking.validation.scored_fit import Found
 
 # Shares that differ by less are the same: which of them is larger is chance.

@@ -1,6 +1,6 @@
 """Many poses tried at once, where one prediction is too uncertain: after an occlusion, or when a pose begins to slip.
 
-The most promising of thousands (:mod:`torchtrack.hypotheses`) are aligned as one batch; the one that explains most is taken.
+The most promising of thousands (:mod:`torchtrack.tracking.relocalization.hypotheses`) are aligned as one batch; the one that explains most is taken.
 """
 
 from dataclasses import fields, replace
@@ -11,8 +11,6 @@ from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
-from torchtrack.doubt import less_certain
-from torchtrack.hypotheses import promising
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.rounds import Fit, align, index_for
@@ -20,6 +18,8 @@ from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import is_likely, less_where_lines_run_on, likeliest, scored_by_events
+from torchtrack.tracking.relocalization.hypotheses import promising
+from torchtrack.tracking.relocalization.last_seen import less_certain
 from torchtrack.tracking.validation.scored_fit import Found, judge_fit
 
 # So many of the poses of a very uncertain object, those that explain most, are aligned again.

@@ -30,7 +30,7 @@ class Found:
         apart: how far apart the directions of the contours are that events lie on.
         asked_apart: how far apart they have to be to count in full; zero for nothing asked.
         elsewhere: which objects a search found in another place than the prediction led to.
-        turn_unclear: which may be turned otherwise about their axis (:mod:`torchtrack.turns`).
+        turn_unclear: which may be turned otherwise about their axis (:mod:`torchtrack.tracking.relocalization.axis_rotation`).
     """
 
     fit: Fit

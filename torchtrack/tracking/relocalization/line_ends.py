@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from torchtrack.core.padded import select_ranked, take_points
-from torchtrack.event_image import event_density, look_up
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.relocalization.event_image import event_density, look_up
 
 # Contour points that are looked at, at most.
 _POINTS = 256

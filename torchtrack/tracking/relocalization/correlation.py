@@ -18,7 +18,7 @@ from torchtrack.core import dispatch
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.views import outlines_by_view
+from torchtrack.tracking.relocalization.view_sphere import outlines_by_view
 
 # Cells a side of the square in which events and outlines are compared.
 _SIDE = 96

@@ -1,8 +1,8 @@
 """Poses worth trying where one prediction is too uncertain: drawn from its covariance, and marked by the events on their contours.
 
 Thousands are marked in the time that a few dozen take to be aligned. Where the prediction is so uncertain that even these hardly
-come near the right one, turns alone are drawn, tried in all places of the image (:mod:`torchtrack.image_shifts`), and the
-best pulled onto the events (:mod:`torchtrack.event_pull`).
+come near the right one, turns alone are drawn, tried in all places of the image (:mod:`torchtrack.tracking.relocalization.correlation`), and the
+best pulled onto the events (:mod:`torchtrack.tracking.relocalization.edge_search`).
 """
 
 from functools import lru_cache
@@ -15,13 +15,13 @@ from torch.nn.functional import avg_pool2d, pad
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.core.lie import difference_about
-from torchtrack.event_image import BORDER_PX, event_density, look_up
-from torchtrack.event_pull import FAR_PX, NEAR_PX, pulled
-from torchtrack.image_shifts import shifted
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.tracking.contours.points import Contours, assemble, sampling_settings
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.views import outlines_at, thinned
+from torchtrack.tracking.relocalization.correlation import shifted
+from torchtrack.tracking.relocalization.edge_search import FAR_PX, NEAR_PX, pulled
+from torchtrack.tracking.relocalization.event_image import BORDER_PX, event_density, look_up
+from torchtrack.tracking.relocalization.view_sphere import outlines_at, thinned
 
 # Events beside a contour are counted this far from it (px), and more than this many of them in one place say no more.
 _BESIDE_PX, ENOUGH_EVENTS = 4.0, 3.0
@@ -109,7 +109,7 @@ def mark(outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Floa
     Args:
         outlines: its contours at each pose; or one for all, which are moved: over a few degrees they stay contours, even on a smooth surface.
         T_cam_obj: the poses.
-        image: how many events there are at every pixel, as :mod:`torchtrack.event_image` has it.
+        image: how many events there are at every pixel, as :mod:`torchtrack.tracking.relocalization.event_image` has it.
     """
     count = len(T_cam_obj)
     if dispatch.apply_to(image):

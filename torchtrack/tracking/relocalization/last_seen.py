@@ -1,9 +1,4 @@
-"""Where an object is looked for that has not been seen well for a while: all around the pose that it had then.
-
-A prediction goes on from what was last taken for the object. One that is lost coasts away, until it is out of the image; a
-pose that slipped runs off in depth, where the few events on its small contours explain all of them; or it holds on to other
-edges, which explain some of it. Meanwhile the object is seen well again, not far from where it was, and nobody looks there.
-"""
+"""Where an object may be that is not where it is predicted: drifted off, or as it was last seen."""
 
 from dataclasses import dataclass, replace
 
@@ -11,22 +6,48 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core import host_sync
-from torchtrack.doubt import is_due, searches
 from torchtrack.state import TrackerState
 from torchtrack.tracking.contours.objects import ObjectBatch
-from torchtrack.tracking.motion.model import MOST_UNCERTAIN, rim_and_centre
+from torchtrack.tracking.motion.model import rim_and_centre
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.triggers import Doubt
 
-# A prediction that is so uncertain, as a share of the most that predictions become, tells nothing any more.
-_NOTHING_KNOWN = 0.8
-# Farther away, or nearer, than when it was last seen well by this factor, an object may have been mistaken for others' edges.
-_OFF_IN_DEPTH = 1.25
+# An object is not looked for farther away than it can have drifted in this time (s), nor turned farther than in this.
+_LONGEST_S, _LONGEST_TURN_S = 0.4, 1.0
+
+
+def drifted(prediction: Prediction, doubt: Doubt, config: SearchConfig) -> Prediction:
+    """The prediction, of objects that are adrift so uncertain as if they had moved otherwise, at some constant velocity, since the doubt began."""
+    objects = prediction.objects
+    speed_m_s = torch.minimum(config.drift_px_s / objects.px_per_m(prediction.T_cam_obj), config.drift_diameters_s * objects.diameter_m).double()
+    velocity = rim_and_centre(speed_m_s[:, None], objects.diameter_m.double()[:, None])
+    turned_s, moved_s = (doubt.doubted_s.clamp(max=longest_s).double()[:, None].expand(-1, 3) for longest_s in (_LONGEST_TURN_S, _LONGEST_S))
+    # Pose and velocity are off together: one such velocity explains both.
+    pose, rate = (torch.diag_embed(part) for part in (velocity * torch.cat([turned_s, moved_s], 1), velocity))
+    root = torch.cat([pose, rate], 1)
+    return replace(prediction, covariance=prediction.covariance + doubt.adrift[:, None, None] * (root @ root.mT))
+
+
+def less_certain(prediction: Prediction, number: int, sigma_px: float, wider_px: float) -> Prediction:
+    """The prediction, of the object ``number`` as if its standard deviation in the image, ``sigma_px``, were ``wider_px``.
+
+    A pose that slipped was sure of itself all the while: its covariance tells the directions it can be off in, but not how far.
+    """
+    covariance = prediction.covariance.clone()
+    covariance[number] *= (wider_px / max(sigma_px, 1e-6)) ** 2
+    return replace(prediction, covariance=covariance)
+
+
 # Standard deviations: turn (rad), and depth (as a share of it).
 _TURN_RAD, _DEPTH_SHARE = 1.0, 0.1
+
+
 # And way across the image (px/s, and as a share of its diagonal), the longer the object was not seen well.
 _SPEED_PX_S, _DIAGONALS = 400.0, 0.2
+
+
 # One look after the other: as far as in a third of all that, in two, in all. A few hundred poses come near the right one but rarely in all.
 _LOOKS = 3
 
@@ -81,45 +102,19 @@ class LastSeen:
         return Prediction(one.objects, T_cam_obj, torch.ones_like(one.usable), velocity, self.covariance[own], acceleration)
 
 
-def is_lost(state: TrackerState, diameter_m: Float[Tensor, "b"], config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """Which objects nothing is known of any more but where they were last seen well, which is long ago."""
-    unseen = _unseen_for_long(state, config)
-    if host_sync.none_of(unseen):
-        return unseen
-    sigma = state.covariance.diagonal(dim1=-2, dim2=-1)[:, :6].sqrt()
-    turn_rad, move_m = sigma.unflatten(1, (2, 3)).amax(-1).unbind(1)
-    unknown = (turn_rad > _NOTHING_KNOWN * MOST_UNCERTAIN) | (move_m > _NOTHING_KNOWN * MOST_UNCERTAIN * diameter_m)
-    return unknown & unseen
-
-
-def looked_for_anew(
-    state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig
-) -> tuple[Bool[Tensor, "b"], Bool[Tensor, "b"]]:
-    """Which objects, not seen well for long, are looked for all around where they were then, in the window to ``t_us``, and why.
-
-    Those that explain little are partly hidden, as a rule. But a pose may also have gone along with what hid the object, and hold on to
-    other edges. What is lost is expected there as it is.
-
-    Returns:
-        Those much farther away than then, or nearer; and those that explain much less.
-    """
-    unseen = _unseen_for_long(state, config)
-    if host_sync.none_of(unseen):
-        return unseen, unseen
-    due = unseen & is_due(state.t_us, t_us, config.search.doubt_us)[0, objects.stream_index] & ~is_lost(state, objects.diameter_m, config)
-    now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.T_last_seen))
-    off_in_depth = torch.maximum(now_m / then_m, then_m / now_m) > _OFF_IN_DEPTH
-    return due & off_in_depth, due & (state.score < config.search.anew_below * state.full_share)
-
-
 def anywhere(covariance: Float[Tensor, "b 12 12"], chosen: Bool[Tensor, "b"]) -> Float[Tensor, "b 12 12"]:
     """Covariances of poses and velocities, of the ``chosen`` objects so large that they may be anywhere in the image."""
     unknown = torch.eye(12, dtype=covariance.dtype, device=covariance.device)
     return torch.where(chosen[:, None, None], unknown, covariance)
 
 
-def _unseen_for_long(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """Which objects were found once, and then not seen well for long."""
-    if not (config.search.anew_us and searches(config)):
-        return torch.zeros_like(state.unseen_s, dtype=torch.bool)
-    return (state.unseen_s >= 1e-6 * config.search.anew_us) & (state.usual_score > 0)
+def as_last_seen(prediction: Prediction, T_last_seen: Float[Tensor, "4 4"]) -> Prediction:
+    """The prediction, of one object, turned and as far away as when it was last seen well, in the place of the image where it is predicted.
+
+    What slips runs off in depth and turns on; in the image it is held by what it slipped onto.
+    """
+    centre_obj, then = prediction.objects.centre_obj[0], T_last_seen.to(prediction.T_cam_obj.dtype)
+    now_cam, then_cam = prediction.centre_cam[0], then[:3, :3] @ centre_obj + then[:3, 3]
+    T_cam_obj = then.clone()
+    T_cam_obj[:3, 3] += now_cam * (then_cam[2] / now_cam[2]) - then_cam
+    return replace(prediction, T_cam_obj=T_cam_obj[None])

@@ -13,12 +13,12 @@ from torchtrack.config.tracker import SolverConfig
 from torchtrack.core import dispatch
 from torchtrack.core.lie import difference_about
 from torchtrack.core.linalg import inverse
-from torchtrack.event_image import BORDER_PX, look_up
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 from torchtrack.tracking.estimation.terms import PoseProblem
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.event_image import BORDER_PX, look_up
 
 # How far contour points look (px), a step of the solver each: of poses far off, and of those that were pulled nearer.
 FAR_PX, NEAR_PX = (12.0, 8.4, 5.9), (7.2, 5.0, 3.5)
@@ -43,7 +43,7 @@ def pulled(
         prediction: of the object, with the ``covariance`` of its pose.
         T_cam_obj: where each begins.
         outlines: contours of each there, or at a pose that is not far off.
-        image: how many events there are at every pixel, as :mod:`torchtrack.event_image` has it.
+        image: how many events there are at every pixel, as :mod:`torchtrack.tracking.relocalization.event_image` has it.
         reaches_px: how far contour points look, a step of the solver each.
     """
     information = (_FIND_PX**2 * inverse(covariance[None])).to(T_cam_obj.dtype)

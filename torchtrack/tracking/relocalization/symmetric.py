@@ -63,15 +63,3 @@ def mirrored(prediction: Prediction, point_obj: Float[Tensor, "3"], normal_obj: 
 def _reflection(normal: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The reflection in a plane with a unit normal (Householder)."""
     return torch.eye(3, dtype=normal.dtype, device=normal.device) - 2 * normal[:, None] * normal
-
-
-def as_last_seen(prediction: Prediction, T_last_seen: Float[Tensor, "4 4"]) -> Prediction:
-    """The prediction, of one object, turned and as far away as when it was last seen well, in the place of the image where it is predicted.
-
-    What slips runs off in depth and turns on; in the image it is held by what it slipped onto.
-    """
-    centre_obj, then = prediction.objects.centre_obj[0], T_last_seen.to(prediction.T_cam_obj.dtype)
-    now_cam, then_cam = prediction.centre_cam[0], then[:3, :3] @ centre_obj + then[:3, 3]
-    T_cam_obj = then.clone()
-    T_cam_obj[:3, 3] += now_cam * (then_cam[2] / now_cam[2]) - then_cam
-    return replace(prediction, T_cam_obj=T_cam_obj[None])

@@ -8,17 +8,17 @@ from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.host_sync import Answer
-from torchtrack.doubt import Doubt, drifted, less_certain
-from torchtrack.other_places import SymmetryPlanes, as_last_seen, mirrored
-from torchtrack.relocation import LastSeen
 from torchtrack.tracking.estimation.rounds import gate_widening
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import AS_MUCH, is_taken
+from torchtrack.tracking.relocalization.axis_rotation import TurningAxes, turns_compared
+from torchtrack.tracking.relocalization.last_seen import LastSeen, as_last_seen, drifted, less_certain
 from torchtrack.tracking.relocalization.refine import search, search_around
+from torchtrack.tracking.relocalization.symmetric import SymmetryPlanes, mirrored
+from torchtrack.tracking.relocalization.triggers import Doubt
 from torchtrack.tracking.validation.scored_fit import Found
 from torchtrack.tracking.validation.status import are_many
-from torchtrack.turns import TurningAxes, turns_compared
 
 # What explains so many times as many events as a pose far off in depth is no smaller thing that chance explains.
 _FAR_MORE = 2.0

@@ -6,7 +6,7 @@ the farther, the longer it lasts. So may one that merely explains less than when
 instead, so that a pose elsewhere has to explain nearly all, and no fewer events, to be taken for it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,15 +14,17 @@ from torch import Tensor
 
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import none_of
-from torchtrack.tracking.motion.model import rim_and_centre
-from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.state import TrackerState
+from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.motion.model import MOST_UNCERTAIN
 
-# An object is not looked for farther away than it can have drifted in this time (s), nor turned farther than in this.
-_LONGEST_S, _LONGEST_TURN_S = 0.4, 1.0
 # An object is new while what it explains when seen well, which rises with every window, is below this share of what it explains.
 _NEW = 0.9
+
+
 # Events that gather less than this share of how far they do when an object is seen well are smeared.
 SMEARED = 0.8
 
@@ -44,8 +46,8 @@ class Doubt:
         has_symmetry: objects with a plane of symmetry.
         unseen_s: how long ago each was last seen well (s).
         strayed: which of those adrift merely explain less than when seen well.
-        may_have_turned: which may be turned about an axis unseen: :mod:`torchtrack.turns`.
-        off_in_depth, little: which are to be looked for all around where they were last seen well, and why: :mod:`torchtrack.relocation`.
+        may_have_turned: which may be turned about an axis unseen: :mod:`torchtrack.tracking.relocalization.axis_rotation`.
+        off_in_depth, little: which are to be looked for all around where they were last seen well, and why: :mod:`torchtrack.tracking.relocalization.last_seen`.
     """
 
     sigma_px: Float[Tensor, "b"]
@@ -197,23 +199,47 @@ def has_strayed(
     return due & low & (unseen_s >= 1e-6 * config.doubt_us) & (sigma_px < config.slip_sigma_px)
 
 
-def drifted(prediction: Prediction, doubt: Doubt, config: SearchConfig) -> Prediction:
-    """The prediction, of objects that are adrift so uncertain as if they had moved otherwise, at some constant velocity, since the doubt began."""
-    objects = prediction.objects
-    speed_m_s = torch.minimum(config.drift_px_s / objects.px_per_m(prediction.T_cam_obj), config.drift_diameters_s * objects.diameter_m).double()
-    velocity = rim_and_centre(speed_m_s[:, None], objects.diameter_m.double()[:, None])
-    turned_s, moved_s = (doubt.doubted_s.clamp(max=longest_s).double()[:, None].expand(-1, 3) for longest_s in (_LONGEST_TURN_S, _LONGEST_S))
-    # Pose and velocity are off together: one such velocity explains both.
-    pose, rate = (torch.diag_embed(part) for part in (velocity * torch.cat([turned_s, moved_s], 1), velocity))
-    root = torch.cat([pose, rate], 1)
-    return replace(prediction, covariance=prediction.covariance + doubt.adrift[:, None, None] * (root @ root.mT))
+# A prediction that is so uncertain, as a share of the most that predictions become, tells nothing any more.
+_NOTHING_KNOWN = 0.8
 
 
-def less_certain(prediction: Prediction, number: int, sigma_px: float, wider_px: float) -> Prediction:
-    """The prediction, of the object ``number`` as if its standard deviation in the image, ``sigma_px``, were ``wider_px``.
+# Farther away, or nearer, than when it was last seen well by this factor, an object may have been mistaken for others' edges.
+_OFF_IN_DEPTH = 1.25
 
-    A pose that slipped was sure of itself all the while: its covariance tells the directions it can be off in, but not how far.
+
+def is_lost(state: TrackerState, diameter_m: Float[Tensor, "b"], config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Which objects nothing is known of any more but where they were last seen well, which is long ago."""
+    unseen = _unseen_for_long(state, config)
+    if host_sync.none_of(unseen):
+        return unseen
+    sigma = state.covariance.diagonal(dim1=-2, dim2=-1)[:, :6].sqrt()
+    turn_rad, move_m = sigma.unflatten(1, (2, 3)).amax(-1).unbind(1)
+    unknown = (turn_rad > _NOTHING_KNOWN * MOST_UNCERTAIN) | (move_m > _NOTHING_KNOWN * MOST_UNCERTAIN * diameter_m)
+    return unknown & unseen
+
+
+def looked_for_anew(
+    state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig
+) -> tuple[Bool[Tensor, "b"], Bool[Tensor, "b"]]:
+    """Which objects, not seen well for long, are looked for all around where they were then, in the window to ``t_us``, and why.
+
+    Those that explain little are partly hidden, as a rule. But a pose may also have gone along with what hid the object, and hold on to
+    other edges. What is lost is expected there as it is.
+
+    Returns:
+        Those much farther away than then, or nearer; and those that explain much less.
     """
-    covariance = prediction.covariance.clone()
-    covariance[number] *= (wider_px / max(sigma_px, 1e-6)) ** 2
-    return replace(prediction, covariance=covariance)
+    unseen = _unseen_for_long(state, config)
+    if host_sync.none_of(unseen):
+        return unseen, unseen
+    due = unseen & is_due(state.t_us, t_us, config.search.doubt_us)[0, objects.stream_index] & ~is_lost(state, objects.diameter_m, config)
+    now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.T_last_seen))
+    off_in_depth = torch.maximum(now_m / then_m, then_m / now_m) > _OFF_IN_DEPTH
+    return due & off_in_depth, due & (state.score < config.search.anew_below * state.full_share)
+
+
+def _unseen_for_long(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Which objects were found once, and then not seen well for long."""
+    if not (config.search.anew_us and searches(config)):
+        return torch.zeros_like(state.unseen_s, dtype=torch.bool)
+    return (state.unseen_s >= 1e-6 * config.search.anew_us) & (state.usual_score > 0)

@@ -17,13 +17,13 @@ from torch.nn.functional import max_pool1d, pad
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.lie import retract_about
-from torchtrack.event_image import event_density
-from torchtrack.hypotheses import ENOUGH_EVENTS, mark
 from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.event_image import event_density
+from torchtrack.tracking.relocalization.hypotheses import ENOUGH_EVENTS, mark
 from torchtrack.tracking.relocalization.refine import align_all, replaced
+from torchtrack.tracking.relocalization.view_sphere import thinned
 from torchtrack.tracking.validation.scored_fit import Found
-from torchtrack.views import thinned
 
 # Turns that are compared, and how many of them are the same: three degrees apart, and twelve.
 _TURNS, _SAME = 120, 4
