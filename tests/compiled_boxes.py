@@ -11,14 +11,15 @@ import torch
 from helpers import SMALL_CAMERA, box_model, pose
 from tracked_boxes import follow, moving_box, windows
 
-from torchtrack import Tracker, compiled
+from torchtrack import Tracker
 from torchtrack.config.tracker import CornerConfig, LearningConfig, MatchingConfig, TrackerConfig
+from torchtrack.tracking import graphs
 
 # What is compiled for each round of matching is the same: two are enough to see that they follow one another.
 SMALL = TrackerConfig(learning=LearningConfig(points=0), corners=CornerConfig(max_corners=0), matching=MatchingConfig(gates_px=(5.0, 1.5)))
 
 
-class Counting(compiled.CompiledStep):
+class Counting(graphs.CompiledStep):
     """Graphs that say of each window whether they took it."""
 
     def __init__(self, tracker, *, compiles=True):
@@ -39,7 +40,7 @@ def with_backend(backend):
         return torch_compile(function, options=options, backend=backend, **how)
 
     torch_compile = torch.compile
-    compile_with.__signature__ = compiled.signature(torch_compile)
+    compile_with.__signature__ = graphs.signature(torch_compile)
     return mock.patch.object(torch, "compile", compile_with)
 
 
@@ -49,7 +50,7 @@ def main(backend, count, device):
     plain = Tracker([box_model()], SMALL_CAMERA, config)
     with torch.inference_mode():
         _, expected = follow(plain, plain.init(pose()[None], 0), cut)
-    with with_backend(backend), mock.patch("torchtrack.tracker.CompiledStep", Counting), torch.inference_mode():
+    with with_backend(backend), mock.patch("torchtrack.tracking.tracker.CompiledStep", Counting), torch.inference_mode():
         tracker = Tracker([box_model()], SMALL_CAMERA, config, compiled=True).to(device)
         state = tracker.init(pose()[None], 0)
         tracker.prepare(state)

@@ -13,7 +13,7 @@ import torch
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, tensors_of, windows
 
-from torchtrack import Tracker, compiled
+from torchtrack import Tracker
 from torchtrack.config.run import RunConfig
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import LearningConfig, ModelTrustConfig, TrackerConfig
@@ -21,6 +21,7 @@ from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import ConfigError
 from torchtrack.runner import run
+from torchtrack.tracking import graphs
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 
 # Something is learned from every third window.
@@ -34,7 +35,7 @@ class Graphs:
 
     def __init__(self, monkeypatch):
         self.calls, self.dropped, self.compiled_for = [], 0, []
-        monkeypatch.setattr(compiled, "_compiled", self._graph_of)
+        monkeypatch.setattr(graphs, "_compiled", self._graph_of)
 
     def _graph_of(self, function, device):
         if function.__name__ == "near_tiles":
@@ -166,7 +167,7 @@ def test_of_many_events_those_far_from_all_objects_are_left_out(graphs, monkeypa
     monkeypatch.setattr(SensorTiles, "keep", lambda *args: kept.append(keep(*args)) or kept[-1])
     for most, is_compiled in ((0, False), (10**6, True), (0, True)):
         kept.clear()
-        monkeypatch.setattr(compiled, "_MANY", most)
+        monkeypatch.setattr(graphs, "_MANY", most)
         # Searches for a new object would be steps without a graph.
         tracker = Tracker([box_model()], WIDE_CAMERA, TrackerConfig(search=SearchConfig(new_share=0)), compiled=is_compiled)
         with torch.inference_mode():
@@ -207,7 +208,7 @@ def test_events_are_filled_up_with_some_of_no_stream(count, streams):
     x, y = (torch.randint(0, 90, (count,), generator=random, dtype=torch.int32) for _ in range(2))
     stream = torch.arange(count) * streams // count
     events = EventBatch(x, y, torch.arange(count), torch.ones(count, dtype=torch.bool), stream)
-    filled = compiled._filled(NearbyEvents(events), streams)
+    filled = graphs._filled(NearbyEvents(events), streams)
     assert len(filled.events) % 64 == 0
     assert count <= len(filled.events) < 1.25 * count + 64
     assert (filled.events.stream_index[count:] == streams).all()
@@ -219,7 +220,7 @@ def test_events_are_filled_up_with_some_of_no_stream(count, streams):
         # Numbers are of each stream's own, as without a graph.
         assert filled.number is None
     # Few sizes for many counts: a GPU holds a graph for each.
-    sizes = {compiled._rounded_up(n) for n in range(1000, 2000)}
+    sizes = {graphs._rounded_up(n) for n in range(1000, 2000)}
     assert len(sizes) <= 6
 
 
@@ -233,7 +234,7 @@ def test_a_compiler_that_fails_is_told(monkeypatch, folder, tmp_path):
     def without_compiler(*args):
         raise RuntimeError("No working C++ compiler found\nand more")
 
-    monkeypatch.setattr(compiled, "_compiled", lambda function, device: without_compiler)
+    monkeypatch.setattr(graphs, "_compiled", lambda function, device: without_compiler)
     with pytest.raises(ConfigError, match=r"could not be compiled: No working C\+\+ compiler found\. It needs a C\+\+ compiler"):
         run(RunConfig(source=folder / "one.npz", compiled=True, output=tmp_path / "out"))
     assert not (tmp_path / "out").exists()

@@ -9,10 +9,10 @@ from host_reads import host_reads
 from tracked_boxes import SCENES, follow
 
 from torchtrack import Tracker
-from torchtrack.compiled import CompiledStep
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
 from torchtrack.core import host_sync
+from torchtrack.tracking.graphs import CompiledStep
 from torchtrack.tracking.validation.status import Status
 
 COUNT = 8

@@ -9,12 +9,13 @@ import torch
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import follow, moving_box, windows
 
-from torchtrack import Tracker, compiled, cuda_graphs
+from torchtrack import Tracker
 from torchtrack.config.tracker import LearningConfig, TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.events import concatenate
-from torchtrack.cuda_graphs import CudaGraphs
-from torchtrack.state import each_tensor
+from torchtrack.tracking import cuda_graphs, graphs
+from torchtrack.tracking.cuda_graphs import CudaGraphs
+from torchtrack.tracking.state import each_tensor
 
 COUNT = 12
 # Windows that something is learned from are taken without a graph: every third.
@@ -125,10 +126,10 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
 
             tracker.graphs._compiles = True
             monkeypatch.setattr(
-                compiled.CompiledStep, "_graph", lambda self, device, learns, advance=advance_as_there: CudaGraphs(partial(advance, learns=learns))
+                graphs.CompiledStep, "_graph", lambda self, device, learns, advance=advance_as_there: CudaGraphs(partial(advance, learns=learns))
             )
-            monkeypatch.setattr(compiled.CompiledStep, "_near", lambda self, state, events, t_us: compiled.NearbyEvents(events))
-            monkeypatch.setattr(compiled, "_in_bursts", lambda opened, filled, t_us, longest_us: (opened, filled))
+            monkeypatch.setattr(graphs.CompiledStep, "_near", lambda self, state, events, t_us: graphs.NearbyEvents(events))
+            monkeypatch.setattr(graphs, "_in_bursts", lambda opened, filled, t_us, longest_us: (opened, filled))
         with torch.inference_mode():
             found.append(follow(tracker, tracker.init(pose().expand(streams, 4, 4), 0), cut)[1])
     assert sum(graph.starts for graph in recorded) >= COUNT // 3

@@ -9,16 +9,16 @@ from helpers import SMALL_CAMERA, box_model, generator, pose, random_twist
 from tracked_boxes import tensors_of
 
 from torchtrack import Tracker
-from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.core.linalg import inverse
-from torchtrack.state import Probation
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.motion.predict import forecast
+from torchtrack.tracking.state import Probation
+from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.scored_fit import Found
 from torchtrack.tracking.validation.status import Status
 

@@ -8,7 +8,7 @@ from both_ways import ROUNDINGS
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import SCENES, WIDE_CAMERA, assert_same, follow, merged, moving_box, poses_of, started, tensors_of, windows
 
-from torchtrack import Tracker, compiled
+from torchtrack import Tracker
 from torchtrack.baselines import tracker_class
 from torchtrack.config.presets import preset
 from torchtrack.config.run import RunConfig
@@ -16,6 +16,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.errors import EventDataError
 from torchtrack.runner import run, track
+from torchtrack.tracking import graphs
 from torchtrack.tracking.estimation import fast_rounds
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 
@@ -200,5 +201,5 @@ def test_events_outside_the_sensor_are_told_before_a_compiled_graph_is_given_the
     spoilt.x[7] = SMALL_CAMERA.width
     before = state.burst_age_us.clone()
     with torch.inference_mode(), pytest.raises(EventDataError, match="event 7 is at .*, outside the sensor of 200x150 pixels"):
-        compiled._in_bursts(state, compiled._filled(NearbyEvents(spoilt), 1), torch.tensor([end_us]), 1000)
+        graphs._in_bursts(state, graphs._filled(NearbyEvents(spoilt), 1), torch.tensor([end_us]), 1000)
     assert torch.equal(state.burst_age_us, before)

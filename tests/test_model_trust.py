@@ -12,8 +12,8 @@ from torchtrack import Tracker
 from torchtrack.config.tracker import ContourConfig, MatchingConfig, ModelTrustConfig, TrackerConfig
 from torchtrack.model_trust import ModelTrust
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
-from torchtrack.state import joined, take_part
 from torchtrack.tracking.contours.points import mesh_elements
+from torchtrack.tracking.state import joined, take_part
 
 COUNT = 30
 OFF, CONFIG = TrackerConfig(), ModelTrustConfig(least_share=0.5)

@@ -12,10 +12,10 @@ import trimesh
 from torchtrack.core.camera import Camera, distort
 from torchtrack.errors import TorchtrackError
 from torchtrack.object_model import ObjectModel
-from torchtrack.state import StepResult
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.time_surface import empty_last_event
+from torchtrack.tracking.state import StepResult
 from torchtrack.tracking.validation.status import Status
 from torchtrack.viz import OverlayObject, OverlayWriter, draw_overlay, overlay_objects, save_still
 

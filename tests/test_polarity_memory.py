@@ -14,9 +14,9 @@ from torchtrack.config.presets import preset
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.online_learning import objects_as_known
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import simulate
+from torchtrack.tracking.adapt import objects_as_known
 from torchtrack.tracking.association.nearest import ContourTable, match_nearest
 from torchtrack.tracking.association.polarity import expected_polarity, is_asked, is_seen_well, nothing_remembered, octant, remembered
 from torchtrack.tracking.contours.index import index_contours

@@ -7,12 +7,13 @@ import torch
 from helpers import IMAGE_SIZE, box_model, contours_at, generator, random_events
 from tracked_boxes import SCENES, assert_same, follow, started
 
-from torchtrack import Tracker, window_parts
+from torchtrack import Tracker
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig, WindowConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
+from torchtrack.tracking import initialization
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.frontend.corners import detect_corners
 from torchtrack.tracking.frontend.time_surface import empty_last_event, object_regions, time_surface, update_last_event
@@ -179,7 +180,7 @@ def test_of_a_larger_object_the_middle_is_taken(nothing_is_read):
     ids=["default", "in parts", "searched"],
 )
 def test_a_tracker_that_reads_nothing_finds_the_same(nothing_is_read, monkeypatch, scene, config):
-    monkeypatch.setattr(window_parts, "_EVENTS_OF_A_PART", 20)
+    monkeypatch.setattr(initialization, "_EVENTS_OF_A_PART", 20)
     starts, stream_index, cameras, cut = scene(COUNT)
     boxes = Tracker([box_model()] * len(starts), cameras, config, stream_index, dtype=torch.float64)
     begin = boxes.init(torch.stack(starts), 0)
@@ -218,7 +219,7 @@ def test_a_steady_step_is_a_step(nothing_is_read, scene, reading):
 def test_a_steady_step_says_when_it_does_not_hold(nothing_is_read, monkeypatch, reason, reading):
     # Made before anything is patched: other tests share it.
     boxes, state, _, window, _ = started(config=STEADY)
-    monkeypatch.setattr(window_parts, "_EVENTS_OF_A_PART", 20)
+    monkeypatch.setattr(initialization, "_EVENTS_OF_A_PART", 20)
     *_, wrong = boxes.steady_step(state, *window)
     assert not wrong
     if not reading:

@@ -132,7 +132,7 @@ def test_settings_named_alone_exist():
 
 def test_files_exist():
     named = set(re.findall(r"[`(\s]((?:configs|scripts|tests|torchtrack|\.github)/[\w./-]*\w|LICENSE)", README))
-    assert {"configs/demo.yaml", "scripts/demo", "torchtrack/tracker.py", "LICENSE"} <= named
+    assert {"configs/demo.yaml", "scripts/demo", "torchtrack/tracking/tracker.py", "LICENSE"} <= named
     for path in named:
         assert (REPOSITORY / path).exists(), path
 

@@ -11,11 +11,11 @@ from torchtrack import Tracker
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.lie import retract_about
-from torchtrack.state import joined
 from torchtrack.tracking.relocalization.acceptance import scored_by_events
 from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere
 from torchtrack.tracking.relocalization.relocalize import _least
 from torchtrack.tracking.relocalization.triggers import is_lost, looked_for_anew
+from torchtrack.tracking.state import joined
 from torchtrack.tracking.validation.status import Status
 
 CONFIG = TrackerConfig()

@@ -41,7 +41,9 @@ def test_rest_explains_nothing_of_what_was_looked_for_in_many_places():
 @pytest.mark.parametrize(("hypotheses", "times"), [(24, 1), (0, 0)])
 def test_a_search_is_rehearsed_before_the_first_window(hypotheses, times, monkeypatch):
     rehearsed = []
-    monkeypatch.setattr("torchtrack.tracker.rehearse", lambda prediction, config: (rehearsed.append(prediction), rehearse(prediction, config)))
+    monkeypatch.setattr(
+        "torchtrack.tracking.tracker.rehearse", lambda prediction, config: (rehearsed.append(prediction), rehearse(prediction, config))
+    )
     tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(hypotheses=hypotheses)))
     tracker.prepare(tracker.init(pose()[None], 0))
     assert len(rehearsed) == times * numba_is_installed()

@@ -7,8 +7,8 @@ from tracked_boxes import follow, moving_box, tracker_of, windows
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
-from torchtrack.speed_limit import largest_speed, limit_speed, unknown_speed
 from torchtrack.tracking.frontend.window_events import WindowEvents
+from torchtrack.tracking.initialization import largest_speed, limit_speed, unknown_speed
 from torchtrack.tracking.motion.model import initial_covariance
 
 DIAMETER_M = torch.tensor([0.2, 0.1])

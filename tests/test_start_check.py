@@ -9,8 +9,8 @@ from torchtrack.core.camera import Camera
 from torchtrack.core.lie import se3_exp
 from torchtrack.errors import PoseError, TorchtrackWarning
 from torchtrack.object_model import ObjectModel
-from torchtrack.start_check import check_in_view
-from torchtrack.tracker import Tracker
+from torchtrack.tracking.start_check import check_in_view
+from torchtrack.tracking.tracker import Tracker
 
 CAMERA = Camera(230.0, 230.0, 119.5, 89.5, 240, 180)
 FISHEYE = Camera(130.0, 130.0, 119.5, 89.5, 240, 180, "fisheye", (-0.02, 0.004, -0.003, 0.0008))

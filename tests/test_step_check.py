@@ -10,7 +10,7 @@ from tracked_boxes import tensors_of
 from torchtrack import Tracker
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError
-from torchtrack.step_check import check_step
+from torchtrack.tracking.step_check import check_step
 
 
 def events_at(times_us, stream: int = 0) -> EventBatch:

@@ -7,10 +7,11 @@ import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors
 from tracked_boxes import assert_same, follow, moving_box, poses_of, started, windows
 
-from torchtrack import Tracker, window_parts
+from torchtrack import Tracker
 from torchtrack.config.tracker import TrackerConfig, WindowConfig
 from torchtrack.core.events import concatenate
-from torchtrack.state import choose_rows
+from torchtrack.tracking import initialization
+from torchtrack.tracking.state import choose_rows
 
 FAST = {"move": (2.0, 1.0, 0.1), "turn": (1.5, -1.0, 2.0)}
 
@@ -18,7 +19,7 @@ FAST = {"move": (2.0, 1.0, 0.1), "turn": (1.5, -1.0, 2.0)}
 @pytest.fixture(autouse=True)
 def few_events_make_a_part(monkeypatch):
     """The boxes of the tests fire far less than a real object does."""
-    monkeypatch.setattr(window_parts, "_EVENTS_OF_A_PART", 40)
+    monkeypatch.setattr(initialization, "_EVENTS_OF_A_PART", 40)
 
 
 def in_parts(parts):
@@ -51,7 +52,7 @@ def test_an_object_whose_place_is_not_known_either_is_looked_for_by_all_events_o
     wild, lost = (variance * torch.eye(12, dtype=torch.float64)[None] for variance in (1e-4, 0.3))
     wild[:, 6:, 6:] *= 1e6
     for covariance, parted in ((state.covariance, False), (wild, True), (lost, False)):
-        unknown = window_parts.of_unknown_motion(
+        unknown = initialization.of_unknown_motion(
             replace(state, covariance=covariance), torch.full_like(state.t_us, end_us), tracker.objects, tracker.config
         )
         assert unknown.tolist() == [parted]

@@ -12,7 +12,7 @@ The pipeline, one file per stage, in data-flow order::
     pose solver    Levenberg-Marquardt on SE(3)               torchtrack.tracking.estimation.levenberg_marquardt
     alignment      rounds of matching and solving             torchtrack.tracking.estimation.rounds
     quality        status, covariance, explained contour      torchtrack.tracking.validation.measures
-    tracker        all of it: state and window in, pose out   torchtrack.tracker
+    tracker        all of it: state and window in, pose out   torchtrack.tracking.tracker
     runner         a whole recording: source, tracker, sinks  torchtrack.runner
 
 In use::
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from torchtrack.io import read_sequence as read_sequence
     from torchtrack.object_model import ObjectModel as ObjectModel
     from torchtrack.runner import track as track
-    from torchtrack.state import StepResult as StepResult
-    from torchtrack.state import TrackerState as TrackerState
-    from torchtrack.tracker import Tracker as Tracker
+    from torchtrack.tracking.state import StepResult as StepResult
+    from torchtrack.tracking.state import TrackerState as TrackerState
+    from torchtrack.tracking.tracker import Tracker as Tracker
     from torchtrack.tracking.validation.status import Status as Status
 
 _HOME = {

@@ -7,8 +7,8 @@ from torchtrack.config.haste import in_haste
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.windows import EventWindow
 from torchtrack.io.keep_up import HastyWindow
-from torchtrack.state import StepResult
-from torchtrack.tracker import Tracker
+from torchtrack.tracking.state import StepResult
+from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.status import Status
 
 # A tracker in haste searches for what is lost once in so long (µs).

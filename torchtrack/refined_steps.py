@@ -7,7 +7,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.retraced_steps import Retracer
 from torchtrack.smoothed_steps import SmoothedObjects, Smoother
 from torchtrack.stepping import Step
-from torchtrack.tracker import Tracker
+from torchtrack.tracking.tracker import Tracker
 
 
 @runtime_checkable

@@ -10,8 +10,8 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.retracing import Gap, retraced
 from torchtrack.smoothed_steps import SmoothedObjects
 from torchtrack.stepping import Step
-from torchtrack.tracker import Tracker
 from torchtrack.tracking.motion.smoother import Filtered, goes_on
+from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.status import Status
 
 # Where objects were lost and found is looked at for so many windows at a time.

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from torchtrack.core.events import EventBatch
 from torchtrack.core.windows import EventWindow
-from torchtrack.first_state import first_state
-from torchtrack.state import StepResult, TrackerState, take_part
 from torchtrack.stepping import Step
-from torchtrack.tracker import Tracker
 from torchtrack.tracking.contours.points import Contours, reproject
+from torchtrack.tracking.initialization import first_state
+from torchtrack.tracking.state import StepResult, TrackerState, take_part
+from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.status import Status
 
 # An object that was lost for longer is hidden, and not followed any farther (s).

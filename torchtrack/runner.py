@@ -27,11 +27,11 @@ from torchtrack.sinks import Sink
 from torchtrack.sinks.resume import has_begun, is_complete
 from torchtrack.sinks.summary import RunSummary
 from torchtrack.smoothed_steps import SmoothedObjects
-from torchtrack.state import StepResult, TrackerState
 from torchtrack.stepping import clipped, cut_windows, steps
 from torchtrack.streams import follow
 from torchtrack.threads import threads
-from torchtrack.tracker import Tracker
+from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.tracker import Tracker
 from torchtrack.window_length import WindowLength
 
 __all__ = ["run", "run_many", "track"]

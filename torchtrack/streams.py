@@ -21,9 +21,9 @@ from torchtrack.haste import Pace
 from torchtrack.refined_steps import Refinement
 from torchtrack.session import Session
 from torchtrack.smoothed_steps import SmoothedObjects
-from torchtrack.state import StepResult, TrackerState, joined, take_part
 from torchtrack.stepping import Step, passed_over, timed_step
-from torchtrack.tracker import Tracker
+from torchtrack.tracking.state import StepResult, TrackerState, joined, take_part
+from torchtrack.tracking.tracker import Tracker
 from torchtrack.window_length import WindowLength
 
 R = TypeVar("R")

@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import WindowConfig
-from torchtrack.state import StepResult, TrackerState
-from torchtrack.tracker import Tracker
 from torchtrack.tracking.contours.points import reproject
+from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.status import Status
 
 # Contours slower than this (px/s) would take longer than any window.

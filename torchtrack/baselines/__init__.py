@@ -9,7 +9,7 @@ from torchtrack.baselines.line import LineTracker
 from torchtrack.baselines.ls import LeastSquaresTracker
 from torchtrack.baselines.straight_edges import too_curved
 from torchtrack.object_model import ObjectModel
-from torchtrack.tracker import Tracker
+from torchtrack.tracking.tracker import Tracker
 
 __all__ = ["LeastSquaresTracker", "LineTracker", "tracker_class", "unsuitable"]
 

@@ -20,8 +20,6 @@ from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.errors import ModelError
 from torchtrack.object_model import ObjectModel
-from torchtrack.state import StepResult, TrackerState
-from torchtrack.tracker import Tracker
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import Contours, reproject
@@ -30,6 +28,8 @@ from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem
 from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.motion.model import left_covariance
+from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.measures import explained_share, visible_share
 from torchtrack.tracking.validation.status import Status, judge
 

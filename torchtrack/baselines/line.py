@@ -20,8 +20,8 @@ from torch import Tensor
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.core.events import EventBatch
 from torchtrack.core.linalg import solve_positive
-from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracking.estimation.terms import Linearisation
+from torchtrack.tracking.state import StepResult, TrackerState
 
 # Deviation of the distance between an event and its line (px): much is common to the events of a line, so it is not small.
 _EVENT_PX = 4.0
@@ -37,13 +37,13 @@ class LineTracker(EventLineTracker):
     """An error-state Kalman filter on pose and velocity, corrected with the distances of events from model lines."""
 
     def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
-        """The state before the first window; see :meth:`torchtrack.tracker.Tracker.init`."""
+        """The state before the first window; see :meth:`torchtrack.tracking.tracker.Tracker.init`."""
         state = super().init(T_cam_obj, t_us)
         deviations = torch.tensor(_FIRST_DEVIATIONS, dtype=torch.float64, device=state.T_cam_obj.device).repeat_interleave(3)
         return replace(state, covariance=torch.diag(deviations.square()).repeat(len(state.T_cam_obj), 1, 1))
 
     def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
-        """Advance every object by one window; see :meth:`torchtrack.tracker.Tracker.step`."""
+        """Advance every object by one window; see :meth:`torchtrack.tracking.tracker.Tracker.step`."""
         window = self._open(state, events, t_end_us, state.velocity)
         predicted = predicted_covariance(state.covariance, window.duration_s.double())
         eye = torch.eye(6, dtype=predicted.dtype, device=predicted.device).expand(len(predicted), 6, 6)

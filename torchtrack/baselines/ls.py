@@ -8,7 +8,7 @@ from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.core import lie
 from torchtrack.core.events import EventBatch
 from torchtrack.core.linalg import inverse
-from torchtrack.state import StepResult, TrackerState
+from torchtrack.tracking.state import StepResult, TrackerState
 
 # Share of a new window in the velocity.
 _VELOCITY_GAIN = 0.6
@@ -23,7 +23,7 @@ class LeastSquaresTracker(EventLineTracker):
     """
 
     def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
-        """Advance every object by one window; see :meth:`torchtrack.tracker.Tracker.step`."""
+        """Advance every object by one window; see :meth:`torchtrack.tracking.tracker.Tracker.step`."""
         window = self._open(state, events, t_end_us, state.velocity)
         nothing = torch.zeros(len(state.velocity), 6, 6, dtype=state.velocity.dtype, device=state.velocity.device)
         found = self._solve_rounds(window, events, nothing, weight=1.0, apart_px=0.0)

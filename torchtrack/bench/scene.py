@@ -27,9 +27,9 @@ from torchtrack.object_model import ObjectModel
 from torchtrack.session import open_session
 from torchtrack.sim import SceneConfig, simulate
 from torchtrack.sim.meshes import make_mesh
-from torchtrack.state import StepResult, TrackerState
 from torchtrack.stepping import clipped
-from torchtrack.tracker import Tracker
+from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.status import Status
 
 SHAPES = ("lbracket", "cube", "satellite", "robot")

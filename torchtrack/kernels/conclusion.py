@@ -1,4 +1,4 @@
-"""What each object's pose is worth, and where it goes on from there: :mod:`torchtrack.conclusion`, object by object."""
+"""What each object's pose is worth, and where it goes on from there: :mod:`torchtrack.tracking.update`, object by object."""
 
 import numpy as np
 

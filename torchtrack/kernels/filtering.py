@@ -50,7 +50,7 @@ def find_unknown_motion(
     most_sigma_px: float,
     is_unknown: Array,
 ) -> None:
-    """Objects that may move far in a window beside what is known: :func:`torchtrack.window_parts.of_unknown_motion`.
+    """Objects that may move far in a window beside what is known: :func:`torchtrack.tracking.initialization.of_unknown_motion`.
 
     Args:
         covariance, T_cam_obj, centre_obj, focal_px, diameter_m, stream_index: of each object.

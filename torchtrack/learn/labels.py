@@ -5,10 +5,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.core.padded import take_points
-from torchtrack.tracker import Tracker
 from torchtrack.tracking.association.weighting_features import Evidence
 from torchtrack.tracking.estimation.rounds import index_for
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.tracker import Tracker
 
 
 def true_distance(tracker: Tracker, evidence: Evidence, T_cam_obj: Float[Tensor, "b 4 4"], velocity: Float[Tensor, "b 6"]) -> Float[Tensor, "b n"]:

@@ -8,12 +8,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.core.events import EventBatch, concatenate
-from torchtrack.first_state import first_state
-from torchtrack.setup_check import check_poses
-from torchtrack.state import TrackerState
-from torchtrack.tracker import Tracker
 from torchtrack.tracking.frontend.time_surface import update_last_event
+from torchtrack.tracking.initialization import check_poses, first_state
 from torchtrack.tracking.motion.model import initial_covariance
+from torchtrack.tracking.state import TrackerState
+from torchtrack.tracking.tracker import Tracker
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ from torchtrack.learn.dataset import ClipConfig, SequenceBatches, WindowDataset
 from torchtrack.learn.labels import true_distance
 from torchtrack.learn.samples import Batch, collate, start_state, state_velocity
 from torchtrack.object_model import ObjectModel
-from torchtrack.tracker import Tracker
 from torchtrack.tracking.association.weighting_features import Evidence, trust_features
 from torchtrack.tracking.association.weighting_network import TrustNetwork
+from torchtrack.tracking.tracker import Tracker
 
 # The velocity a sample starts with is uncertain by this: as it is in the middle of a motion (m/s).
 _SPEED_SIGMA_M_S = 0.1

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchtrack.core.camera import MIN_DEPTH_M, Camera, distort, project
 from torchtrack.core.lie import transform_points
 from torchtrack.object_model import ObjectModel
-from torchtrack.state import StepResult
+from torchtrack.tracking.state import StepResult
 from torchtrack.tracking.validation.status import Status
 
 # Sensors are enlarged by a whole number until they are at least this wide.
@@ -72,7 +72,7 @@ def overlay_objects(
     """What to draw of the objects that are seen in one stream.
 
     Args:
-        result: of :meth:`torchtrack.tracker.Tracker.step`.
+        result: of :meth:`torchtrack.tracking.tracker.Tracker.step`.
         models: one per object of the tracker.
         camera: the stream's.
         names: one per object; the models' when not given.

@@ -9,7 +9,6 @@ from torchtrack.core import dispatch, lie
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import ForecastSettings
-from torchtrack.state import TrackerState
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import (
     MOST_UNCERTAIN,
@@ -22,6 +21,7 @@ from torchtrack.tracking.motion.model import (
     without_spin,
 )
 from torchtrack.tracking.motion.prediction import MAX_DEPTH_M, Prediction, before_camera
+from torchtrack.tracking.state import TrackerState
 
 
 def forecast(

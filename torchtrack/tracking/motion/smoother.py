@@ -14,8 +14,8 @@ from torch import Tensor
 from torchtrack.config.tracker import MotionConfig
 from torchtrack.core.lie import difference_about, retract_about
 from torchtrack.core.linalg import inverse
-from torchtrack.state import TrackerState
 from torchtrack.tracking.motion.model import predict_covariance
+from torchtrack.tracking.state import TrackerState
 
 # Squared distance (12 degrees of freedom) from what was to be expected above which an object was found in another place: what
 # came before is not dragged there. Of what the filter holds for possible, 2 in 100 million are farther.

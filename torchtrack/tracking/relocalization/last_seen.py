@@ -8,11 +8,11 @@ from torch import Tensor
 
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.state import TrackerState
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import rim_and_centre
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.triggers import Doubt
+from torchtrack.tracking.state import TrackerState
 
 # An object is not looked for farther away than it can have drifted in this time (s), nor turned farther than in this.
 _LONGEST_S, _LONGEST_TURN_S = 0.4, 1.0

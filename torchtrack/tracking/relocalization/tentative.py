@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
-from torchtrack.state import Probation, StepResult, TrackerState
 from torchtrack.tracking.estimation.rounds import may_be_anywhere
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.state import Probation, StepResult, TrackerState
 from torchtrack.tracking.validation.status import Status
 
 # A window speaks for a find by its share of what is wanted, as far as it is more than this.

@@ -17,9 +17,9 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import none_of
-from torchtrack.state import TrackerState
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import MOST_UNCERTAIN
+from torchtrack.tracking.state import TrackerState
 
 # An object is new while what it explains when seen well, which rises with every window, is below this share of what it explains.
 _NEW = 0.9

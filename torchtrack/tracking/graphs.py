@@ -1,7 +1,7 @@
 """Steady windows as one graph: on a GPU a recording of some three thousand small operations; compiled, fused kernels in their place.
 
 What a step of one object costs is the calls of operations, not what they compute. On a GPU, the part of it in which nothing
-has to be decided is recorded once, and then started as a whole (:mod:`torchtrack.cuda_graphs`). ``torch.compile`` turns it into
+has to be decided is recorded once, and then started as a whole (:mod:`torchtrack.tracking.cuda_graphs`). ``torch.compile`` turns it into
 fewer and larger kernels, there and on a CPU. Shapes are those of a GPU (:mod:`torchtrack.core.host_sync`), and the number of events
 is left open.
 
@@ -27,15 +27,15 @@ from torch.nn.functional import pad
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.constants import cells_within
 from torchtrack.core.events import EventBatch, check_on_sensor, pad_streams
-from torchtrack.cuda_graphs import CudaGraphs
 from torchtrack.errors import ConfigError
-from torchtrack.online_learning import due_lessons
-from torchtrack.state import S, StepResult, TrackerState, each_tensor
+from torchtrack.tracking.adapt import due_lessons
+from torchtrack.tracking.cuda_graphs import CudaGraphs
 from torchtrack.tracking.frontend.bursts import update_bursts
 from torchtrack.tracking.frontend.tiles import NearbyEvents
+from torchtrack.tracking.state import S, StepResult, TrackerState, each_tensor
 
 if TYPE_CHECKING:
-    from torchtrack.tracker import Tracker
+    from torchtrack.tracking.tracker import Tracker
 
 P, R = ParamSpec("P"), TypeVar("R")
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]

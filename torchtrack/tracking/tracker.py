@@ -11,21 +11,12 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor, nn
 
-from torchtrack.compiled import CompiledStep
-from torchtrack.conclusion import conclude
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, pad_streams
-from torchtrack.first_state import first_state
 from torchtrack.object_model import ObjectModel
-from torchtrack.online_learning import Lesson, learned_after, objects_as_known
-from torchtrack.setup_check import check_poses
-from torchtrack.speed_limit import held_back
-from torchtrack.start_check import check_in_view
-from torchtrack.state import StepResult, TrackerState, choose_rows
-from torchtrack.step_check import check_step
-from torchtrack.tracked_objects import TrackedObjects
+from torchtrack.tracking.adapt import Lesson, learned_after, objects_as_known
 from torchtrack.tracking.adaptation.pixel_latency import LOOK_US, dated, late_share_after
 from torchtrack.tracking.association.observations import Observations, corner_observations, join, select_events
 from torchtrack.tracking.association.weighting_features import Evidence, judged
@@ -38,8 +29,11 @@ from torchtrack.tracking.frontend.sensors import farthest_event_px
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.frontend.window_events import ObjectEvents
+from torchtrack.tracking.graphs import CompiledStep
+from torchtrack.tracking.initialization import check_poses, first_state, held_back, of_unknown_motion, to_be_parted
 from torchtrack.tracking.motion.predict import forecast
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.axis_rotation import may_have_turned
 from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere
 from torchtrack.tracking.relocalization.refine import rehearse
@@ -56,10 +50,13 @@ from torchtrack.tracking.relocalization.triggers import (
     looked_for_anew,
     searches,
 )
+from torchtrack.tracking.start_check import check_in_view
+from torchtrack.tracking.state import StepResult, TrackerState, choose_rows
+from torchtrack.tracking.step_check import check_step
+from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.measures import asked_apart
 from torchtrack.tracking.validation.scored_fit import explained_at_rest, judge_fit
 from torchtrack.tracking.validation.status import Status
-from torchtrack.window_parts import of_unknown_motion, to_be_parted
 
 _QUESTIONS = host_sync.Questions()
 
@@ -77,7 +74,7 @@ class Tracker(TrackedObjects):
             ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
             comes with the package, for what ``matching.learned_trust`` says. Other poses that a search tries are aligned
             without it.
-        compiled: whether steady windows are taken by compiled graphs, see :mod:`torchtrack.compiled`.
+        compiled: whether steady windows are taken by compiled graphs, see :mod:`torchtrack.tracking.graphs`.
         kernels: whether Numba's kernels are used where they apply, see :mod:`torchtrack.kernels`.
 
     Raises:

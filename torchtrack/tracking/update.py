@@ -11,7 +11,6 @@ from torchtrack.core import dispatch, host_sync, lie
 from torchtrack.core.linalg import inverse
 from torchtrack.kernels.arrays import as_arrays
 from torchtrack.kernels.settings import ConclusionSettings
-from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracking.association.polarity import is_seen_well, remembered
 from torchtrack.tracking.association.weights import ON_CONTOUR_PX
 from torchtrack.tracking.contours.points import Contours, reproject
@@ -20,6 +19,7 @@ from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import Acceleration, fade, found_acceleration, left_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.triggers import SMEARED, in_doubt
+from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.measures import visible_share
 from torchtrack.tracking.validation.scored_fit import Found
 from torchtrack.tracking.validation.status import (

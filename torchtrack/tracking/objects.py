@@ -8,11 +8,11 @@ from torch.nn.functional import pad
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import Camera
+from torchtrack.errors import ModelError
 from torchtrack.model_trust import element_groups
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourModel, group_by_model
 from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, stacked, symmetry_planes, turning_axis
-from torchtrack.setup_check import check_setup
 from torchtrack.tracking.association.weighting_network import LimbTrust, TrustNetwork, shipped_weigher
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
@@ -24,7 +24,7 @@ from torchtrack.tracking.relocalization.triggers import mirrors, turns
 
 
 class TrackedObjects(nn.Module):
-    """The objects of a tracker, in its streams; arguments as those of :class:`torchtrack.tracker.Tracker`."""
+    """The objects of a tracker, in its streams; arguments as those of :class:`torchtrack.tracking.tracker.Tracker`."""
 
     intrinsics: Tensor
     ideal_pixels: Tensor
@@ -148,3 +148,18 @@ class TrackedObjects(nn.Module):
     def streams(self) -> int:
         """Number of event streams."""
         return len(self.ideal_pixels)
+
+
+def check_setup(objects: Sequence[ObjectModel], cameras: Sequence[Camera], streams: Sequence[int], config: TrackerConfig) -> None:
+    """Raise ``ValueError`` unless objects, cameras and streams fit together, and ``ModelError`` for a model without contours."""
+    if not objects:
+        raise ValueError("a tracker needs at least one object.")
+    if len(streams) != len(objects):
+        raise ValueError(f"stream_index needs one entry per object: got {len(streams)} for {len(objects)} objects.")
+    if not all(0 <= s < len(cameras) for s in streams):
+        raise ValueError(f"stream_index must be within the {len(cameras)} cameras given (one per stream), got {streams}.")
+    for model in objects:
+        if config.contours.source == "splat" and len(model.surface_points) == 0:
+            raise ModelError(
+                f"'{model.name}' has no surface to take splatted contours from: give a mesh, or set contours.source to 'mesh', which takes polylines."
+            )

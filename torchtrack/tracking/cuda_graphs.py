@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtrack.state import each_tensor
+from torchtrack.tracking.state import each_tensor
 
 _Function = Callable[..., tuple[Any, ...]]
 
@@ -93,7 +93,7 @@ def _held(tensor: Tensor) -> Tensor:
 
 
 def _tensors(*values: Any) -> Iterator[Tensor]:
-    """All tensors of dataclasses, of those within them, or themselves, in the order of :func:`~torchtrack.state.each_tensor`."""
+    """All tensors of dataclasses, of those within them, or themselves, in the order of :func:`~torchtrack.tracking.state.each_tensor`."""
     for value in values:
         if torch.is_tensor(value):
             yield value

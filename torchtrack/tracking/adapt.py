@@ -8,12 +8,12 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.model_trust import judge_elements
-from torchtrack.state import StepResult, TrackerState
 from torchtrack.tracking.adaptation.surface_learning import Surroundings, learn_after
 from torchtrack.tracking.association.polarity import expected_polarity, is_asked
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.scored_fit import Found
 from torchtrack.tracking.validation.status import Status
 
