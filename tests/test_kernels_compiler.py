@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 
-INNER = "from torchtrack.kernels.compiler import kernel\n\n\n@kernel()\ndef inner(x):\n    return x + {more}\n"
-OUTER = "from inner import inner\nfrom torchtrack.kernels.compiler import kernel\n\n\n@kernel()\ndef outer(x):\n    return 10 * inner(x)\n"
+INNER = "from torchtrack.backends.numba.compiler import kernel\n\n\n@kernel()\ndef inner(x):\n    return x + {more}\n"
+OUTER = "from inner import inner\nfrom torchtrack.backends.numba.compiler import kernel\n\n\n@kernel()\ndef outer(x):\n    return 10 * inner(x)\n"
 ASK = "import sys; sys.path.insert(0, sys.argv[1]); from outer import outer; print(outer(1), sum(outer.stats.cache_hits.values()))"
 
 
@@ -27,7 +27,7 @@ def test_a_kernel_is_compiled_anew_when_one_that_it_calls_has_changed(tmp_path):
 
 
 def test_kernels_compile_where_nothing_can_be_cached(monkeypatch):
-    from torchtrack.kernels import compiler
+    from torchtrack.backends.numba import compiler
 
     compile_function = compiler.numba.njit
 

@@ -269,7 +269,7 @@ def test_without_numba_the_error_names_the_extra(monkeypatch):
     for name in ("rasterizer", "shading", "raster_drawer"):
         monkeypatch.delitem(sys.modules, f"torchtrack.sim.{name}", raising=False)
         monkeypatch.delattr(torchtrack.sim, name, raising=False)
-    monkeypatch.delitem(sys.modules, "torchtrack.kernels.compiler", raising=False)
+    monkeypatch.delitem(sys.modules, "torchtrack.backends.numba.compiler", raising=False)
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'torchtrack\[sim\]'"):
         Renderer([square()], CAMERA, plain_background(64, 48, 0.1))

@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.core import dispatch, host_sync
-from torchtrack.kernels.arrays import as_arrays
 
 
 def solve_factored(right: Float[Tensor, "b n k"], factor: Float[Tensor, "b n n"]) -> Float[Tensor, "b n k"]:
@@ -27,7 +27,7 @@ def inverse(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:
     """
     if dispatch.apply_to(matrices):
         # Not at the top: Numba is an extra.
-        from torchtrack.kernels.filtering import invert
+        from torchtrack.backends.numba.filtering import invert
 
         inverses = torch.empty_like(matrices, memory_format=torch.contiguous_format)
         invert(*as_arrays(matrices, inverses))

@@ -11,7 +11,7 @@ few cache lines, and a pixel's samples are tested in one go. Coordinates are flo
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.backends.numba.compiler import Array, kernel
 
 # A triangle is seen edge-on, or is a sliver, when its volume with the camera is below this share of its corners' distances.
 _SLIVER = 1e-13

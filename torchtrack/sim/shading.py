@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.backends.numba.compiler import Array, kernel
 
 Triple = tuple[float, float, float]
 

@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, lie
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.events import EventBatch, stream_bounds
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import PoseError
-from torchtrack.kernels.arrays import as_arrays
 from torchtrack.model_trust import ModelTrust
 from torchtrack.tracking.adaptation.learned_contours import LearnedContours
 from torchtrack.tracking.adaptation.pixel_latency import unknown_circuits
@@ -140,7 +140,7 @@ def of_unknown_motion(state: TrackerState, t_us: Int[Tensor, "s"], objects: Obje
 def _of_unknown_motion_by_kernel(state: TrackerState, t_us: Int[Tensor, "s"], objects: ObjectBatch, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """:func:`of_unknown_motion`, object by object."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.filtering import find_unknown_motion
+    from torchtrack.backends.numba.filtering import find_unknown_motion
 
     is_unknown = torch.empty_like(objects.stream_index, dtype=torch.bool)
     own = as_arrays(objects.centre_obj, objects.intrinsics[:, 0], objects.diameter_m, objects.stream_index, t_us - state.t_us)

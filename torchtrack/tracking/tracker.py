@@ -75,7 +75,7 @@ class Tracker(TrackedObjects):
             comes with the package, for what ``matching.learned_trust`` says. Other poses that a search tries are aligned
             without it.
         compiled: whether steady windows are taken by compiled graphs, see :mod:`torchtrack.tracking.graphs`.
-        kernels: whether Numba's kernels are used where they apply, see :mod:`torchtrack.kernels`.
+        kernels: whether Numba's kernels are used where they apply, see :mod:`torchtrack.backends.numba`.
 
     Raises:
         ConfigError: if graphs are asked for, and this version of PyTorch cannot make them.

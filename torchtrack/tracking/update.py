@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import ConclusionSettings
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync, lie
 from torchtrack.core.linalg import inverse
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import ConclusionSettings
 from torchtrack.tracking.association.polarity import is_seen_well, remembered
 from torchtrack.tracking.association.weights import ON_CONTOUR_PX
 from torchtrack.tracking.contours.points import Contours, reproject
@@ -139,7 +139,7 @@ def _judged_by_kernel(
 ) -> _Judgement:
     """:func:`_judged`, object by object; ``expected`` is the prediction's acceleration."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels import conclusion as kernels
+    from torchtrack.backends.numba import conclusion as kernels
 
     objects, solution, batch = prediction.objects, found.fit.solution, len(dt_s)
     in_view = visible_share(found.fit.contours, objects.image_size)

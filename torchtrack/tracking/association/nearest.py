@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.linalg import vecdot
 
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import TableSettings
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.core import dispatch
 from torchtrack.core.image_velocity import MovingObjects
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import TableSettings
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.observations import Observations
@@ -83,7 +83,7 @@ class ContourTable:
 def _table_by_kernel(contours: Contours, index: ContourIndex, polarity: Tensor | None, *, of_print: bool, close_px: float) -> ContourTable:
     """:meth:`ContourTable.of`, point by point."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels import table as kernels
+    from torchtrack.backends.numba import table as kernels
 
     limb, crease, texture = (int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
     close = ASIDE_PX, PARALLEL, APART_PX, TOUCHING_PX, DEPTH_SHARE, SORTED_PX2

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.core import dispatch
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.padded import take_points
-from torchtrack.kernels.arrays import as_arrays
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.window_events import GOLDEN_RATIO, ObjectEvents, laid_out
@@ -75,7 +75,7 @@ def _selected_by_kernel(
 ) -> tuple[Float[Tensor, "b c 5"], Bool[Tensor, "b c"]]:
     """What is told of the events that :func:`select_events` takes, and which there are, event by event."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.selection import select
+    from torchtrack.backends.numba.selection import select
 
     rows, own, counts = laid_out(events)
     number = torch.arange(rows.mask.shape[1]).expand(len(rows.mask), -1) if rows.number is None else rows.number

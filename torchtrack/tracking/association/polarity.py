@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.core import dispatch
-from torchtrack.kernels.arrays import as_arrays
 
 # Directions that are told apart.
 _OCTANTS = 8
@@ -75,7 +75,7 @@ def remembered(
     """
     if dispatch.apply_to(dark):
         # Not at the top: Numba is an extra.
-        from torchtrack.kernels.quality import remember
+        from torchtrack.backends.numba.measures import remember
 
         after = darker_outside.clone(memory_format=torch.contiguous_format)
         remember(*as_arrays(after, directions.transpose(1, 2), dark, weights, window_s), memory_s, _LITTLE_EVIDENCE)

@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import softsign
 
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import PatchSettings
 from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
 from torchtrack.core.padded import take_points
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import PatchSettings
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.index import ContourIndex
@@ -160,7 +160,7 @@ def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Bool[Tens
 def _limb_features_by_kernel(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
     """:func:`limb_features`, observation by observation."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.trust import describe
+    from torchtrack.backends.numba.limb_features import describe
 
     observations, contours, index, history = evidence.observations, evidence.contours, evidence.index, evidence.history
     moving, (events, own, counts) = evidence.prediction.moving(compensated=True), laid_out(evidence.seen)

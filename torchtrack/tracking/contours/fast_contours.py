@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import SamplingSettings
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import SamplingSettings
 from torchtrack.object_model.contour_source import ContourModel
 
 # What of a model its contour points are sampled from, beside the faces.
@@ -20,7 +20,7 @@ def mesh_points(
 ) -> tuple[Tensor, ...]:
     """Points and tangents ``[b, m, 3]``, kinds and mask of all objects' contours, before hidden parts are removed."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels import contours as kernels
+    from torchtrack.backends.numba import contours as kernels
 
     batch, room = len(T_cam_obj), settings.max_edge_points + max(len(model.texture_points) for model in models)
     sampled = T_cam_obj.new_empty(batch, kernels.SAMPLED, room).numpy()
@@ -43,7 +43,7 @@ def projected(
 ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m 2"]]:
     """Points in the camera's frame, and their pixels."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.contours import project as by_kernel
+    from torchtrack.backends.numba.contours import project as by_kernel
 
     points = points_obj.transpose(1, 2)
     points_cam, pixels = points.new_empty(points.shape), points.new_empty(len(points), 2, points.shape[2])
@@ -61,7 +61,7 @@ def shown(
 ) -> tuple[Tensor, ...]:
     """Which contour points show at a pose, and all of them in the camera's frame, their pixels, and their normals in the image."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.contours import show
+    from torchtrack.backends.numba.contours import show
 
     points, tangents = points_obj.transpose(1, 2), tangents_obj.transpose(1, 2)
     points_cam, pixels, normals, is_shown = points.new_empty(points.shape), *points.new_empty(2, len(mask), 2, mask.shape[1]), torch.empty_like(mask)

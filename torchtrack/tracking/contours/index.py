@@ -14,11 +14,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import Cells, IndexSettings
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.constants import constant, disc
 from torchtrack.core.padded import take_points
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import Cells, IndexSettings
 from torchtrack.tracking.contours.points import Contours
 
 # Squared distances are compared in these fractions of a pixel².
@@ -151,7 +151,7 @@ def index_contours(
 def _by_kernel(contours: Contours, image_size: tuple[int, int], answer: host_sync.Answer, cell_px: int) -> ContourIndex:
     """:func:`index_contours`, point by point."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels import index as kernels
+    from torchtrack.backends.numba import index as kernels
 
     margin = _reach(max([0, *answer.numbers()]), cell_px) + 2
     middle = 0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)

@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.backends.numba.parameters import SamplingSettings
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.lie import affine, transform_points
 from torchtrack.core.padded import select_ranked
-from torchtrack.kernels.settings import SamplingSettings
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.tracking.contours import fast_contours
 

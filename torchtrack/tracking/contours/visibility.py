@@ -13,13 +13,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import GridSettings
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.lie import affine, transform_points
 from torchtrack.core.padded import bounds
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import GridSettings
 from torchtrack.object_model.contour_source import ContourModel
 from torchtrack.tracking.contours.points import Contours
 
@@ -109,7 +109,7 @@ def _hidden_by_self(scene: Scene, contours: Contours) -> Tensor:
 def _hidden_by_self_by_kernel(scene: Scene, contours: Contours, hidden: Tensor) -> Tensor:
     """:func:`_hidden_by_self`, object by object."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.visibility import hide_behind_faces
+    from torchtrack.backends.numba.visibility import hide_behind_faces
 
     points = as_arrays(contours.points_cam.transpose(1, 2), contours.mask)
     T_cam_obj, tolerance_m = as_arrays(scene.T_cam_obj, _ON_FACE * scene.diameters_m)
@@ -248,7 +248,7 @@ def _hidden_in_buffer_by_kernel(
 ) -> Tensor:
     """:func:`_hidden_in_buffer`, sample by sample and point by point."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels import visibility as kernels
+    from torchtrack.backends.numba import visibility as kernels
 
     streams, height, width = scene.image_shape
     hidden, margin_m, first = torch.zeros_like(contours.mask), config.depth_margin * scene.diameters_m, np.empty((streams, 2))

@@ -4,11 +4,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import MatchingSettings, RoundSettings
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import MatchingSettings, RoundSettings
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.nearest import ContourTable
 from torchtrack.tracking.association.observations import Observations
@@ -48,8 +48,8 @@ def align_rounds(
         finely: objects whose contours are looked up finely.
     """
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels import matching as rows
-    from torchtrack.kernels import rounds
+    from torchtrack.backends.numba import matching as rows
+    from torchtrack.backends.numba import rounds
 
     objects, (batch, count) = prediction.objects, observations.mask.shape
     # What the kernel writes to lies row by row in memory: of anything else it would be given a copy.

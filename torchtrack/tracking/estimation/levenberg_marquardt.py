@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import DampingSettings, SolvingSettings
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import MIN_DEPTH_M
@@ -19,8 +21,6 @@ from torchtrack.core.constants import constant
 from torchtrack.core.image_velocity import pose_jacobian
 from torchtrack.core.lie import affine, small_difference_about, turned
 from torchtrack.core.linalg import solve_factored, solve_positive
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import DampingSettings, SolvingSettings
 from torchtrack.tracking.estimation.robust_loss import LOSSES, robust_loss, robust_weight
 from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, WindowTerms
 
@@ -219,7 +219,7 @@ def solve_pose(
 def _solved_by_kernel(problem: PoseProblem, T_start: Tensor, config: SolverConfig, from_prior: Tensor) -> Linearisation:
     """:func:`solve_pose`, object by object."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.solving import solve_poses
+    from torchtrack.backends.numba.solving import solve_poses
 
     window = problem.window or _no_window(problem)
     T_cam_obj, offset = (value.detach().clone(memory_format=torch.contiguous_format) for value in (T_start, from_prior))

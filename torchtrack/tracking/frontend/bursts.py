@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
 from torchtrack.core.events import PaddedEvents
-from torchtrack.kernels.arrays import as_arrays
 
 # Ages (µs) are kept in 16 bits; it does not matter by how much longer ago a burst began.
 LONG_AGO_US = 32_000
@@ -67,7 +67,7 @@ def _update_by_kernel(
 ) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
     """:func:`update_bursts`, one event after the other."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.events import update_bursts as update
+    from torchtrack.backends.numba.events import update_bursts as update
 
     ages, into_us = torch.empty(burst_age_us.shape, dtype=torch.int16), torch.empty(events.mask.shape, dtype=torch.int16)
     update(*as_arrays(*vars(events).values(), elapsed_us), longest_us, LONG_AGO_US, *as_arrays(burst_age_us, ages, into_us))

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.core.events import EventBatch, PaddedEvents, check_on_sensor, of_streams, pad_streams
-from torchtrack.kernels.arrays import as_arrays
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
 from torchtrack.tracking.frontend.corners import Corners, detect_corners, no_corners
@@ -116,7 +116,7 @@ class Sensors:
     def _seen_by_kernel(self, window: PaddedEvents, into_burst_us: Int[Tensor, "s e"]) -> WindowEvents:
         """:meth:`seen`, event by event."""
         # Not at the top: Numba is an extra.
-        from torchtrack.kernels import events as kernels
+        from torchtrack.backends.numba import events as kernels
 
         batch = len(self.stream_index)
         # What all see alike is written once.
@@ -131,7 +131,7 @@ class Sensors:
     ) -> tuple[ObjectEvents, Int[Tensor, "s 2 h w"]]:
         """The events in tiles near each object, as it saw them, and the bursts' ages with them, event by event."""
         # Not at the top: Numba is an extra.
-        from torchtrack.kernels import events as kernels
+        from torchtrack.backends.numba import events as kernels
 
         events = of_streams(events, 1)
         (numbers, count), batch = tiles.numbers_near(events, near), len(near)

@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import TileSettings
 from torchtrack.core import dispatch
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.constants import constant
 from torchtrack.core.events import EventBatch, check_on_sensor
 from torchtrack.core.lie import transform_points
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import TileSettings
 from torchtrack.tracking.motion.prediction import Prediction
 
 # Side of a tile (px, as a power of two).
@@ -94,7 +94,7 @@ class SensorTiles(nn.Module):
     def _near_by_kernel(self, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
         """:meth:`near`, tile by tile."""
         # Not at the top: Numba is an extra.
-        from torchtrack.kernels.events import near_tiles
+        from torchtrack.backends.numba.events import near_tiles
 
         objects = prediction.objects
         near = torch.empty(len(window_s), len(self.middle), dtype=torch.bool)
@@ -129,7 +129,7 @@ class SensorTiles(nn.Module):
             EventDataError: if an event is outside the sensor.
         """
         # Not at the top: Numba is an extra.
-        from torchtrack.kernels.events import keep
+        from torchtrack.backends.numba.events import keep
 
         kept = np.empty(len(events) + 1, np.int64)
         count = int(keep(*as_arrays(events.x, events.y, near.any(0)), TILE_BITS, self.columns, self.width, self.height, kept))

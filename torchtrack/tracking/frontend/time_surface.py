@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.events import EventBatch, check_on_sensor, stream_bounds
 from torchtrack.core.padded import bounds
-from torchtrack.kernels.arrays import as_arrays
 
 # Time of a pixel that never fired: far in the past, and its age still fits int64 microseconds.
 NEVER_US = -(2**62)
@@ -64,7 +64,7 @@ def update_last_event(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -
 def _update_by_kernel(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -> Int[Tensor, "s h w"]:
     """:func:`update_last_event`, one event after the other."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.events import newest
+    from torchtrack.backends.numba.events import newest
 
     updated = last_event_us.clone(memory_format=torch.contiguous_format)
     if not newest(*as_arrays(events.x, events.y, events.t_us, stream_bounds(events, len(updated)), updated)):

@@ -4,11 +4,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import ForecastSettings
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
 from torchtrack.core import dispatch, lie
 from torchtrack.core.camera import MIN_DEPTH_M
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import ForecastSettings
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import (
     MOST_UNCERTAIN,
@@ -67,7 +67,7 @@ def _by_kernel(
 ) -> Prediction:
     """:func:`forecast`, object by object."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels import forecast as kernels
+    from torchtrack.backends.numba import forecast as kernels
 
     batch, axes = len(dt_s), far_pose.new_empty(0, 3) if axes_obj is None else axes_obj
     T_prior, usable = far_pose.new_empty(batch, 4, 4), torch.empty(batch, dtype=torch.bool)

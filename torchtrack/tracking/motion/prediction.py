@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core import dispatch
 from torchtrack.core.camera import MIN_DEPTH_M
@@ -14,7 +15,6 @@ from torchtrack.core.image_velocity import MovingObjects, pixel_velocity, pose_j
 from torchtrack.core.lie import retract_about, step_about, transform_points
 from torchtrack.core.linalg import inverse
 from torchtrack.core.padded import select_ranked, take_points
-from torchtrack.kernels.arrays import as_arrays
 from torchtrack.tracking.contours.objects import ObjectBatch, repeat_row
 from torchtrack.tracking.contours.points import Contours, assemble
 from torchtrack.tracking.motion.model import Acceleration
@@ -102,7 +102,7 @@ class Prediction:
         """Poses half a window of length ``dt_s`` earlier; those at its end where they would not be before the camera."""
         if dispatch.apply_to(self.T_cam_obj):
             # Not at the top: Numba is an extra.
-            from torchtrack.kernels.forecast import in_mid_window
+            from torchtrack.backends.numba.forecast import in_mid_window
 
             middle = torch.empty_like(self.T_cam_obj, memory_format=torch.contiguous_format)
             in_mid_window(*as_arrays(self.T_cam_obj, self.velocity, dt_s, self.objects.centre_obj), MIN_DEPTH_M, MAX_DEPTH_M, middle.numpy())
@@ -164,7 +164,7 @@ class Prediction:
     def _sigma_px_by_kernel(self, contours: Contours) -> Float[Tensor, "b"]:
         """:meth:`sigma_px`, point by point."""
         # Not at the top: Numba is an extra.
-        from torchtrack.kernels.quality import variance_across
+        from torchtrack.backends.numba.measures import variance_across
 
         variance = contours.pixels.new_empty(len(contours.mask))
         seen = as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.mask)

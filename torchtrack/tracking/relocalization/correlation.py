@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.fft import irfft2, rfft2
 from torch.nn.functional import avg_pool2d, max_pool2d
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
-from torchtrack.kernels.arrays import as_arrays
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.view_sphere import outlines_by_view
@@ -121,7 +121,7 @@ def _peaks(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tuple[F
     """The highest cells of each map, none of which is close to a higher one, and which they are; of cells that are allowed alone."""
     if dispatch.apply_to(fit):
         # Not at the top: Numba is an extra.
-        from torchtrack.kernels.shifts import peaks
+        from torchtrack.backends.numba.hypotheses import peaks
 
         best, place = fit.new_full((len(fit), _SHIFTS), _NONE), torch.empty(len(fit), _SHIFTS, dtype=torch.int64)
         peaks(*as_arrays(fit, allowed), _APART, *as_arrays(best, place))

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core import dispatch
 from torchtrack.core.lie import difference_about
 from torchtrack.core.linalg import inverse
-from torchtrack.kernels.arrays import as_arrays
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 from torchtrack.tracking.estimation.terms import PoseProblem
@@ -70,7 +70,7 @@ def found(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> t
 def _found_by_kernel(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
     """:func:`found`, point by point."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.event_pull import find
+    from torchtrack.backends.numba.hypotheses import find
 
     targets, weights = image.new_empty(*outlines.mask.shape, 2), image.new_empty(outlines.mask.shape)
     points = as_arrays(outlines.pixels.transpose(1, 2), outlines.normals.transpose(1, 2), outlines.mask)

@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.core.lie import difference_about
-from torchtrack.kernels.arrays import as_arrays
 from torchtrack.tracking.contours.points import Contours, assemble, sampling_settings
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.correlation import shifted
@@ -129,7 +129,7 @@ def _marked_by_kernel(
 ) -> Float[Tensor, "n"]:
     """:func:`mark`, point by point."""
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.contours import mark as by_kernel
+    from torchtrack.backends.numba.contours import mark as by_kernel
 
     marks = image.new_empty(len(T_cam_obj))
     points = as_arrays(outlines.points_obj.transpose(1, 2), outlines.tangents_obj.transpose(1, 2), outlines.mask)

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.parameters import QualitySettings
 from torchtrack.config.search import QualityConfig
 from torchtrack.core import dispatch
 from torchtrack.core.host_sync import none_of
 from torchtrack.core.image_velocity import MovingObjects, pixel_velocity
-from torchtrack.kernels.arrays import as_arrays
-from torchtrack.kernels.settings import QualitySettings
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.weights import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SMEAR_PX, on_and_around, patch, patch_sums
 from torchtrack.tracking.contours.points import Contours
@@ -71,7 +71,7 @@ def shares(
         measured = measured_share(contours, matches, velocity, image_size, config)
         return measured, gathered_share(matches, config), directions_apart(matches)
     # Not at the top: Numba is an extra.
-    from torchtrack.kernels.quality import shares as by_kernel
+    from torchtrack.backends.numba.measures import shares as by_kernel
 
     measured, gathered, apart = contours.pixels.new_empty(3, len(contours.mask))
     shown = as_arrays(*(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask)
@@ -157,7 +157,7 @@ def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tens
     """Share of an object's contour points that lie in the image; zero without any."""
     if dispatch.apply_to(contours.pixels):
         # Not at the top: Numba is an extra.
-        from torchtrack.kernels.quality import visible
+        from torchtrack.backends.numba.measures import visible
 
         share = contours.pixels.new_empty(len(contours.mask))
         visible(*as_arrays(contours.pixels.transpose(1, 2), contours.mask), *image_size, share.numpy())

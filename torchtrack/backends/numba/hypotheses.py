@@ -1,8 +1,36 @@
-"""The shifts at which outlines fit best: of :mod:`torchtrack.tracking.relocalization.correlation`, cell by cell."""
+"""Where contour points find events along their normals: :func:`torchtrack.tracking.relocalization.edge_search.found`, point by point."""
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.contours import at
+
+
+@kernel(fastmath=FAST)
+def find(
+    pixels: Array, normals: Array, mask: Array, image: Array, border_px: int, reach_px: float, looks: int, targets: Array, weights: Array
+) -> None:
+    """The place with most events along the normal of each contour point, rather near by, and how much that counts.
+
+    Args:
+        pixels, normals, mask: ``[k, 2, m]`` and ``[k, m]``.
+        image: ``[h, w]``, with a border of ``border_px``.
+        reach_px: how far each looks, at so many ``looks``.
+        targets, weights: ``[k, m, 2]`` and ``[k, m]``, filled.
+    """
+    flat, height, width = image.ravel(), float(image.shape[0]), float(image.shape[1])
+    step_px = np.linspace(-reach_px, reach_px, looks)
+    near = 1.0 - np.abs(step_px) / (reach_px + 1.0)
+    for k in range(len(mask)):
+        for i in range(mask.shape[1]):
+            u, v, nu, nv = pixels[k, 0, i], pixels[k, 1, i], normals[k, 0, i], normals[k, 1, i]
+            most, place = 0.0, 0
+            if mask[k, i]:
+                for j in range(looks):
+                    there = at(flat, width, height, u + step_px[j] * nu, v + step_px[j] * nv, border_px) * near[j]
+                    place = j if there > most else place
+                    most = max(there, most)
+            targets[k, i, 0], targets[k, i, 1], weights[k, i] = u + step_px[place] * nu, v + step_px[place] * nv, most
 
 
 @kernel()

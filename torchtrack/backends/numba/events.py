@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.motion import Numbers, entries, lens, placed
-from torchtrack.kernels.settings import TileSettings
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import Numbers, entries, lens, placed
+from torchtrack.backends.numba.parameters import TileSettings
 
 # Rows of what an object sees of an event.
 PIXELS, AGE, INTO_BURST, POLARITY = 0, 2, 3, 4

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.look_up import nearest, nearest_of_four
-from torchtrack.kernels.motion import Numbers, across, inverse_depth, placed
-from torchtrack.kernels.settings import Cells, MatchingSettings
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import Numbers, across, inverse_depth, placed
+from torchtrack.backends.numba.look_up import nearest, nearest_of_four
+from torchtrack.backends.numba.parameters import Cells, MatchingSettings
 
 # Rows of what was observed.
 U, V, AGE, INTO_BURST, POLARITY, TRUST = range(6)
@@ -61,7 +61,7 @@ def match(
         seen: ``[6, n]``, and which of them exist.
         place: ``[n, 2]``.
         table: ``[m, COLUMNS]``.
-        pose, intrinsics: of the object, from :mod:`torchtrack.kernels.motion`; so are its ``motion``, and its ``change`` by an acceleration.
+        pose, intrinsics: of the object, from :mod:`torchtrack.backends.numba.geometry`; so are its ``motion``, and its ``change`` by an acceleration.
         contour, is_near, is_matched, matches: filled; ``[n]``, and ``[ROWS, n]``. Weights are those of ``match_nearest``.
         votes: room for ``[patches², 3]``.
     """

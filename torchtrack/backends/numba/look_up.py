@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.settings import Cells
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.parameters import Cells
 
 _NOWHERE = 1e30
 

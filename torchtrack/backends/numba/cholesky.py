@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
+from torchtrack.backends.numba.compiler import Array, kernel
 
 
 @kernel()

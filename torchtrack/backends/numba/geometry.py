@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
 
 Numbers = tuple[float, ...]
 

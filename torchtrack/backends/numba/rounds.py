@@ -5,8 +5,9 @@ One Gauss-Newton step a round, as :func:`torchtrack.tracking.estimation.levenber
 
 import numpy as np
 
-from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.matching import (
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import Numbers, at_depth, centre_of, drift, entries, lens
+from torchtrack.backends.numba.matching import (
     AGE,
     DIRECTION_U,
     DIRECTION_V,
@@ -23,9 +24,8 @@ from torchtrack.kernels.matching import (
     believe,
     match,
 )
-from torchtrack.kernels.motion import Numbers, at_depth, centre_of, drift, entries, lens
-from torchtrack.kernels.settings import Cells, DampingSettings, MatchingSettings, RoundSettings
-from torchtrack.kernels.solving import damped_step, move, normal_equations, row_of
+from torchtrack.backends.numba.parameters import Cells, DampingSettings, MatchingSettings, RoundSettings
+from torchtrack.backends.numba.solving import damped_step, move, normal_equations, row_of
 
 # Pose, velocity and swelling; and their residual, in the rows of a Jacobian.
 UNKNOWNS, _RESIDUAL = 13, 13

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from torchtrack.kernels.cholesky import factorise, solve
-from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.motion import Numbers, centre_of, entries, inverse_depth, is_finite, lens, turn, turned
-from torchtrack.kernels.settings import DampingSettings, SolvingSettings
+from torchtrack.backends.numba.cholesky import factorise, solve
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import Numbers, centre_of, entries, inverse_depth, is_finite, lens, turn, turned
+from torchtrack.backends.numba.parameters import DampingSettings, SolvingSettings
 
 # Sums of products run along as many observations at a time: what they need stays in the fastest memory.
 _ALONG = FAST | {"reassoc"}

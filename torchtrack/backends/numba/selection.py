@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.look_up import nearest
-from torchtrack.kernels.motion import at_depth, drift, lens
-from torchtrack.kernels.settings import Cells
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import at_depth, drift, lens
+from torchtrack.backends.numba.look_up import nearest
+from torchtrack.backends.numba.parameters import Cells
 
 
 @kernel(fastmath=FAST)

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.matching import patch
-from torchtrack.kernels.motion import across, drift, inverse_depth, lens
-from torchtrack.kernels.settings import QualitySettings
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import across, drift, inverse_depth, lens
+from torchtrack.backends.numba.matching import patch
+from torchtrack.backends.numba.parameters import QualitySettings
 
 
 @kernel(fastmath=FAST)

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
-from torchtrack.kernels.filtering import inverse
-from torchtrack.kernels.motion import centre_of, is_finite
-from torchtrack.kernels.settings import ConclusionSettings
+from torchtrack.backends.numba.compiler import Array, kernel
+from torchtrack.backends.numba.filtering import inverse
+from torchtrack.backends.numba.geometry import centre_of, is_finite
+from torchtrack.backends.numba.parameters import ConclusionSettings
 
 # As torchtrack.tracking.validation.status.Status.
 TRACKING, UNCERTAIN, LOST, TOO_FEW_EVENTS, OUT_OF_VIEW, DIVERGED = range(6)

@@ -19,7 +19,7 @@ class Cells(NamedTuple):
 
 
 class MatchingSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.matching` goes by: settings, and constants of :mod:`torchtrack.tracking.association.weights`."""
+    """What :mod:`torchtrack.backends.numba.matching` goes by: settings, and constants of :mod:`torchtrack.tracking.association.weights`."""
 
     burst_px: float
     dark_shift_px: float
@@ -42,7 +42,7 @@ class MatchingSettings(NamedTuple):
 
 
 class RoundSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.rounds` goes by beside that: settings, and constants of :mod:`torchtrack.tracking.estimation.levenberg_marquardt`."""
+    """What :mod:`torchtrack.backends.numba.rounds` goes by beside that: settings, and constants of :mod:`torchtrack.tracking.estimation.levenberg_marquardt`."""
 
     compensated: bool
     velocity_in_window: bool
@@ -62,7 +62,7 @@ class DampingSettings(NamedTuple):
 
 
 class SolvingSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.solving` goes by beside that.
+    """What :mod:`torchtrack.backends.numba.solving` goes by beside that.
 
     Args:
         loss: none (0), Huber (1) or Tukey (2).
@@ -79,7 +79,7 @@ class SolvingSettings(NamedTuple):
 
 
 class IndexSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.index` goes by: constants of :mod:`torchtrack.tracking.contours.index`, and the image.
+    """What :mod:`torchtrack.backends.numba.index` goes by: constants of :mod:`torchtrack.tracking.contours.index`, and the image.
 
     Args:
         middle_u, middle_v: of the image (px).
@@ -100,7 +100,7 @@ class IndexSettings(NamedTuple):
 
 
 class TableSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.table` goes by: settings, and constants of :mod:`torchtrack.tracking.association.weights`.
+    """What :mod:`torchtrack.backends.numba.contour_table` goes by: settings, and constants of :mod:`torchtrack.tracking.association.weights`.
 
     Args:
         limb, crease, texture: numbers of kinds of contours.
@@ -125,7 +125,7 @@ class TableSettings(NamedTuple):
 
 
 class GridSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.visibility` goes by: the layout of depth buffers.
+    """What :mod:`torchtrack.backends.numba.visibility` goes by: the layout of depth buffers.
 
     Args:
         rows, columns: of each stream's.
@@ -147,7 +147,7 @@ class GridSettings(NamedTuple):
 
 
 class SamplingSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.contours` goes by: settings, and constants of :mod:`torchtrack.tracking.contours.points`.
+    """What :mod:`torchtrack.backends.numba.contours` goes by: settings, and constants of :mod:`torchtrack.tracking.contours.points`.
 
     Args:
         occluding: whether edges between a front and a back face are contours.
@@ -171,7 +171,7 @@ class SamplingSettings(NamedTuple):
 
 
 class TileSettings(NamedTuple):
-    """What :func:`torchtrack.kernels.events.near_tiles` goes by.
+    """What :func:`torchtrack.backends.numba.events.near_tiles` goes by.
 
     Args:
         sigmas: objects are expected within so many standard deviations of their prediction.
@@ -185,7 +185,7 @@ class TileSettings(NamedTuple):
 
 
 class QualitySettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.quality` goes by: settings, the image, and constants of :mod:`torchtrack.tracking.validation.measures` and ``matching``."""
+    """What :mod:`torchtrack.backends.numba.measures` goes by: settings, the image, and constants of :mod:`torchtrack.tracking.validation.measures` and ``matching``."""
 
     height: int
     width: int
@@ -202,7 +202,7 @@ class QualitySettings(NamedTuple):
 
 
 class ForecastSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.forecast` goes by: settings, and constants of :mod:`torchtrack.tracking.motion.model` and ``prediction``.
+    """What :mod:`torchtrack.backends.numba.forecast` goes by: settings, and constants of :mod:`torchtrack.tracking.motion.model` and ``prediction``.
 
     Args:
         holds: whether objects are expected to stay where they are.
@@ -225,7 +225,7 @@ class ForecastSettings(NamedTuple):
 
 
 class ConclusionSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.conclusion` goes by: settings, and constants of the stages that it stands for.
+    """What :mod:`torchtrack.backends.numba.conclusion` goes by: settings, and constants of the stages that it stands for.
 
     Args:
         holds: whether what failed stays where it was.
@@ -264,7 +264,7 @@ class ConclusionSettings(NamedTuple):
 
 
 class PatchSettings(NamedTuple):
-    """What :mod:`torchtrack.kernels.trust` goes by: constants of :mod:`torchtrack.tracking.association.weighting_features`.
+    """What :mod:`torchtrack.backends.numba.limb_features` goes by: constants of :mod:`torchtrack.tracking.association.weighting_features`.
 
     Args:
         across_px, along_px: where the patch is sampled.

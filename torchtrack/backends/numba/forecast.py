@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
-from torchtrack.kernels.motion import depth_of, inverse_depth, is_finite, turn
-from torchtrack.kernels.settings import ForecastSettings
+from torchtrack.backends.numba.compiler import Array, kernel
+from torchtrack.backends.numba.geometry import depth_of, inverse_depth, is_finite, turn
+from torchtrack.backends.numba.parameters import ForecastSettings
 
 # What is told of each motion: its velocity, and of its acceleration what is expected, its variance, and its rate.
 VELOCITY, EXPECTED, VARIANCE, RATE = range(4)

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.look_up import nearest
-from torchtrack.kernels.motion import Numbers, across, at_depth, drift, inverse_depth, lens
-from torchtrack.kernels.settings import Cells, PatchSettings
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import Numbers, across, at_depth, drift, inverse_depth, lens
+from torchtrack.backends.numba.look_up import nearest
+from torchtrack.backends.numba.parameters import Cells, PatchSettings
 
 # Places are worked out so many at once: what is left over would be, one at a time.
 _AT_ONCE = 32
@@ -51,7 +51,7 @@ def describe(
     Args:
         objects: ``[r]``, which these are.
         u, v, age_s, polarity, mask: ``[e, n]``: events of each object, or one row for all.
-        own, counts: as :func:`torchtrack.kernels.selection.select` takes them.
+        own, counts: as :func:`torchtrack.backends.numba.selection.select` takes them.
         pixels, ages_s, polarities, exists: ``[b, 2, n]`` and ``[b, n]`` of the observations.
         points_cam, normals, kind: ``[b, 3, m]``, ``[b, 2, m]`` and ``[b, m]`` of contour points; ``nearest_of_cell [b, p]`` and
             ``first [b, 2]`` are their index.

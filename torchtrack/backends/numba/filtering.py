@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from torchtrack.kernels.cholesky import factorise, solve
-from torchtrack.kernels.compiler import Array, kernel
-from torchtrack.kernels.motion import depth_of, inverse_depth
+from torchtrack.backends.numba.cholesky import factorise, solve
+from torchtrack.backends.numba.compiler import Array, kernel
+from torchtrack.backends.numba.geometry import depth_of, inverse_depth
 
 # Variances are taken to be no less.
 _LEAST = 1e-30

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.motion import Numbers, entries, inverse_depth, lens, placed, turned
-from torchtrack.kernels.settings import SamplingSettings
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import Numbers, entries, inverse_depth, lens, placed, turned
+from torchtrack.backends.numba.parameters import SamplingSettings
 
 # Rows of a model's table of edges, and of the points sampled on them.
 _START, _VECTOR, _DIRECTION, _TURNING, _KIND = 0, 3, 6, 9, 12

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import Array, kernel
-from torchtrack.kernels.look_up import nearest
-from torchtrack.kernels.matching import COLUMNS, EXPECTED, INDEXED_U, INDEXED_V, LIMB, MISTAKEN, NORMAL_U, NORMAL_V, ORIENTED, X, Y, Z
-from torchtrack.kernels.quality import octant
-from torchtrack.kernels.settings import Cells, TableSettings
+from torchtrack.backends.numba.compiler import Array, kernel
+from torchtrack.backends.numba.look_up import nearest
+from torchtrack.backends.numba.matching import COLUMNS, EXPECTED, INDEXED_U, INDEXED_V, LIMB, MISTAKEN, NORMAL_U, NORMAL_V, ORIENTED, X, Y, Z
+from torchtrack.backends.numba.measures import octant
+from torchtrack.backends.numba.parameters import Cells, TableSettings
 
 __all__ = ["COLUMNS", "fill"]
 

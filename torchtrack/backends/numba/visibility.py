@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from torchtrack.kernels.compiler import FAST, Array, kernel
-from torchtrack.kernels.motion import Numbers, entries, inverse_depth, lens, placed, turned
-from torchtrack.kernels.settings import GridSettings
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import Numbers, entries, inverse_depth, lens, placed, turned
+from torchtrack.backends.numba.parameters import GridSettings
 
 # Deeper than what there is nothing at.
 _DEEPEST = np.iinfo(np.int64).max
