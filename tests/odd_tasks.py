@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from torchtrack.errors import ConfigError
-from torchtrack.executor import run_tasks
+from torchtrack.run.executor import run_tasks
 
 
 def do(task, tell):

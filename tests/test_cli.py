@@ -141,7 +141,7 @@ def test_importing_the_package_loads_nothing_heavy():
 
 def test_importing_a_tracker_leaves_the_compiler_alone():
     """It takes as long to load as PyTorch itself."""
-    code = "import sys, torchtrack.tracking.tracker, torchtrack.executor.on_ray; print('torchtrack.tracking.tracker' in sys.modules, 'torch._dynamo' in sys.modules)"
+    code = "import sys, torchtrack.tracking.tracker, torchtrack.run.executor.on_ray; print('torchtrack.tracking.tracker' in sys.modules, 'torch._dynamo' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.split() == ["True", "False"]
 

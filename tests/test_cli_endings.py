@@ -14,7 +14,7 @@ from tiny_sequence import write_tiny_sequence
 from torchtrack.cli import main
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io import read_tum
-from torchtrack.sinks.folder import ended
+from torchtrack.run.sinks.folder import ended
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_a_signal_outside_a_run_ends_in_good_order(tmp_path, monkeypatch):
 _KILLED = """
 import os, signal, sys
 from torchtrack.config.run import RunConfig
-from torchtrack.runner import run
+from torchtrack.run.runner import run
 class Killing:
     count = 0
     def add(self, step):

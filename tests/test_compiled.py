@@ -20,7 +20,7 @@ from torchtrack.config.tracker import LearningConfig, ModelTrustConfig, TrackerC
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import ConfigError
-from torchtrack.runner import run
+from torchtrack.run.runner import run
 from torchtrack.tracking import graphs
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 

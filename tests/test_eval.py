@@ -12,12 +12,12 @@ from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
 from torchtrack.core.lie import se3_interpolate, so3_exp
 from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
 from torchtrack.eval.evaluate import evaluate, measure
-from torchtrack.eval.metrics import PoseErrors, pose_errors, summarise
 from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table
 from torchtrack.io import Trajectory
 from torchtrack.io.convert import convert
-from torchtrack.sinks.summary import finite
+from torchtrack.run.metrics import PoseErrors, pose_errors, summarise
+from torchtrack.run.sinks.summary import finite
 
 KEYS = (
     *("sequence", "object", "method", "windows", "mean_rotation_deg", "mean_translation_cm", "median_rotation_deg"),

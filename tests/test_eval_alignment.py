@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from torchtrack.eval.alignment import alignment
+from torchtrack.run.sinks.alignment import alignment
 
 
 def line():

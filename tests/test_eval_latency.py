@@ -6,7 +6,7 @@ from torchtrack.config.run import RunConfig
 from torchtrack.errors import EventDataError
 from torchtrack.eval.latency import estimate_latency
 from torchtrack.exit_codes import ExitCode
-from torchtrack.session import open_session
+from torchtrack.run.session import open_session
 from torchtrack.sim import CameraConfig, EventCameraConfig, MotionConfig, ObjectConfig, SceneConfig, simulate, write
 
 LATENCY_US = 6000

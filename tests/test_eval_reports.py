@@ -11,9 +11,9 @@ from torchtrack.config.load import load
 from torchtrack.errors import ConfigError
 from torchtrack.eval.compact import compact_report
 from torchtrack.eval.grid import headings
-from torchtrack.eval.metrics import PoseErrors, summarise
 from torchtrack.eval.paper import check_cells, paper_report, paper_tables
 from torchtrack.eval.results import Evaluation, Failure, NotApplicable, ObjectResult
+from torchtrack.run.metrics import PoseErrors, summarise
 
 
 def result(method, sequence="cube_slow", label="cube", rotation_deg=1.0, translation_cm=0.5, step_ms=10.0):

@@ -12,8 +12,8 @@ import pytest
 from conftest import REPOSITORY, needs_ray
 
 from torchtrack.errors import ConfigError, MissingExtraError
-from torchtrack.executor import ATTEMPTS, TaskFailure, run_tasks
-from torchtrack.executor.groups import grouped, run_in_groups
+from torchtrack.run.executor import ATTEMPTS, TaskFailure, run_tasks
+from torchtrack.run.executor.groups import grouped, run_in_groups
 
 PARALLEL = ["local", pytest.param("ray", marks=needs_ray)]
 

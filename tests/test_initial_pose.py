@@ -7,8 +7,8 @@ from pydantic import ValidationError
 from torchtrack.config.run import ObjectConfig, PoseConfig
 from torchtrack.core.lie import se3_exp
 from torchtrack.errors import ConfigError, PoseError
-from torchtrack.initial_pose import initial_pose
 from torchtrack.io import Trajectory, write_tum
+from torchtrack.run.initial_pose import initial_pose
 
 
 def moving(start_us: int = 0, count: int = 11, step_us: int = 10_000) -> Trajectory:

@@ -24,7 +24,7 @@ from torchtrack.io.filters import (
     find_hot_pixels,
     region_camera,
 )
-from torchtrack.session import open_session
+from torchtrack.run.session import open_session
 
 SIZE = {"width": 64, "height": 48}
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)

@@ -25,8 +25,8 @@ from torchtrack.io import extras, read_sequence
 from torchtrack.io.keep_up import KeepUp
 from torchtrack.io.live import DvSource, Evk4Source, StreamSource, open_live
 from torchtrack.io.writers.evt3 import Evt3Writer
-from torchtrack.runner import run
-from torchtrack.session import open_session
+from torchtrack.run.runner import run
+from torchtrack.run.session import open_session
 
 SIZE = {"width": 64, "height": 48}
 

@@ -14,8 +14,8 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import rotation_angle_deg
 from torchtrack.core.windows import EventWindow
-from torchtrack.haste import Pace
 from torchtrack.io.keep_up import FEWEST_EVENTS, LONGEST_US, MOST_JOINED, HastyWindow, WaitingWindows
+from torchtrack.run.haste import Pace
 from torchtrack.tracking.validation.status import Status
 
 CAPACITY = 64

@@ -15,7 +15,7 @@ from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.errors import EventDataError
-from torchtrack.runner import run, track
+from torchtrack.run.runner import run, track
 from torchtrack.tracking import graphs
 from torchtrack.tracking.estimation import fast_rounds
 from torchtrack.tracking.frontend.tiles import NearbyEvents

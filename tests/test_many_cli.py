@@ -13,7 +13,7 @@ from torchtrack.cli import main
 from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.eval.evaluate import evaluate
 from torchtrack.exit_codes import ExitCode
-from torchtrack.sinks.summary import finite
+from torchtrack.run.sinks.summary import finite
 
 SCENE = "name: a\ncamera: {width: 60, height: 40, fx: 60, fy: 60}\nduration_s: 0.02\nobjects: [{label: cube, shape: cube}]\n"
 

@@ -15,7 +15,7 @@ from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError
 from torchtrack.io import read_sequence
 from torchtrack.object_model import ObjectModel
-from torchtrack.runner import track
+from torchtrack.run.runner import track
 from torchtrack.tracking.validation.status import Status
 
 MOTIONS = {

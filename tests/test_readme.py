@@ -25,9 +25,9 @@ from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.run import RunConfig
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io import read_calibration
+from torchtrack.run.sinks.poses import COLUMNS
 from torchtrack.sim import SceneConfig
 from torchtrack.sim.suite import scenes_of
-from torchtrack.sinks.poses import COLUMNS
 from torchtrack.tracking.validation.status import Status
 
 REPOSITORY = Path(__file__).resolve().parents[1]

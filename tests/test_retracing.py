@@ -11,12 +11,12 @@ from torchtrack import Tracker, preset
 from torchtrack.config.tracker import SmoothingConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.core.windows import EventWindow
-from torchtrack.refined_steps import Refinement, refined_steps
-from torchtrack.retraced_steps import Retracer
-from torchtrack.retracing import Gap, _in_reverse, retraced
-from torchtrack.runner import track
-from torchtrack.smoothed_steps import SmoothedObjects
-from torchtrack.stepping import Step
+from torchtrack.run.refine import Refinement, refined_steps
+from torchtrack.run.retrace import Retracer
+from torchtrack.run.retracing import Gap, _in_reverse, retraced
+from torchtrack.run.runner import track
+from torchtrack.run.smooth import SmoothedObjects
+from torchtrack.run.stepping import Step
 from torchtrack.tracking.validation.status import Status
 
 COUNT, FIRST, SEEN = 24, 8, 20

@@ -18,12 +18,12 @@ from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import WindowConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import rotation_angle_deg
+from torchtrack.core.windows import clipped
 from torchtrack.errors import CalibrationError, ConfigError, EventDataError, MissingFileError, OutputError, PoseError, UnknownFormatError
 from torchtrack.io import line_file, read_sequence, read_tum
-from torchtrack.runner import run, run_many, track
-from torchtrack.session import Session, open_session
-from torchtrack.stepping import clipped
-from torchtrack.streams import build_tracker
+from torchtrack.run.runner import run, run_many, track
+from torchtrack.run.session import Session, open_session
+from torchtrack.run.streams import build_tracker
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from tiny_sequence import write_tiny_sequence
 
 from torchtrack.config.run import RunConfig
 from torchtrack.errors import ConfigError, EventDataError, TorchtrackWarning
-from torchtrack.runner import run
+from torchtrack.run.runner import run
 
 
 @pytest.fixture(scope="module")

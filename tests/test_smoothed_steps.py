@@ -21,11 +21,11 @@ from torchtrack.errors import EventDataError
 from torchtrack.io import read_tum
 from torchtrack.io.columns import Columns
 from torchtrack.io.live import LiveSource
-from torchtrack.runner import run, track
-from torchtrack.session import open_session
-from torchtrack.smoothed_steps import SmoothedObjects, Smoother
-from torchtrack.stepping import cut_windows
-from torchtrack.streams import follow
+from torchtrack.run.runner import run, track
+from torchtrack.run.session import open_session
+from torchtrack.run.smooth import SmoothedObjects, Smoother
+from torchtrack.run.stepping import cut_windows
+from torchtrack.run.streams import follow
 
 LAG_S = 0.01
 SMOOTHED = {"smoothing": {"lag_s": LAG_S}}

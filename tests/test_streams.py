@@ -11,12 +11,12 @@ from tiny_sequence import write_tiny_sequence
 
 from torchtrack.config.run import RunConfig
 from torchtrack.errors import ConfigError, EventDataError
-from torchtrack.executor import TaskFailure
-from torchtrack.runner import run, run_many
-from torchtrack.session import open_session
-from torchtrack.sinks.summary import RunSummary
-from torchtrack.stepping import cut_windows
-from torchtrack.streams import follow
+from torchtrack.run.executor import TaskFailure
+from torchtrack.run.runner import run, run_many
+from torchtrack.run.session import open_session
+from torchtrack.run.sinks.summary import RunSummary
+from torchtrack.run.stepping import cut_windows
+from torchtrack.run.streams import follow
 
 
 @pytest.fixture(scope="module")

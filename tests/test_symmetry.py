@@ -6,10 +6,10 @@ import trimesh
 from helpers import random_pose
 
 from torchtrack.core.lie import se3_exp, so3_exp
-from torchtrack.eval.metrics import pose_errors
 from torchtrack.io import Trajectory
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axes, revolution_axis, symmetry_planes, turning_axis
+from torchtrack.run.metrics import pose_errors
 from torchtrack.sim.curved import vase
 
 SEEN_AXIS = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -13,9 +13,9 @@ from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import WindowConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import se3_exp
-from torchtrack.runner import track
-from torchtrack.session import open_session
-from torchtrack.streams import build_tracker
+from torchtrack.run.runner import track
+from torchtrack.run.session import open_session
+from torchtrack.run.streams import build_tracker
 from torchtrack.tracking.validation.status import Status
 from torchtrack.window_length import WindowLength, contour_speed, next_window_us, tell_lengths
 

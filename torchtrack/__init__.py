@@ -13,7 +13,7 @@ The pipeline, one file per stage, in data-flow order::
     alignment      rounds of matching and solving             torchtrack.tracking.estimation.rounds
     quality        status, covariance, explained contour      torchtrack.tracking.validation.measures
     tracker        all of it: state and window in, pose out   torchtrack.tracking.tracker
-    runner         a whole recording: source, tracker, sinks  torchtrack.runner
+    runner         a whole recording: source, tracker, sinks  torchtrack.run.runner
 
 In use::
 
@@ -43,26 +43,26 @@ if TYPE_CHECKING:
     from torchtrack.io import open_events as open_events
     from torchtrack.io import read_sequence as read_sequence
     from torchtrack.object_model import ObjectModel as ObjectModel
-    from torchtrack.runner import track as track
+    from torchtrack.run.runner import track as track
     from torchtrack.tracking.state import StepResult as StepResult
     from torchtrack.tracking.state import TrackerState as TrackerState
     from torchtrack.tracking.tracker import Tracker as Tracker
     from torchtrack.tracking.validation.status import Status as Status
 
 _HOME = {
-    "Camera": "camera",
-    "EventBatch": "events",
+    "Camera": "core.camera",
+    "EventBatch": "core.events",
     "ObjectModel": "object_model",
-    "Status": "quality",
-    "StepResult": "state",
-    "Tracker": "tracker",
+    "Status": "tracking.validation.status",
+    "StepResult": "tracking.state",
+    "Tracker": "tracking.tracker",
     "TrackerConfig": "config.tracker",
-    "TrackerState": "state",
+    "TrackerState": "tracking.state",
     "Trajectory": "io",
     "open_events": "io",
     "preset": "config.presets",
     "read_sequence": "io",
-    "track": "runner",
+    "track": "run.runner",
 }
 
 __all__ = [*_HOME, "__version__", "errors"]

@@ -19,7 +19,7 @@ from torchtrack.config.settings import CommandLineText
 from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import ConfigError, TorchtrackError
 from torchtrack.exit_codes import ExitCode
-from torchtrack.interrupt import ended_in_good_order
+from torchtrack.run.interrupt import ended_in_good_order
 from torchtrack.standard_streams import flushed, report, take_any_text
 
 

@@ -23,20 +23,20 @@ from torchtrack.eval.grid import markdown
 from torchtrack.eval.latency import estimate_latency
 from torchtrack.eval.sources import find_sequences
 from torchtrack.eval.tables import results_table, run_headline, run_table
-from torchtrack.executor import TaskFailure
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io import read_calibration
 from torchtrack.io.atomic import check_other_file
 from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines
-from torchtrack.runner import run, run_many
-from torchtrack.session import open_session
+from torchtrack.run.executor import TaskFailure
+from torchtrack.run.runner import run, run_many
+from torchtrack.run.session import open_session
+from torchtrack.run.sinks.folder import check_folder
+from torchtrack.run.sinks.progress import ProgressBar
+from torchtrack.run.sinks.resume import check_resumable, is_complete
+from torchtrack.run.sinks.summary import RunSummary
 from torchtrack.sim import SceneConfig
 from torchtrack.sim.suite import is_suite, run_suite, scenes_of, simulate_to_file
 from torchtrack.sim.video import VideoConfig, write_video_events
-from torchtrack.sinks.folder import check_folder
-from torchtrack.sinks.progress import ProgressBar
-from torchtrack.sinks.resume import check_resumable, is_complete
-from torchtrack.sinks.summary import RunSummary
 from torchtrack.standard_streams import OutputConsole
 
 # Tables need this much where the output is no terminal, which says how wide it is.

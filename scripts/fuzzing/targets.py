@@ -14,7 +14,7 @@ from torchtrack.core.files import naming
 from torchtrack.eval.evaluate import plan
 from torchtrack.io import is_sequence, open_events, read_calibration, read_sequence, read_trajectory
 from torchtrack.object_model import ObjectModel
-from torchtrack.session import open_session
+from torchtrack.run.session import open_session
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.suite import is_suite, scenes_of
 

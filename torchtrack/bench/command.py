@@ -15,7 +15,7 @@ from torchtrack.commands import output_console
 from torchtrack.errors import ConfigError, MissingExtraError
 from torchtrack.exit_codes import ExitCode
 from torchtrack.io.atomic import check_writable
-from torchtrack.runner import threads
+from torchtrack.run.runner import threads
 
 
 def bench(part: str, output: Path, compare: Path | None, setup: Setup) -> int:

@@ -9,7 +9,7 @@ from torchtrack.bench.scene import HD, SHAPES, Scene, read, shapes_of, simulated
 from torchtrack.bench.setup import Setup
 from torchtrack.core.dispatch import numba_is_installed
 from torchtrack.core.events import EventBatch
-from torchtrack.stepping import cut_windows, steps
+from torchtrack.run.stepping import cut_windows, steps
 from torchtrack.window_length import WindowLength
 
 # Targets (ms) of the median, and of the step that 95 % are faster than, on one thread of a CPU and on a large GPU.

@@ -21,13 +21,13 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import Camera, project
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.core.lie import rotation_angle_deg, transform_points
+from torchtrack.core.windows import clipped
 from torchtrack.errors import ConfigError
 from torchtrack.io import Trajectory
 from torchtrack.object_model import ObjectModel
-from torchtrack.session import open_session
+from torchtrack.run.session import open_session
 from torchtrack.sim import SceneConfig, simulate
 from torchtrack.sim.meshes import make_mesh
-from torchtrack.stepping import clipped
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.status import Status

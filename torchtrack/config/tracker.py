@@ -232,7 +232,7 @@ class ModelTrustConfig(Settings):
 
 
 class SmoothingConfig(Settings):
-    """Poses of a recording refined by what came after them, see :mod:`torchtrack.tracking.motion.smoother` and :mod:`torchtrack.retracing`."""
+    """Poses of a recording refined by what came after them, see :mod:`torchtrack.tracking.motion.smoother` and :mod:`torchtrack.run.retracing`."""
 
     lag_s: float = Field(
         0.0, ge=0, le=10, description="Each pose of a recording is refined by the windows of so much time after it (s); 0 for not at all."

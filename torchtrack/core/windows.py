@@ -136,3 +136,16 @@ def _before_silence(t_us: Int[Tensor, "e"]) -> int | None:
         return None
     silent = torch.nonzero(torch.diff(t_us) > LONGEST_SILENCE_US)
     return int(t_us[int(silent[0])]) if len(silent) else None
+
+
+def clipped(chunks: Iterable[EventBatch], start_us: int, end_us: int | None = None) -> Iterator[EventBatch]:
+    """Events with ``start_us < t <= end_us`` of a stream, reading no further than needed."""
+    for chunk in chunks:
+        if len(chunk) == 0:
+            continue
+        newest_us = int(chunk.t_us[-1])
+        inside = chunk.slice_time(start_us, newest_us if end_us is None else end_us)
+        if len(inside):
+            yield inside
+        if end_us is not None and newest_us > end_us:
+            return

@@ -14,20 +14,20 @@ from torchtrack.errors import EventDataError
 from torchtrack.eval.compact import compact_report
 from torchtrack.eval.grid import Report
 from torchtrack.eval.journal import Journal, Measured, identity
-from torchtrack.eval.metrics import PoseErrors, summarise
 from torchtrack.eval.paper import check_cells, paper_report
 from torchtrack.eval.results import Evaluation, Failure, NotApplicable, ObjectResult, write_results
 from torchtrack.eval.sources import cell_sequences, find_sequences
-from torchtrack.executor import TaskFailure, Tell
-from torchtrack.executor.groups import run_in_groups
-from torchtrack.executor.tasks import without_errors
 from torchtrack.io.atomic import check_writable
-from torchtrack.session import open_session
+from torchtrack.run.executor import TaskFailure, Tell
+from torchtrack.run.executor.groups import run_in_groups
+from torchtrack.run.executor.tasks import without_errors
+from torchtrack.run.metrics import PoseErrors, summarise
+from torchtrack.run.runner import threads
+from torchtrack.run.session import open_session
+from torchtrack.run.sinks.record import ObjectRecord, Record
+from torchtrack.run.stepping import Step, cut_windows
+from torchtrack.run.streams import follow
 from torchtrack.sim.suite import Told
-from torchtrack.sinks.record import ObjectRecord, Record
-from torchtrack.stepping import Step, cut_windows
-from torchtrack.streams import follow
-from torchtrack.threads import threads
 from torchtrack.tracking.validation.status import Status
 from torchtrack.window_length import WindowLength
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtrack.io.atomic import atomic_path
-from torchtrack.sinks.summary import finite
+from torchtrack.run.sinks.summary import finite
 
 _LATEX = {"\\": r"\textbackslash{}", "°": r"$^\circ$", "δ": r"$\delta$", "Δ": r"$\Delta$", "†": r"$^\dagger$"}
 _LATEX |= {character: f"\\{character}" for character in "&%$#_{}"}

@@ -12,10 +12,10 @@ import torch
 import torchtrack
 from torchtrack.config.run import RunConfig
 from torchtrack.errors import UnknownFormatError
-from torchtrack.eval.metrics import PoseErrors, summarise
 from torchtrack.eval.results import NotApplicable, ObjectResult
 from torchtrack.io.atomic import writing
 from torchtrack.io.line_file import LineFile
+from torchtrack.run.metrics import PoseErrors, summarise
 
 Measured = Sequence[ObjectResult | NotApplicable]
 """What was measured of one sequence under one method."""

@@ -21,7 +21,7 @@ from torchtrack.core.camera import project, undistortion_table
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import EventDataError
 from torchtrack.object_model.contour_source import group_by_model
-from torchtrack.session import Session
+from torchtrack.run.session import Session
 from torchtrack.tracking.contours.points import Contours, mesh_contours
 
 # Latencies that are tried first, µs.

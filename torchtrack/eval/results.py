@@ -6,9 +6,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from torchtrack.eval.metrics import Metrics, PoseErrors
 from torchtrack.io.atomic import atomic_path
-from torchtrack.sinks.summary import finite
+from torchtrack.run.metrics import Metrics, PoseErrors
+from torchtrack.run.sinks.summary import finite
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from rich.table import Table
 
 from torchtrack.eval.results import Evaluation, NotApplicable, ObjectResult
-from torchtrack.sinks.summary import RunSummary
+from torchtrack.run.sinks.summary import RunSummary
 
 
 def results_table(evaluation: Evaluation) -> Table:

@@ -19,12 +19,11 @@ from torch.utils.data import Dataset, IterableDataset, Sampler, get_worker_info
 from torchtrack.config.settings import Settings
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.core.lie import se3_inverse, se3_log
-from torchtrack.core.windows import windows_by_time
+from torchtrack.core.windows import clipped, windows_by_time
 from torchtrack.errors import EventDataError
 from torchtrack.io import Sequence, Trajectory, read_sequence
 from torchtrack.learn.augmentation import AugmentationConfig, augmented
 from torchtrack.learn.samples import Sample
-from torchtrack.stepping import clipped
 
 Source = str | os.PathLike[str] | Sequence
 

@@ -21,13 +21,13 @@ from torchtrack.config.load import load, read_yaml
 from torchtrack.config.settings import Settings
 from torchtrack.core.limits import limits
 from torchtrack.errors import ConfigError, MissingFileError, TorchtrackError
-from torchtrack.executor import TaskFailure, Tell, run_tasks
 from torchtrack.io.atomic import check_writable
 from torchtrack.io.sequence import read_sequence
+from torchtrack.run.executor import TaskFailure, Tell, run_tasks
+from torchtrack.run.runner import threads
 from torchtrack.sim.output import check_output, write
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import Progress, simulate
-from torchtrack.threads import threads
 
 # Progress of a scene is told in steps of this share.
 _PROGRESS_STEP = 0.02

@@ -1,16 +1,18 @@
 """Alignment of events and contours over a run, at the tracked pose and at the one that it started from."""
 
 from array import array
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import cKDTree
 
 from torchtrack.core.camera import undistortion_table
-from torchtrack.eval.alignment import alignment
-from torchtrack.session import Session
-from torchtrack.stepping import Step
+from torchtrack.run.session import Session
+from torchtrack.run.stepping import Step
 from torchtrack.tracking.contours.points import reproject
 
 
@@ -53,3 +55,33 @@ class AlignmentRecord:
 
 def _median(values: np.ndarray) -> float:
     return float(np.median(values)) if len(values) else float("nan")
+
+
+# Events further from every contour point say nothing about an object.
+GATE_PX = 10.0
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Events and the contours of one object.
+
+    Args:
+        median_px: median distance of the events near the contours, normal to them; NaN where there is none.
+        share_near: share of all events that are near the contours.
+    """
+
+    median_px: float
+    share_near: float
+
+
+def alignment(events: Float[ndarray, "e 2"], contour: Float[ndarray, "m 2"], normals: Float[ndarray, "m 2"]) -> Alignment:
+    """Alignment of events with contour points, all in ideal pixels; an event counts towards its nearest point."""
+    if len(events) == 0 or len(contour) == 0:
+        return Alignment(float("nan"), 0.0)
+    distance, nearest = cKDTree(contour).query(events, distance_upper_bound=GATE_PX)
+    near = np.isfinite(distance)
+    if not near.any():
+        return Alignment(float("nan"), 0.0)
+    offsets = events[near] - contour[nearest[near]]
+    normal_px = np.abs((offsets * normals[nearest[near]]).sum(1))
+    return Alignment(float(np.median(normal_px)), float(near.mean()))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from torchtrack.stepping import Step
+from torchtrack.run.stepping import Step
 
 # Shorter ones are usual of slow objects; a fast one moves on by tens of pixels in this time.
 _SHORTEST_US = 50_000

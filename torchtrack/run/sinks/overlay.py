@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torchtrack.config.run import OverlayConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.session import Session
-from torchtrack.stepping import Step
+from torchtrack.run.session import Session
+from torchtrack.run.stepping import Step
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
 from torchtrack.tracking.frontend.time_surface import empty_last_event, update_last_event
 from torchtrack.tracking.state import StepResult, each_tensor

@@ -2,7 +2,7 @@
 
 from typing import Protocol, runtime_checkable
 
-from torchtrack.stepping import Step
+from torchtrack.run.stepping import Step
 
 
 @runtime_checkable

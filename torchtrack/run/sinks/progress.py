@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from torchtrack.stepping import Step
+from torchtrack.run.stepping import Step
 
 
 class _Rates(ProgressColumn):

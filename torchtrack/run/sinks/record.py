@@ -10,12 +10,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.core.lie import so3_log
-from torchtrack.eval.metrics import PoseErrors, pose_errors
 from torchtrack.io import Trajectory
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axis
-from torchtrack.sinks.silences import Silences
-from torchtrack.stepping import Step
+from torchtrack.run.metrics import PoseErrors, pose_errors
+from torchtrack.run.sinks.silences import Silences
+from torchtrack.run.stepping import Step
 from torchtrack.tracking.validation.status import Status
 
 

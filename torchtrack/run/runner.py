@@ -2,34 +2,37 @@
 
 import multiprocessing
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+
+import torch
 
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.run import RunConfig, TrackingConfig
 from torchtrack.config.tracker import WindowConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.limits import limits
+from torchtrack.core.windows import clipped
 from torchtrack.errors import ConfigError, EventDataError, TorchtrackError
-from torchtrack.executor import TaskFailure, Tell
-from torchtrack.executor.groups import run_in_groups
-from torchtrack.executor.tasks import without_errors
-from torchtrack.interrupt import Interrupt
 from torchtrack.io import EventSource
 from torchtrack.io.event_stream import EventStream
 from torchtrack.io.live import LiveSource
 from torchtrack.io.mending import mended_batches
 from torchtrack.io.problems import Problems
-from torchtrack.refined_steps import Refinement, refined_steps
-from torchtrack.run_outputs import RunOutputs
-from torchtrack.session import Session
-from torchtrack.sinks import Sink
-from torchtrack.sinks.resume import has_begun, is_complete
-from torchtrack.sinks.summary import RunSummary
-from torchtrack.smoothed_steps import SmoothedObjects
-from torchtrack.stepping import clipped, cut_windows, steps
-from torchtrack.streams import follow
-from torchtrack.threads import threads
+from torchtrack.run.executor import TaskFailure, Tell
+from torchtrack.run.executor.groups import run_in_groups
+from torchtrack.run.executor.tasks import without_errors
+from torchtrack.run.interrupt import Interrupt
+from torchtrack.run.outputs import RunOutputs
+from torchtrack.run.refine import Refinement, refined_steps
+from torchtrack.run.session import Session
+from torchtrack.run.sinks import Sink
+from torchtrack.run.sinks.resume import has_begun, is_complete
+from torchtrack.run.sinks.summary import RunSummary
+from torchtrack.run.smooth import SmoothedObjects
+from torchtrack.run.stepping import cut_windows, steps
+from torchtrack.run.streams import follow
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.tracker import Tracker
 from torchtrack.window_length import WindowLength
@@ -144,3 +147,14 @@ def _run_group(tasks: Sequence[tuple[RunConfig, bool]], tell: Tell) -> list[RunS
         # A process that was told to end, by one that waits for just that.
         raise KeyboardInterrupt
     return outcomes
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Let PyTorch use ``count`` threads within the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

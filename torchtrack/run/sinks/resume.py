@@ -13,9 +13,9 @@ from torchtrack.config.run import RunConfig
 from torchtrack.core.lie import rotation_from_quaternion
 from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
 from torchtrack.io.atomic import writing
-from torchtrack.sinks.folder import CONFIG, POSES, ended
-from torchtrack.sinks.poses import COLUMNS, tum_path
-from torchtrack.sinks.record import Earlier
+from torchtrack.run.sinks.folder import CONFIG, POSES, ended
+from torchtrack.run.sinks.poses import COLUMNS, tum_path
+from torchtrack.run.sinks.record import Earlier
 from torchtrack.tracking.validation.status import Status
 
 # Settings that say where results go and how fast they are had, not what they are.

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from torchtrack.errors import ConfigError
-from torchtrack.executor.tasks import ATTEMPTS, TaskFailure, Tell, attempt, killed, reason_of
 from torchtrack.io.extras import optional
+from torchtrack.run.executor.tasks import ATTEMPTS, TaskFailure, Tell, attempt, killed, reason_of
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.retracing import Gap, retraced
-from torchtrack.smoothed_steps import SmoothedObjects
-from torchtrack.stepping import Step
+from torchtrack.run.retracing import Gap, retraced
+from torchtrack.run.smooth import SmoothedObjects
+from torchtrack.run.stepping import Step
 from torchtrack.tracking.motion.smoother import Filtered, goes_on
 from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.status import Status

@@ -15,9 +15,8 @@ from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch
 from torchtrack.core.files import naming
 from torchtrack.core.limits import check_limit, limits
-from torchtrack.core.windows import EventWindow
+from torchtrack.core.windows import EventWindow, clipped
 from torchtrack.errors import CalibrationError, ConfigError, EventDataError, TorchtrackWarning
-from torchtrack.initial_pose import initial_pose
 from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, open_events, read_calibration, read_sequence
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS
 from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, Region, downscaled_camera, find_hot_pixels, region_camera
@@ -26,7 +25,7 @@ from torchtrack.io.live import LiveSource, open_live
 from torchtrack.io.polarity_code import told_if_alike
 from torchtrack.io.problems import Problems
 from torchtrack.object_model import ObjectModel
-from torchtrack.stepping import clipped
+from torchtrack.run.initial_pose import initial_pose
 
 # A pose from longer before the first event is doubtful: an object that moves fires events. From so long, the clocks differ.
 _DOUBTFUL_START_S, _FARTHEST_START_S = 1.0, 10.0

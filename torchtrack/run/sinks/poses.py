@@ -9,9 +9,9 @@ from pathlib import Path
 from torchtrack.core.lie import quaternion_from_rotation
 from torchtrack.io.line_file import LineFile
 from torchtrack.io.seconds import format_seconds
-from torchtrack.sinks.folder import POSES
-from torchtrack.sinks.record import Record
-from torchtrack.stepping import Step
+from torchtrack.run.sinks.folder import POSES
+from torchtrack.run.sinks.record import Record
+from torchtrack.run.stepping import Step
 from torchtrack.tracking.validation.status import Status
 
 COLUMNS = (

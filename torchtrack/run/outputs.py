@@ -11,19 +11,19 @@ from torchtrack.config.load import as_yaml
 from torchtrack.config.run import RunConfig
 from torchtrack.core.windows import EventWindow
 from torchtrack.errors import EventDataError, MissingFileError, OutputError, TorchtrackError, UnknownFormatError
-from torchtrack.interrupt import Interrupt
 from torchtrack.io.atomic import writing
 from torchtrack.io.keep_up import KeepUp
-from torchtrack.session import Session, open_session
-from torchtrack.sinks import Sink
-from torchtrack.sinks.alignment import AlignmentRecord
-from torchtrack.sinks.folder import CONFIG, SUMMARY, OutputFolder
-from torchtrack.sinks.overlay import Overlay
-from torchtrack.sinks.poses import PoseFiles
-from torchtrack.sinks.record import Record
-from torchtrack.sinks.resume import check_resumable, take_up
-from torchtrack.sinks.summary import Ended, Facts, RunSummary, summarise_run, write_summary
-from torchtrack.stepping import Step, cut_windows
+from torchtrack.run.interrupt import Interrupt
+from torchtrack.run.session import Session, open_session
+from torchtrack.run.sinks import Sink
+from torchtrack.run.sinks.alignment import AlignmentRecord
+from torchtrack.run.sinks.folder import CONFIG, SUMMARY, OutputFolder
+from torchtrack.run.sinks.overlay import Overlay
+from torchtrack.run.sinks.poses import PoseFiles
+from torchtrack.run.sinks.record import Record
+from torchtrack.run.sinks.resume import check_resumable, take_up
+from torchtrack.run.sinks.summary import Ended, Facts, RunSummary, summarise_run, write_summary
+from torchtrack.run.stepping import Step, cut_windows
 from torchtrack.window_length import WindowLength
 
 

@@ -78,16 +78,3 @@ def timed_step(
             # Work on the GPU is queued: without waiting, the time measured is that of queueing.
             torch.cuda.synchronize(device)
     return next_state, result, time.perf_counter() - begun
-
-
-def clipped(chunks: Iterable[EventBatch], start_us: int, end_us: int | None = None) -> Iterator[EventBatch]:
-    """Events with ``start_us < t <= end_us`` of a stream, reading no further than needed."""
-    for chunk in chunks:
-        if len(chunk) == 0:
-            continue
-        newest_us = int(chunk.t_us[-1])
-        inside = chunk.slice_time(start_us, newest_us if end_us is None else end_us)
-        if len(inside):
-            yield inside
-        if end_us is not None and newest_us > end_us:
-            return

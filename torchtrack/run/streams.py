@@ -17,11 +17,11 @@ from torchtrack.config.run import TrackingConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.windows import EventWindow
 from torchtrack.errors import ConfigError, TorchtrackError
-from torchtrack.haste import Pace
-from torchtrack.refined_steps import Refinement
-from torchtrack.session import Session
-from torchtrack.smoothed_steps import SmoothedObjects
-from torchtrack.stepping import Step, passed_over, timed_step
+from torchtrack.run.haste import Pace
+from torchtrack.run.refine import Refinement
+from torchtrack.run.session import Session
+from torchtrack.run.smooth import SmoothedObjects
+from torchtrack.run.stepping import Step, passed_over, timed_step
 from torchtrack.tracking.state import StepResult, TrackerState, joined, take_part
 from torchtrack.tracking.tracker import Tracker
 from torchtrack.window_length import WindowLength

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 
 import torchtrack
-from torchtrack.eval.metrics import Metrics, summarise
 from torchtrack.io.atomic import writing
 from torchtrack.io.problems import ClockChange, Problems
-from torchtrack.sinks.record import ObjectRecord, Record
-from torchtrack.sinks.silences import Silence
+from torchtrack.run.metrics import Metrics, summarise
+from torchtrack.run.sinks.record import ObjectRecord, Record
+from torchtrack.run.sinks.silences import Silence
 from torchtrack.tracking.validation.status import Status
 
 # For what may come into a summary at its end: why it ended, gaps, changes of the clock.

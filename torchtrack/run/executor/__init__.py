@@ -14,8 +14,8 @@ from typing import TypeVar
 
 from torchtrack.config.executor import ExecutorName
 from torchtrack.errors import ConfigError
-from torchtrack.executor.local import run_here, run_in_processes
-from torchtrack.executor.tasks import ATTEMPTS, TaskFailure, Tell
+from torchtrack.run.executor.local import run_here, run_in_processes
+from torchtrack.run.executor.tasks import ATTEMPTS, TaskFailure, Tell
 
 __all__ = ["ATTEMPTS", "TaskFailure", "Tell", "run_tasks"]
 
@@ -52,7 +52,7 @@ def run_tasks(
     processes = min(jobs, len(tasks))
     if executor == "ray" and tasks:
         # Each process imports this file anew: what it does not need would only make it slower to start.
-        from torchtrack.executor.on_ray import run_on_ray
+        from torchtrack.run.executor.on_ray import run_on_ray
 
         return run_on_ray(function, tasks, jobs, told)
     return run_in_processes(function, tasks, processes, told) if processes > 1 else run_here(function, tasks, told)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any, NoReturn, TypeVar
 
-from torchtrack.executor.tasks import ATTEMPTS, TaskFailure, Tell, attempt, killed
+from torchtrack.run.executor.tasks import ATTEMPTS, TaskFailure, Tell, attempt, killed
 
 T = TypeVar("T")
 R = TypeVar("R")

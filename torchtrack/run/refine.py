@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterator
 from typing import Protocol, runtime_checkable
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.retraced_steps import Retracer
-from torchtrack.smoothed_steps import SmoothedObjects, Smoother
-from torchtrack.stepping import Step
+from torchtrack.run.retrace import Retracer
+from torchtrack.run.smooth import SmoothedObjects, Smoother
+from torchtrack.run.stepping import Step
 from torchtrack.tracking.tracker import Tracker
 
 

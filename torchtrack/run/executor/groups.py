@@ -4,7 +4,7 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import TypeVar
 
 from torchtrack.config.executor import ExecutorName
-from torchtrack.executor import TaskFailure, Tell, run_tasks
+from torchtrack.run.executor import TaskFailure, Tell, run_tasks
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -20,7 +20,7 @@ def run_in_groups(
 ) -> Iterator[tuple[Sequence[int], Sequence[R | TaskFailure]]]:
     """Tasks of several items each; gives the numbers of the items of each and what became of them, as it comes.
 
-    See :func:`torchtrack.executor.run_tasks`.
+    See :func:`torchtrack.run.executor.run_tasks`.
 
     Args:
         function: called with the items of a group; gives an outcome for each.

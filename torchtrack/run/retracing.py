@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchtrack.core.events import EventBatch
 from torchtrack.core.windows import EventWindow
-from torchtrack.stepping import Step
+from torchtrack.run.stepping import Step
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.initialization import first_state
 from torchtrack.tracking.state import StepResult, TrackerState, take_part

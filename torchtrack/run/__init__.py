@@ -1,0 +1,1 @@
+"""From a source through the tracker to files."""
