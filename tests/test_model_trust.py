@@ -10,8 +10,8 @@ from tracked_boxes import assert_same, follow, moving_box, poses_of, windows
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import ContourConfig, MatchingConfig, ModelTrustConfig, TrackerConfig
-from torchtrack.model_trust import ModelTrust
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
+from torchtrack.tracking.adaptation.model_trust import ModelTrust
 from torchtrack.tracking.contours.points import mesh_elements
 from torchtrack.tracking.state import joined, take_part
 

@@ -16,8 +16,8 @@ from torchtrack.core.lie import se3_exp
 from torchtrack.run.runner import track
 from torchtrack.run.session import open_session
 from torchtrack.run.streams import build_tracker
+from torchtrack.run.window_length import WindowLength, contour_speed, next_window_us, tell_lengths
 from torchtrack.tracking.validation.status import Status
-from torchtrack.window_length import WindowLength, contour_speed, next_window_us, tell_lengths
 
 DEPTH_M, WINDOW_US = 0.5, 5000
 ADAPTIVE = WindowConfig(mode="adaptive", motion_px=1.0, duration_us=6000, shortest_us=2000, longest_us=20_000)

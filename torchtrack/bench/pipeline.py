@@ -10,7 +10,7 @@ from torchtrack.bench.setup import Setup
 from torchtrack.core.dispatch import numba_is_installed
 from torchtrack.core.events import EventBatch
 from torchtrack.run.stepping import cut_windows, steps
-from torchtrack.window_length import WindowLength
+from torchtrack.run.window_length import WindowLength
 
 # Targets (ms) of the median, and of the step that 95 % are faster than, on one thread of a CPU and on a large GPU.
 ONE_OBJECT_MS: dict[str, tuple[float | None, float | None]] = {"cpu": (4.0, 6.0), "cuda": (1.5, None)}

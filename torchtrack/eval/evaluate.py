@@ -27,9 +27,9 @@ from torchtrack.run.session import open_session
 from torchtrack.run.sinks.record import ObjectRecord, Record
 from torchtrack.run.stepping import Step, cut_windows
 from torchtrack.run.streams import follow
+from torchtrack.run.window_length import WindowLength
 from torchtrack.sim.suite import Told
 from torchtrack.tracking.validation.status import Status
-from torchtrack.window_length import WindowLength
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """What contours are made from: the constant tensors of an object's model, and the elements that it is made of.
 
-An element is a part of the model that may turn out not to be seen (:mod:`torchtrack.model_trust`): a long crease, the short
+An element is a part of the model that may turn out not to be seen (:mod:`torchtrack.tracking.adaptation.model_trust`): a long crease, the short
 ones of one place, all short ones that are bent but little, a segment, the print in one place.
 """
 

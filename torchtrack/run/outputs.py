@@ -24,7 +24,7 @@ from torchtrack.run.sinks.record import Record
 from torchtrack.run.sinks.resume import check_resumable, take_up
 from torchtrack.run.sinks.summary import Ended, Facts, RunSummary, summarise_run, write_summary
 from torchtrack.run.stepping import Step, cut_windows
-from torchtrack.window_length import WindowLength
+from torchtrack.run.window_length import WindowLength
 
 
 class RunOutputs:

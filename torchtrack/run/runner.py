@@ -33,9 +33,9 @@ from torchtrack.run.sinks.summary import RunSummary
 from torchtrack.run.smooth import SmoothedObjects
 from torchtrack.run.stepping import cut_windows, steps
 from torchtrack.run.streams import follow
+from torchtrack.run.window_length import WindowLength
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.tracker import Tracker
-from torchtrack.window_length import WindowLength
 
 __all__ = ["run", "run_many", "track"]
 

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from torchtrack.core.events import EventBatch
 from torchtrack.core.windows import EventWindow, windows_by_count, windows_by_time
+from torchtrack.run.window_length import WindowLength, tell_lengths
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US
 from torchtrack.tracking.motion.model import initial_covariance
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.tracker import Tracker
-from torchtrack.window_length import WindowLength, tell_lengths
 
 
 @dataclass(frozen=True)

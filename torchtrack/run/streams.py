@@ -22,9 +22,9 @@ from torchtrack.run.refine import Refinement
 from torchtrack.run.session import Session
 from torchtrack.run.smooth import SmoothedObjects
 from torchtrack.run.stepping import Step, passed_over, timed_step
+from torchtrack.run.window_length import WindowLength
 from torchtrack.tracking.state import StepResult, TrackerState, joined, take_part
 from torchtrack.tracking.tracker import Tracker
-from torchtrack.window_length import WindowLength
 
 R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
-from torchtrack.model_trust import judge_elements
+from torchtrack.tracking.adaptation.model_trust import judge_elements
 from torchtrack.tracking.adaptation.surface_learning import Surroundings, learn_after
 from torchtrack.tracking.association.polarity import expected_polarity, is_asked
 from torchtrack.tracking.contours.objects import ObjectBatch

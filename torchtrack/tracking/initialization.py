@@ -14,8 +14,8 @@ from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.events import EventBatch, stream_bounds
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import PoseError
-from torchtrack.model_trust import ModelTrust
 from torchtrack.tracking.adaptation.learned_contours import LearnedContours
+from torchtrack.tracking.adaptation.model_trust import ModelTrust
 from torchtrack.tracking.adaptation.pixel_latency import unknown_circuits
 from torchtrack.tracking.association.polarity import nothing_remembered
 from torchtrack.tracking.contours.objects import ObjectBatch

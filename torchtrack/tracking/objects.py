@@ -9,10 +9,10 @@ from torch.nn.functional import pad
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import Camera
 from torchtrack.errors import ModelError
-from torchtrack.model_trust import element_groups
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourModel, group_by_model
 from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, stacked, symmetry_planes, turning_axis
+from torchtrack.tracking.adaptation.model_trust import element_groups
 from torchtrack.tracking.association.weighting_network import LimbTrust, TrustNetwork, shipped_weigher
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables

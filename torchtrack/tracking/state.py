@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.model_trust import ModelTrust
 from torchtrack.tracking.adaptation.learned_contours import LearnedContours
+from torchtrack.tracking.adaptation.model_trust import ModelTrust
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.corners import Corners
 
