@@ -30,7 +30,7 @@ from torchtrack.sim import SceneConfig
 from torchtrack.sim.suite import scenes_of
 from torchtrack.tracking.validation.status import Status
 
-REPOSITORY = Path(__file__).resolve().parents[1]
+REPOSITORY = Path(__file__).resolve().parents[2]
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 SETTINGS = {"track": RunConfig, "evaluate": EvaluateConfig, "demo": DemoConfig, "simulate": SceneConfig}
 COMMANDS = ("track", "evaluate", "simulate", "demo", "outline", "info", "convert", "bench", "settings")

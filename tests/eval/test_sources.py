@@ -12,7 +12,7 @@ from torchtrack.eval.paper import check_cells
 from torchtrack.eval.sources import cell_sequences
 from torchtrack.io import read_sequence
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "evaluate"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "evaluate"
 SCENE = """
 name: small
 duration_s: 0.02

@@ -13,7 +13,7 @@ from torchtrack.learn.dataset import ClipConfig
 from torchtrack.learn.training import Trainer, TrainingConfig
 from torchtrack.tracking.association.weighting_network import TrustNetwork
 
-SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "train_weights.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "train_weights.py"
 SMALL = TrainingConfig(
     clip=ClipConfig(windows=2, past_us=5_000),
     augmentation=AugmentationConfig(noise_hz=20.0, jitter_rotation_deg=0.2),

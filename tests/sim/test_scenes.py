@@ -18,7 +18,7 @@ from torchtrack.sim.simulation import render_frames
 from torchtrack.sim.suite import scenes_of
 from torchtrack.sim.world import make_world
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "simulate"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "simulate"
 SMALL = CameraConfig(width=120, height=90, fx=130.0, fy=130.0)
 SWING = MotionConfig(position_m=(0.0, 0.0, 0.4), rotation_deg=(30.0, 35.0, 10.0))
 

@@ -26,7 +26,7 @@ from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 
 # Something is learned from every third window.
 LEARNING = TrackerConfig(learning=LearningConfig(first_windows=0, every=3, up_to_share=1.0))
-TESTS = Path(__file__).resolve().parent
+TESTS = Path(__file__).resolve().parents[1] / "support"
 COUNT = 12
 
 
