@@ -1,6 +1,5 @@
 """Fixtures that every test may use. Shapes and types of the whole package are checked in the first calls of each test."""
 
-import importlib.util
 import os
 from pathlib import Path
 
@@ -8,13 +7,10 @@ import jaxtyping
 import pytest
 import torch
 from first_calls import check_again
+from places import REPOSITORY
 
 # Must come before the first import of torchtrack: it wraps the package's functions as they are loaded.
 jaxtyping.install_import_hook("torchtrack", "first_calls.checked")
-
-REPOSITORY = Path(__file__).resolve().parents[1]
-
-needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs ray: pip install 'torchtrack[cluster]'")
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -72,5 +68,5 @@ def way(request):
     # Not at the top: what it imports must find the hook in place.
     from torchtrack.core import dispatch
 
-    with dispatch.kernels(wanted=request.param):
+    with dispatch.backend(wanted=request.param):
         yield

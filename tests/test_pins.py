@@ -4,7 +4,7 @@ import re
 import subprocess
 
 import pytest
-from conftest import REPOSITORY
+from places import REPOSITORY
 
 PIN = "tests/pins/base"
 

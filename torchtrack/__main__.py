@@ -2,6 +2,6 @@
 
 import sys
 
-from torchtrack.cli import main
+from torchtrack.cli.main import main
 
 sys.exit(main())

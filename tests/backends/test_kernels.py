@@ -6,10 +6,10 @@ import pytest
 import torch
 import trimesh
 from both_ways import assert_as_close, both_ways
+from close_edges import two_depths
 from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_events, random_pose, random_twist
-from test_common_error import two_depths
-from test_prediction import boxes
-from test_visibility import ball, l_prism
+from predicted_boxes import boxes
+from solid_models import ball, l_prism
 
 from torchtrack.config.search import QualityConfig
 from torchtrack.config.tracker import ContourConfig
@@ -19,7 +19,7 @@ from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
 from torchtrack.tracking.association.matches import Matches
-from torchtrack.tracking.association.nearest import ContourTable
+from torchtrack.tracking.association.nearest import contour_table
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.association.polarity import remembered
 from torchtrack.tracking.contours.index import index_contours
@@ -160,7 +160,7 @@ def test_the_table_of_contours(close_px, polarity, dtype):
     contours, polarity = random_contours(dtype=dtype), None if polarity is None else polarity.to(dtype)
     contours = replace(contours, points_cam=contours.points_cam + uniform(*contours.mask.shape, 1, seed=5, dtype=dtype))
     index = index_contours(contours, IMAGE_SIZE, 7, 2)
-    ours, theirs = both_ways(lambda: ContourTable.of(contours, index, polarity, close_px=close_px).rows)
+    ours, theirs = both_ways(lambda: contour_table(contours, index, polarity, close_px=close_px).rows)
     counts = contours.mask[:, None].expand_as(ours)
     torch.testing.assert_close(ours[counts], theirs[counts], rtol=1e-5, atol=1e-5)
 
@@ -168,7 +168,7 @@ def test_the_table_of_contours(close_px, polarity, dtype):
 @pytest.mark.parametrize("apart_px", [0.05, 0.3, 1.0])
 def test_the_table_of_sharp_edges_that_nearly_cover_each_other(apart_px):
     contours, index = two_depths(apart_px)
-    ours, theirs = both_ways(lambda: ContourTable.of(contours, index, close_px=1.7).rows)
+    ours, theirs = both_ways(lambda: contour_table(contours, index, close_px=1.7).rows)
     torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-12)
 
 

@@ -15,6 +15,7 @@ from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.window_events import SharedEvents, WindowEvents
+from torchtrack.tracking.initialization import first_state
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 BENT_CAMERA = replace(SMALL_CAMERA, distortion_model="plumb_bob", distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))
@@ -27,7 +28,7 @@ def window_of(objects: int, count: int, window_us: int, camera: Camera = SMALL_C
     tracker = Tracker([box_model()] * objects, camera, dtype=torch.float64)
     T_cam_obj = pose().repeat(objects, 1, 1)
     T_cam_obj[:, :3, 3] = torch.tensor(PLACES_M[:objects]).double()
-    state = tracker.init(T_cam_obj, 0)
+    state = first_state(tracker, T_cam_obj, torch.zeros(1, dtype=torch.int64))
     ages = torch.randint(LONG_AGO_US, state.burst_age_us.shape, generator=generator(1), dtype=torch.int16)
     events = random_events(count, width=camera.width, height=camera.height, duration_us=window_us - 1) if count else EventBatch.empty()
     t_us, dt_s = torch.tensor([window_us]), torch.full((objects,), 1e-6 * window_us).double()

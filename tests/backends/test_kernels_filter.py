@@ -57,7 +57,7 @@ def boxes(config=None, dtype=torch.float64):
 
 def forecasts(tracker, state, axes_obj=None):
     dt_s = uniform(OBJECTS, low=1e-3, high=2e-2, seed=11).to(tracker.intrinsics.dtype)
-    return lambda: forecast(state, dt_s, tracker.objects, axes_obj, tracker.far_pose, tracker.config)
+    return lambda: forecast(state.motion, dt_s, tracker.objects, axes_obj, tracker.far_pose, tracker.config)
 
 
 def told(prediction):

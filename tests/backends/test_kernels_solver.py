@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 from both_ways import assert_as_close, both_ways
-from helpers import random_pose, random_twist
-from test_pose_solver import LOSSES, cast, far_off, perturbed, problem_at
-from test_pose_solver_window import windowed
+from helpers import perturbed, random_pose, random_twist
+from pose_problems import LOSSES, cast, far_off, problem_at
+from window_problems import windowed
 
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose

@@ -17,10 +17,10 @@ from torchtrack.core import dispatch
 from torchtrack.errors import EventDataError
 from torchtrack.run.runner import run, track
 from torchtrack.tracking import graphs
-from torchtrack.tracking.estimation import fast_rounds
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
+from torchtrack.backends.numba.rounds import knows
 
 SETTINGS = {
     "default": {},
@@ -106,23 +106,22 @@ def test_scenes_of_several_objects_and_streams_are_the_same(scene, model):
 
 @pytest.mark.parametrize("name", ["steps", "mutual", "refreshed", "no prior"])
 def test_settings_that_the_kernel_does_not_know_go_without_it(name):
-    with torch.inference_mode():
-        assert fast_rounds.applies(TrackerConfig(), torch.zeros(1))
-        assert not fast_rounds.applies(TrackerConfig.model_validate(SETTINGS[name]), torch.zeros(1))
-        assert not fast_rounds.applies(preset("paper"), torch.zeros(1))
+    assert knows(TrackerConfig())
+    assert not knows(TrackerConfig.model_validate(SETTINGS[name]))
+    assert not knows(preset("paper"))
 
 
 def test_where_gradients_are_recorded_there_are_no_kernels():
-    assert not dispatch.apply_to(torch.zeros(1))
+    assert not dispatch.may_accelerate(torch.zeros(1))
     with torch.no_grad():
-        assert dispatch.apply_to(torch.zeros(1))
+        assert dispatch.may_accelerate(torch.zeros(1))
 
 
 def test_within_what_does_without_kernels_nothing_asks_for_them():
-    with torch.inference_mode(), dispatch.kernels(wanted=False), dispatch.kernels(wanted=True):
-        assert not dispatch.apply_to(torch.zeros(1))
+    with torch.inference_mode(), dispatch.backend(wanted=False), dispatch.backend(wanted=True):
+        assert not dispatch.may_accelerate(torch.zeros(1))
     with torch.inference_mode():
-        assert dispatch.apply_to(torch.zeros(1))
+        assert dispatch.may_accelerate(torch.zeros(1))
 
 
 def test_without_numba_all_is_done_by_pytorch(monkeypatch):
@@ -131,7 +130,7 @@ def test_without_numba_all_is_done_by_pytorch(monkeypatch):
         tracker.kernels = False
         _, expected = tracker.step(state, events, end_us)
         tracker.kernels = True
-        monkeypatch.setattr(dispatch, "numba_is_installed", lambda: False)
+        monkeypatch.setattr(dispatch, "backend_is_installed", lambda: False)
         _, found = tracker.step(state, events, end_us)
     assert_same(found, expected)
 
@@ -162,19 +161,20 @@ def test_a_neighbour_that_fails_changes_nothing():
 
 def test_a_stream_is_tracked_by_kernels(monkeypatch):
     """The loop over windows records no gradients."""
-    asked = []
-    monkeypatch.setattr(fast_rounds, "applies", lambda config, values: bool(asked.append(dispatch.apply_to(values))))
+    taken, operation = [], dispatch.OPERATIONS["tracking.estimation.rounds.align_rounds"]
+    accelerated = operation.accelerated
+    monkeypatch.setattr(operation, "accelerated", lambda *args: taken.append(args) or accelerated(*args))
     trajectory, events = moving_box(pose(), 2)
     tracker = Tracker([box_model()], SMALL_CAMERA)
     assert len(list(track([events], tracker, tracker.init(trajectory.T_cam_obj[:1], 0)))) == 2
-    assert asked and all(asked)
+    assert len(taken) >= 2
 
 
 @pytest.mark.parametrize("streams", [[0, 1], [0, 0], [0]])
 @pytest.mark.parametrize("name", ["default", "paper", "line"])
 def test_what_is_compiled_is_compiled_before_the_first_window(name, streams, monkeypatch):
     asked = []
-    monkeypatch.setattr(dispatch, "numba_is_installed", lambda: not asked.append(name))
+    monkeypatch.setattr(dispatch, "backend_is_installed", lambda: not asked.append(name))
     tracker = tracker_class(name)([box_model()] * len(streams), [SMALL_CAMERA] * (max(streams) + 1), preset(name), streams)
     state = tracker.init(torch.stack([pose()] * len(streams)), 0)
     before = [tensor.clone() for tensor in tensors_of(state)]

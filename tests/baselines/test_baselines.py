@@ -1,5 +1,7 @@
 """The comparison methods: that they track what they are made for, and say what they are not made for."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 import trimesh
@@ -45,7 +47,9 @@ def test_objects_do_not_disturb_each_other(name):
     alone, beside = tracker_for(name, [box_model()]), tracker_for(name, [box_model(), box_model((0.1, 0.1, 0.1))], stream_index=[0, 0])
     away = pose((0.1, 0.2, 0.3), (0.0, 5.0, 1.0))
     _, first = follow(alone, alone.init(pose()[None], 0), windows(events, 2))
-    _, both = follow(beside, beside.init(torch.stack([pose(), away]), 0), windows(events, 2))
+    state = beside.init(pose().expand(2, 4, 4), 0)
+    state = replace(state, T_cam_obj=torch.stack([pose(), away]))
+    _, both = follow(beside, state, windows(events, 2))
     torch.testing.assert_close(poses_of(both), poses_of(first), rtol=0, atol=1e-5)
     assert int(both[-1].status[1]) == Status.OUT_OF_VIEW
 

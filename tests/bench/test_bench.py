@@ -12,9 +12,9 @@ from torchtrack.bench.clock import Clock
 from torchtrack.bench.plots import Plot, draw
 from torchtrack.bench.results import Report, Result, as_markdown, machine, older_medians, plain, time_result
 from torchtrack.bench.setup import Setup
-from torchtrack.cli import main
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.main import main
 from torchtrack.errors import ConfigError, MissingExtraError, MissingFileError
-from torchtrack.exit_codes import ExitCode
 
 CPU = torch.device("cpu")
 

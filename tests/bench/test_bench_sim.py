@@ -3,8 +3,8 @@ import json
 import pytest
 
 from torchtrack.bench import sim
-from torchtrack.cli import main
-from torchtrack.exit_codes import ExitCode
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.main import main
 
 
 def test_the_simulator_is_measured(monkeypatch, tmp_path, capsys):

@@ -13,8 +13,8 @@ from torchtrack.bench.peers import filters, poses, surfaces, trackers
 from torchtrack.bench.peers.comparison import Comparison
 from torchtrack.bench.setup import Setup
 from torchtrack.bench.solver import RESIDUALS, poses_of_points
-from torchtrack.cli import main
-from torchtrack.exit_codes import ExitCode
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.main import main
 
 QUICK = Setup(repeats=1)
 

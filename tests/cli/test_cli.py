@@ -8,7 +8,7 @@ import pytest
 from tiny_sequence import write_tiny_sequence
 
 import torchtrack
-from torchtrack.cli import main, split_overrides
+from torchtrack.cli.main import main, split_overrides
 from torchtrack.errors import ConfigError
 
 
@@ -141,7 +141,8 @@ def test_importing_the_package_loads_nothing_heavy():
 
 def test_importing_a_tracker_leaves_the_compiler_alone():
     """It takes as long to load as PyTorch itself."""
-    code = "import sys, torchtrack.tracking.tracker, torchtrack.run.executor.on_ray; print('torchtrack.tracking.tracker' in sys.modules, 'torch._dynamo' in sys.modules)"
+    modules = "'torchtrack.tracking.tracker' in sys.modules, 'torch._dynamo' in sys.modules"
+    code = f"import sys, torchtrack.tracking.tracker, torchtrack.run.executor.on_ray; print({modules})"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.split() == ["True", "False"]
 

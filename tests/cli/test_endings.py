@@ -8,11 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import REPOSITORY
+from places import REPOSITORY
 from tiny_sequence import write_tiny_sequence
 
-from torchtrack.cli import main
-from torchtrack.exit_codes import ExitCode
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.main import main
 from torchtrack.io import read_tum
 from torchtrack.run.sinks.folder import ended
 
@@ -43,7 +43,7 @@ class AtThird:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_run_that_is_told_to_end_keeps_its_results_and_goes_on(sequence_path, tmp_path, monkeypatch, capsys, number):
-    monkeypatch.setattr("torchtrack.commands.ProgressBar", lambda *about: AtThird(lambda: os.kill(os.getpid(), number)))
+    monkeypatch.setattr("torchtrack.cli.track.ProgressBar", lambda *about: AtThird(lambda: os.kill(os.getpid(), number)))
     handler = signal.getsignal(number)
     assert track(sequence_path, tmp_path / "out") == ExitCode.INTERRUPTED
     assert signal.getsignal(number) is handler
@@ -60,7 +60,7 @@ def test_a_signal_outside_a_run_ends_in_good_order(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGTERM)
         raise AssertionError("should not come here")
 
-    monkeypatch.setattr("torchtrack.commands_io.convert", simulating)
+    monkeypatch.setattr("torchtrack.cli.files.convert", simulating)
     assert main(["convert", "a.npz", str(tmp_path / "b.npz")]) == ExitCode.INTERRUPTED
 
 
@@ -134,7 +134,7 @@ def test_a_file_that_may_not_be_read_is_one_line(sequence_path, monkeypatch, cap
     def refused(*about):
         raise PermissionError(13, "Permission denied", "secret.npz")
 
-    monkeypatch.setattr("torchtrack.commands.open_session", refused)
+    monkeypatch.setattr("torchtrack.cli.track.open_session", refused)
     assert main(["track", str(sequence_path), "--quiet"]) == ExitCode.FAILED
     assert capsys.readouterr().err.startswith("error: cannot use 'secret.npz': Permission denied.")
 

@@ -7,12 +7,12 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY, needs_ray
+from places import REPOSITORY, needs_ray
 
-from torchtrack.cli import main
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.main import main
 from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.eval.evaluate import evaluate
-from torchtrack.exit_codes import ExitCode
 from torchtrack.run.sinks.summary import finite
 
 SCENE = "name: a\ncamera: {width: 60, height: 40, fx: 60, fy: 60}\nduration_s: 0.02\nobjects: [{label: cube, shape: cube}]\n"
@@ -80,7 +80,7 @@ def test_evaluate_gives_the_same_on_a_ray_cluster(cluster, folder, tmp_path):
     arguments = ["evaluate", str(tmp_path / "bad.npz"), str(folder), "--methods", "default", "--quiet"]
     assert main([*arguments, "--jobs", "1", "-o", str(tmp_path / "local")]) == ExitCode.FAILED
     environment = {**os.environ, "RAY_ADDRESS": cluster, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", "import sys; from torchtrack.cli import main; sys.exit(main())", *arguments, "--executor", "ray"]
+    command = [sys.executable, "-c", "import sys; from torchtrack.cli.main import main; sys.exit(main())", *arguments, "--executor", "ray"]
     done = subprocess.run([*command, "-o", str(tmp_path / "ray")], env=environment, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == ExitCode.FAILED, done.stderr
     assert "failed: bad (default)" in done.stderr

@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 import torch
 
+from torchtrack.cli.outline import outline_dark_shapes, read_grey_image, write_polylines
 from torchtrack.core.camera import Camera, distort
 from torchtrack.errors import MissingFileError, ModelError, UnknownFormatError
 from torchtrack.object_model import ObjectModel
-from torchtrack.outline import outline_dark_shapes, read_grey_image, write_polylines
 
 PINHOLE = Camera(fx=100.0, fy=110.0, cx=59.5, cy=39.5, width=120, height=80)
 FISHEYE = Camera(fx=100.0, fy=110.0, cx=59.5, cy=39.5, width=120, height=80, distortion_model="fisheye", distortion=(0.05, 0.01, 0.0, 0.0))

@@ -1,6 +1,6 @@
 import pytest
 
-from torchtrack.cli import main
+from torchtrack.cli.main import main
 from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
 from torchtrack.core.limits import Limits, check_limit, current_limits, limits

@@ -3,7 +3,7 @@
 import trimesh
 from tiny_sequence import write_tiny_sequence
 
-from torchtrack.cli import main
+from torchtrack.cli.main import main
 
 
 def write_ball(folder):

@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from torchtrack.cli import main
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.main import main
 from torchtrack.config.run import RunConfig
 from torchtrack.errors import EventDataError
 from torchtrack.eval.latency import estimate_latency
-from torchtrack.exit_codes import ExitCode
 from torchtrack.run.session import open_session
 from torchtrack.sim import CameraConfig, EventCameraConfig, MotionConfig, ObjectConfig, SceneConfig, simulate, write
 
@@ -70,7 +70,7 @@ def test_without_truth_or_motion_there_is_nothing_to_find(late, tmp_path):
 
 
 def test_the_command_shows_a_row_per_sequence(late, found, capsys, monkeypatch):
-    monkeypatch.setattr("torchtrack.commands.estimate_latency", lambda session: found)
+    monkeypatch.setattr("torchtrack.cli.evaluate.estimate_latency", lambda session: found)
     assert main(["evaluate", str(late), "--estimate-latency"]) == ExitCode.DONE
     shown = capsys.readouterr().out
     assert "late" in shown

@@ -9,7 +9,7 @@ from functools import partial
 
 import odd_tasks
 import pytest
-from conftest import REPOSITORY, needs_ray
+from places import REPOSITORY, needs_ray
 
 from torchtrack.errors import ConfigError, MissingExtraError
 from torchtrack.run.executor import ATTEMPTS, TaskFailure, run_tasks
@@ -33,7 +33,7 @@ def mixed(request, tmp_path_factory):
     kinds = list(tasks)
     with pytest.MonkeyPatch.context() as patch:
         # Ray's workers do not know the folder of the tests.
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(REPOSITORY / "tests"), str(REPOSITORY)]))
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(REPOSITORY / "tests" / "support"), str(REPOSITORY)]))
         found = run_tasks(odd_tasks.do, list(tasks.items()), request.param, 2, lambda number, share: told.append((number, share)))
         return {kinds[number]: outcome for number, outcome in found}, told, folder
 
@@ -101,7 +101,7 @@ def test_a_cluster_that_is_not_there_is_an_error(monkeypatch):
 
 @pytest.mark.parametrize("executor", PARALLEL)
 def test_an_interrupt_ends_the_processes_and_leaves_nothing_half_written(executor, tmp_path):
-    command = [sys.executable, str(REPOSITORY / "tests" / "odd_tasks.py"), executor, str(tmp_path)]
+    command = [sys.executable, str(REPOSITORY / "tests" / "support" / "odd_tasks.py"), executor, str(tmp_path)]
     # A shell lets its background jobs ignore the interrupt, and they hand that on.
     heeding = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     program = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=heeding)

@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from places import REPOSITORY
 
 from torchtrack.errors import EventDataError, OutputError
 from torchtrack.io.atomic import atomic_path, check_other_file, check_writable

@@ -8,7 +8,7 @@ from io_files import everything
 from torchtrack.bench.io import HEIGHT, TARGETS, WIDTH, measure, synthetic, write_events
 from torchtrack.bench.results import Report, Result, as_markdown, machine
 from torchtrack.bench.setup import Setup
-from torchtrack.cli import main
+from torchtrack.cli.main import main
 from torchtrack.core.events import concatenate
 from torchtrack.io import open_events
 

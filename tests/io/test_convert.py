@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from io_files import assert_same, everything
 from tiny_sequence import write_tiny_sequence
 
-from torchtrack.cli import main
+from torchtrack.cli.main import main
 from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError, UnknownFormatError
 from torchtrack.io import open_events, read_sequence

@@ -318,15 +318,14 @@ def test_ctrl_c_leaves_complete_outputs(tmp_path):
     writer.write(events)
     writer.close()
     command = [sys.executable, "-m", "torchtrack", "track", str(tmp_path / "live.yaml"), "--quiet"]
-    command[1:3] = ["-c", "import sys; from torchtrack.cli import main; sys.exit(main())"]
+    command[1:3] = ["-c", "import sys; from torchtrack.cli.main import main; sys.exit(main())"]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdin.write((tmp_path / "e.raw").read_bytes())
     process.stdin.flush()
     waited = time.monotonic() + 60
-    # The run makes its output folder under a temporary name once it tracks.
-    while not any(tmp_path.glob(".out*")) and time.monotonic() < waited:
+    poses = tmp_path / "out" / "poses.csv"
+    while not (poses.exists() and len(poses.read_text().splitlines()) > 1) and time.monotonic() < waited:
         time.sleep(0.05)
-    time.sleep(2)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 130, errors.decode()

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import REPOSITORY
+from places import REPOSITORY
 from tiny_sequence import CAMERA, write_tiny_sequence
 
 import torchtrack

@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from conftest import REPOSITORY
+from places import REPOSITORY
 
 
 def test_damaged_files_give_results_or_clear_errors():

@@ -270,7 +270,7 @@ def test_background_image_is_linear_in_light(tmp_path):
 
 def test_camera_is_centred_unless_told_otherwise():
     assert (SMALL.build().cx, SMALL.build().cy) == (59.5, 44.5)
-    assert CameraConfig(cx=10.0).build().cx == 10.0
+    assert CameraConfig(cx=300.0).build().cx == 300.0
 
 
 def test_camera_can_come_from_a_calibration_file(tmp_path):

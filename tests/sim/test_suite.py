@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from torchtrack.cli import main
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.main import main
 from torchtrack.errors import ConfigError, EventDataError, MissingFileError
-from torchtrack.exit_codes import ExitCode
 from torchtrack.io.sequence import read_sequence
 from torchtrack.sim import SceneConfig
 from torchtrack.sim.render import Frame

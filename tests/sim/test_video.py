@@ -8,9 +8,9 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from torchtrack.cli import main
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.main import main
 from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
-from torchtrack.exit_codes import ExitCode
 from torchtrack.io import open_events
 from torchtrack.sim.surface import srgb_to_linear
 from torchtrack.sim.video import VideoConfig, between, events_of_video, video_frames, write_video_events

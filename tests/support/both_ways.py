@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from tracked_boxes import tensors_of
 
-from torchtrack.core.dispatch import kernels
+from torchtrack.core.dispatch import backend
 
 ROUNDINGS = {torch.float32: 2e-4, torch.float64: 1e-9}
 
@@ -13,7 +13,7 @@ ROUNDINGS = {torch.float32: 2e-4, torch.float64: 1e-9}
 def both_ways(compute: Callable):
     """What kernels give, and what goes without them."""
     with torch.inference_mode():
-        with kernels(wanted=False):
+        with backend(wanted=False):
             plain = compute()
         return compute(), plain
 

@@ -21,7 +21,7 @@ from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import ConfigError
 from torchtrack.run.runner import run
-from torchtrack.tracking import graphs
+from torchtrack.tracking import graphs as room
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 
 # Something is learned from every third window.
@@ -35,7 +35,7 @@ class Graphs:
 
     def __init__(self, monkeypatch):
         self.calls, self.dropped, self.compiled_for = [], 0, []
-        monkeypatch.setattr(graphs, "_compiled", self._graph_of)
+        monkeypatch.setattr(room, "_compiled", self._graph_of)
 
     def _graph_of(self, function, device):
         if function.__name__ == "near_tiles":
@@ -167,7 +167,7 @@ def test_of_many_events_those_far_from_all_objects_are_left_out(graphs, monkeypa
     monkeypatch.setattr(SensorTiles, "keep", lambda *args: kept.append(keep(*args)) or kept[-1])
     for most, is_compiled in ((0, False), (10**6, True), (0, True)):
         kept.clear()
-        monkeypatch.setattr(graphs, "_MANY", most)
+        monkeypatch.setattr(room, "_MANY", most)
         # Searches for a new object would be steps without a graph.
         tracker = Tracker([box_model()], WIDE_CAMERA, TrackerConfig(search=SearchConfig(new_share=0)), compiled=is_compiled)
         with torch.inference_mode():
@@ -208,7 +208,7 @@ def test_events_are_filled_up_with_some_of_no_stream(count, streams):
     x, y = (torch.randint(0, 90, (count,), generator=random, dtype=torch.int32) for _ in range(2))
     stream = torch.arange(count) * streams // count
     events = EventBatch(x, y, torch.arange(count), torch.ones(count, dtype=torch.bool), stream)
-    filled = graphs._filled(NearbyEvents(events), streams)
+    filled = room._filled(NearbyEvents(events), streams)
     assert len(filled.events) % 64 == 0
     assert count <= len(filled.events) < 1.25 * count + 64
     assert (filled.events.stream_index[count:] == streams).all()
@@ -220,7 +220,7 @@ def test_events_are_filled_up_with_some_of_no_stream(count, streams):
         # Numbers are of each stream's own, as without a graph.
         assert filled.number is None
     # Few sizes for many counts: a GPU holds a graph for each.
-    sizes = {graphs._rounded_up(n) for n in range(1000, 2000)}
+    sizes = {room._rounded_up(n) for n in range(1000, 2000)}
     assert len(sizes) <= 6
 
 
@@ -234,7 +234,7 @@ def test_a_compiler_that_fails_is_told(monkeypatch, folder, tmp_path):
     def without_compiler(*args):
         raise RuntimeError("No working C++ compiler found\nand more")
 
-    monkeypatch.setattr(graphs, "_compiled", lambda function, device: without_compiler)
+    monkeypatch.setattr(room, "_compiled", lambda function, device: without_compiler)
     with pytest.raises(ConfigError, match=r"could not be compiled: No working C\+\+ compiler found\. It needs a C\+\+ compiler"):
         run(RunConfig(source=folder / "one.npz", compiled=True, output=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
@@ -259,7 +259,7 @@ def test_a_run_is_the_same_with_graphs(graphs, folder, tmp_path):
 
 def in_own_process(backend, device="cpu"):
     """What a tracker that is compiled by a backend gives, in a process in which no types are checked."""
-    path = os.pathsep.join([str(TESTS.parent), str(TESTS)])
+    path = os.pathsep.join([str(TESTS.parents[1]), str(TESTS)])
     command = [sys.executable, "-W", "error::UserWarning", str(TESTS / "compiled_boxes.py"), backend, str(COUNT), device]
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -32,6 +32,7 @@ from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.frontend.time_surface import NEVER_US
+from torchtrack.tracking.initialization import first_state
 from torchtrack.tracking.validation.status import Status
 
 # ---- bad set-ups
@@ -296,7 +297,8 @@ def test_contours_of_a_pose_that_is_held_are_those_of_that_pose():
 def test_an_object_out_of_view_is_told():
     tracker = tracker_of(config=HOLD)
     T = pose(translation=(0.6, 0.0, 0.5))[None]
-    _, result = tracker.step(tracker.init(T, 0), random_events(500, width=200, height=150), 10_000)
+    state = first_state(tracker, T, torch.zeros(1, dtype=torch.int64))
+    _, result = tracker.step(state, random_events(500, width=200, height=150), 10_000)
     assert Status(int(result.status)) == Status.OUT_OF_VIEW
     assert torch.equal(result.T_cam_obj, T)
 

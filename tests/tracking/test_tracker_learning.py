@@ -214,7 +214,7 @@ def test_the_weigher_moves_with_the_tracker():
 
 def test_its_state_can_be_kept_and_restored():
     tracker, state, window = weighing(ByAge(slope=-0.5, offset=1.0))
-    other = Tracker([box_model()], replace(SMALL_CAMERA, fx=100.0), dtype=torch.float64, weigher=ByAge())
+    other = Tracker([box_model()], replace(SMALL_CAMERA, fx=230.0), dtype=torch.float64, weigher=ByAge())
     other.load_state_dict(tracker.state_dict())
     with torch.no_grad():
         assert_same(other(window[0], state, window[1]), tracker.step(state, *window))

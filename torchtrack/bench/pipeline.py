@@ -7,7 +7,7 @@ import numpy as np
 from torchtrack.bench.results import Report, Result, time_result
 from torchtrack.bench.scene import HD, SHAPES, Scene, read, shapes_of, simulated, started, with_events_outside
 from torchtrack.bench.setup import Setup
-from torchtrack.core.dispatch import numba_is_installed
+from torchtrack.core.dispatch import backend_is_installed
 from torchtrack.core.events import EventBatch
 from torchtrack.run.stepping import cut_windows, steps
 from torchtrack.run.window_length import WindowLength
@@ -54,7 +54,7 @@ def _of_scenes(setup: Setup) -> Iterator[_Part]:
         # On a CPU, graphs gain little where kernels work on many objects.
         for compiled in setup.ways if kind == "cuda" else (False,):
             yield _latency(setup, name, simulated(shapes_of(count), columns), target_ms, streams=streams, compiled=compiled)
-    if kind == "cpu" and numba_is_installed():
+    if kind == "cpu" and backend_is_installed():
         yield _latency(setup, f"1 object ({SHAPES[0]})", simulated(SHAPES[:1]), kernels=False)
         count, columns, _, _ = MANY[kind][0]
         yield _latency(setup, f"{count} objects", simulated(shapes_of(count), columns), kernels=False)

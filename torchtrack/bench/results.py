@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from torchtrack.bench.plots import Plot, draw
-from torchtrack.core.dispatch import numba_is_installed
+from torchtrack.core.dispatch import backend_is_installed
 from torchtrack.errors import ConfigError, MissingFileError
 from torchtrack.io.atomic import atomic_path
 
@@ -97,7 +97,7 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
         "python": platform.python_version(),
         "numpy": np.__version__,
         "torch": torch.__version__,
-        "kernels": f"numba {version('numba')}" if numba_is_installed() else "none, as Numba is not installed",
+        "kernels": f"numba {version('numba')}" if backend_is_installed() else "none, as Numba is not installed",
     }
 
 

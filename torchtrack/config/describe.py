@@ -44,6 +44,9 @@ def _default(field: FieldInfo) -> str:
     default = field.get_default(call_default_factory=True, validated_data={})
     if default is None:
         return "-"
+    if isinstance(default, Path):
+        # Within the working folder, which differs from user to user.
+        return str(default.relative_to(Path.cwd())) if default.is_relative_to(Path.cwd()) else str(default)
     return str(list(default)) if isinstance(default, tuple) else str(default).lower() if isinstance(default, bool) else str(default)
 
 

@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.core import dispatch, host_sync
+from torchtrack.core import host_sync
+from torchtrack.core.dispatch import accelerable
 
 
 def solve_factored(right: Float[Tensor, "b n k"], factor: Float[Tensor, "b n n"]) -> Float[Tensor, "b n k"]:
@@ -20,18 +20,12 @@ def solve_factored(right: Float[Tensor, "b n k"], factor: Float[Tensor, "b n n"]
     return torch.linalg.solve_triangular(factor.mT, halfway, upper=True)
 
 
+@accelerable
 def inverse(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:
     """Inverse of symmetric positive definite matrices; infinite on the diagonal where one is not.
 
     Taken with a unit diagonal: rotations and translations, poses and velocities differ by many orders of magnitude.
     """
-    if dispatch.apply_to(matrices):
-        # Not at the top: Numba is an extra.
-        from torchtrack.backends.numba.filtering import invert
-
-        inverses = torch.empty_like(matrices, memory_format=torch.contiguous_format)
-        invert(*as_arrays(matrices, inverses))
-        return inverses
     scale = matrices.diagonal(dim1=-2, dim2=-1).clamp(min=1e-30).rsqrt()
     scales = scale[:, :, None] * scale[:, None]
     factor, info = torch.linalg.cholesky_ex(matrices * scales)

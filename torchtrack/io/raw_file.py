@@ -76,7 +76,7 @@ class RawFile(EventFile):
         with self.path.open("rb") as stream:
             stream.seek(self.offset)
             if self.start_us is not None:
-                decoder = _skip_to(stream, decoder, self.start_us - self.base_us)
+                decoder = _skip_to(stream, decoder, self.start_us - self.base_us, self.problems)
             for words in words_of(stream, decoder.dtype, self.problems):
                 events = decoder.feed(words)
                 yield replace(events, t_us=shifted(events.t_us, self.base_us))
@@ -103,10 +103,11 @@ def words_of(stream: BinaryIO, dtype: np.dtype, problems: Problems) -> Iterator[
     problems.found(Problem.DAMAGED, bool(rest), f"it ends within a word: {len(rest)} bytes are left over. Copy it again.")
 
 
-def _skip_to(stream: BinaryIO, decoder: WordDecoder, start_us: int) -> WordDecoder:
+def _skip_to(stream: BinaryIO, decoder: WordDecoder, start_us: int, problems: Problems) -> WordDecoder:
     """Leave the stream at a block that may hold ``start_us``; returns a decoder that knows what was before it."""
     while True:
-        at, before = stream.tell(), copy.copy(decoder)
+        # Its clock is a copy, too: what is looked at beyond this place must not move it. Faults are counted in one place.
+        at, before = stream.tell(), copy.deepcopy(decoder, {id(problems): problems})
         words = np.frombuffer(stream.read(_BLOCK_BYTES)[: _BLOCK_BYTES // 8 * 8], np.uint8)
         words = words[: len(words) // decoder.dtype.itemsize * decoder.dtype.itemsize].view(decoder.dtype)
         reached = decoder.skip(words)

@@ -8,9 +8,9 @@ import torch
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.run.retracing import Gap, retraced
-from torchtrack.run.smooth import SmoothedObjects
+from torchtrack.run.smooth import SmoothedObjects, filtered_of
 from torchtrack.run.stepping import Step
-from torchtrack.tracking.motion.smoother import Filtered, goes_on
+from torchtrack.tracking.motion.smoother import goes_on
 from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.status import Status
 
@@ -78,7 +78,7 @@ class Retracer:
         newest, begun = self._held[self._looked_at - 1 :], time.perf_counter()
         if len(newest) > 1:
             objects, states = self._objects, [step.state for step in newest]
-            found = goes_on(Filtered.of(states), objects.centre_obj, objects.diameter_m, self._config.motion)
+            found = goes_on(filtered_of(states), objects.centre_obj, objects.diameter_m, self._config.motion)
             status = torch.stack([step.result.status for step in newest[1:]]).cpu()
             lost = ~found | (status >= int(Status.LOST))
             seen = torch.stack([state.unseen_s == 0 for state in states[1:]]).cpu() & ~lost

@@ -16,6 +16,7 @@ from torchtrack.run.stepping import Step
 from torchtrack.tracking.contours.points import reproject
 from torchtrack.tracking.motion.model import left_covariance
 from torchtrack.tracking.motion.smoother import Filtered, smoothed
+from torchtrack.tracking.state import TrackerState
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def _refined(held: Sequence[Step], objects: SmoothedObjects, config: TrackerConf
     """The first ``count`` of the steps, smoothed by all of them."""
     if not count:
         return []
-    after = smoothed(Filtered.of([step.state for step in held]), objects.centre_obj, objects.diameter_m, config.motion)
+    after = smoothed(filtered_of([step.state for step in held]), objects.centre_obj, objects.diameter_m, config.motion)
     poses = zip(orthonormalise(after.T_cam_obj), after.velocity, after.covariance, strict=True)
     return [_with_pose(step, objects, *pose) for step, pose in zip(held[:count], poses, strict=False)]
 
@@ -86,3 +87,9 @@ def _with_pose(step: Step, objects: SmoothedObjects, T_cam_obj: Tensor, velocity
     contours = reproject(result.contours, T_cam_obj.to(points.dtype), objects.intrinsics.to(points))
     state = replace(state, T_cam_obj=T_cam_obj, velocity=velocity.to(state.velocity.dtype), covariance=covariance)
     return replace(step, state=state, result=replace(result, T_cam_obj=T_cam_obj, covariance=left, contours=contours))
+
+
+def filtered_of(states: Sequence[TrackerState]) -> Filtered:
+    """What the states of one stream after consecutive windows say."""
+    known = zip(*((state.T_cam_obj, state.velocity, state.covariance) for state in states), strict=True)
+    return Filtered(torch.cat([state.t_us for state in states]).cpu(), *(torch.stack(values).double().cpu() for values in known))

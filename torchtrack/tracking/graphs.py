@@ -17,25 +17,23 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from inspect import signature
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchtrack.core import dispatch, host_sync
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core import host_sync
 from torchtrack.core.constants import cells_within
 from torchtrack.core.events import EventBatch, check_on_sensor, pad_streams
 from torchtrack.errors import ConfigError
 from torchtrack.tracking.adapt import due_lessons
 from torchtrack.tracking.cuda_graphs import CudaGraphs
 from torchtrack.tracking.frontend.bursts import update_bursts
-from torchtrack.tracking.frontend.tiles import NearbyEvents
+from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 from torchtrack.tracking.state import S, StepResult, TrackerState, each_tensor
-
-if TYPE_CHECKING:
-    from torchtrack.tracking.tracker import Tracker
 
 P, R = ParamSpec("P"), TypeVar("R")
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
@@ -50,6 +48,38 @@ _MANY = 16_384
 _DIGITS, _MULTIPLE = 3, 64
 
 
+@runtime_checkable
+class Steadily(Protocol):
+    """What graphs are made of: a tracker, as far as it takes steady windows."""
+
+    config: TrackerConfig
+    tiles: SensorTiles | None
+
+    @property
+    def shows_all(self) -> bool:
+        """Whether a weigher of one's own is shown all events."""
+        ...
+
+    @property
+    def on_surfaces(self) -> Tensor | None:
+        """On which objects contours can be learned."""
+        ...
+
+    def opened(self, state: TrackerState, events: EventBatch) -> TrackerState:
+        """The state with the newest events of a window in its map."""
+        ...
+
+    def near_tiles(self, state: TrackerState, t_us: Int[Tensor, "s"]) -> Tensor | None:
+        """Tiles with events that can have to do with each object."""
+        ...
+
+    def steady_advance(
+        self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"], *, learns: bool = False
+    ) -> tuple[TrackerState, StepResult, Tensor]:
+        """A window with nothing to decide, and whether anything was."""
+        ...
+
+
 class CompiledStep:
     """Takes steady windows by graphs, made when they are first needed: compiled for a minute or more, and for seconds from a cache on disk.
 
@@ -61,7 +91,7 @@ class CompiledStep:
         ConfigError: if this version of PyTorch cannot.
     """
 
-    def __init__(self, tracker: "Tracker", *, compiles: bool = True) -> None:
+    def __init__(self, tracker: Steadily, *, compiles: bool = True) -> None:
         if compiles and "isolate_recompiles" not in signature(torch.compile).parameters:
             raise ConfigError(f"compiled: PyTorch {torch.__version__} cannot compile a tracker. Update it to 2.13 or later, or go without.")
         self._tracker, self._compiles = tracker, compiles
@@ -219,8 +249,7 @@ def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest
     Not in the graph: where 16 bits are enough, a CPU's compiler takes one pixel at a time.
     """
     streams, most = len(t_us), filled.events.most_of_one
-    if dispatch.apply_to(t_us):
-        # Unlike PyTorch's operations, kernels do not look where they read and write.
+    if host_sync.read_at_once(t_us):
         height, width = opened.burst_age_us.shape[-2:]
         check_on_sensor(filled.events, width, height)
     window = pad_streams(filled.events, streams, t_us)

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core import dispatch, lie
+from torchtrack.core import lie
 from torchtrack.core.camera import MIN_DEPTH_M, project
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.events import EventBatch, stream_bounds
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import PoseError
@@ -127,26 +127,19 @@ def of_unknown_motion(state: TrackerState, t_us: Int[Tensor, "s"], objects: Obje
     window = config.window
     if window.parts == 1 or not config.solver.prior:
         return torch.zeros_like(objects.stream_index, dtype=torch.bool)
-    if dispatch.apply_to(state.covariance):
-        return _of_unknown_motion_by_kernel(state, t_us, objects, config)
+    return moves_unknown(state, t_us, objects, config)
+
+
+@accelerable
+def moves_unknown(state: TrackerState, t_us: Int[Tensor, "s"], objects: ObjectBatch, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """:func:`of_unknown_motion` where windows are taken in parts."""
+    window = config.window
     window_s = ((t_us - state.t_us) * 1e-6)[objects.stream_index]
     unknown_m_s = unknown_speed(state.covariance, objects.diameter_m).to(objects.intrinsics.dtype)
     px_per_m = objects.px_per_m(state.T_cam_obj.to(unknown_m_s.dtype))
     sigma_m = state.covariance.diagonal(dim1=1, dim2=2)[:, 3:5].mean(1).sqrt().to(px_per_m.dtype)
     # What is not known to be anywhere is looked for by all events of a window, and with the motion that leads to each place.
     return (unknown_m_s * window_s * px_per_m > window.max_unknown_px) & (px_per_m * sigma_m <= config.search.wide_sigma_px)
-
-
-def _of_unknown_motion_by_kernel(state: TrackerState, t_us: Int[Tensor, "s"], objects: ObjectBatch, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """:func:`of_unknown_motion`, object by object."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba.filtering import find_unknown_motion
-
-    is_unknown = torch.empty_like(objects.stream_index, dtype=torch.bool)
-    own = as_arrays(objects.centre_obj, objects.intrinsics[:, 0], objects.diameter_m, objects.stream_index, t_us - state.t_us)
-    limits = config.window.max_unknown_px, config.search.wide_sigma_px
-    find_unknown_motion(*as_arrays(state.covariance, state.T_cam_obj), *own, *limits, is_unknown.numpy())
-    return is_unknown
 
 
 def check_poses(T_cam_obj: Tensor, centre_obj: Float[Tensor, "b 3"], names: Sequence[str]) -> None:

@@ -12,6 +12,7 @@ from torchtrack.tracking.adaptation.learned_contours import LearnedContours
 from torchtrack.tracking.adaptation.model_trust import ModelTrust
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.corners import Corners
+from torchtrack.tracking.motion.model import MotionState
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,11 @@ class TrackerState:
         full_share: of the moving contour, what events explain when the object is seen well: rises as fast, but falls slowly.
         full_gathered: the same of how far events near its contours are on them.
         full_count: matched observations when the object is seen well, likewise.
-        full_apart: how far apart the directions of contours with events on them are then (:func:`torchtrack.tracking.validation.measures.directions_apart`).
+        full_apart: how far apart the directions of contours with events on them are then (:func:`tracking.validation.measures.directions_apart`).
         doubted_s: for how long, less the time it was not, the object has been in doubt of being elsewhere (s).
         T_last_seen: pose of each object when it was last seen well (float64).
         unseen_s: how long ago that was (s).
-        darker_outside: which side of each object's contours is the darker one, by the octant that they face: :mod:`torchtrack.tracking.association.polarity`.
+        darker_outside: which side of each object's contours is the darker one, by the octant that they face: :mod:`tracking.association.polarity`.
         late_share: how many of the events on its moving contours come late in their bursts: :mod:`torchtrack.tracking.adaptation.pixel_latency`.
         t_us: end of the last window of each stream (µs).
         last_event_us: time of the newest event of every sensor pixel (µs).
@@ -84,6 +85,11 @@ class TrackerState:
     probation: Probation
     learned: LearnedContours | None = None
     model_trust: ModelTrust | None = None
+
+    @property
+    def motion(self) -> MotionState:
+        """What the motion model predicts from."""
+        return MotionState(self.T_cam_obj, self.velocity, self.acceleration, self.covariance)
 
     def numbered(self, before: "TrackerState", more: int = 0) -> "TrackerState":
         """The state with as many windows taken as ``before``, and some more."""

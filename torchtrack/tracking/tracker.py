@@ -70,7 +70,7 @@ class Tracker(TrackedObjects):
         config: settings; the ``default`` preset when not given.
         stream_index: the stream each object is seen in; the first for all when not given.
         dtype: precision of the pipeline; poses are kept in float64.
-        weigher: judges every window's :class:`torchtrack.tracking.association.weighting_features.Evidence`: how far each observation is to be believed,
+        weigher: judges every window's :class:`tracking.association.weighting_features.Evidence`: how far each observation is to be believed,
             ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
             comes with the package, for what ``matching.learned_trust`` says. Other poses that a search tries are aligned
             without it.
@@ -144,7 +144,7 @@ class Tracker(TrackedObjects):
         """
         t_us = self._window_end(state, events, t_end_us)
         check_step(state.t_us, events, t_us)
-        with torch.autocast(t_us.device.type, enabled=False), dispatch.kernels(wanted=self.kernels):
+        with torch.autocast(t_us.device.type, enabled=False), dispatch.backend(wanted=self.kernels):
             steady = self._steady(state, events, t_us)
             if steady is not None:
                 return _counted(steady)
@@ -179,8 +179,8 @@ class Tracker(TrackedObjects):
             state: from :meth:`init`.
         """
         self.graphs.prepare(state)
-        with torch.inference_mode(), dispatch.kernels(wanted=self.kernels):
-            if dispatch.apply_to(self.intrinsics):
+        with torch.inference_mode(), dispatch.backend(wanted=self.kernels):
+            if dispatch.may_accelerate(self.intrinsics):
                 # Kernels are compiled, or read from the disk, when they are first called: for a window without events.
                 self._advance(state, EventBatch.empty(), state.t_us + 1)
                 if searches(self.config):
@@ -313,7 +313,9 @@ class Tracker(TrackedObjects):
     def _predict(self, state: TrackerState, dt_s: Tensor) -> Prediction:
         """Predicted pose and motion, and how certain they are."""
         objects = objects_as_known(self.objects, state, self.element_groups, self.on_surfaces is not None, self.config)
-        return forecast(state, dt_s, objects, self.revolution_axes if self.revolves else None, self.far_pose, self.config)
+        return forecast(
+            state.motion, dt_s, objects, self.revolution_axes if self.revolves and self.config.motion.spin_fades else None, self.far_pose, self.config
+        )
 
     def _doubt(self, state: TrackerState, t_us: Tensor, sigma_px: Tensor, starting: Tensor, anew: tuple[Tensor, Tensor]) -> Doubt:
         """What speaks for trying other poses in the window that ends at ``t_us``; with why objects are looked for ``anew``."""

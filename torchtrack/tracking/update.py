@@ -6,27 +6,22 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.backends.numba.parameters import ConclusionSettings
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core import dispatch, host_sync, lie
+from torchtrack.core import host_sync, lie
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.linalg import inverse
 from torchtrack.tracking.association.polarity import is_seen_well, remembered
 from torchtrack.tracking.association.weights import ON_CONTOUR_PX
 from torchtrack.tracking.contours.points import Contours, reproject
-from torchtrack.tracking.estimation.rounds import ANYWHERE, Fit, may_be_anywhere
+from torchtrack.tracking.estimation.rounds import Fit, may_be_anywhere
 from torchtrack.tracking.frontend.corners import Corners
-from torchtrack.tracking.motion.model import Acceleration, fade, found_acceleration, left_covariance, with_dropped
+from torchtrack.tracking.motion.model import fade, found_acceleration, left_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.triggers import SMEARED, in_doubt
+from torchtrack.tracking.relocalization.triggers import in_doubt
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.measures import visible_share
 from torchtrack.tracking.validation.scored_fit import Found
 from torchtrack.tracking.validation.status import (
-    HIDDEN_FROM,
-    HIDDEN_FULLY,
-    HIDDEN_LEAST,
-    HIDDEN_TIMES,
     Status,
     holding_on,
     judge,
@@ -35,12 +30,12 @@ from torchtrack.tracking.validation.status import (
 )
 
 # Share of a new window in the usual quality.
-_USUAL_GAIN = 0.1
+USUAL_GAIN = 0.1
 # And in the full one where it is less: what is hidden for a while is not seen well.
-_FALL_GAIN = 0.005
+FALL_GAIN = 0.005
 # A pose that explains this share of what it does when seen well, by this share of the observations, is remembered as one: most that
 # slipped explain less, or are far away, where few explain all.
-_CERTAIN, _CERTAIN_COUNT = 0.9, 0.5
+CERTAIN, CERTAIN_COUNT = 0.9, 0.5
 
 
 def conclude(
@@ -59,11 +54,7 @@ def conclude(
         widening: of each object's first gate.
         dt_s: length of the window.
     """
-    expected = prediction.acceleration
-    if config.solver.prior and expected is not None and dispatch.apply_to(dt_s):
-        after, covariance, status = _judged_by_kernel(state, prediction, expected, widening, found, dt_s, config)
-    else:
-        after, covariance, status = _judged(state, prediction, widening, found, dt_s, config)
+    after, covariance, status = judged_objects(state, prediction, widening, found, dt_s, config)
     contours = _where_they_are(found.fit, after.T_cam_obj, status >= int(Status.LOST), prediction.objects.intrinsics)
     result = StepResult(state.t_us, after.T_cam_obj, covariance, status, found.share, contours, corners, found.count)
     sides = _darker_outside(state, found, status, dt_s, config)
@@ -79,12 +70,13 @@ def _where_they_are(fit: Fit, T_cam_obj: Float[Tensor, "b 4 4"], failed: Bool[Te
 
 
 # The state with what is known of poses and motions after a window, covariances of the poses' left perturbation, and statuses.
-_Judgement = tuple[TrackerState, Float[Tensor, "b 6 6"], Int[Tensor, "b"]]
+Judgement = tuple[TrackerState, Float[Tensor, "b 6 6"], Int[Tensor, "b"]]
 
 
-def _judged(
+@accelerable
+def judged_objects(
     state: TrackerState, prediction: Prediction, widening: Float[Tensor, "b"], found: Found, dt_s: Float[Tensor, "b"], config: TrackerConfig
-) -> _Judgement:
+) -> Judgement:
     """What every object's pose is worth, and where it goes on from there: arguments as those of :func:`conclude`."""
     objects, share, solution = prediction.objects, found.share, found.fit.solution
     in_view = visible_share(found.fit.contours, objects.image_size)
@@ -107,8 +99,8 @@ def _judged(
     seen_well = ~failed & (share >= config.quality.certain_at * state.full_share)
     acceleration = _acceleration(prediction, found, torch.where(seen_well, trusted, 0), dt_s)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
-    certain = (share >= _CERTAIN * state.full_share) & (status == int(Status.TRACKING))
-    certain &= (found.count >= _CERTAIN_COUNT * state.full_count) | (not config.search.by_events)
+    certain = (share >= CERTAIN * state.full_share) & (status == int(Status.TRACKING))
+    certain &= (found.count >= CERTAIN_COUNT * state.full_count) | (not config.search.by_events)
     usual_score, full_share, full_gathered, full_count = _usual(state, found, failed)
     after = replace(
         state,
@@ -128,81 +120,6 @@ def _judged(
     return after, left_covariance(covariance[:, :6, :6], centre_cam), status
 
 
-def _judged_by_kernel(
-    state: TrackerState,
-    prediction: Prediction,
-    expected: Acceleration,
-    widening: Float[Tensor, "b"],
-    found: Found,
-    dt_s: Float[Tensor, "b"],
-    config: TrackerConfig,
-) -> _Judgement:
-    """:func:`_judged`, object by object; ``expected`` is the prediction's acceleration."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba import conclusion as kernels
-
-    objects, solution, batch = prediction.objects, found.fit.solution, len(dt_s)
-    in_view = visible_share(found.fit.contours, objects.image_size)
-    told = torch.stack([found.share, found.score, found.gathered, found.full_gathered, in_view, widening])
-    remembered = torch.stack([state.usual_score, state.full_share, state.full_gathered, state.full_count, state.doubted_s, state.unseen_s])
-    T_last_seen = state.T_last_seen.clone(memory_format=torch.contiguous_format)
-    T_cam_obj, covariance, left = (T_last_seen.new_empty(batch, size, size) for size in (4, 12, 6))
-    (velocity, acceleration), status = dt_s.new_empty(2, batch, 6), found.count.new_empty(batch)
-    kernels.conclude(
-        *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance, prediction.information),
-        *as_arrays(expected.expected, expected.variance, solution.T_cam_obj, solution.from_prior, solution.hessian),
-        *as_arrays(found.elsewhere, found.turn_unclear, found.count, told, dt_s, objects.centre_obj, objects.diameter_m),
-        _settings(config),
-        *as_arrays(remembered, T_last_seen, T_cam_obj, velocity, acceleration, covariance, left, status),
-    )
-    usual_score, full_share, full_gathered, full_count, doubted_s, unseen_s = remembered.unbind()
-    after = replace(
-        state,
-        T_cam_obj=T_cam_obj,
-        velocity=velocity,
-        acceleration=acceleration,
-        covariance=covariance,
-        usual_score=usual_score,
-        full_share=full_share,
-        full_gathered=full_gathered,
-        full_count=full_count,
-        doubted_s=doubted_s,
-        T_last_seen=T_last_seen,
-        unseen_s=unseen_s,
-    )
-    return after, left, status
-
-
-def _settings(config: TrackerConfig) -> ConclusionSettings:
-    """What a kernel goes by that concludes as :func:`conclude` does."""
-    return ConclusionSettings(
-        holds=config.motion.without_events == "hold",
-        anywhere=ANYWHERE,
-        uncertain_below=config.quality.uncertain_below,
-        lost_below=config.quality.lost_below,
-        caught_above=config.quality.caught_above,
-        certain_at=config.quality.certain_at,
-        partly_hidden=config.quality.partly_hidden,
-        hidden_from=HIDDEN_FROM,
-        hidden_fully=HIDDEN_FULLY,
-        hidden_least=HIDDEN_LEAST,
-        hidden_observations=HIDDEN_TIMES * config.quality.min_observations,
-        holds_on=config.quality.holds_on,
-        min_observations=config.quality.min_observations,
-        min_visible_share=config.quality.min_visible_share,
-        max_step_rotation_rad=config.quality.max_step_rotation_rad,
-        max_step_translation=config.quality.max_step_translation,
-        observation_px=config.solver.observation_px,
-        coast_s=config.motion.coast_s,
-        doubted_below=config.search.doubted_below,
-        smeared=SMEARED,
-        usual_gain=_USUAL_GAIN,
-        fall_gain=_FALL_GAIN,
-        certain_share=_CERTAIN,
-        certain_count=_CERTAIN_COUNT if config.search.by_events else 0.0,
-    )
-
-
 def _darker_outside(
     state: TrackerState, found: Found, status: Int[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> Float[Tensor, "b 8"]:
@@ -219,7 +136,7 @@ def _darker_outside(
 
 def _usual(state: TrackerState, found: Found, failed: Bool[Tensor, "b"]) -> tuple[Float[Tensor, "b"], ...]:
     """Score as a rule, and share, gathering and observations when seen well, with a window more; of objects that failed, as before."""
-    usual = torch.where(failed, state.usual_score, torch.lerp(state.usual_score, found.score, _USUAL_GAIN))
+    usual = torch.where(failed, state.usual_score, torch.lerp(state.usual_score, found.score, USUAL_GAIN))
     full_share = torch.where(failed, state.full_share, _seen_well(state.full_share, found.share))
     full_gathered = torch.where(failed | found.gathered.isnan(), state.full_gathered, _seen_well(state.full_gathered, found.gathered))
     full_count = torch.where(failed, state.full_count, _seen_well(state.full_count, found.count.to(state.full_count.dtype)))
@@ -233,7 +150,7 @@ def _full_apart(state: TrackerState, after: TrackerState, found: Found) -> Float
 
 def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     """A running mean of when objects are seen well: it rises fast, and falls slowly."""
-    return torch.maximum(*(torch.lerp(before, now, gain) for gain in (_USUAL_GAIN, _FALL_GAIN)))
+    return torch.maximum(*(torch.lerp(before, now, gain) for gain in (USUAL_GAIN, FALL_GAIN)))
 
 
 def _acceleration(prediction: Prediction, found: Found, trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 6"]:

@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from close_edges import two_depths
 from helpers import IMAGE_SIZE, contours_at, generator, moving_objects, seen, upright_line
 from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import MatchingConfig, SolverConfig, TrackerConfig
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.tracking.association.nearest import ContourTable, match_nearest
+from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.observations import join, select_events
 from torchtrack.tracking.association.weights import SORTED_PX2, mistaken_px2, told_by_each
 from torchtrack.tracking.contours.index import index_contours
@@ -38,7 +39,7 @@ def test_observations_are_counted_by_patch_where_they_are_on_a_contour():
     """Two patches (16 px) with 30 and 5 observations on an upright line, and some 2 px beside it, which do not count."""
     rows = torch.cat([torch.linspace(33, 46, 30), torch.linspace(81, 94, 5), torch.linspace(33, 46, 8)]).double()
     columns = torch.cat([torch.full((35,), 85.2), torch.full((8,), 87.0)]).double()
-    table = ContourTable.of(contours := upright_line(85.0), index_contours(contours, IMAGE_SIZE, 8, 1))
+    table = contour_table(contours := upright_line(85.0), index_contours(contours, IMAGE_SIZE, 8, 1))
     observations, still = seen(torch.stack([columns, rows], -1)[None]), moving_objects((0.0, 0.0), 1, torch.float64)
     matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, MatchingConfig(dark_shift_px=0.0))
     assert matches.beside[0].tolist() == [30] * 30 + [5] * 5 + [30] * 8
@@ -85,7 +86,7 @@ def test_a_displaced_place_with_many_events_pulls_less_with_an_error_in_common()
     rows = torch.cat([torch.linspace(33, 46, 100), torch.linspace(81, 94, 10)]).double()
     noise = 0.05 * torch.randn(110, generator=generator(3), dtype=torch.float64)
     columns = 85 + noise + torch.cat([torch.full((100,), 0.5), torch.zeros(10)]).double()
-    table = ContourTable.of(contours := upright_line(85.0), index_contours(contours, IMAGE_SIZE, 8, 1))
+    table = contour_table(contours := upright_line(85.0), index_contours(contours, IMAGE_SIZE, 8, 1))
     observations, still = seen(torch.stack([columns, rows], -1)[None]), moving_objects((0.0, 0.0), 1, torch.float64)
     matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, MatchingConfig(dark_shift_px=0.0, polarity=False))
     means = []
@@ -124,16 +125,6 @@ def test_what_is_one_edge_or_far_from_the_next_is_not_mistaken(apart_px):
     assert (mistaken(*two_lines(apart_px)) == 0).all()
 
 
-def two_depths(apart_px, kind=ContourKind.CREASE, depth_m=1.05):
-    """Two upright lines, the second at another depth than the first, and a point whose depth makes the object 0.1 m deep."""
-    far = upright_line(80.0 + apart_px, kind=kind)
-    far.points_cam[..., 2] = depth_m
-    corner = contours_at([[[20.0, 20.0]]], kind=kind)
-    corner.points_cam[..., 2] = 1.1
-    contours = joined(joined(upright_line(80.0, kind=kind), far), corner)
-    return contours, index_contours(contours, IMAGE_SIZE, 8, 1)
-
-
 @pytest.mark.parametrize("apart_px", [0.2, 0.45, 1.0])
 def test_sharp_edges_at_different_depths_share_what_is_seen_even_where_they_cover_each_other(apart_px):
     found = mistaken(*two_depths(apart_px))[:-1]
@@ -165,6 +156,6 @@ def test_what_is_seen_between_close_edges_tells_less_where_that_counts():
     contours, index = two_lines(2.0)
     observations, still = seen(torch.tensor([[[79.8, 60.0], [82.1, 60.0]]]).double()), moving_objects((0.0, 0.0), 1, torch.float64)
     for close_px, expected in ((0.0, 0.0), (2.0, 2 * math.exp(-1))):
-        table = ContourTable.of(contours, index, close_px=close_px)
+        table = contour_table(contours, index, close_px=close_px)
         matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, MatchingConfig(dark_shift_px=0.0))
         torch.testing.assert_close(matches.mistaken_px2, torch.full((1, 2), expected, dtype=torch.float64))

@@ -6,7 +6,7 @@ from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
 from pydantic import ValidationError
 
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.tracking.association.nearest import ContourTable, match_nearest
+from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.weights import mutual_agreement, patch, patch_sums
 from torchtrack.tracking.contours.index import index_contours
 
@@ -79,7 +79,7 @@ def test_patches_of_another_size():
 def weights_on_a_line(offsets, rows, **settings):
     """Weights of observations beside the line at 80 px."""
     places = torch.stack([80 + torch.as_tensor(offsets, dtype=torch.float64), torch.as_tensor(rows, dtype=torch.float64)], -1)[None]
-    table = ContourTable.of(upright_line(80.0), index_contours(upright_line(80.0), IMAGE_SIZE, 8, 1))
+    table = contour_table(upright_line(80.0), index_contours(upright_line(80.0), IMAGE_SIZE, 8, 1))
     config = MatchingConfig(**{"concentration": False, "polarity": False, "dark_shift_px": 0.0, "mutual_px": 0.7, **settings})
     return match_nearest(seen(places), table, places, moving_objects((0.0, 0.0)), 4.0, config)[0].weights[0]
 

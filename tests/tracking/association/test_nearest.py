@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_pose, seen, upright_line
+from nearest_cases import matching, nearest
 
 from torchtrack.config.tracker import ContourConfig, MatchingConfig
 from torchtrack.core.image_velocity import MovingObjects, object_plane_velocity
@@ -13,26 +14,11 @@ from torchtrack.core.lie import retract_about
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
 from torchtrack.tracking.association.along_flow import match_along_flow
 from torchtrack.tracking.association.matches import both_coordinates
-from torchtrack.tracking.association.nearest import ContourTable, match_nearest
+from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.weights import concentration, on_and_around, patch, patch_sums
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import Contours, mesh_contours, reproject
-
-
-def matching(**settings):
-    """Settings without what corrects and weights the matches, unless it is asked for."""
-    return MatchingConfig(**{"dark_shift_px": 0.0, "limb_dark_shift_px": 0.0, "concentration": False, "polarity": False, **settings})
-
-
-def nearest(observations, contours, *, velocity=(0.0, 0.0), believed=None, gate_px=3.0, index=None, cell_px=1, **settings):
-    """The matches of ``match_nearest``, with all contours moving at ``velocity`` (px/s)."""
-    dtype = contours.pixels.dtype
-    moving = moving_objects(velocity, len(contours.pixels), dtype)
-    believed = torch.as_tensor(velocity if believed is None else believed, dtype=dtype)
-    table = ContourTable.of(contours, index or index_contours(contours, IMAGE_SIZE, 8, cell_px))
-    place = observations.pixels + believed * observations.age_s[..., None]
-    return match_nearest(observations, table, place, moving, gate_px, matching(**settings))
 
 
 def brute_force(contours, places, number):
@@ -203,7 +189,7 @@ def test_an_index_of_an_earlier_pose_still_finds_the_contours():
     first, place = nearest(observation, after, index=index)
     assert first.mask.all()
     assert place[0, 0].tolist() == pytest.approx([80.5, 60.0])
-    table = ContourTable.of(upright_line(87.0), index)
+    table = contour_table(upright_line(87.0), index)
     second = match_nearest(seen([[[86.5, 60.0]]]), table, place, moving_objects((0.0, 0.0)), 3.0, matching())[0]
     assert second.mask.all()
     assert second.contour.tolist() == [[40]]
@@ -281,7 +267,7 @@ def test_events_of_a_moving_box_are_all_matched_within_a_pixel():
     earlier = reproject(contours, T_before, intrinsics)
     observations = seen(earlier.pixels.round(), age_s=5e-3)
     objects = MovingObjects(T_now, velocity, T_now[:, :3, 3], intrinsics)
-    table = ContourTable.of(contours, index_contours(contours, IMAGE_SIZE, 8, 1))
+    table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1))
     place = observations.pixels + 5e-3 * object_plane_velocity(observations.pixels, velocity, T_now[:, :3, 3], intrinsics)
     inside = ((earlier.pixels > 0) & (earlier.pixels < torch.tensor([199, 149]))).all(-1)
     assert int(inside.sum()) > 200

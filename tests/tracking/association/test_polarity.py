@@ -17,7 +17,7 @@ from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import simulate
 from torchtrack.tracking.adapt import objects_as_known
-from torchtrack.tracking.association.nearest import ContourTable, match_nearest
+from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.polarity import expected_polarity, is_asked, is_seen_well, nothing_remembered, octant, remembered
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.validation.measures import explained_share
@@ -106,7 +106,7 @@ def matched(dark, *, expected=1.0, kind=ContourKind.LIMB):
     v = 32 + 15 * torch.rand(len(dark), generator=generator(), dtype=torch.float64)
     places = torch.stack([torch.full_like(v, 80.0), v], -1)[None]
     polarity = None if expected is None else torch.zeros(1, 8, dtype=torch.float64).index_fill(1, torch.tensor([RIGHT]), expected)
-    table = ContourTable.of(contours, index_contours(contours, IMAGE_SIZE, 8, 1), polarity)
+    table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1), polarity)
     observations = seen(places, polarity=torch.tensor(dark, dtype=torch.float64)[None])
     config = MatchingConfig(concentration=False, dark_shift_px=0.0, limb_dark_shift_px=0.0)
     return contours, match_nearest(observations, table, places, moving_objects((500.0, 0.0)), 3.0, config)[0]

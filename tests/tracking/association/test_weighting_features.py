@@ -9,7 +9,7 @@ from tracked_boxes import follow, merged, moving_box, tensors_of, windows
 
 from torchtrack import Tracker, preset
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
-from torchtrack.core.dispatch import kernels
+from torchtrack.core.dispatch import backend
 from torchtrack.core.events import concatenate
 from torchtrack.tracking.association.weighting_features import limb_features
 from torchtrack.tracking.association.weighting_network import LimbTrust, TrustNetwork
@@ -53,7 +53,7 @@ def tracked(models, starts, streams=None, spoilt=None):
 def test_sharp_edges_are_believed_in_full(dtype):
     evidence, weigher = evidence_of((BOX, SMOOTH), dtype)
     for wanted in (False, True):
-        with torch.no_grad(), kernels(wanted=wanted):
+        with torch.no_grad(), backend(wanted=wanted):
             trust = weigher(evidence)
         assert (trust[0] == 1).all()
         of_smooth = trust[1][evidence.observations.mask[1]]
@@ -74,7 +74,7 @@ def test_limbs_are_described_the_same_by_a_kernel(dtype):
     evidence, _ = evidence_of((SMOOTH, BOX, SMOOTH), dtype)
     with torch.no_grad():
         features, is_limb, objects = limb_features(evidence)
-        with kernels(wanted=False):
+        with backend(wanted=False):
             expected, wanted, every = limb_features(evidence)
     # Of the box there is nothing to describe.
     assert objects.tolist() == [0, 2] and every.tolist() == [0, 1, 2]

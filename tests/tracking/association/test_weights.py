@@ -6,7 +6,7 @@ from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
 
 from torchtrack.config.tracker import MatchingConfig
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.tracking.association.nearest import ContourTable, match_nearest
+from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.weights import on_and_around, patch, patch_sums, polarity_agreement
 from torchtrack.tracking.contours.index import index_contours
 
@@ -84,7 +84,7 @@ def weights_on_a_line(polarity, *, speed=500.0, kind=ContourKind.CREASE, polarit
     v = 32 + 15 * torch.rand(len(polarity), generator=generator(), dtype=torch.float64)
     places = torch.stack([torch.full_like(v, 80.0), v], -1)[None]
     observations = seen(places, polarity=torch.tensor(polarity, dtype=torch.float64)[None])
-    table = ContourTable.of(contours, index_contours(contours, IMAGE_SIZE, 8, 1), of_print=print_counts)
+    table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1), of_print=print_counts)
     config = MatchingConfig(concentration=False, dark_shift_px=0.0, limb_dark_shift_px=0.0, polarity=polarity_counts)
     return match_nearest(observations, table, places, moving_objects((speed, 0.0)), 3.0, config)[0].weights[0]
 

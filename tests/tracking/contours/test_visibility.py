@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-import trimesh
 from helpers import SMALL_CAMERA, box_model, pose, random_pose
+from solid_models import ball, l_prism
 
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import Camera
@@ -17,22 +17,6 @@ from torchtrack.tracking.validation.measures import visible_share
 
 CONFIG = ContourConfig()
 LARGE_CAMERA = Camera(fx=600.0, fy=600.0, cx=319.5, cy=239.5, width=640, height=480)
-
-
-def l_prism():
-    """An L-shaped bar: concave, twenty faces, the outside seen anticlockwise."""
-    outline = np.array([[0, 0], [0.12, 0], [0.12, 0.04], [0.04, 0.04], [0.04, 0.12], [0, 0.12]]) - 0.04
-    low, high = (np.column_stack([outline, np.full(6, z)]) for z in (-0.03, 0.03))
-    cap = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]
-    faces = [[a + 6 for a in face] for face in cap] + [face[::-1] for face in cap]
-    for i in range(6):
-        j = (i + 1) % 6
-        faces += [[i, j, j + 6], [i, j + 6, i + 6]]
-    return trimesh.Trimesh(np.concatenate([low, high]), faces, process=False)
-
-
-def ball(radius_m, centre=(0.0, 0.0, 0.0), subdivisions=3):
-    return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius_m).apply_translation(centre)
 
 
 def extracted(models, T, *, streams=None, camera=SMALL_CAMERA, stream_count=None, config=CONFIG, dtype=torch.float64):

@@ -5,9 +5,9 @@ from dataclasses import fields, replace
 import pytest
 import torch
 from helpers import generator, perturbed, pose, random_pose
-from test_pose_solver import cost_of, problem_at
-from test_pose_solver_window import windowed
+from pose_problems import cost_of, problem_at
 from torch.autograd import gradcheck
+from window_problems import windowed
 
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core.lie import cayley, move_about, retract_about, se3_exp

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from helpers import generator, seen, upright_line
-from test_matching import nearest
+from nearest_cases import nearest
 
 from torchtrack.core.events import EventBatch, PaddedEvents, concatenate, pad_streams
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US, no_bursts, update_bursts, without_tail

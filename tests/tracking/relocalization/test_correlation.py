@@ -8,7 +8,7 @@ from tracked_boxes import in_motion
 
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.tracking.relocalization.correlation import _peaks, shifted
+from torchtrack.tracking.relocalization.correlation import peaks, shifted
 from torchtrack.tracking.relocalization.view_sphere import outlines_at
 
 CONFIG = TrackerConfig(search=SearchConfig(kept=12))
@@ -93,7 +93,7 @@ def test_events_that_are_nowhere_count_for_nothing():
 def test_peaks_are_higher_than_all_around_them(share, dtype):
     fit = torch.randn((20, 96, 96), generator=generator(), dtype=torch.float64).to(dtype)
     allowed = torch.rand((96, 96), generator=generator(1)) < share
-    (best, place), (others, other_place) = both_ways(lambda: _peaks(fit, allowed))
+    (best, place), (others, other_place) = both_ways(lambda: peaks(fit, allowed))
     assert torch.equal(best, others)
     there = best > -9
     assert torch.equal(place[there], other_place[there])

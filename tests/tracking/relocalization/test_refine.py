@@ -11,7 +11,7 @@ from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, poses_of, st
 from torchtrack import Tracker
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core.dispatch import numba_is_installed
+from torchtrack.core.dispatch import backend_is_installed
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization.acceptance import is_likely, likeliest
@@ -46,7 +46,7 @@ def test_a_search_is_rehearsed_before_the_first_window(hypotheses, times, monkey
     )
     tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(hypotheses=hypotheses)))
     tracker.prepare(tracker.init(pose()[None], 0))
-    assert len(rehearsed) == times * numba_is_installed()
+    assert len(rehearsed) == times * backend_is_installed()
 
 
 # ---- what is found

@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
+from measured_matches import matches_at
 
 from torchtrack.config.search import QualityConfig
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.validation.measures import explained_share, gathered_share, visible_share
 from torchtrack.tracking.validation.status import Status, holding_on, judge, needed_share, partly_hidden, trust
@@ -29,18 +29,6 @@ def contours_at(pixels, normals=(1.0, 0.0), mask=None):
     mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
     normals = torch.tensor(normals, dtype=torch.float64).expand_as(pixels)
     return Contours(points, torch.zeros_like(points), torch.full(mask.shape, int(ContourKind.CREASE)), mask, points, pixels, normals)
-
-
-def matches_at(targets, near=None, offsets=0.0):
-    """Observations at ``targets``, all ``offsets`` px off the contours that they are near to; none of them is matched."""
-    targets = torch.as_tensor(targets, dtype=torch.float64)
-    near = torch.ones(targets.shape[:2], dtype=torch.bool) if near is None else torch.as_tensor(near)
-    offsets = torch.as_tensor(offsets, dtype=torch.float64).expand(near.shape)
-    nothing = torch.zeros(near.shape, dtype=torch.int64)
-    points = torch.zeros(*near.shape, 3, dtype=torch.float64)
-    directions, zeros, ones = torch.zeros_like(targets), torch.zeros_like(offsets), torch.ones_like(offsets)
-    place = points, targets, directions, offsets, near
-    return Matches(nothing, torch.zeros_like(near), ones, zeros, *place, limb=zeros, beside=zeros, mistaken_px2=zeros, dark=zeros, as_expected=ones)
 
 
 def upright_line(u=80.0, count=80, first=20.0):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_quality import matches_at
+from measured_matches import matches_at
 from tracked_boxes import started
 
 from torchtrack.config.search import QualityConfig

@@ -1,11 +1,27 @@
 """What each object's pose is worth, and where it goes on from there: :mod:`torchtrack.tracking.update`, object by object."""
 
-import numpy as np
+from dataclasses import replace
 
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.backends.numba.filtering import inverse
 from torchtrack.backends.numba.geometry import centre_of, is_finite
-from torchtrack.backends.numba.parameters import ConclusionSettings
+from torchtrack.backends.numba.parameters import ConclusionSettings, filled
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.dispatch import accelerates
+from torchtrack.tracking import update
+from torchtrack.tracking.estimation.rounds import ANYWHERE
+from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.triggers import SMEARED
+from torchtrack.tracking.state import TrackerState
+from torchtrack.tracking.validation import status
+from torchtrack.tracking.validation.measures import visible_share
+from torchtrack.tracking.validation.scored_fit import Found
 
 # As torchtrack.tracking.validation.status.Status.
 TRACKING, UNCERTAIN, LOST, TOO_FEW_EVENTS, OUT_OF_VIEW, DIVERGED = range(6)
@@ -269,3 +285,66 @@ def _remember(
 def _seen_well(before: float, now: float, settings: ConclusionSettings) -> float:
     """A running mean of when objects are seen well: it rises fast, and falls slowly."""
     return before + (settings.usual_gain if now > before else settings.fall_gain) * (now - before)
+
+
+def _has_motion(state: TrackerState, prediction: Prediction, widening: Tensor, found: Found, dt_s: Tensor, config: TrackerConfig) -> bool:
+    """Whether objects are predicted with their motion."""
+    return config.solver.prior and prediction.acceleration is not None
+
+
+@accelerates(update.judged_objects, supports=_has_motion)
+def judged_objects_numba(
+    state: TrackerState, prediction: Prediction, widening: Float[Tensor, "b"], found: Found, dt_s: Float[Tensor, "b"], config: TrackerConfig
+) -> update.Judgement:
+    """Object by object."""
+    objects, solution, batch, expected = prediction.objects, found.fit.solution, len(dt_s), prediction.acceleration
+    if expected is None:
+        raise ValueError("a kernel needs the prediction's acceleration.")
+    in_view = visible_share(found.fit.contours, objects.image_size)
+    told = torch.stack([found.share, found.score, found.gathered, found.full_gathered, in_view, widening])
+    remembered = torch.stack([state.usual_score, state.full_share, state.full_gathered, state.full_count, state.doubted_s, state.unseen_s])
+    T_last_seen = state.T_last_seen.clone(memory_format=torch.contiguous_format)
+    T_cam_obj, covariance, left = (T_last_seen.new_empty(batch, size, size) for size in (4, 12, 6))
+    (velocity, acceleration), status_of = dt_s.new_empty(2, batch, 6), found.count.new_empty(batch)
+    conclude(
+        *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance, prediction.information),
+        *as_arrays(expected.expected, expected.variance, solution.T_cam_obj, solution.from_prior, solution.hessian),
+        *as_arrays(found.elsewhere, found.turn_unclear, found.count, told, dt_s, objects.centre_obj, objects.diameter_m),
+        _settings(config),
+        *as_arrays(remembered, T_last_seen, T_cam_obj, velocity, acceleration, covariance, left, status_of),
+    )
+    usual_score, full_share, full_gathered, full_count, doubted_s, unseen_s = remembered.unbind()
+    after = replace(
+        state,
+        T_cam_obj=T_cam_obj,
+        velocity=velocity,
+        acceleration=acceleration,
+        covariance=covariance,
+        usual_score=usual_score,
+        full_share=full_share,
+        full_gathered=full_gathered,
+        full_count=full_count,
+        doubted_s=doubted_s,
+        T_last_seen=T_last_seen,
+        unseen_s=unseen_s,
+    )
+    return after, left, status_of
+
+
+def _settings(config: TrackerConfig) -> ConclusionSettings:
+    """What a kernel goes by that concludes."""
+    return filled(
+        ConclusionSettings,
+        config.quality,
+        config.search,
+        config.solver,
+        config.motion,
+        status,
+        update,
+        holds=config.motion.without_events == "hold",
+        anywhere=ANYWHERE,
+        smeared=SMEARED,
+        hidden_observations=status.HIDDEN_TIMES * config.quality.min_observations,
+        certain_share=update.CERTAIN,
+        certain_count=update.CERTAIN_COUNT if config.search.by_events else 0.0,
+    )

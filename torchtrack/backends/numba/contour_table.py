@@ -1,12 +1,24 @@
-"""The table of what observations take from contour points: :meth:`torchtrack.tracking.association.nearest.ContourTable.of`, point by point."""
+"""The table of what observations take from contour points: :meth:`torchtrack.tracking.association.nearest.contour_table`, point by point."""
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
+from torchtrack.backends.numba.index import cells_of
 from torchtrack.backends.numba.look_up import nearest
 from torchtrack.backends.numba.matching import COLUMNS, EXPECTED, INDEXED_U, INDEXED_V, LIMB, MISTAKEN, NORMAL_U, NORMAL_V, ORIENTED, X, Y, Z
 from torchtrack.backends.numba.measures import octant
-from torchtrack.backends.numba.parameters import Cells, TableSettings
+from torchtrack.backends.numba.parameters import Cells, TableSettings, filled
+from torchtrack.core.dispatch import accelerates
+from torchtrack.object_model.contour_source import ContourKind
+from torchtrack.tracking.association import nearest as nearest_contours
+from torchtrack.tracking.association import weights
+from torchtrack.tracking.association.nearest import ContourTable
+from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.contours.points import Contours
 
 __all__ = ["COLUMNS", "fill"]
 
@@ -85,7 +97,7 @@ def _add_mistaken(
     settings: TableSettings,
     table: Array,
 ) -> None:
-    """How far off what is seen on points of edges is, should it be of the edge beside: :func:`torchtrack.tracking.association.weights.mistaken_px2`."""
+    """How far off what is seen on points of edges is, should it be of the edge beside: :func:`tracking.association.weights.mistaken_px2`."""
     least_m = settings.depth_share * _range(depth_m, mask)
     for i in range(len(mask)):
         if not mask[i] or not table[i, ORIENTED]:
@@ -113,3 +125,18 @@ def _range(values: Array, mask: Array) -> float:
         if mask[i]:
             least, largest = min(least, values[i]), max(largest, values[i])
     return max(largest - least, 0.0)
+
+
+@accelerates(nearest_contours.contour_table)
+def contour_table_numba(
+    contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_print: bool = True, close_px: float = 0.0
+) -> ContourTable:
+    """Point by point."""
+    limb, crease, texture = (int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
+    settings = filled(TableSettings, weights, limb=limb, crease=crease, texture=texture, of_print=of_print, close_px=close_px)
+    table, not_plain = contours.points_obj.new_empty(*contours.mask.shape, COLUMNS), torch.empty_like(contours.mask[:, 0])
+    points, pixels, normals, indexed = (value.transpose(1, 2) for value in (contours.points_obj, contours.pixels, contours.normals, index.pixels))
+    expected = pixels.new_empty(len(table), 0) if polarity is None else polarity
+    given = as_arrays(points, contours.points_cam[..., 2], pixels, normals, contours.kind, contours.mask, indexed, index.nearest, index.first)
+    fill(*given, cells_of(index), *as_arrays(expected), settings, table.numpy(), not_plain.numpy())
+    return ContourTable(table.transpose(1, 2), index, not_plain)

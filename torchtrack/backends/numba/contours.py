@@ -1,10 +1,24 @@
 """Contour points of a mesh, and where they show: :func:`torchtrack.tracking.contours.points.mesh_contours` and ``assemble``, object by object."""
 
-import numpy as np
+from collections.abc import Sequence
 
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, entries, inverse_depth, lens, placed, turned
 from torchtrack.backends.numba.parameters import SamplingSettings
+from torchtrack.config.tracker import ContourConfig
+from torchtrack.core.camera import MIN_DEPTH_M
+from torchtrack.core.dispatch import accelerates
+from torchtrack.object_model.contour_source import ContourKind, ContourModel
+from torchtrack.tracking.contours import points
+from torchtrack.tracking.contours.points import MAX_ACTIVE_EDGES, MIN_PX_PER_M, MIN_TEXTURE_COSINE, Contours
+from torchtrack.tracking.relocalization import hypotheses
+from torchtrack.tracking.relocalization.event_image import BORDER_PX
 
 # Rows of a model's table of edges, and of the points sampled on them.
 _START, _VECTOR, _DIRECTION, _TURNING, _KIND = 0, 3, 6, 9, 12
@@ -37,7 +51,7 @@ def sample(
 
     Args:
         members: numbers of the objects.
-        edge_ends, face_normals, face_offsets, is_crease, is_segment, edges: of the model's edges, as :class:`torchtrack.object_model.contour_source.ContourModel`
+        edge_ends, face_normals, face_offsets, is_crease, is_segment, edges: of the model's edges, as :class:`contour_source.ContourModel`
             has them, but for those of faces, ``[2, 3, e]`` and ``[2, e]``; so are those of texture.
         sampled, kind: ``[b, SAMPLED, n]`` and ``[b, n]``, with room enough; filled as far as ``counts [b]`` says.
     """
@@ -298,3 +312,89 @@ def project(points_obj: Array, T_cam_obj: Array, intrinsics: Array, points_cam: 
             inverse = inverse_depth(z)
             points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i] = x, y, z
             pixels[b, 0, i], pixels[b, 1, i] = x * inverse * fx + cx, y * inverse * fy + cy
+
+
+# What of a model its contour points are sampled from, beside the faces.
+_SAMPLED_FROM = ("is_crease", "is_segment", "edges", "texture_points", "texture_tangents", "texture_normals")
+# What only shows points takes none of the settings that sample them.
+_TO_SHOW = ContourConfig()
+
+
+def sampling_settings(config: ContourConfig = _TO_SHOW) -> SamplingSettings:
+    """What a kernel goes by that samples contours, or only shows what was sampled."""
+    return SamplingSettings(
+        occluding=config.occluding,
+        most_edges=MAX_ACTIVE_EDGES,
+        max_edge_points=config.max_edge_points,
+        spacing_px=config.spacing_px,
+        texture=int(ContourKind.TEXTURE),
+        least_cosine=MIN_TEXTURE_COSINE,
+        least_depth_m=MIN_DEPTH_M,
+        least_px_per_m=MIN_PX_PER_M,
+    )
+
+
+def _all_are_shown(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> bool:
+    """Whether no elements are left out."""
+    return shown is None
+
+
+@accelerates(points.mesh_points, supports=_all_are_shown)
+def mesh_points_numba(
+    models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None
+) -> tuple[Tensor, ...]:
+    """Edge by edge."""
+    settings, batch = sampling_settings(config), len(T_cam_obj)
+    room = settings.max_edge_points + max(len(model.texture_points) for model in models)
+    sampled = T_cam_obj.new_empty(batch, SAMPLED, room).numpy()
+    kind, counts = np.empty((batch, room), np.int64), np.zeros(batch, np.int64)
+    seen = as_arrays(T_cam_obj, intrinsics)
+    for model in models:
+        of_edges = model.edge_ends, model.face_normals.movedim(0, -1), model.face_offsets.T
+        of_model = as_arrays(model.members, *of_edges, *(getattr(model, name) for name in _SAMPLED_FROM))
+        sample(*of_model, model.texture_spacing_m, *seen, settings, sampled, kind, counts)
+    # One place at least: what selects from contours needs one to point at.
+    width = max(int(counts.max()), 1)
+    points_obj, tangents_obj = T_cam_obj.new_empty(2, batch, 3, width)
+    kinds, mask = torch.empty(batch, width, dtype=torch.int64), torch.empty(batch, width, dtype=torch.bool)
+    gather(sampled, kind, counts, *as_arrays(points_obj, tangents_obj, kinds, mask))
+    return points_obj.transpose(1, 2), tangents_obj.transpose(1, 2), kinds, mask
+
+
+@accelerates(points.projected)
+def projected_numba(
+    points_obj: Float[Tensor, "b m 3"], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]
+) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m 2"]]:
+    """Point by point."""
+    rows = points_obj.transpose(1, 2)
+    points_cam, pixels = rows.new_empty(rows.shape), rows.new_empty(len(rows), 2, rows.shape[2])
+    project(*as_arrays(rows, T_cam_obj, intrinsics, points_cam, pixels))
+    return points_cam.transpose(1, 2), pixels.transpose(1, 2)
+
+
+@accelerates(points.assemble)
+def assemble_numba(
+    points_obj: Float[Tensor, "b m 3"],
+    tangents_obj: Float[Tensor, "b m 3"],
+    kind: Int[Tensor, "b m"],
+    mask: Bool[Tensor, "b m"],
+    T_cam_obj: Float[Tensor, "b 4 4"],
+    intrinsics: Float[Tensor, "b 4"],
+) -> Contours:
+    """Point by point."""
+    rows, tangents = points_obj.transpose(1, 2), tangents_obj.transpose(1, 2)
+    points_cam, pixels, normals, is_shown = rows.new_empty(rows.shape), *rows.new_empty(2, len(mask), 2, mask.shape[1]), torch.empty_like(mask)
+    show(*as_arrays(rows, tangents, mask, T_cam_obj, intrinsics), sampling_settings(), *as_arrays(points_cam, pixels, normals, is_shown))
+    return Contours(points_obj, tangents_obj, kind, is_shown, *(value.transpose(1, 2) for value in (points_cam, pixels, normals)))
+
+
+@accelerates(hypotheses.mark)
+def mark_numba(
+    outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"], image: Float[Tensor, "h w"]
+) -> Float[Tensor, "n"]:
+    """Point by point."""
+    marks = image.new_empty(len(T_cam_obj))
+    given = as_arrays(outlines.points_obj.transpose(1, 2), outlines.tangents_obj.transpose(1, 2), outlines.mask)
+    seen = as_arrays(T_cam_obj, intrinsics[0])
+    mark(*given, *seen, sampling_settings(), *as_arrays(image), BORDER_PX, hypotheses.BESIDE_PX, marks.numpy())
+    return marks

@@ -1,10 +1,25 @@
 """From a window's events to what each object sees of them: :mod:`torchtrack.tracking.frontend.tiles`, ``bursts`` and ``sensors``, event by event."""
 
-import numpy as np
+from dataclasses import replace
 
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, entries, lens, placed
 from torchtrack.backends.numba.parameters import TileSettings
+from torchtrack.core.camera import MIN_DEPTH_M
+from torchtrack.core.dispatch import accelerates
+from torchtrack.core.events import EventBatch, PaddedEvents, check_on_sensor, of_streams, stream_bounds
+from torchtrack.tracking.frontend import bursts, tiles, time_surface
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US
+from torchtrack.tracking.frontend.sensors import Sensors
+from torchtrack.tracking.frontend.tiles import TILE_BITS, NearbyEvents, SensorTiles
+from torchtrack.tracking.frontend.window_events import ObjectEvents, SharedEvents, WindowEvents
+from torchtrack.tracking.motion.prediction import Prediction
 
 # Rows of what an object sees of an event.
 PIXELS, AGE, INTO_BURST, POLARITY = 0, 2, 3, 4
@@ -275,3 +290,109 @@ def see(
             seen[PIXELS, b, i], seen[PIXELS + 1, b, i] = ideal[pixel, 0], ideal[pixel, 1]
             seen[AGE, b, i], seen[INTO_BURST, b, i] = age_us[s, i] * 1e-6, into_us[s, i] * 1e-6
             seen[POLARITY, b, i] = 1.0 if polarity[s, i] else -1.0
+
+
+def _ages_tell(burst_age_us: Tensor, elapsed_us: Tensor, events: PaddedEvents, longest_us: int) -> bool:
+    """Whether ages of bursts tell what began in the window: not in longer ones."""
+    return bool((elapsed_us < LONG_AGO_US).all())
+
+
+@accelerates(bursts.update_bursts, supports=_ages_tell)
+def update_bursts_numba(
+    burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int
+) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
+    """One event after the other."""
+    ages, into_us = torch.empty(burst_age_us.shape, dtype=torch.int16), torch.empty(events.mask.shape, dtype=torch.int16)
+    update_bursts(*as_arrays(*vars(events).values(), elapsed_us), longest_us, LONG_AGO_US, *as_arrays(burst_age_us, ages, into_us))
+    return ages, into_us
+
+
+@accelerates(time_surface.update_last_event)
+def update_last_event_numba(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -> Int[Tensor, "s h w"]:
+    """One event after the other."""
+    updated = last_event_us.clone(memory_format=torch.contiguous_format)
+    if not newest(*as_arrays(events.x, events.y, events.t_us, stream_bounds(events, len(updated)), updated)):
+        check_on_sensor(events, width=last_event_us.shape[2], height=last_event_us.shape[1])
+    return updated
+
+
+@accelerates(tiles.SensorTiles.near)
+def near_numba(sensor: SensorTiles, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
+    """Tile by tile."""
+    objects = prediction.objects
+    near = torch.empty(len(window_s), len(sensor.middle), dtype=torch.bool)
+    variance = prediction.covariance.diagonal(dim1=-2, dim2=-1)[:, :6]
+    moving = as_arrays(prediction.velocity, variance, prediction.T_cam_obj, window_s)
+    own = as_arrays(objects.centre_obj, objects.half_extent, objects.diameter_m, objects.intrinsics)
+    settings = TileSettings(tiles.SIGMAS, margin_px + tiles.SLACK_PX, MIN_DEPTH_M)
+    near_tiles(*as_arrays(sensor.middle, sensor.reach_px), *moving, *own, settings, near.numpy())
+    return near
+
+
+@accelerates(tiles.SensorTiles.numbers_near)
+def numbers_near_numba(sensor: SensorTiles, events: EventBatch, near: Bool[Tensor, "b t"]) -> np.ndarray:
+    """Event by event."""
+    kept = np.empty(len(events) + 1, np.int64)
+    count = int(keep(*as_arrays(events.x, events.y, near.any(0)), TILE_BITS, sensor.columns, sensor.width, sensor.height, kept))
+    if count < 0:
+        check_on_sensor(events, sensor.width, sensor.height)
+    return kept[:count]
+
+
+@accelerates(Sensors.seen, supports=lambda sensors, window, into_burst_us=None, number=None: into_burst_us is not None and number is None)
+def seen_numba(
+    sensors: Sensors, window: PaddedEvents, into_burst_us: Int[Tensor, "s e"] | None = None, number: Int[Tensor, "e"] | None = None
+) -> WindowEvents:
+    """Event by event."""
+    if into_burst_us is None:
+        raise ValueError("a kernel needs to be told how far events are into their bursts.")
+    batch = len(sensors.stream_index)
+    # What all see alike is written once.
+    own = sensors.stream_index[:1] if len(sensors.ideal_pixels) == 1 else sensors.stream_index
+    seen = sensors.ideal_pixels.new_empty(SEEN, len(own), window.mask.shape[1])
+    told = as_arrays(window.x, window.y, window.age_us, into_burst_us, window.polarity, window.mask, sensors.ideal_pixels)
+    see(*told, *as_arrays(own), seen.numpy())
+    return _of_rows(seen.expand(-1, batch, -1), window.mask[own].expand(batch, -1))
+
+
+def _are_chosen(sensors: Sensors, nearby: NearbyEvents, burst_age_us: Tensor, t_us: Tensor, elapsed_us: Tensor, longest_us: int) -> bool:
+    """Whether the events that count are still to be chosen by their tiles, in a window short enough for ages of bursts to tell what began in it."""
+    return nearby.near_tiles is not None and int(elapsed_us) < LONG_AGO_US
+
+
+@accelerates(Sensors.window_events, supports=_are_chosen)
+def window_events_numba(
+    sensors: Sensors,
+    nearby: NearbyEvents,
+    burst_age_us: Int[Tensor, "s 2 h w"],
+    t_us: Int[Tensor, "s"],
+    elapsed_us: Int[Tensor, "s"],
+    longest_us: int,
+) -> tuple[ObjectEvents, Int[Tensor, "s 2 h w"]]:
+    """The events in tiles near each object, as it saw them, and the bursts' ages with them, event by event."""
+    near, tiles_of = nearby.near_tiles, sensors.tiles
+    if near is None or tiles_of is None:
+        raise ValueError("a kernel chooses events by their tiles: there have to be some.")
+    events = of_streams(nearby.events, 1)
+    kept, batch = numbers_near_numba(tiles_of, events, near), len(near)
+    # One place at least: what selects from events needs one to point at.
+    numbers = kept if len(kept) else np.zeros(1, np.int64)
+    places = len(numbers)
+    seen, ages_us = sensors.ideal_pixels.new_empty(SEEN, 1, places), torch.empty(burst_age_us.shape, dtype=burst_age_us.dtype)
+    exists, of_bursts = torch.empty(1, places, dtype=torch.bool), (int(elapsed_us), longest_us, LONG_AGO_US)
+    of_events = as_arrays(events.x, events.y, events.t_us, events.polarity)
+    maps = as_arrays(sensors.ideal_pixels[0], burst_age_us[0], ages_us[0])
+    see_kept(kept, *of_events, int(t_us), *of_bursts, *maps, *as_arrays(seen[:, 0], exists[0]))
+    shared = replace(_of_rows(seen, exists), number=torch.from_numpy(numbers[None]))
+    if batch == 1:
+        return shared, ages_us
+    # Only what is written of this is ever looked at.
+    own, counts = torch.empty(batch, places + 1, dtype=torch.int32), torch.empty(batch, dtype=torch.int64)
+    divide(kept, *of_events[:2], *as_arrays(near), TILE_BITS, tiles_of.columns, *as_arrays(own, counts))
+    return SharedEvents(shared, own, counts), ages_us
+
+
+def _of_rows(seen: Float[Tensor, "5 b e"], exists: Bool[Tensor, "b e"]) -> WindowEvents:
+    """Events by their rows: pixels, ages, times into their bursts, and polarities."""
+    age_s, into_burst_s, polarity = seen[2:].unbind()
+    return WindowEvents(seen[:2].permute(1, 2, 0), age_s, into_burst_s, polarity, exists)

@@ -1,10 +1,20 @@
 """Small matrices of the filter: functions of :mod:`torchtrack.tracking.motion.model`, object by object."""
 
 import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.cholesky import factorise, solve
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.backends.numba.geometry import depth_of, inverse_depth
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core import linalg
+from torchtrack.core.dispatch import accelerates
+from torchtrack.tracking import initialization
+from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.state import TrackerState
 
 # Variances are taken to be no less.
 _LEAST = 1e-30
@@ -67,3 +77,21 @@ def find_unknown_motion(
         px_per_m = focal_px[b] * inverse_depth(depth_of(T_cam_obj[b], centre_obj[b]))
         unknown_px = np.sqrt(moving + turning * (0.5 * diameter_m[b]) ** 2) * elapsed_us[stream_index[b]] * 1e-6 * px_per_m
         is_unknown[b] = unknown_px > max_unknown_px and np.sqrt(place) * px_per_m <= most_sigma_px
+
+
+@accelerates(linalg.inverse)
+def inverse_numba(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:
+    """Matrix by matrix."""
+    inverses = torch.empty_like(matrices, memory_format=torch.contiguous_format)
+    invert(*as_arrays(matrices, inverses))
+    return inverses
+
+
+@accelerates(initialization.moves_unknown)
+def moves_unknown_numba(state: TrackerState, t_us: Int[Tensor, "s"], objects: ObjectBatch, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Object by object."""
+    is_unknown = torch.empty_like(objects.stream_index, dtype=torch.bool)
+    own = as_arrays(objects.centre_obj, objects.intrinsics[:, 0], objects.diameter_m, objects.stream_index, t_us - state.t_us)
+    limits = config.window.max_unknown_px, config.search.wide_sigma_px
+    find_unknown_motion(*as_arrays(state.covariance, state.T_cam_obj), *own, *limits, is_unknown.numpy())
+    return is_unknown

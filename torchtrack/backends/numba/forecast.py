@@ -1,10 +1,21 @@
 """Where objects are expected at a window's end: :mod:`torchtrack.tracking.motion.predict`, object by object."""
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.backends.numba.geometry import depth_of, inverse_depth, is_finite, turn
-from torchtrack.backends.numba.parameters import ForecastSettings
+from torchtrack.backends.numba.parameters import ForecastSettings, filled
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.camera import MIN_DEPTH_M
+from torchtrack.core.dispatch import accelerates
+from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.motion import model, predict
+from torchtrack.tracking.motion.model import Acceleration, MotionState
+from torchtrack.tracking.motion.prediction import MAX_DEPTH_M, Prediction
 
 # What is told of each motion: its velocity, and of its acceleration what is expected, its variance, and its rate.
 VELOCITY, EXPECTED, VARIANCE, RATE = range(4)
@@ -179,3 +190,35 @@ def in_mid_window(
             moved[k] = -0.5 * dt_s[b] * velocity[b, k]
         if not _step(T_cam_obj[b], centre_obj[b], moved, least_depth_m, most_depth_m, middle[b]):
             middle[b] = T_cam_obj[b]
+
+
+@accelerates(predict.forecast)
+def forecast_numba(
+    state: MotionState,
+    dt_s: Float[Tensor, "b"],
+    objects: ObjectBatch,
+    axes_obj: Float[Tensor, "b 3"] | None,
+    far_pose: Float[Tensor, "b 4 4"],
+    config: TrackerConfig,
+) -> Prediction:
+    """Object by object."""
+    batch, axes = len(dt_s), far_pose.new_empty(0, 3) if axes_obj is None else axes_obj
+    T_prior, usable = far_pose.new_empty(batch, 4, 4), torch.empty(batch, dtype=torch.bool)
+    told, covariance = far_pose.new_empty(TOLD, batch, 6), state.covariance.new_empty(batch, 12, 12)
+    known = as_arrays(state.T_cam_obj, state.velocity, state.acceleration, state.covariance, dt_s)
+    of_objects = as_arrays(objects.centre_obj, objects.diameter_m, objects.intrinsics, axes, far_pose)
+    settings = filled(
+        ForecastSettings, config.motion, model, holds=config.motion.model == "hold", least_depth_m=MIN_DEPTH_M, most_depth_m=MAX_DEPTH_M
+    )
+    forecast(*known, *of_objects, settings, *as_arrays(T_prior, usable, told, covariance))
+    velocity, *of_acceleration = told.unbind()
+    return Prediction(objects, T_prior, usable, velocity, covariance, Acceleration(*of_acceleration) if config.solver.prior else None)
+
+
+@accelerates(Prediction.in_mid_window)
+def in_mid_window_numba(prediction: Prediction, dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 4 4"]:
+    """Object by object."""
+    middle = torch.empty_like(prediction.T_cam_obj, memory_format=torch.contiguous_format)
+    given = as_arrays(prediction.T_cam_obj, prediction.velocity, dt_s, prediction.objects.centre_obj)
+    in_mid_window(*given, MIN_DEPTH_M, MAX_DEPTH_M, middle.numpy())
+    return middle

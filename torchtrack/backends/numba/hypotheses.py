@@ -1,9 +1,17 @@
 """Where contour points find events along their normals: :func:`torchtrack.tracking.relocalization.edge_search.found`, point by point."""
 
 import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.contours import at
+from torchtrack.core.dispatch import accelerates
+from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.relocalization import correlation, edge_search
+from torchtrack.tracking.relocalization.event_image import BORDER_PX
 
 
 @kernel(fastmath=FAST)
@@ -65,3 +73,20 @@ def _is_peak(fit: Array, allowed: Array, row: int, column: int, apart: int) -> b
             if fit[i, j] > fit[row, column] and allowed[i, j]:
                 return False
     return np.isfinite(fit[row, column])
+
+
+@accelerates(correlation.peaks)
+def peaks_numba(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
+    """Cell by cell."""
+    best, place = fit.new_full((len(fit), correlation.SHIFTS), correlation.NONE), torch.empty(len(fit), correlation.SHIFTS, dtype=torch.int64)
+    peaks(*as_arrays(fit, allowed), correlation.APART, *as_arrays(best, place))
+    return best, place
+
+
+@accelerates(edge_search.found)
+def found_numba(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
+    """Point by point."""
+    targets, weights = image.new_empty(*outlines.mask.shape, 2), image.new_empty(outlines.mask.shape)
+    points = as_arrays(outlines.pixels.transpose(1, 2), outlines.normals.transpose(1, 2), outlines.mask)
+    find(*points, *as_arrays(image), BORDER_PX, reach_px, edge_search.LOOKS, *as_arrays(targets, weights))
+    return targets, weights

@@ -1,9 +1,17 @@
 """Making an index of nearest contour points: :func:`torchtrack.tracking.contours.index.index_contours`, point by point."""
 
 import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.parameters import IndexSettings
+from torchtrack.backends.numba.parameters import Cells, IndexSettings
+from torchtrack.core import host_sync
+from torchtrack.core.dispatch import accelerates
+from torchtrack.tracking.contours.index import DISTANCE_STEPS, FAR_CELLS, HALF_DIAGONAL, OFF_BORDER_PX, ContourIndex, index_contours, radii, reach
+from torchtrack.tracking.contours.points import Contours
 
 
 @kernel()
@@ -83,3 +91,26 @@ def _write_point(
             number[cell] = own if is_nearer else number[cell]
             steps[cell] = far if is_nearer else steps[cell]
         begin += np.uint64(columns)
+
+
+@accelerates(index_contours)
+def index_contours_numba(
+    contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"] | host_sync.Answer, cell_px: int
+) -> ContourIndex:
+    """Point by point."""
+    answer = radii(radius_px, contours)
+    margin = reach(max([0, *answer.numbers()]), cell_px) + 2
+    middle = 0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)
+    settings = IndexSettings(*middle, float(cell_px), margin, DISTANCE_STEPS, HALF_DIAGONAL, FAR_CELLS)
+    pixels, mask, radius = as_arrays(contours.pixels, contours.mask, answer.on_device)
+    first, is_inside = contours.pixels.new_empty(len(pixels), 2), np.empty_like(mask)
+    rows, columns = extents(pixels, mask, radius, settings, is_inside, first.numpy())
+    # Narrow numbers: half as much of the memory that a processor has near.
+    nearest = torch.empty(len(pixels), rows * columns, dtype=torch.int32)
+    write(pixels, is_inside, radius, first.numpy(), columns, settings, nearest.numpy())
+    return ContourIndex(first, (rows, columns), cell_px, nearest, contours.pixels, answer)
+
+
+def cells_of(index: ContourIndex) -> Cells:
+    """The layout of an index as kernels know it."""
+    return Cells(*index.size, float(index.cell_px), OFF_BORDER_PX)

@@ -1,11 +1,22 @@
 """What describes observations of limbs, one at a time: :func:`torchtrack.tracking.association.weighting_features.limb_features`."""
 
 import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, across, at_depth, drift, inverse_depth, lens
+from torchtrack.backends.numba.index import cells_of
 from torchtrack.backends.numba.look_up import nearest
 from torchtrack.backends.numba.parameters import Cells, PatchSettings
+from torchtrack.core.dispatch import accelerates
+from torchtrack.object_model.contour_source import ContourKind
+from torchtrack.tracking.association import weighting_features
+from torchtrack.tracking.association.weighting_features import Evidence
+from torchtrack.tracking.frontend.history import BORDER_PX
+from torchtrack.tracking.frontend.window_events import laid_out
 
 # Places are worked out so many at once: what is left over would be, one at a time.
 _AT_ONCE = 32
@@ -164,7 +175,7 @@ def _find_places(u: float, v: float, nu: float, nv: float, across_px: Array, alo
 
 @kernel(fastmath=FAST)
 def _find_pixels(u: float, v: float, nu: float, nv: float, across_px: Array, height: int, width: int, places: Array) -> None:
-    """Rows of a table of sensor pixels for places across the contour, several at once: as :func:`torchtrack.tracking.frontend.history.on_sensor` finds them."""
+    """Rows of a table of sensor pixels for places across the contour, several at once: as :func:`tracking.frontend.history.on_sensor` finds them."""
     kind = across_px.dtype.type
     u, v, nu, nv, right, bottom = kind(u), kind(v), kind(nu), kind(nv), kind(width - 1), kind(height - 1)
     for k in range(len(places)):
@@ -215,3 +226,26 @@ def _describe_one(
     row[settings.of_kind + settings.limb] = row[_EXISTS] = 1.0
     row[_SPEED], row[_AGE] = np.log1p(speed / settings.unit_px_s), age_share
     row[_POLARITY], row[_SIDE], row[_KNOWN] = polarity, polarity * outward, abs(polarity)
+
+
+@accelerates(weighting_features.limb_features)
+def limb_features_numba(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
+    """Observation by observation."""
+    observations, contours, index, history = evidence.observations, evidence.contours, evidence.index, evidence.history
+    moving, (events, own, counts) = evidence.prediction.moving(compensated=True), laid_out(evidence.seen)
+    has_limb = ((contours.kind == int(ContourKind.LIMB)) & contours.mask).any(1)
+    objects, is_limb = has_limb.nonzero()[:, 0], torch.zeros_like(observations.mask)
+    # As many for all: how many a neighbour has would show in roundings.
+    features = observations.age_s.new_empty(len(objects), observations.mask.shape[1], weighting_features.FEATURES)
+    w = weighting_features
+    describe(
+        *as_arrays(objects, *events.pixels.unbind(-1), events.age_s, events.polarity, events.mask, own, counts),
+        *as_arrays(observations.pixels.transpose(1, 2), observations.age_s, observations.polarity, observations.mask),
+        *as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.kind, index.nearest, index.first),
+        cells_of(index),
+        *as_arrays(moving.velocity, moving.centre_cam, moving.intrinsics),
+        *as_arrays(history.sensor_numbers, history.stream_index, history.last_event_us, history.t_us),
+        PatchSettings(w.ACROSS_PX, w.ALONG_PX, w.SIDE, BORDER_PX, int(ContourKind.LIMB), w.OF_KIND, w.SLOW_PX_S, w.SPEED_UNIT_PX_S, w.OLDEST_PX),
+        *as_arrays(features, is_limb),
+    )
+    return features, is_limb, objects

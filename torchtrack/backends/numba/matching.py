@@ -1,4 +1,4 @@
-"""Matching one object's observations with its contours: :func:`torchtrack.tracking.association.nearest.match_nearest`, and what its matches come to weigh."""
+"""Matching one object's observations with its contours: :func:`tracking.association.nearest.match_nearest`, and what its matches come to weigh."""
 
 import numpy as np
 

@@ -1,11 +1,23 @@
-"""What events explain of an object's contours, and how they gather on them: shares of :mod:`torchtrack.tracking.validation.measures`, object by object."""
+"""What events explain of an object's contours, and how they gather on them: shares of :mod:`tracking.validation.measures`, object by object."""
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import across, drift, inverse_depth, lens
 from torchtrack.backends.numba.matching import patch
-from torchtrack.backends.numba.parameters import QualitySettings
+from torchtrack.backends.numba.parameters import QualitySettings, filled
+from torchtrack.config.search import QualityConfig
+from torchtrack.core.dispatch import accelerates
+from torchtrack.core.image_velocity import MovingObjects
+from torchtrack.tracking.association import polarity, weights
+from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.motion.prediction import LOOKED_AT, Prediction
+from torchtrack.tracking.validation import measures
 
 
 @kernel(fastmath=FAST)
@@ -90,7 +102,7 @@ def _apart(directions: Array, offsets: Array, is_near: Array, on_contour_px: flo
 
 @kernel(fastmath=FAST)
 def visible(pixels: Array, mask: Array, height: int, width: int, share: Array) -> None:
-    """Share of contour points in the image: :func:`torchtrack.tracking.validation.measures.visible_share`, of ``pixels [b, 2, m]`` and ``mask [b, m]``."""
+    """Share of contour points in the image: :func:`tracking.validation.measures.visible_share`, of ``pixels [b, 2, m]`` and ``mask [b, m]``."""
     for b in range(len(mask)):
         total = seen = 0
         for i in range(mask.shape[1]):
@@ -172,3 +184,51 @@ def _gradient(point_cam: Array, normal: Array, centre_cam: Array, intrinsics: Ar
     ax, ay, az = point_cam[0] - centre_cam[0], point_cam[1] - centre_cam[1], point_cam[2] - centre_cam[2]
     row[0], row[1], row[2] = ay * gz - az * gy, az * gx - ax * gz, ax * gy - ay * gx
     row[3], row[4], row[5] = gx, gy, gz
+
+
+@accelerates(Prediction.sigma_px)
+def sigma_px_numba(prediction: Prediction, contours: Contours) -> Float[Tensor, "b"]:
+    """Point by point."""
+    variance = contours.pixels.new_empty(len(contours.mask))
+    seen = as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.mask)
+    own = as_arrays(prediction.covariance[:, :6, :6], prediction.centre_cam, prediction.objects.intrinsics)
+    variance_across(*seen, *own, LOOKED_AT, variance.numpy())
+    return variance.sqrt()
+
+
+@accelerates(measures.shares)
+def shares_numba(
+    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: QualityConfig
+) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
+    """Point by point."""
+    measured, gathered, apart = contours.pixels.new_empty(3, len(contours.mask))
+    shown = as_arrays(*(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask)
+    moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
+    matched = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
+    height, width = image_size
+    settings = filled(QualitySettings, config, measures, weights, height=height, width=width)
+    shares(*shown, *moving, *matched, settings, measured.numpy(), gathered.numpy(), apart.numpy())
+    return measured, gathered, apart
+
+
+@accelerates(measures.visible_share)
+def visible_share_numba(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
+    """Point by point."""
+    share = contours.pixels.new_empty(len(contours.mask))
+    visible(*as_arrays(contours.pixels.transpose(1, 2), contours.mask), *image_size, share.numpy())
+    return share
+
+
+@accelerates(polarity.remembered)
+def remembered_numba(
+    darker_outside: Float[Tensor, "b 8"],
+    directions: Float[Tensor, "b n 2"],
+    dark: Float[Tensor, "b n"],
+    weights: Float[Tensor, "b n"],
+    window_s: Float[Tensor, "b"],
+    memory_s: float,
+) -> Float[Tensor, "b 8"]:
+    """Event by event."""
+    after = darker_outside.clone(memory_format=torch.contiguous_format)
+    remember(*as_arrays(after, directions.transpose(1, 2), dark, weights, window_s), memory_s, polarity.LITTLE_EVIDENCE)
+    return after

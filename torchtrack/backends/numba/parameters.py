@@ -1,6 +1,6 @@
 """What kernels go by: settings and constants of the pipeline, as plain numbers. Making them takes no Numba."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 
 class Cells(NamedTuple):
@@ -42,7 +42,7 @@ class MatchingSettings(NamedTuple):
 
 
 class RoundSettings(NamedTuple):
-    """What :mod:`torchtrack.backends.numba.rounds` goes by beside that: settings, and constants of :mod:`torchtrack.tracking.estimation.levenberg_marquardt`."""
+    """What :mod:`torchtrack.backends.numba.rounds` goes by beside that: settings, and constants of :mod:`estimation.levenberg_marquardt`."""
 
     compensated: bool
     velocity_in_window: bool
@@ -185,7 +185,7 @@ class TileSettings(NamedTuple):
 
 
 class QualitySettings(NamedTuple):
-    """What :mod:`torchtrack.backends.numba.measures` goes by: settings, the image, and constants of :mod:`torchtrack.tracking.validation.measures` and ``matching``."""
+    """What :mod:`torchtrack.backends.numba.measures` goes by: settings, the image, and constants of :mod:`validation.measures` and ``matching``."""
 
     height: int
     width: int
@@ -285,3 +285,27 @@ class PatchSettings(NamedTuple):
     slow_px_s: float
     unit_px_s: float
     oldest_px: float
+
+
+T = TypeVar("T")
+
+
+def filled(kind: type[T], *sources: object, **more: Any) -> T:
+    """Parameters of a kernel by the names of its fields: what is given, else an attribute of the first source that has one.
+
+    Args:
+        kind: a named tuple.
+        sources: settings, or modules with constants, whose names are those of the fields in capitals.
+        more: fields that no source has.
+    """
+    names: tuple[str, ...] = kind._fields  # type: ignore[attr-defined]
+    made: T = kind(*(more[name] if name in more else _looked_up(name, sources) for name in names))
+    return made
+
+
+def _looked_up(name: str, sources: tuple[object, ...]) -> Any:
+    for source in sources:
+        for spelled in (name, name.upper()):
+            if hasattr(source, spelled):
+                return getattr(source, spelled)
+    raise AttributeError(f"no source has '{name}'")

@@ -1,12 +1,17 @@
 """The rounds of matching and solving of :func:`torchtrack.tracking.estimation.rounds.align`, object by object.
 
-One Gauss-Newton step a round, as :func:`torchtrack.tracking.estimation.levenberg_marquardt.solve_pose` takes with one iteration, Tukey's loss and a prior.
+One Gauss-Newton step a round, as :func:`tracking.estimation.levenberg_marquardt.solve_pose` takes with one iteration, Tukey's loss and a prior.
 """
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, at_depth, centre_of, drift, entries, lens
+from torchtrack.backends.numba.index import cells_of
 from torchtrack.backends.numba.matching import (
     AGE,
     DIRECTION_U,
@@ -16,6 +21,7 @@ from torchtrack.backends.numba.matching import (
     POINT_X,
     POINT_Y,
     POINT_Z,
+    ROWS,
     TARGET_U,
     TARGET_V,
     WEIGHT,
@@ -24,8 +30,20 @@ from torchtrack.backends.numba.matching import (
     believe,
     match,
 )
-from torchtrack.backends.numba.parameters import Cells, DampingSettings, MatchingSettings, RoundSettings
-from torchtrack.backends.numba.solving import damped_step, move, normal_equations, row_of
+from torchtrack.backends.numba.parameters import Cells, DampingSettings, MatchingSettings, RoundSettings, filled
+from torchtrack.backends.numba.solving import damped_step, damping_settings, move, normal_equations, row_of
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.constants import constant
+from torchtrack.core.dispatch import accelerates
+from torchtrack.tracking.association import weights
+from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.nearest import ContourTable
+from torchtrack.tracking.association.observations import Observations
+from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.estimation import rounds
+from torchtrack.tracking.estimation.rounds import Gates, Start
+from torchtrack.tracking.estimation.terms import Linearisation
+from torchtrack.tracking.motion.prediction import Prediction
 
 # Pose, velocity and swelling; and their residual, in the rows of a Jacobian.
 UNKNOWNS, _RESIDUAL = 13, 13
@@ -142,3 +160,59 @@ def _linearise(
         weights[used] = weight * robust * robust
         used += 1
     return used
+
+
+def knows(config: TrackerConfig) -> bool:
+    """Whether the kernel does all that is set: the settings of the preset ``default``, and most beside them."""
+    matching, solver = config.matching, config.solver
+    usual = solver.prior and solver.iterations == 1 and solver.loss == "tukey" and not any(config.contours.refresh_rounds)
+    return usual and not matching.along_flow and matching.residual == "normal" and not matching.mutual_px
+
+
+@accelerates(rounds.align_rounds, supports=lambda start, table, observations, gates, config: knows(config))
+def align_rounds_numba(
+    start: Start, table: ContourTable, observations: Observations, gates: Gates, config: TrackerConfig
+) -> tuple[Linearisation, Matches, Contours]:
+    """Observation by observation, all rounds of an object at once."""
+    prediction, information = start.prediction, start.information
+    objects, (batch, count) = prediction.objects, observations.mask.shape
+    # What the kernel writes to lies row by row in memory: of anything else it would be given a copy.
+    T_cam_obj, offset = (value.clone(memory_format=torch.contiguous_format) for value in (start.begin.T_cam_obj, start.offset))
+    gradient, hessian = offset.new_empty(offset.shape), offset.new_empty(information.shape)
+    contour = torch.empty(batch, count, dtype=torch.int64)
+    is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool)
+    matches = torch.empty(batch, ROWS, count, dtype=offset.dtype)
+    common = {"min_observations": config.quality.min_observations, "common_px2": config.solver.common_px**2}
+    align(
+        *as_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
+        cells_of(table.index),
+        *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, objects.intrinsics, objects.centre_obj),
+        *as_arrays(constant(config.matching.gates_px, offset.dtype, offset.device), gates.wider, gates.finely),
+        filled(MatchingSettings, config.matching, config.solver, weights, **common),
+        RoundSettings(config.matching.motion_compensation, config.solver.velocity_in_window),
+        damping_settings(config.solver, information),
+        *as_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
+    )
+    return Linearisation(T_cam_obj, gradient, hessian, offset), _matches(contour, is_near, is_matched, matches), start.contours
+
+
+def _seen(observations: Observations) -> Float[Tensor, "b 6 n"]:
+    """Rows of what was observed."""
+    trust = torch.ones_like(observations.age_s) if observations.trust is None else observations.trust
+    return torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.into_burst_s, observations.polarity, trust], 1)
+
+
+def _acceleration(prediction: Prediction, config: TrackerConfig) -> tuple[Tensor, Tensor]:
+    """The acceleration that is expected, and how much of it goes with velocities that were not; none where these do not change."""
+    if prediction.acceleration is None or not config.solver.acceleration_in_window:
+        return torch.zeros_like(prediction.velocity), torch.zeros_like(prediction.velocity)
+    return prediction.acceleration.expected, prediction.acceleration.rate_hz
+
+
+def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 15 n"]) -> Matches:
+    """The matches as the pipeline knows them."""
+    weights, age_s, points, targets, directions, *rest = rows.split((1, 1, 3, 2, 2, 1, 1, 1, 1, 1, 1), 1)
+    offsets, limb, beside, mistaken, dark, as_expected = (value[:, 0] for value in rest)
+    points_obj, targets, directions = (value.transpose(1, 2) for value in (points, targets, directions))
+    told = weights[:, 0], age_s[:, 0], points_obj, targets, directions, offsets
+    return Matches(contour, is_matched, *told, is_near, limb, beside, mistaken, dark, as_expected)

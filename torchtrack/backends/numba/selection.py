@@ -1,11 +1,20 @@
 """Choosing the events that are observed: :func:`torchtrack.tracking.association.observations.select_events`, object by object."""
 
 import numpy as np
+import torch
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import at_depth, drift, lens
+from torchtrack.backends.numba.index import cells_of
 from torchtrack.backends.numba.look_up import nearest
 from torchtrack.backends.numba.parameters import Cells
+from torchtrack.core.dispatch import accelerates
+from torchtrack.core.image_velocity import MovingObjects
+from torchtrack.tracking.association import observations
+from torchtrack.tracking.association.observations import Observations
+from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.frontend.window_events import GOLDEN_RATIO, ObjectEvents, laid_out
 
 
 @kernel(fastmath=FAST)
@@ -98,3 +107,16 @@ def _draw(near: Array, total: np.int64, number: Array, fill: float, golden_ratio
         near[drawn] = near[j]
         drawn += lot - np.floor(lot) < share
     return drawn
+
+
+@accelerates(observations.select_events)
+def select_events_numba(events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int) -> Observations:
+    """Event by event."""
+    rows, own, counts = laid_out(events)
+    number = torch.arange(rows.mask.shape[1]).expand(len(rows.mask), -1) if rows.number is None else rows.number
+    batch = len(objects.velocity)
+    chosen, exists = rows.pixels.new_empty(batch, 5, count), torch.empty(batch, count, dtype=torch.bool)
+    seen = as_arrays(*rows.pixels.unbind(-1), rows.age_s, rows.into_burst_s, rows.polarity, rows.mask, number, own, counts)
+    moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics, index.nearest, index.first)
+    select(*seen, *moving, cells_of(index), observations.FILL, GOLDEN_RATIO, chosen.numpy(), exists.numpy())
+    return observations.event_observations(chosen.transpose(1, 2), exists)

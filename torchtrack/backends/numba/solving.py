@@ -1,11 +1,20 @@
-"""Levenberg-Marquardt of :func:`torchtrack.tracking.estimation.levenberg_marquardt.solve_pose`, object by object, and the parts of a step that rounds share."""
+"""Levenberg-Marquardt of :func:`tracking.estimation.levenberg_marquardt.solve_pose`, object by object, and the parts of a step that rounds share."""
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.cholesky import factorise, solve
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, centre_of, entries, inverse_depth, is_finite, lens, turn, turned
 from torchtrack.backends.numba.parameters import DampingSettings, SolvingSettings
+from torchtrack.config.tracker import SolverConfig
+from torchtrack.core.dispatch import accelerates
+from torchtrack.tracking.estimation import levenberg_marquardt as lm
+from torchtrack.tracking.estimation.robust_loss import LOSSES
+from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, WindowTerms
 
 # Sums of products run along as many observations at a time: what they need stays in the fastest memory.
 _ALONG = FAST | {"reassoc"}
@@ -205,3 +214,35 @@ def move(T_cam_obj: Array, centre_obj: Array, offset: Array, step: Array) -> Non
             T_cam_obj[j, k] = into[j, k]
     for k in range(len(step)):
         offset[k] += step[k]
+
+
+def damping_settings(config: SolverConfig, hessian: Float[Tensor, "b k k"]) -> DampingSettings:
+    """What a kernel goes by that damps Hessians like this one."""
+    return DampingSettings(config.damping, lm.LEAST_DIAGONAL, lm.least_share(hessian))
+
+
+@accelerates(lm.solve_pose)
+def solve_pose_numba(
+    problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig, from_prior: Float[Tensor, "b k"] | None = None
+) -> Linearisation:
+    """Object by object."""
+    from_prior = lm.offset_from_prior(problem, T_start) if from_prior is None else from_prior
+    window = problem.window or _no_window(problem)
+    T_cam_obj, offset = (value.detach().clone(memory_format=torch.contiguous_format) for value in (T_start, from_prior))
+    gradient, hessian = torch.empty_like(offset), torch.empty_like(problem.prior_information, memory_format=torch.contiguous_format)
+    observed = problem.points_obj, problem.targets, problem.directions, problem.weights, window.age_s, window.outward
+    of_objects = window.velocity, window.rate_hz, problem.intrinsics, problem.centre_obj, problem.scale_px, problem.prior_information
+    rounding = lm.ROUNDINGS * torch.finfo(T_start.dtype).eps
+    solve_poses(
+        *as_arrays(*(value.detach() for value in (*observed, *of_objects))),
+        SolvingSettings(config.iterations, LOSSES.index(config.loss), rounding, lm.DAMPING_START, lm.DAMPING_GROWTH, lm.DAMPING_DECAY),
+        damping_settings(config, hessian),
+        *as_arrays(T_cam_obj, offset, gradient, hessian),
+    )
+    return Linearisation(T_cam_obj, gradient, hessian, offset)
+
+
+def _no_window(problem: PoseProblem) -> WindowTerms:
+    """What stands for terms that a problem has not."""
+    nothing, no_motion = problem.weights.new_empty(len(problem.weights), 0), problem.weights.new_empty(len(problem.weights), 6)
+    return WindowTerms(nothing, no_motion, nothing, no_motion)

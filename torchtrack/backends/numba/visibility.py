@@ -1,10 +1,20 @@
 """Hidden contour points: :func:`torchtrack.tracking.contours.visibility.hidden_by_faces` and the depth buffer there, object by object."""
 
 import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
 
+from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, entries, inverse_depth, lens, placed, turned
 from torchtrack.backends.numba.parameters import GridSettings
+from torchtrack.config.tracker import ContourConfig
+from torchtrack.core.camera import MIN_DEPTH_M
+from torchtrack.core.dispatch import accelerates
+from torchtrack.tracking.contours import visibility
+from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.contours.visibility import Scene
 
 # Deeper than what there is nothing at.
 _DEEPEST = np.iinfo(np.int64).max
@@ -121,7 +131,7 @@ def around(pixels: Array, mask: Array, stream_index: Array, cell_px: float, heig
 
 @kernel()
 def _every(samples: int, T_cam_obj: Array, intrinsics: Array, diameter_m: float, grid: GridSettings) -> int:
-    """The so manieth surface sample of an object that is taken, a power of two: :func:`torchtrack.tracking.contours.visibility.depth_buffer` halves them so."""
+    """The so manieth surface sample of an object that is taken, a power of two: :func:`tracking.contours.visibility.depth_buffer` halves them so."""
     size_cells = diameter_m * intrinsics[0] / max(T_cam_obj[2, 3], grid.least_depth_m) / grid.side_px
     spare, every = samples / max(grid.samples_per_cell * size_cells * size_cells, 1.0), 1
     while 2 * every <= spare:
@@ -220,3 +230,40 @@ def hide_in_buffer(
                 counts = not exact[b] or owner[cell] != b
                 behind = behind and counts and farthest_m > depth[cell] / grid.steps_per_m
             hidden[b, i] = hidden[b, i] or behind
+
+
+@accelerates(visibility.hidden_by_self)
+def hidden_by_self_numba(scene: Scene, contours: Contours) -> Bool[Tensor, "b m"]:
+    """Object by object."""
+    hidden = torch.zeros_like(contours.mask)
+    points = as_arrays(contours.points_cam.transpose(1, 2), contours.mask)
+    T_cam_obj, tolerance_m = as_arrays(scene.T_cam_obj, visibility.ON_FACE * scene.diameters_m)
+    for model in scene.models:
+        if len(model.triangles):
+            members, triangles, normals = as_arrays(model.members, model.triangles, model.triangle_normals)
+            hide_behind_faces(members, T_cam_obj, triangles, normals, tolerance_m, *points, hidden.numpy())
+    return hidden
+
+
+@accelerates(visibility.hidden_in_buffer)
+def hidden_in_buffer_numba(
+    scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"], exact: Bool[Tensor, "b 1"], config: ContourConfig
+) -> Bool[Tensor, "b m"]:
+    """Sample by sample and point by point."""
+    streams, height, width = scene.image_shape
+    hidden, margin_m, first = torch.zeros_like(contours.mask), config.depth_margin * scene.diameters_m, np.empty((streams, 2))
+    points_cam, pixels, normals, mask = as_arrays(
+        *(value.transpose(1, 2) for value in (contours.points_cam, contours.pixels, contours.normals)), contours.mask
+    )
+    T_cam_obj, intrinsics, stream_index, diameters_m = as_arrays(scene.T_cam_obj, scene.intrinsics, scene.stream_index, scene.diameters_m)
+    cell_px = float(config.depth_cell_px)
+    rows, columns = around(pixels, mask, stream_index, cell_px, height, width, first)
+    steps_per_m, enough = visibility.DEPTH_STEPS_PER_M, visibility.SAMPLES_PER_CELL
+    settings = GridSettings(rows, columns, cell_px, height, width, steps_per_m, MIN_DEPTH_M, enough)
+    depth, owner = (np.full(streams * rows * columns, value) for value in (visibility.NOTHING, len(drawn)))
+    for model in scene.models:
+        of_model = as_arrays(model.members, drawn, model.surface_points.T)
+        draw(*of_model, T_cam_obj, intrinsics, diameters_m, stream_index, first, settings, depth, owner)
+    own = as_arrays(exact[:, 0], margin_m)
+    hide_in_buffer(points_cam, pixels, normals, mask, *own, stream_index, first, settings, depth, owner, hidden.numpy())
+    return hidden

@@ -69,7 +69,8 @@ class ObjectRecord:
         if not len(t_us):
             return
         self.statuses.update(statuses)
-        self.quality_sum += sum(qualities)
+        judged = [quality for status, quality in zip(statuses, qualities, strict=True) if status != Status.TOO_FEW_EVENTS]
+        self.quality_sum, self.judged_windows = self.quality_sum + sum(judged), self.judged_windows + len(judged)
         rotations = T_cam_obj[:, :3, :3]
         self.turned = self.turned + so3_log(rotations[1:] @ rotations[:-1].mT).sum(0)
         self._last_rotation = rotations[-1]

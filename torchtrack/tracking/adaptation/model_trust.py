@@ -17,7 +17,7 @@ from torchtrack.config.tracker import ModelTrustConfig, TrackerConfig
 from torchtrack.core.camera import project
 from torchtrack.core.padded import take_points
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
-from torchtrack.tracking.association.nearest import ContourTable, match_nearest
+from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.association.weights import on_and_around
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
@@ -159,7 +159,7 @@ def _observed(fitted: Prediction, contours: Contours, index: ContourIndex, event
     matching, moving = config.matching, fitted.moving(compensated=True)
     seen = select_events(events, index, fitted.moving(compensated=True), matching.max_events)
     place = fitted.carried(seen.pixels, seen.age_s)
-    table, gate_px = ContourTable.of(contours, index), max(matching.gates_px)
+    table, gate_px = contour_table(contours, index), max(matching.gates_px)
     # Once more from where the first contour's own motion carries it.
     for _ in range(2):
         matches, place = match_nearest(seen, table, place, moving, gate_px, matching)

@@ -7,22 +7,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.linalg import vecdot
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.backends.numba.parameters import TableSettings
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.core import dispatch
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.polarity import octant
 from torchtrack.tracking.association.weights import (
-    APART_PX,
-    ASIDE_PX,
-    DEPTH_SHARE,
-    PARALLEL,
-    SORTED_PX2,
-    TOUCHING_PX,
     agreeing,
     dark_shift_px,
     leading_side,
@@ -49,30 +41,6 @@ class ContourTable:
     index: ContourIndex
     not_plain: Bool[Tensor, "b"]
 
-    @classmethod
-    def of(
-        cls, contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_print: bool = True, close_px: float = 0.0
-    ) -> "ContourTable":
-        """The table of contours and their index.
-
-        The normals of the mesh's own edges are oriented: they point outwards. Those of print point to its darker side.
-
-        Args:
-            polarity: expected of the mesh's own edges, by the octant that they face (:func:`torchtrack.tracking.association.polarity.expected_polarity`).
-            of_print: whether anything is expected of print.
-            close_px: distance from which parallel edges are told apart; 0 for always.
-        """
-        if dispatch.apply_to(contours.pixels):
-            return _table_by_kernel(contours, index, polarity, of_print=of_print, close_px=close_px)
-        limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
-        oriented, expected = limb | crease, (texture & of_print).to(contours.pixels.dtype)
-        if polarity is not None:
-            expected = torch.where(oriented, polarity.gather(1, octant(contours.normals)), expected)
-        mistaken = mistaken_px2(contours, index, oriented, crease, close_px) if close_px else torch.zeros_like(expected)
-        marks = torch.stack([limb.to(expected.dtype), oriented.to(expected.dtype), expected, mistaken], -1)
-        values = (contours.points_obj, contours.normals, index.pixels, marks)
-        return cls(torch.cat([value.transpose(1, 2) for value in values], 1), index, ((limb | texture) & contours.mask).any(1))
-
     def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, ...]:
         """Of contour points: places on the object, normals, pixels when indexed; limb or not, oriented or not, darker side expected, mistaken."""
         taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
@@ -80,20 +48,27 @@ class ContourTable:
         return points_obj, normals, indexed, *marks.unbind(-1)
 
 
-def _table_by_kernel(contours: Contours, index: ContourIndex, polarity: Tensor | None, *, of_print: bool, close_px: float) -> ContourTable:
-    """:meth:`ContourTable.of`, point by point."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba import table as kernels
+@accelerable
+def contour_table(
+    contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_print: bool = True, close_px: float = 0.0
+) -> ContourTable:
+    """The table of contours and their index.
 
-    limb, crease, texture = (int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
-    close = ASIDE_PX, PARALLEL, APART_PX, TOUCHING_PX, DEPTH_SHARE, SORTED_PX2
-    settings = TableSettings(limb, crease, texture, of_print, close_px, *close)
-    table, not_plain = contours.points_obj.new_empty(*contours.mask.shape, kernels.COLUMNS), torch.empty_like(contours.mask[:, 0])
-    points, pixels, normals, indexed = (value.transpose(1, 2) for value in (contours.points_obj, contours.pixels, contours.normals, index.pixels))
-    expected = pixels.new_empty(len(table), 0) if polarity is None else polarity
-    given = as_arrays(points, contours.points_cam[..., 2], pixels, normals, contours.kind, contours.mask, indexed, index.nearest, index.first)
-    kernels.fill(*given, index.cells, *as_arrays(expected), settings, table.numpy(), not_plain.numpy())
-    return ContourTable(table.transpose(1, 2), index, not_plain)
+    The normals of the mesh's own edges are oriented: they point outwards. Those of print point to its darker side.
+
+    Args:
+        polarity: expected of the mesh's own edges, by the octant that they face (:func:`torchtrack.tracking.association.polarity.expected_polarity`).
+        of_print: whether anything is expected of print.
+        close_px: distance from which parallel edges are told apart; 0 for always.
+    """
+    limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
+    oriented, expected = limb | crease, (texture & of_print).to(contours.pixels.dtype)
+    if polarity is not None:
+        expected = torch.where(oriented, polarity.gather(1, octant(contours.normals)), expected)
+    mistaken = mistaken_px2(contours, index, oriented, crease, close_px) if close_px else torch.zeros_like(expected)
+    marks = torch.stack([limb.to(expected.dtype), oriented.to(expected.dtype), expected, mistaken], -1)
+    values = (contours.points_obj, contours.normals, index.pixels, marks)
+    return ContourTable(torch.cat([value.transpose(1, 2) for value in values], 1), index, ((limb | texture) & contours.mask).any(1))
 
 
 def match_nearest(

@@ -6,16 +6,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.core import dispatch
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.padded import take_points
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.frontend.corners import Corners
-from torchtrack.tracking.frontend.window_events import GOLDEN_RATIO, ObjectEvents, laid_out
+from torchtrack.tracking.frontend.window_events import ObjectEvents
 
 # Lots are drawn for a little less than what there is room for, as their number varies.
-_FILL = 0.95
+FILL = 0.95
 
 
 @dataclass(frozen=True)
@@ -49,42 +48,27 @@ def corner_observations(corners: Corners) -> Observations:
     return Observations(corners.pixels, corners.age_s, unknown, unknown, corners.mask, corners.flow, corners.has_flow)
 
 
+@accelerable
 def select_events(events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int) -> Observations:
     """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time.
 
     Which of them are taken hangs on each event's own number, not on how many come before it: a pose that is a little
     different takes almost the same events.
     """
-    if dispatch.apply_to(objects.velocity):
-        values, exists = _selected_by_kernel(events, index, objects, count)
-    else:
-        events = events.rows()
-        pixels, mask = events.pixels, events.mask
-        near = mask & (index.look_up(torch.addcmul(pixels, objects.plane_velocity(pixels), events.age_s[..., None])) >= 0)
-        total = near.sum(-1, keepdim=True)
-        share = torch.where(total > count, _FILL * count / total, 1.0)
-        chosen, exists = events.draw(near, share, count)
-        rows = [pixels.transpose(1, 2), events.age_s[:, None], events.into_burst_s[:, None], events.polarity[:, None]]
-        values = take_points(torch.cat(rows, 1).transpose(1, 2), chosen)
+    events = events.rows()
+    pixels, mask = events.pixels, events.mask
+    near = mask & (index.look_up(torch.addcmul(pixels, objects.plane_velocity(pixels), events.age_s[..., None])) >= 0)
+    total = near.sum(-1, keepdim=True)
+    share = torch.where(total > count, FILL * count / total, 1.0)
+    chosen, exists = events.draw(near, share, count)
+    rows = [pixels.transpose(1, 2), events.age_s[:, None], events.into_burst_s[:, None], events.polarity[:, None]]
+    return event_observations(take_points(torch.cat(rows, 1).transpose(1, 2), chosen), exists)
+
+
+def event_observations(values: Float[Tensor, "b c 5"], exists: Bool[Tensor, "b c"]) -> Observations:
+    """Observations of events: columns of pixels, ages, times into their bursts, and polarities."""
     flow = torch.zeros_like(values[..., :2])
     return Observations(values[..., :2], values[..., 2], values[..., 3], values[..., 4], exists, flow, torch.zeros_like(exists))
-
-
-def _selected_by_kernel(
-    events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int
-) -> tuple[Float[Tensor, "b c 5"], Bool[Tensor, "b c"]]:
-    """What is told of the events that :func:`select_events` takes, and which there are, event by event."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba.selection import select
-
-    rows, own, counts = laid_out(events)
-    number = torch.arange(rows.mask.shape[1]).expand(len(rows.mask), -1) if rows.number is None else rows.number
-    batch = len(objects.velocity)
-    chosen, exists = rows.pixels.new_empty(batch, 5, count), torch.empty(batch, count, dtype=torch.bool)
-    seen = as_arrays(*rows.pixels.unbind(-1), rows.age_s, rows.into_burst_s, rows.polarity, rows.mask, number, own, counts)
-    moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics, index.nearest, index.first)
-    select(*seen, *moving, index.cells, _FILL, GOLDEN_RATIO, chosen.numpy(), exists.numpy())
-    return chosen.transpose(1, 2), exists
 
 
 def join(first: Observations, second: Observations) -> Observations:

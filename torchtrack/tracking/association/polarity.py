@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.core import dispatch
+from torchtrack.core.dispatch import accelerable
 
 # Directions that are told apart.
 _OCTANTS = 8
@@ -21,7 +20,7 @@ _LEAST_FULL = 0.6
 # Shares of what is explained when seen well, from which a window is remembered, and below which the memory counts: at last, in full.
 _SEEN_WELL, _SEEN, _HARDLY_SEEN = 0.8, 0.9, 0.6
 # So much evidence of a direction in a window makes it count by a half.
-_LITTLE_EVIDENCE = 3.0
+LITTLE_EVIDENCE = 3.0
 
 
 def nothing_remembered(like: Float[Tensor, "b _"]) -> Float[Tensor, "b 8"]:
@@ -58,6 +57,7 @@ def is_seen_well(share: Float[Tensor, "b"], full_share: Float[Tensor, "b"]) -> B
     return share >= _SEEN_WELL * full_share.clamp(min=_LEAST_FULL)
 
 
+@accelerable
 def remembered(
     darker_outside: Float[Tensor, "b 8"],
     directions: Float[Tensor, "b n 2"],
@@ -73,15 +73,8 @@ def remembered(
         dark: 1 where an event says that the outer side is the darker one, -1 the inner one, 0 unknown.
         weights: of the events; zero where nothing is to be learned.
     """
-    if dispatch.apply_to(dark):
-        # Not at the top: Numba is an extra.
-        from torchtrack.backends.numba.measures import remember
-
-        after = darker_outside.clone(memory_format=torch.contiguous_format)
-        remember(*as_arrays(after, directions.transpose(1, 2), dark, weights, window_s), memory_s, _LITTLE_EVIDENCE)
-        return after
     total, evidence = _sums(directions, dark, weights).unbind(1)
-    gain = (1 - torch.exp(-window_s / memory_s))[:, None] * evidence / (evidence + _LITTLE_EVIDENCE)
+    gain = (1 - torch.exp(-window_s / memory_s))[:, None] * evidence / (evidence + LITTLE_EVIDENCE)
     return torch.lerp(darker_outside, total / evidence.clamp(min=1e-3), gain)
 
 

@@ -8,17 +8,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import softsign
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.backends.numba.parameters import PatchSettings
-from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.padded import take_points
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.frontend.history import BORDER_PX, History
-from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents, laid_out
+from torchtrack.tracking.frontend.history import History
+from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 
 
@@ -66,19 +64,19 @@ def judged(evidence: Evidence, weigher: nn.Module) -> Observations:
 
 
 # Where the patch is sampled: across the contour and along it (px). Negative is behind the moving edge.
-_ACROSS_PX, _ALONG_PX = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0), (-2.0, 0.0, 2.0)
+ACROSS_PX, ALONG_PX = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0), (-2.0, 0.0, 2.0)
 
 
 # What is older than this, in px of the edge's motion, says no more.
-_OLDEST_PX = 6.0
+OLDEST_PX = 6.0
 
 
 # Slower than this (px/s), an edge has no direction that it moves to. Speeds are told in this unit, by their logarithm.
-_SLOW_PX_S, _SPEED_UNIT_PX_S = 10.0, 100.0
+SLOW_PX_S, SPEED_UNIT_PX_S = 10.0, 100.0
 
 
 # Events are counted by pixel, a power of two of them a side: what is that far apart shares a place, and hardly ever fires at once.
-_SIDE = 256
+SIDE = 256
 
 
 # A place beyond this is nowhere (px).
@@ -89,13 +87,13 @@ _FARTHEST_PX = 1e6
 _KINDS = int(ContourKind.SPLAT) + 1
 
 
-_COUNTS, _SINGLE = 2 * len(_ACROSS_PX) * len(_ALONG_PX), 6
+_COUNTS, _SINGLE = 2 * len(ACROSS_PX) * len(ALONG_PX), 6
 
 
-_OF_KIND = _COUNTS + len(_ACROSS_PX)
+OF_KIND = _COUNTS + len(ACROSS_PX)
 
 
-FEATURES = _OF_KIND + _KINDS + _SINGLE
+FEATURES = OF_KIND + _KINDS + _SINGLE
 
 
 """How many numbers describe an observation."""
@@ -121,7 +119,7 @@ class _Frame:
 
     def around(self, centre: Float[Tensor, "b n 2"], along_px: tuple[float, ...]) -> tuple[Float[Tensor, "b n p"], Float[Tensor, "b n p"]]:
         """Columns and rows of the places of a patch around each centre."""
-        across, along = constant(tuple(product(_ACROSS_PX, along_px)), centre.dtype, centre.device).T
+        across, along = constant(tuple(product(ACROSS_PX, along_px)), centre.dtype, centre.device).T
         (u, v), (nu, nv) = centre[..., None].unbind(-2), self.normal[..., None].unbind(-2)
         return u + across * nu - along * nv, v + across * nv + along * nu
 
@@ -135,7 +133,7 @@ def trust_features(evidence: Evidence) -> Float[Tensor, "b n f"]:
     # Not by one_hot, which reads values back to check them.
     kinds = (kind[..., None] == torch.arange(_KINDS, device=kind.device)).to(polarity.dtype)
     single = [
-        (frame.speed_px_s / _SPEED_UNIT_PX_S).log1p(),
+        (frame.speed_px_s / SPEED_UNIT_PX_S).log1p(),
         polarity,
         polarity * frame.outward,
         polarity.abs(),
@@ -145,40 +143,15 @@ def trust_features(evidence: Evidence) -> Float[Tensor, "b n f"]:
     return torch.cat([_counts(evidence, frame), _ages(evidence, frame), kinds, torch.stack(single, -1)], -1)
 
 
+@accelerable
 def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
     """:func:`trust_features`, which observations are nearest to the limb of a smooth surface, and of which objects there may be any.
 
     Of other observations and other objects they need not be told.
     """
-    if dispatch.apply_to(evidence.observations.age_s):
-        return _limb_features_by_kernel(evidence)
     features = trust_features(evidence)
-    of_limb = features[..., _OF_KIND + int(ContourKind.LIMB)] * features[..., -1] > 0
+    of_limb = features[..., OF_KIND + int(ContourKind.LIMB)] * features[..., -1] > 0
     return features, of_limb & evidence.observations.mask, torch.arange(len(features), device=features.device)
-
-
-def _limb_features_by_kernel(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
-    """:func:`limb_features`, observation by observation."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba.limb_features import describe
-
-    observations, contours, index, history = evidence.observations, evidence.contours, evidence.index, evidence.history
-    moving, (events, own, counts) = evidence.prediction.moving(compensated=True), laid_out(evidence.seen)
-    has_limb = ((contours.kind == int(ContourKind.LIMB)) & contours.mask).any(1)
-    objects, is_limb = has_limb.nonzero()[:, 0], torch.zeros_like(observations.mask)
-    # As many for all: how many a neighbour has would show in roundings.
-    features = observations.age_s.new_empty(len(objects), observations.mask.shape[1], FEATURES)
-    describe(
-        *as_arrays(objects, *events.pixels.unbind(-1), events.age_s, events.polarity, events.mask, own, counts),
-        *as_arrays(observations.pixels.transpose(1, 2), observations.age_s, observations.polarity, observations.mask),
-        *as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.kind, index.nearest, index.first),
-        index.cells,
-        *as_arrays(moving.velocity, moving.centre_cam, moving.intrinsics),
-        *as_arrays(history.sensor_numbers, history.stream_index, history.last_event_us, history.t_us),
-        PatchSettings(_ACROSS_PX, _ALONG_PX, _SIDE, BORDER_PX, int(ContourKind.LIMB), _OF_KIND, _SLOW_PX_S, _SPEED_UNIT_PX_S, _OLDEST_PX),
-        *as_arrays(features, is_limb),
-    )
-    return features, is_limb, objects
 
 
 def _frame(evidence: Evidence) -> _Frame:
@@ -191,7 +164,7 @@ def _frame(evidence: Evidence) -> _Frame:
     speed = (normals * velocity).sum(-1)
     outward = torch.where(speed < 0, -1.0, 1.0).to(speed.dtype)
     moved = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
-    return _Frame(found >= 0, kind[..., 0].long(), outward[..., None] * normals, outward, speed.abs().clamp(min=_SLOW_PX_S), moved)
+    return _Frame(found >= 0, kind[..., 0].long(), outward[..., None] * normals, outward, speed.abs().clamp(min=SLOW_PX_S), moved)
 
 
 def _age_share(observations: Observations) -> Float[Tensor, "b n"]:
@@ -206,7 +179,7 @@ def _ages(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
     places = torch.stack(frame.around(observations.pixels, (0.0,)), -1)
     newest_s = evidence.age_s(places.flatten(1, 2)).view(places.shape[:3])
     behind_px = (newest_s - observations.age_s[..., None]) * frame.speed_px_s[..., None]
-    return behind_px.clamp(-_OLDEST_PX, _OLDEST_PX) / _OLDEST_PX
+    return behind_px.clamp(-OLDEST_PX, OLDEST_PX) / OLDEST_PX
 
 
 def _counts(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
@@ -214,9 +187,9 @@ def _counts(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
     events = evidence.events
     moved = evidence.prediction.carried(events.pixels, events.age_s)
     cell = 2 * _cells(moved[..., 0], moved[..., 1]) + (events.polarity > 0)
-    counts = torch.zeros(len(cell), 2 * _SIDE**2, dtype=moved.dtype, device=moved.device)
+    counts = torch.zeros(len(cell), 2 * SIDE**2, dtype=moved.dtype, device=moved.device)
     counts = counts.scatter_add(1, cell, events.mask.to(moved.dtype))
-    places = 2 * _cells(*frame.around(frame.moved, _ALONG_PX))
+    places = 2 * _cells(*frame.around(frame.moved, ALONG_PX))
     own = places + (evidence.observations.polarity >= 0)[..., None]
     of_both = torch.cat([own, 2 * places + 1 - own], -1)
     return softsign(counts.gather(1, of_both.flatten(1)).view(of_both.shape))
@@ -224,5 +197,5 @@ def _counts(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
 
 def _cells(u: Float[Tensor, "*b"], v: Float[Tensor, "*b"]) -> Int[Tensor, "*b"]:
     """The place that each pixel is counted at."""
-    column, row = (value.round().nan_to_num(0.0).clamp(-_FARTHEST_PX, _FARTHEST_PX).long() & (_SIDE - 1) for value in (u, v))
-    return torch.add(column, row, alpha=_SIDE)
+    column, row = (value.round().nan_to_num(0.0).clamp(-_FARTHEST_PX, _FARTHEST_PX).long() & (SIDE - 1) for value in (u, v))
+    return torch.add(column, row, alpha=SIDE)

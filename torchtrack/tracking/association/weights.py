@@ -174,6 +174,7 @@ def mutual_agreement(
 
 
 def two_of(like: Tensor) -> Tensor:
+    """Two, as a tensor like this one."""
     return constant((2.0,), like.dtype, like.device)
 
 

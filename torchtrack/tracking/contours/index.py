@@ -9,28 +9,26 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.backends.numba.parameters import Cells, IndexSettings
-from torchtrack.core import dispatch, host_sync
+from torchtrack.core import host_sync
 from torchtrack.core.constants import constant, disc
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.padded import take_points
 from torchtrack.tracking.contours.points import Contours
 
 # Squared distances are compared in these fractions of a pixel².
-_DISTANCE_STEPS = 16
+DISTANCE_STEPS = 16
 # Points whose distances are written at once: larger temporaries page-fault on the CPU.
 _CHUNK = 2048
 # Events lie at whole pixels, on the borders of cells or in the middle of four: looked up a little aside, roundings choose nothing (px).
-_OFF_BORDER_PX = 2.0**-8
+OFF_BORDER_PX = 2.0**-8
 # From the middle of a cell to its corner, in cells.
-_HALF_DIAGONAL = 0.5**0.5
+HALF_DIAGONAL = 0.5**0.5
 # Farther than any cell of an image, and than any contour is looked for (px).
-_FAR_CELLS, _FAR_PX = 2**20, 2.0**12
+FAR_CELLS, _FAR_PX = 2**20, 2.0**12
 
 
 @dataclass(frozen=True)
@@ -53,11 +51,6 @@ class ContourIndex:
     pixels: Float[Tensor, "b m 2"]
     radius_px: host_sync.Answer
 
-    @property
-    def cells(self) -> Cells:
-        """The layout as kernels know it."""
-        return Cells(*self.size, float(self.cell_px), _OFF_BORDER_PX)
-
     def look_up(self, pixels: Float[Tensor, "b n 2"], finely: Bool[Tensor, "b"] | None = None) -> Int[Tensor, "b n"]:
         """The contour point nearest to the centre of each pixel's cell, -1 where none is near.
 
@@ -67,7 +60,7 @@ class ContourIndex:
         """
         rows, columns = self.size
         # Whole cells first: rounded the same way wherever the region begins.
-        column, row = pixels.add(0.5 * self.cell_px + _OFF_BORDER_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
+        column, row = pixels.add(0.5 * self.cell_px + OFF_BORDER_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
         nearest = self.nearest.gather(1, self._flat(column.clamp(0, columns - 1), row.clamp(0, rows - 1))).long()
         if finely is None or host_sync.none_of(finely):
             return nearest
@@ -76,7 +69,7 @@ class ContourIndex:
     def _nearest_of_four(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
         """The nearest to each pixel of the contour points that the four cells around it know."""
         rows, columns = self.size
-        column, row = pixels.add(_OFF_BORDER_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
+        column, row = pixels.add(OFF_BORDER_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
         first = self._flat(column.clamp(0, columns - 2), row.clamp(0, rows - 2))
         # A table of the places that cells know, where these are fewer than the places asked for.
         table = self._places(self.nearest.long()) if rows * columns <= 4 * pixels.shape[1] else None
@@ -104,6 +97,7 @@ class ContourIndex:
         return torch.add(column, row, alpha=self.size[1]).nan_to_num_(0.0).long()
 
 
+@accelerable
 def index_contours(
     contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"] | host_sync.Answer, cell_px: int
 ) -> ContourIndex:
@@ -116,14 +110,12 @@ def index_contours(
         radius_px: how far from a contour it is still found; one for all objects, or one for each.
     """
     batch, count, _ = contours.pixels.shape
-    answer = _radii(radius_px, contours)
-    if dispatch.apply_to(contours.pixels):
-        return _by_kernel(contours, image_size, answer, cell_px)
+    answer = radii(radius_px, contours)
     radius, radii_px = answer.on_device, answer.numbers()
     middle = constant((0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)), contours.pixels.dtype, contours.pixels.device)
     inside = contours.mask & ((contours.pixels - middle).abs() < middle + radius[:, None, None]).all(-1)
     centre = (contours.pixels / cell_px).round()
-    margin = _reach(max([0, *radii_px]), cell_px) + 2
+    margin = reach(max([0, *radii_px]), cell_px) + 2
     low = _first_cells(centre, inside, margin)
     local = torch.where(inside[..., None], centre - low[:, None], margin)
     rows, columns = _size(local, image_size, margin, cell_px)
@@ -132,7 +124,7 @@ def index_contours(
         spread = torch.arange(count, device=local.device) % (columns - 2 * margin) + margin
         local[..., 0] = torch.where(inside, local[..., 0], spread.to(local.dtype))
     # Distance and number of a point in one integer, as narrow as will do.
-    dtype = torch.int32 if _DISTANCE_STEPS * (max([0, *radii_px]) + 1) ** 2 * count < 2**31 else torch.int64
+    dtype = torch.int32 if DISTANCE_STEPS * (max([0, *radii_px]) + 1) ** 2 * count < 2**31 else torch.int64
     keys = torch.full((batch * rows * columns,), torch.iinfo(dtype).max, dtype=dtype, device=radius.device)
     # Points that are not inside are too far from their cells to write anything.
     to_centre = torch.where(inside[..., None], cell_px * centre - contours.pixels, _FAR_PX)
@@ -144,28 +136,11 @@ def index_contours(
         for of_part in parts:
             _write(keys, of_part, reach_px, cell_px, columns, count)
     keys = keys.view(batch, -1)
-    nearest = torch.where(keys < ((_DISTANCE_STEPS * radius.square() + 1) * count)[:, None], keys % count, -1).long()
+    nearest = torch.where(keys < ((DISTANCE_STEPS * radius.square() + 1) * count)[:, None], keys % count, -1).long()
     return ContourIndex(low, (rows, columns), cell_px, nearest, contours.pixels, answer)
 
 
-def _by_kernel(contours: Contours, image_size: tuple[int, int], answer: host_sync.Answer, cell_px: int) -> ContourIndex:
-    """:func:`index_contours`, point by point."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba import index as kernels
-
-    margin = _reach(max([0, *answer.numbers()]), cell_px) + 2
-    middle = 0.5 * (image_size[1] - 1), 0.5 * (image_size[0] - 1)
-    settings = IndexSettings(*middle, float(cell_px), margin, _DISTANCE_STEPS, _HALF_DIAGONAL, _FAR_CELLS)
-    pixels, mask, radius = as_arrays(contours.pixels, contours.mask, answer.on_device)
-    first, is_inside = contours.pixels.new_empty(len(pixels), 2), np.empty_like(mask)
-    rows, columns = kernels.extents(pixels, mask, radius, settings, is_inside, first.numpy())
-    # Narrow numbers: half as much of the memory that a processor has near.
-    nearest = torch.empty(len(pixels), rows * columns, dtype=torch.int32)
-    kernels.write(pixels, is_inside, radius, first.numpy(), columns, settings, nearest.numpy())
-    return ContourIndex(first, (rows, columns), cell_px, nearest, contours.pixels, answer)
-
-
-def _radii(radius_px: int | Tensor | host_sync.Answer, contours: Contours) -> host_sync.Answer:
+def radii(radius_px: int | Tensor | host_sync.Answer, contours: Contours) -> host_sync.Answer:
     """The radius of each object."""
     if isinstance(radius_px, int):
         return host_sync.Answer.of(radius_px, contours.mask[:, 0].long())
@@ -175,7 +150,7 @@ def _radii(radius_px: int | Tensor | host_sync.Answer, contours: Contours) -> ho
 def _first_cells(centre: Float[Tensor, "b m 2"], inside: Bool[Tensor, "b m"], margin: int) -> Float[Tensor, "b 2"]:
     """First cell (column, row) of each object's region, ``margin`` cells before its points."""
     if host_sync.read_at_once(centre):
-        return torch.where(inside[..., None], centre, torch.inf).amin(1).clamp(max=_FAR_CELLS) - margin
+        return torch.where(inside[..., None], centre, torch.inf).amin(1).clamp(max=FAR_CELLS) - margin
     # What is farther from the image than its radius, less than a margin, is not inside.
     return constant((1 - 2 * margin,) * 2, centre.dtype, centre.device).expand(len(centre), 2)
 
@@ -212,17 +187,17 @@ def _write(keys: Tensor, points: tuple[Tensor, Tensor, Tensor], radius_px: int, 
     """
     cell, to_centre, number = points
     # The cells that reach into the radius around a cell's middle.
-    column, row = disc(radius_px / cell_px + _HALF_DIAGONAL, to_centre.dtype, to_centre.device)
-    steps = _squared_distances(_DISTANCE_STEPS**0.5 * to_centre, _DISTANCE_STEPS**0.5 * cell_px * torch.stack([column, row], -1))
+    column, row = disc(radius_px / cell_px + HALF_DIAGONAL, to_centre.dtype, to_centre.device)
+    steps = _squared_distances(DISTANCE_STEPS**0.5 * to_centre, DISTANCE_STEPS**0.5 * cell_px * torch.stack([column, row], -1))
     # What is farther than the radius need not be told apart, and must fit.
-    key = steps.clamp_(0, _DISTANCE_STEPS * radius_px**2 + 1).to(keys.dtype).mul_(count).add_(number[:, None])
+    key = steps.clamp_(0, DISTANCE_STEPS * radius_px**2 + 1).to(keys.dtype).mul_(count).add_(number[:, None])
     around = torch.add(column, row, alpha=columns).long()
     keys.scatter_reduce_(0, (cell[:, None] + around).flatten(), key.flatten(), "amin")
 
 
-def _reach(radius_px: int, cell_px: int) -> int:
+def reach(radius_px: int, cell_px: int) -> int:
     """How many cells away a point still counts."""
-    return int(radius_px / cell_px + _HALF_DIAGONAL)
+    return int(radius_px / cell_px + HALF_DIAGONAL)
 
 
 def _squared_distances(to_centre: Float[Tensor, "p 2"], offsets: Float[Tensor, "d 2"]) -> Float[Tensor, "p d"]:

@@ -53,7 +53,7 @@ class ObjectBatch:
         shared: whether any stream has more than one object.
         learned: contour points beside those of the models; none when not given.
         shown: which elements of the models are taken for contours; all when not given.
-        polarity: the darker side expected of contours, by the octant that they face (:mod:`torchtrack.tracking.association.polarity`); nothing when not given.
+        polarity: the darker side expected of contours, by the octant that they face (:mod:`tracking.association.polarity`); nothing when not given.
     """
 
     models: Sequence[ContourModel]

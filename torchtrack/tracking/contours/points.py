@@ -11,33 +11,28 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.backends.numba.parameters import SamplingSettings
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.core import dispatch, host_sync
+from torchtrack.core import host_sync
 from torchtrack.core.camera import MIN_DEPTH_M, project
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.lie import affine, transform_points
 from torchtrack.core.padded import select_ranked
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
-from torchtrack.tracking.contours import fast_contours
 
 # Of a model with no more edges than this, all are looked at.
 _FEW_EDGES = 512
 
 
 # Active edges beyond this many are thinned evenly before they are projected.
-_MAX_ACTIVE_EDGES = 8192
+MAX_ACTIVE_EDGES = 8192
 
 
 # Tangents that the image shows shorter than this (px/m) have no direction in it.
-_MIN_PX_PER_M = 1e-3
+MIN_PX_PER_M = 1e-3
 
 
 # Texture seen at a grazing angle (cosine below this) is foreshortened beyond use. What fires and is left out draws what is beside it.
-_MIN_TEXTURE_COSINE = 0.02
-
-
-# To show what was sampled takes no setting: made once, as making them takes longer than a kernel does.
-_TO_SHOW = ContourConfig()
+MIN_TEXTURE_COSINE = 0.02
 
 
 # Points and tangents (object frame), kinds and mask; where it was said which elements are shown, the element of each as well.
@@ -120,8 +115,8 @@ def _places_for(active: Bool[Tensor, "b e"]) -> int:
     """Places for the active edges of each object: of many edges, few are. On a GPU, which would have to be waited for, as many as there may be."""
     edges = active.shape[1]
     if edges <= _FEW_EDGES or not host_sync.read_at_once(active):
-        return min(edges, _MAX_ACTIVE_EDGES)
-    return min(max(int(active.sum(1).amax()), 1), _MAX_ACTIVE_EDGES)
+        return min(edges, MAX_ACTIVE_EDGES)
+    return min(max(int(active.sum(1).amax()), 1), MAX_ACTIVE_EDGES)
 
 
 def _lengths_px(ends: Float[Tensor, "b e 2 3"], T_cam_obj: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -137,7 +132,7 @@ def _texture_mask(model: ContourModel, T_cam_obj: Tensor) -> Tensor:
     """Texture points on faces that look at the camera."""
     points = transform_points(T_cam_obj, model.texture_points.expand(len(T_cam_obj), -1, -1))
     normals = model.texture_normals @ T_cam_obj[:, :3, :3].transpose(1, 2)
-    return (normals * points).sum(-1) < -_MIN_TEXTURE_COSINE * points.square().sum(-1).sqrt()
+    return (normals * points).sum(-1) < -MIN_TEXTURE_COSINE * points.square().sum(-1).sqrt()
 
 
 def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
@@ -187,17 +182,22 @@ def image_normals(
     # Clamped before the root, which has no slope at zero: padding must not spoil gradients.
     length = (u * u + v * v).clamp(min=1e-18).sqrt()
     normals = torch.stack([-v, u], 1) / length[:, None]
-    return normals.transpose(1, 2), length > _MIN_PX_PER_M
+    return normals.transpose(1, 2), length > MIN_PX_PER_M
 
 
 def reproject(contours: Contours, T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
     """The same contour points seen from a pose nearby: normals are kept, which turn far less than points move."""
-    if dispatch.apply_to(T_cam_obj):
-        points_cam, pixels = fast_contours.projected(contours.points_obj, T_cam_obj, intrinsics)
-    else:
-        points_cam = transform_points(T_cam_obj, contours.points_obj)
-        pixels = project(points_cam, intrinsics)
+    points_cam, pixels = projected(contours.points_obj, T_cam_obj, intrinsics)
     return replace(contours, points_cam=points_cam, pixels=pixels)
+
+
+@accelerable
+def projected(
+    points_obj: Float[Tensor, "b m 3"], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]
+) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m 2"]]:
+    """Points in the camera's frame, and their pixels."""
+    points_cam = transform_points(T_cam_obj, points_obj)
+    return points_cam, project(points_cam, intrinsics)
 
 
 def joined(first: Contours, second: Contours) -> Contours:
@@ -217,7 +217,7 @@ def mesh_contours(
     Args:
         shown: which elements of each object's model are taken; all when not given.
     """
-    points, tangents, kind, mask, *_ = _mesh_points(models, T_cam_obj, intrinsics, config, shown)
+    points, tangents, kind, mask, *_ = mesh_points(models, T_cam_obj, intrinsics, config, shown)
     return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics)
 
 
@@ -229,14 +229,13 @@ def mesh_elements(
     shown: Bool[Tensor, "b k"],
 ) -> tuple[Contours, Int[Tensor, "b m"]]:
     """:func:`mesh_contours`, and the element of the model that each point is on (:mod:`torchtrack.object_model.contour_source`)."""
-    points, tangents, kind, mask, element = _mesh_points(models, T_cam_obj, intrinsics, config, shown)
+    points, tangents, kind, mask, element = mesh_points(models, T_cam_obj, intrinsics, config, shown)
     return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics), element
 
 
-def _mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
+@accelerable
+def mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
     """Contour points of all objects, in places of their own, before hidden parts are removed."""
-    if shown is None and dispatch.apply_to(T_cam_obj):
-        return fast_contours.mesh_points(models, T_cam_obj, intrinsics, sampling_settings(config))
     if len(models) == 1:
         return _model_contours(models[0], T_cam_obj, intrinsics, config, shown)
     parts = [
@@ -248,26 +247,13 @@ def _mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: 
     return tuple(torch.cat([_widened(value, width) for value in column])[order] for column in zip(*parts, strict=True))
 
 
-def sampling_settings(config: ContourConfig = _TO_SHOW) -> SamplingSettings:
-    """What a kernel goes by that samples as :func:`mesh_contours` does, or only shows what was sampled."""
-    return SamplingSettings(
-        occluding=config.occluding,
-        most_edges=_MAX_ACTIVE_EDGES,
-        max_edge_points=config.max_edge_points,
-        spacing_px=config.spacing_px,
-        texture=int(ContourKind.TEXTURE),
-        least_cosine=_MIN_TEXTURE_COSINE,
-        least_depth_m=MIN_DEPTH_M,
-        least_px_per_m=_MIN_PX_PER_M,
-    )
-
-
 def _widened(values: Tensor, count: int) -> Tensor:
     """Padded with zeros to at least ``count`` places."""
     missing = max(count - values.shape[1], 0)
     return torch.cat([values, values.new_zeros(len(values), missing, *values.shape[2:])], 1) if missing else values
 
 
+@accelerable
 def assemble(
     points_obj: Float[Tensor, "b m 3"],
     tangents_obj: Float[Tensor, "b m 3"],
@@ -277,9 +263,6 @@ def assemble(
     intrinsics: Float[Tensor, "b 4"],
 ) -> Contours:
     """Contours from points in the object's frame; those behind the camera or without a normal are masked."""
-    if dispatch.apply_to(points_obj):
-        shown, *seen = fast_contours.shown(points_obj, tangents_obj, mask, T_cam_obj, intrinsics, sampling_settings())
-        return Contours(points_obj, tangents_obj, kind, shown, *seen)
     points_cam = transform_points(T_cam_obj, points_obj)
     tangents_cam = affine(T_cam_obj[:, :3, :3], tangents_obj.transpose(1, 2)).transpose(1, 2)
     normals, has_normal = image_normals(points_cam, tangents_cam, intrinsics)

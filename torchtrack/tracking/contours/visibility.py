@@ -8,32 +8,30 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.backends.numba.parameters import GridSettings
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.core import dispatch, host_sync
+from torchtrack.core import host_sync
 from torchtrack.core.camera import MIN_DEPTH_M, project
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.lie import affine, transform_points
 from torchtrack.core.padded import bounds
 from torchtrack.object_model.contour_source import ContourModel
 from torchtrack.tracking.contours.points import Contours
 
 # A point this far behind a face's plane is behind it, not on it (diameters).
-_ON_FACE = 2e-3
+ON_FACE = 2e-3
 # Tests of points against triangles that are made at once: larger temporaries page-fault on the CPU.
 _MOST_TESTS = 2**19
 # Depths are compared in whole micrometres, with the object's number in the low bits.
-_DEPTH_STEPS_PER_M, _OBJECT_BITS = 1e6, 20
-_NOTHING = 2**62
+DEPTH_STEPS_PER_M, _OBJECT_BITS = 1e6, 20
+NOTHING = 2**62
 # Images that are farther apart than this have no cell in common.
 _BESIDE_CELLS = 2
 # So many surface samples for each cell of the square around an object leave no holes: its outline fills half of it, seen from both sides.
-_SAMPLES_PER_CELL = 8
+SAMPLES_PER_CELL = 8
 
 
 @dataclass(frozen=True)
@@ -87,11 +85,10 @@ def _hidden_by(tests: Float[Tensor, "b t 4"], points: Float[Tensor, "b 4 m"]) ->
     return torch.bmm(tests, points).unflatten(1, (-1, 4)).amin(2).amax(1) > 0
 
 
-def _hidden_by_self(scene: Scene, contours: Contours) -> Tensor:
+@accelerable
+def hidden_by_self(scene: Scene, contours: Contours) -> Tensor:
     """Points of objects with few faces that these hide."""
     hidden = torch.zeros_like(contours.mask)
-    if dispatch.apply_to(contours.pixels):
-        return _hidden_by_self_by_kernel(scene, contours, hidden)
     for model in scene.models:
         if len(model.triangles):
             # All objects, where all have the model: a list of them would be looked up.
@@ -102,21 +99,7 @@ def _hidden_by_self(scene: Scene, contours: Contours) -> Tensor:
             triangles = transform_points(T_cam_obj, corners).unflatten(1, (-1, 3))
             normals = model.triangle_normals @ T_cam_obj[:, :3, :3].transpose(1, 2)
             points_cam = contours.points_cam[members][:, :places]
-            hidden[members, :places] = hidden_by_faces(points_cam, triangles, normals, _ON_FACE * scene.diameters_m[members])
-    return hidden
-
-
-def _hidden_by_self_by_kernel(scene: Scene, contours: Contours, hidden: Tensor) -> Tensor:
-    """:func:`_hidden_by_self`, object by object."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba.visibility import hide_behind_faces
-
-    points = as_arrays(contours.points_cam.transpose(1, 2), contours.mask)
-    T_cam_obj, tolerance_m = as_arrays(scene.T_cam_obj, _ON_FACE * scene.diameters_m)
-    for model in scene.models:
-        if len(model.triangles):
-            members, triangles, normals = as_arrays(model.members, model.triangles, model.triangle_normals)
-            hide_behind_faces(members, T_cam_obj, triangles, normals, tolerance_m, *points, hidden.numpy())
+            hidden[members, :places] = hidden_by_faces(points_cam, triangles, normals, ON_FACE * scene.diameters_m[members])
     return hidden
 
 
@@ -183,13 +166,13 @@ def depth_buffer(scene: Scene, grid: DepthGrid, drawn: Bool[Tensor, "b"] | None 
         for members, samples, taken in _samples(model, drawn, scene, grid.cell_px):
             points = transform_points(scene.T_cam_obj[members], samples.expand(len(members), -1, -1))
             cells.append(grid.cell(project(points, scene.intrinsics[members]), scene.stream_index[members]).flatten())
-            key = ((points[..., 2] * _DEPTH_STEPS_PER_M).long() << _OBJECT_BITS) + members[:, None]
-            keys.append(torch.where((points[..., 2] > MIN_DEPTH_M) & taken, key, _NOTHING).flatten())
+            key = ((points[..., 2] * DEPTH_STEPS_PER_M).long() << _OBJECT_BITS) + members[:, None]
+            keys.append(torch.where((points[..., 2] > MIN_DEPTH_M) & taken, key, NOTHING).flatten())
     rows, columns = grid.size
-    nearest = torch.full((len(grid.first) * rows * columns,), _NOTHING, device=scene.T_cam_obj.device)
+    nearest = torch.full((len(grid.first) * rows * columns,), NOTHING, device=scene.T_cam_obj.device)
     if cells:
         nearest.scatter_reduce_(0, torch.cat(cells), torch.cat(keys), "amin")
-    depth_m = (nearest >> _OBJECT_BITS).to(scene.T_cam_obj.dtype) / _DEPTH_STEPS_PER_M
+    depth_m = (nearest >> _OBJECT_BITS).to(scene.T_cam_obj.dtype) / DEPTH_STEPS_PER_M
     return depth_m, nearest & ((1 << _OBJECT_BITS) - 1)
 
 
@@ -214,22 +197,24 @@ def _halvings(model: ContourModel, members: Int[Tensor, "k"], scene: Scene, cell
     """How many times the surface samples of some objects of a model are halved, as few will do where the objects are small in the image."""
     depth_m = scene.T_cam_obj[members, 2, 3].clamp(min=MIN_DEPTH_M)
     size_cells = scene.diameters_m[members] * scene.intrinsics[members, 0] / depth_m / cell_px
-    spare = len(model.surface_points) / (_SAMPLES_PER_CELL * size_cells.square()).clamp(min=1)
+    spare = len(model.surface_points) / (SAMPLES_PER_CELL * size_cells.square()).clamp(min=1)
     return spare.log2().long().clamp(min=0)
 
 
-def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -> Tensor:
+@accelerable
+def hidden_in_buffer(
+    scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"], exact: Bool[Tensor, "b 1"], config: ContourConfig
+) -> Bool[Tensor, "b m"]:
     """Points behind another surface in the depth buffer; an object's own counts where it has too many faces for the exact test.
 
     Beside the limb of a curved surface that surface is nearer, in the same cell even; beyond it, it ends. So a point is
     hidden only where it is also behind what lies a cell to each side of its contour.
+
+    Args:
+        drawn: objects whose surface is drawn.
+        exact: objects that are tested against their own faces.
     """
-    exact, cell_px = _tested_exactly(scene), config.depth_cell_px
-    drawn = ~exact[:, 0] | _beside_others(scene, contours, cell_px)
-    if host_sync.none_of(drawn):
-        return torch.zeros_like(contours.mask)
-    if dispatch.apply_to(contours.pixels):
-        return _hidden_in_buffer_by_kernel(scene, contours, drawn, exact[:, 0], config)
+    cell_px = config.depth_cell_px
     _, height, width = scene.image_shape
     u, v = contours.pixels.unbind(-1)
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
@@ -241,31 +226,6 @@ def _hidden_in_buffer(scene: Scene, contours: Contours, config: ContourConfig) -
     farthest_m = contours.points_cam[..., 2] - config.depth_margin * scene.diameters_m[:, None]
     behind = (farthest_m[:, None] > depth_m.take(cell)) & (other | ~exact[:, None])
     return inside & behind.all(1)
-
-
-def _hidden_in_buffer_by_kernel(
-    scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"], exact: Bool[Tensor, "b"], config: ContourConfig
-) -> Tensor:
-    """:func:`_hidden_in_buffer`, sample by sample and point by point."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba import visibility as kernels
-
-    streams, height, width = scene.image_shape
-    hidden, margin_m, first = torch.zeros_like(contours.mask), config.depth_margin * scene.diameters_m, np.empty((streams, 2))
-    points_cam, pixels, normals, mask = as_arrays(
-        *(value.transpose(1, 2) for value in (contours.points_cam, contours.pixels, contours.normals)), contours.mask
-    )
-    T_cam_obj, intrinsics, stream_index, diameters_m = as_arrays(scene.T_cam_obj, scene.intrinsics, scene.stream_index, scene.diameters_m)
-    cell_px = float(config.depth_cell_px)
-    rows, columns = kernels.around(pixels, mask, stream_index, cell_px, height, width, first)
-    settings = GridSettings(rows, columns, cell_px, height, width, _DEPTH_STEPS_PER_M, MIN_DEPTH_M, _SAMPLES_PER_CELL)
-    depth, owner = (np.full(streams * rows * columns, value) for value in (_NOTHING, len(drawn)))
-    for model in scene.models:
-        of_model = as_arrays(model.members, drawn, model.surface_points.T)
-        kernels.draw(*of_model, T_cam_obj, intrinsics, diameters_m, stream_index, first, settings, depth, owner)
-    own = as_arrays(exact, margin_m)
-    kernels.hide_in_buffer(points_cam, pixels, normals, mask, *own, stream_index, first, settings, depth, owner, hidden.numpy())
-    return hidden
 
 
 def _beside_others(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tensor, "b"]:
@@ -292,8 +252,11 @@ def _tested_exactly(scene: Scene) -> Tensor:
 
 def remove_hidden(contours: Contours, scene: Scene, config: ContourConfig) -> Contours:
     """Contours without the points that the object itself or another one of its stream hides."""
-    hidden = _hidden_by_self(scene, contours)
+    hidden = hidden_by_self(scene, contours)
     needs_buffer = scene.shared or any(len(model.triangles) == 0 for model in scene.models)
     if needs_buffer:
-        hidden = hidden | _hidden_in_buffer(scene, contours, config)
+        exact = _tested_exactly(scene)
+        drawn = ~exact[:, 0] | _beside_others(scene, contours, config.depth_cell_px)
+        if not host_sync.none_of(drawn):
+            hidden = hidden | hidden_in_buffer(scene, contours, drawn, exact, config)
     return replace(contours, mask=contours.mask & ~hidden)

@@ -12,28 +12,27 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.backends.numba.parameters import DampingSettings, SolvingSettings
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.core import dispatch, host_sync
+from torchtrack.core import host_sync
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.constants import constant
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.image_velocity import pose_jacobian
 from torchtrack.core.lie import affine, small_difference_about, turned
 from torchtrack.core.linalg import solve_factored, solve_positive
-from torchtrack.tracking.estimation.robust_loss import LOSSES, robust_loss, robust_weight
+from torchtrack.tracking.estimation.robust_loss import robust_loss, robust_weight
 from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, WindowTerms
 
 # Damping after the first rejected step, and how it grows and shrinks (Nielsen's simple rule).
-_DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY = 1e-4, 10.0, 0.1
+DAMPING_START, DAMPING_GROWTH, DAMPING_DECAY = 1e-4, 10.0, 0.1
 
 
 # What is added to a Hessian's diagonal beside its damping: so much, and this share of its largest entry.
-_LEAST_DIAGONAL, _LEAST_SHARE = 1e-12, 1e-9
+LEAST_DIAGONAL, _LEAST_SHARE = 1e-12, 1e-9
 
 
 # A cost, which is a long sum, is known to this many units of rounding.
-_ROUNDINGS = 8
+ROUNDINGS = 8
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ def robust_cost(problem: PoseProblem, T_cam_obj: Float[Tensor, "b 4 4"], from_pr
     return _cost(problem, robust_loss(seen.residuals, problem.scale_px, loss), from_prior, _pull(problem, from_prior))
 
 
-def _from_prior(problem: PoseProblem, T_cam_obj: Tensor) -> Tensor:
+def offset_from_prior(problem: PoseProblem, T_cam_obj: Tensor) -> Tensor:
     """Offset of a pose from the prior; whatever else is unknown is as predicted."""
     moved = small_difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
     return torch.nn.functional.pad(moved, (0, problem.prior_information.shape[-1] - moved.shape[-1]))
@@ -147,7 +146,7 @@ def _normal_equations(problem: PoseProblem, seen: _Seen, robust: Tensor, pull: T
     return pull + product[..., unknowns], problem.prior_information + product[..., :unknowns]
 
 
-def _least_share(hessian: Tensor) -> float:
+def least_share(hessian: Tensor) -> float:
     """Share of the largest entry that is added to a diagonal.
 
     It keeps directions that nothing observes solvable: their step is zero, as their gradient is, but for rounding. Poses alone
@@ -159,9 +158,7 @@ def _least_share(hessian: Tensor) -> float:
 def _damped(hessian: Tensor, damping: Tensor) -> Tensor:
     """The Hessian, damped along its diagonal."""
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
-    floor = torch.add(
-        constant((_LEAST_DIAGONAL,), hessian.dtype, hessian.device), diagonal[:, :6].amax(-1, keepdim=True), alpha=_least_share(hessian)
-    )
+    floor = torch.add(constant((LEAST_DIAGONAL,), hessian.dtype, hessian.device), diagonal[:, :6].amax(-1, keepdim=True), alpha=least_share(hessian))
     damped = hessian.clone()
     damped.diagonal(dim1=-2, dim2=-1).add_(torch.addcmul(floor, diagonal, damping[:, None]))
     return damped
@@ -178,6 +175,7 @@ def _last_step(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
 
 
 @torch.no_grad()
+@accelerable
 def solve_pose(
     problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig, from_prior: Float[Tensor, "b k"] | None = None
 ) -> Linearisation:
@@ -196,9 +194,7 @@ def solve_pose(
         The last linearisation, with the pose that its step led to.
     """
     if from_prior is None:
-        from_prior = _from_prior(problem, T_start)
-    if dispatch.apply_to(T_start):
-        return _solved_by_kernel(problem, T_start, config, from_prior)
+        from_prior = offset_from_prior(problem, T_start)
     rows = _as_rows(problem)
     damping = torch.full_like(problem.scale_px, config.damping)
     place = _Place.of(problem, T_start, from_prior)
@@ -207,44 +203,13 @@ def solve_pose(
         next_place = place.moved(_judged_step(gradient, hessian, damping))
         *next_equations, next_cost = _look(problem, rows, next_place, config.loss, judged=True)
         # Near the optimum, rounding must not decide.
-        better = next_cost <= cost * (1 + _ROUNDINGS * torch.finfo(cost.dtype).eps)
-        damping = torch.where(better, damping * _DAMPING_DECAY, damping.clamp(min=_DAMPING_START) * _DAMPING_GROWTH)
+        better = next_cost <= cost * (1 + ROUNDINGS * torch.finfo(cost.dtype).eps)
+        damping = torch.where(better, damping * DAMPING_DECAY, damping.clamp(min=DAMPING_START) * DAMPING_GROWTH)
         new, old = ((*vars(at).values(), *rest) for at, rest in ((next_place, (*next_equations, next_cost)), (place, (gradient, hessian, cost))))
         *where, gradient, hessian, cost = _choose(better, new, old)
         place = _Place(*where)
     found = place.moved(_last_step(gradient, hessian, damping))
     return Linearisation(found.pose(problem), gradient, hessian, found.from_prior)
-
-
-def _solved_by_kernel(problem: PoseProblem, T_start: Tensor, config: SolverConfig, from_prior: Tensor) -> Linearisation:
-    """:func:`solve_pose`, object by object."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba.solving import solve_poses
-
-    window = problem.window or _no_window(problem)
-    T_cam_obj, offset = (value.detach().clone(memory_format=torch.contiguous_format) for value in (T_start, from_prior))
-    gradient, hessian = torch.empty_like(offset), torch.empty_like(problem.prior_information, memory_format=torch.contiguous_format)
-    observed = problem.points_obj, problem.targets, problem.directions, problem.weights, window.age_s, window.outward
-    of_objects = window.velocity, window.rate_hz, problem.intrinsics, problem.centre_obj, problem.scale_px, problem.prior_information
-    rounding = _ROUNDINGS * torch.finfo(T_start.dtype).eps
-    solve_poses(
-        *as_arrays(*(value.detach() for value in (*observed, *of_objects))),
-        SolvingSettings(config.iterations, LOSSES.index(config.loss), rounding, _DAMPING_START, _DAMPING_GROWTH, _DAMPING_DECAY),
-        damping_settings(config, hessian),
-        *as_arrays(T_cam_obj, offset, gradient, hessian),
-    )
-    return Linearisation(T_cam_obj, gradient, hessian, offset)
-
-
-def _no_window(problem: PoseProblem) -> WindowTerms:
-    """What stands for terms that a problem has not."""
-    nothing, no_motion = problem.weights.new_empty(len(problem.weights), 0), problem.weights.new_empty(len(problem.weights), 6)
-    return WindowTerms(nothing, no_motion, nothing, no_motion)
-
-
-def damping_settings(config: SolverConfig, hessian: Float[Tensor, "b k k"]) -> DampingSettings:
-    """What a kernel goes by that damps Hessians like this one as :func:`solve_pose` does."""
-    return DampingSettings(config.damping, _LEAST_DIAGONAL, _least_share(hessian))
 
 
 def _look(problem: PoseProblem, rows: _Rows, place: _Place, loss: str, *, judged: bool) -> tuple[Tensor, Tensor, Tensor]:

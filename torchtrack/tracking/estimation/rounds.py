@@ -9,16 +9,16 @@ from torch.nn.functional import pad
 
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.core.constants import constant
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.host_sync import Answer
 from torchtrack.tracking.association.along_flow import match_along_flow
 from torchtrack.tracking.association.matches import Matches, both_coordinates
-from torchtrack.tracking.association.nearest import ContourTable, match_nearest
+from torchtrack.tracking.association.nearest import ContourTable, contour_table, match_nearest
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.weights import told_by_each
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject
-from torchtrack.tracking.estimation import fast_rounds
 from torchtrack.tracking.estimation.implicit_gradient import with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, WindowTerms
@@ -104,29 +104,75 @@ def align(
     begin = prediction if offset is None else prediction.moved(offset)
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
     table = _table(contours, index, objects, matching)
-    finely = _looked_up_finely(objects, begin, table, widening, matching)
-    narrowing = _narrowing(widening, len(matching.gates_px))
-    if fast_rounds.applies(config, offset):
-        solution, matches = fast_rounds.align_rounds(prediction, begin.T_cam_obj, offset, information, table, observations, narrowing, finely, config)
-        return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
+    gates = Gates(widening, _narrowing(widening, len(matching.gates_px)), _looked_up_finely(objects, begin, table, widening, matching))
+    start = Start(prediction, begin, offset, information, contours, index)
+    solution, matches, contours = align_rounds(start, table, observations, gates, config)
+    return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the rounds of an alignment begin.
+
+    Args:
+        prediction: what the prior draws to.
+        begin: where they begin, and ``offset`` of that from the prediction.
+        information: of the prior.
+        contours: visible there, and ``index`` of them.
+    """
+
+    prediction: Prediction
+    begin: Prediction
+    offset: Float[Tensor, "b k"]
+    information: Float[Tensor, "b k k"]
+    contours: Contours
+    index: ContourIndex
+
+
+@dataclass(frozen=True)
+class Gates:
+    """How far observations are looked for from contours.
+
+    Args:
+        widening: of each object's first gate.
+        wider: by how much each round's gate is wider, for each object.
+        finely: objects whose contours are looked up finely.
+    """
+
+    widening: Float[Tensor, "b"]
+    wider: Float[Tensor, "r b"]
+    finely: Bool[Tensor, "b"]
+
+
+@accelerable
+def align_rounds(
+    start: Start, table: ContourTable, observations: Observations, gates: Gates, config: TrackerConfig
+) -> tuple[Linearisation, Matches, Contours]:
+    """Rounds of matching and solving: the solution and the matches of the last one, and the contours that these are of.
+
+    Args:
+        table: of the contours where the rounds begin.
+    """
+    prediction, begin, offset, contours = start.prediction, start.begin, start.offset, start.contours
+    objects, matching = prediction.objects, config.matching
     place = _first_place(begin, observations, config)
-    for number, (gate_px, wider) in enumerate(zip(matching.gates_px, narrowing, strict=True)):
+    for number, (gate_px, wider) in enumerate(zip(matching.gates_px, gates.wider, strict=True)):
         if number and number in config.contours.refresh_rounds:
             contours = objects.contours(begin.T_cam_obj, config.contours)
-            table = _table(contours, index_for(contours, objects.image_size, config, widening, index.radius_px), objects, matching)
+            index = index_for(contours, objects.image_size, config, gates.widening, start.index.radius_px)
+            table = _table(contours, index, objects, matching)
             place = _first_place(begin, observations, config)
         moving = begin.moving(compensated=matching.motion_compensation, offset=offset if config.solver.acceleration_in_window else None)
         if matching.along_flow:
             contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
             matches = match_along_flow(observations, contours, moving, gate_px, matching)
         else:
-            matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider, finely)
+            matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider, gates.finely)
         matches = _believed(matches, observations, config)
-        problem = _problem(prediction, information, matches, observations, offset, gate_px * wider, config)
+        problem = _problem(prediction, start.information, matches, observations, offset, gate_px * wider, config)
         solution = solve_pose(problem, begin.T_cam_obj, config.solver, offset)
         begin, offset = prediction.at(solution.T_cam_obj, solution.from_prior), solution.from_prior
-    solution = with_gradient(problem, solution, config.solver)
-    return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
+    return with_gradient(problem, solution, config.solver), matches, contours
 
 
 def _looked_up_finely(
@@ -145,7 +191,7 @@ def _looked_up_finely(
 
 def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config: MatchingConfig) -> ContourTable:
     """What observations take from their contours, with the polarity that is expected of them."""
-    return ContourTable.of(contours, index, objects.polarity, of_print=config.print_polarity, close_px=config.close_edges_px)
+    return contour_table(contours, index, objects.polarity, of_print=config.print_polarity, close_px=config.close_edges_px)
 
 
 def _narrowing(widening: Float[Tensor, "b"], rounds: int) -> Float[Tensor, "r b"]:

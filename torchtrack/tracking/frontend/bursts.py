@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.core import dispatch
 from torchtrack.core.constants import constant
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.events import PaddedEvents
 
 # Ages (µs) are kept in 16 bits; it does not matter by how much longer ago a burst began.
@@ -28,6 +27,7 @@ def aged(burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"]) -> 
     return torch.minimum(burst_age_us, LONG_AGO_US - elapsed_us).add_(elapsed_us)
 
 
+@accelerable
 def update_bursts(
     burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int
 ) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
@@ -44,9 +44,6 @@ def update_bursts(
 
     Of padding, the second result says nothing.
     """
-    # Of longer windows, ages do not tell what began in them.
-    if dispatch.apply_to(burst_age_us) and bool((elapsed_us < LONG_AGO_US).all()):
-        return _update_by_kernel(burst_age_us, elapsed_us, events, longest_us)
     _, _, height, width = burst_age_us.shape
     ages = aged(burst_age_us, elapsed_us)
     # In place: out of place, the whole map is copied again.
@@ -60,18 +57,6 @@ def update_bursts(
     flat.scatter_reduce_(1, place, torch.where(begins, age_us, -1), "amax")
     into_us = torch.where(begins, flat.gather(1, place), before_us) - age_us
     return ages, torch.where(into_us < longest_us, into_us, 0)
-
-
-def _update_by_kernel(
-    burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int
-) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
-    """:func:`update_bursts`, one event after the other."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba.events import update_bursts as update
-
-    ages, into_us = torch.empty(burst_age_us.shape, dtype=torch.int16), torch.empty(events.mask.shape, dtype=torch.int16)
-    update(*as_arrays(*vars(events).values(), elapsed_us), longest_us, LONG_AGO_US, *as_arrays(burst_age_us, ages, into_us))
-    return ages, into_us
 
 
 def without_tail(

@@ -11,11 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.backends.numba.parameters import TileSettings
-from torchtrack.core import dispatch
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.constants import constant
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.events import EventBatch, check_on_sensor
 from torchtrack.core.lie import transform_points
 from torchtrack.tracking.motion.prediction import Prediction
@@ -23,9 +21,9 @@ from torchtrack.tracking.motion.prediction import Prediction
 # Side of a tile (px, as a power of two).
 TILE_BITS = 3
 # Objects are expected within this many standard deviations of their prediction.
-_SIGMAS = 4.0
+SIGMAS = 4.0
 # What is looked up near contours is so much coarser than a pixel (px).
-_SLACK_PX = 4.0
+SLACK_PX = 4.0
 # Corners of a box, in halves of its sides from its middle.
 _CORNERS = tuple(product((-1.0, 1.0), repeat=3))
 
@@ -71,48 +69,28 @@ class SensorTiles(nn.Module):
         """The tile of each pixel."""
         return torch.add(x >> TILE_BITS, y >> TILE_BITS, alpha=self.columns).long()
 
+    @accelerable
     def near(self, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
         """Tiles that anything can be seen in, within a window before ``prediction``, that is no farther than a margin from each object."""
-        if dispatch.apply_to(prediction.velocity):
-            return self._near_by_kernel(prediction, window_s, margin_px)
         objects, (turning, speed_m_s) = prediction.objects, prediction.velocity.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
         turned, moved, *_ = prediction.covariance.diagonal(dim1=-2, dim2=-1).unflatten(1, (4, 3)).amax(-1).sqrt().to(turning.dtype).unbind(1)
         rim_m = 0.5 * objects.diameter_m
-        within_m = ((speed_m_s + rim_m * turning) * window_s + _SIGMAS * (moved + rim_m * turned))[:, None]
+        within_m = ((speed_m_s + rim_m * turning) * window_s + SIGMAS * (moved + rim_m * turned))[:, None]
         corners_obj = objects.centre_obj[:, None] + constant(_CORNERS, turning.dtype, turning.device) * objects.half_extent[:, None]
         corners = transform_points(prediction.T_cam_obj, corners_obj)
         nearest_m, slope = corners[..., 2] - within_m, corners[..., :2] / corners[..., 2:]
         # No point of a ball is farther from its middle along an axis of the image: by the derivative of x/z along any way in it.
         around_px = objects.intrinsics[:, None, :2] * (1 + slope * slope).sqrt() * (within_m / nearest_m)[..., None]
         # Written so that what is not a number, or may lie beside or behind the camera, is near everywhere.
-        around_px = torch.where((nearest_m > MIN_DEPTH_M)[..., None], around_px, torch.inf) + (margin_px + _SLACK_PX)
+        around_px = torch.where((nearest_m > MIN_DEPTH_M)[..., None], around_px, torch.inf) + (margin_px + SLACK_PX)
         at = project(corners, objects.intrinsics)
         low, high = (at - around_px).amin(1), (at + around_px).amax(1)
         reach_px = self.reach_px[:, None]
         return ((self.middle + reach_px >= low[:, None]) & (self.middle - reach_px <= high[:, None])).all(-1)
 
-    def _near_by_kernel(self, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
-        """:meth:`near`, tile by tile."""
-        # Not at the top: Numba is an extra.
-        from torchtrack.backends.numba.events import near_tiles
-
-        objects = prediction.objects
-        near = torch.empty(len(window_s), len(self.middle), dtype=torch.bool)
-        variance = prediction.covariance.diagonal(dim1=-2, dim2=-1)[:, :6]
-        moving = as_arrays(prediction.velocity, variance, prediction.T_cam_obj, window_s)
-        own = as_arrays(objects.centre_obj, objects.half_extent, objects.diameter_m, objects.intrinsics)
-        settings = TileSettings(_SIGMAS, margin_px + _SLACK_PX, MIN_DEPTH_M)
-        near_tiles(*as_arrays(self.middle, self.reach_px), *moving, *own, settings, near.numpy())
-        return near
-
     def keep(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> NearbyEvents:
         """The events in tiles near any object."""
-        if dispatch.apply_to(events.x):
-            kept, count = self.numbers_near(events, near)
-            kept = kept[:count]
-        else:
-            # NumPy finds them several times faster.
-            kept = np.flatnonzero(near.any(0).numpy()[self._of(events.x, events.y).numpy()])
+        kept = self.numbers_near(events, near)
         if len(kept) == 0:
             # Padding, which stands for no event at all, has no number and is near nothing.
             return NearbyEvents(EventBatch.empty())
@@ -122,20 +100,16 @@ class SensorTiles(nn.Module):
         of_each = _of_each(near.numpy(), self._of(events.x, events.y).numpy()) if len(near) > 1 else None
         return NearbyEvents(events, number, of_each)
 
-    def numbers_near(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> tuple[np.ndarray, int]:
-        """The numbers of the events in tiles near any object, event by event, and how many these are; after them there are no numbers.
+    @accelerable
+    def numbers_near(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> np.ndarray:
+        """The numbers of the events in tiles near any object.
 
         Raises:
             EventDataError: if an event is outside the sensor.
         """
-        # Not at the top: Numba is an extra.
-        from torchtrack.backends.numba.events import keep
-
-        kept = np.empty(len(events) + 1, np.int64)
-        count = int(keep(*as_arrays(events.x, events.y, near.any(0)), TILE_BITS, self.columns, self.width, self.height, kept))
-        if count < 0:
-            check_on_sensor(events, self.width, self.height)
-        return kept, count
+        check_on_sensor(events, self.width, self.height)
+        # NumPy finds them several times faster.
+        return np.flatnonzero(near.any(0).numpy()[self._of(events.x, events.y).numpy()])
 
 
 def _of_each(near: np.ndarray, tile: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.core import dispatch, host_sync
+from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
-from torchtrack.core.events import EventBatch, check_on_sensor, stream_bounds
+from torchtrack.core.dispatch import accelerable
+from torchtrack.core.events import EventBatch
 from torchtrack.core.padded import bounds
 
 # Time of a pixel that never fired: far in the past, and its age still fits int64 microseconds.
@@ -40,6 +40,7 @@ def empty_last_event(streams: int, height: int, width: int, device: torch.device
 
 
 @torch.no_grad()
+@accelerable
 def update_last_event(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -> Int[Tensor, "s h w"]:
     """The map of newest event times (µs) after ``events``; the input is left as it was.
 
@@ -48,8 +49,6 @@ def update_last_event(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -
     Raises:
         EventDataError: if an event is outside the sensor, where kernels are used.
     """
-    if dispatch.apply_to(last_event_us):
-        return _update_by_kernel(last_event_us, events)
     streams, height, width = last_event_us.shape
     # In the type of the coordinates, which is narrower than that of an index.
     pixel = torch.add(events.x, events.y, alpha=width).long()
@@ -58,17 +57,6 @@ def update_last_event(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -
     updated = last_event_us.clone()
     # In place on the copy: out of place, the whole map is copied twice.
     updated.view(-1).scatter_reduce_(0, pixel, events.t_us, "amax")
-    return updated
-
-
-def _update_by_kernel(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -> Int[Tensor, "s h w"]:
-    """:func:`update_last_event`, one event after the other."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba.events import newest
-
-    updated = last_event_us.clone(memory_format=torch.contiguous_format)
-    if not newest(*as_arrays(events.x, events.y, events.t_us, stream_bounds(events, len(updated)), updated)):
-        check_on_sensor(events, width=last_event_us.shape[2], height=last_event_us.shape[1])
     return updated
 
 

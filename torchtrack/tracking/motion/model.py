@@ -25,6 +25,23 @@ STEEPNESS = 4
 
 
 @dataclass(frozen=True)
+class MotionState:
+    """Pose and motion of each object at its stream's time, and how certain they are.
+
+    Args:
+        T_cam_obj: poses (float64).
+        velocity: rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s).
+        acceleration: how they changed in the last window (rad/s², m/s²).
+        covariance: of pose and velocity (float64), in the chart that this file describes.
+    """
+
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    velocity: Float[Tensor, "b 6"]
+    acceleration: Float[Tensor, "b 6"]
+    covariance: Float[Tensor, "b 12 12"]
+
+
+@dataclass(frozen=True)
 class Acceleration:
     """How velocities come to be what they are at a window's end: by an acceleration that is constant over the window.
 

@@ -6,11 +6,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import ContourConfig
-from torchtrack.core import dispatch
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.constants import once
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.image_velocity import MovingObjects, pixel_velocity, pose_jacobian
 from torchtrack.core.lie import retract_about, step_about, transform_points
 from torchtrack.core.linalg import inverse
@@ -22,7 +21,7 @@ from torchtrack.tracking.motion.model import Acceleration
 # Nothing that is tracked is farther away (m).
 MAX_DEPTH_M = 1e4
 # Contour points that the uncertainty is looked at, at most.
-_LOOKED_AT = 64
+LOOKED_AT = 64
 
 
 @dataclass(frozen=True)
@@ -98,15 +97,9 @@ class Prediction:
         seen = self.objects.contours(self.in_mid_window(dt_s), config)
         return assemble(seen.points_obj, seen.tangents_obj, seen.kind, seen.mask, self.T_cam_obj, self.objects.intrinsics)
 
+    @accelerable
     def in_mid_window(self, dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 4 4"]:
         """Poses half a window of length ``dt_s`` earlier; those at its end where they would not be before the camera."""
-        if dispatch.apply_to(self.T_cam_obj):
-            # Not at the top: Numba is an extra.
-            from torchtrack.backends.numba.forecast import in_mid_window
-
-            middle = torch.empty_like(self.T_cam_obj, memory_format=torch.contiguous_format)
-            in_mid_window(*as_arrays(self.T_cam_obj, self.velocity, dt_s, self.objects.centre_obj), MIN_DEPTH_M, MAX_DEPTH_M, middle.numpy())
-            return middle
         back = self.velocity * (-0.5 * dt_s)[:, None]
         middle = step_about(self.T_cam_obj, back, self.objects.centre_obj)
         return before_camera(middle, self.objects.centre_obj, self.T_cam_obj)[0]
@@ -147,12 +140,11 @@ class Prediction:
         T_cam_obj, velocity, covariance = (put(getattr(self, name), getattr(other, name)) for name in ("T_cam_obj", "velocity", "covariance"))
         return Prediction(self.objects, T_cam_obj, self.usable, velocity, covariance, acceleration)
 
+    @accelerable
     def sigma_px(self, contours: Contours) -> Float[Tensor, "b"]:
         """Standard deviation of the contours across themselves in the image (px), in the mean over them."""
-        if dispatch.apply_to(contours.pixels):
-            return self._sigma_px_by_kernel(contours)
         # Of the visible points, not of all places: how many there are depends on the other objects.
-        chosen, mask = select_ranked(contours.mask, _LOOKED_AT)
+        chosen, mask = select_ranked(contours.mask, LOOKED_AT)
         points, normals = take_points(contours.points_cam, chosen), take_points(contours.normals, chosen)
         inverse_depth = points[..., 2].clamp(min=MIN_DEPTH_M).reciprocal()
         slope = normals * self.objects.intrinsics[:, None, :2] * inverse_depth[..., None]
@@ -160,17 +152,6 @@ class Prediction:
         jacobian = pose_jacobian((points - self.centre_cam[:, None]).transpose(1, 2), (*slope.unbind(-1), along))
         variance = (jacobian * (self.covariance[:, :6, :6].to(jacobian.dtype) @ jacobian)).sum(1)
         return ((variance * mask).sum(-1) / mask.sum(-1).clamp(min=1)).sqrt()
-
-    def _sigma_px_by_kernel(self, contours: Contours) -> Float[Tensor, "b"]:
-        """:meth:`sigma_px`, point by point."""
-        # Not at the top: Numba is an extra.
-        from torchtrack.backends.numba.measures import variance_across
-
-        variance = contours.pixels.new_empty(len(contours.mask))
-        seen = as_arrays(contours.points_cam.transpose(1, 2), contours.normals.transpose(1, 2), contours.mask)
-        own = as_arrays(self.covariance[:, :6, :6], self.centre_cam, self.objects.intrinsics)
-        variance_across(*seen, *own, _LOOKED_AT, variance.numpy())
-        return variance.sqrt()
 
 
 def far_pose(centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:

@@ -4,7 +4,6 @@ The pose of a window stands on the events up to its end. Those of the windows af
 to, and how fast. What is refined comes later for it, so this is for recordings, and for whoever can wait.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +14,6 @@ from torchtrack.config.tracker import MotionConfig
 from torchtrack.core.lie import difference_about, retract_about
 from torchtrack.core.linalg import inverse
 from torchtrack.tracking.motion.model import predict_covariance
-from torchtrack.tracking.state import TrackerState
 
 # Squared distance (12 degrees of freedom) from what was to be expected above which an object was found in another place: what
 # came before is not dragged there. Of what the filter holds for possible, 2 in 100 million are farther.
@@ -37,12 +35,6 @@ class Filtered:
     T_cam_obj: Float[Tensor, "n b 4 4"]
     velocity: Float[Tensor, "n b 6"]
     covariance: Float[Tensor, "n b 12 12"]
-
-    @classmethod
-    def of(cls, states: Sequence[TrackerState]) -> "Filtered":
-        """What the states of one stream after consecutive windows say."""
-        known = zip(*((state.T_cam_obj, state.velocity, state.covariance) for state in states), strict=True)
-        return cls(torch.cat([state.t_us for state in states]).cpu(), *(torch.stack(values).double().cpu() for values in known))
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,8 @@ from torch import Tensor
 from torch.fft import irfft2, rfft2
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core import dispatch
+from torchtrack.core.dispatch import accelerable
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.view_sphere import outlines_by_view
@@ -27,11 +26,11 @@ _SIGMAS, _DIAMETERS = 2.5, 1.3
 # Cells to each side that events are blurred over, and that what is beside them is taken from.
 _BLUR, _BESIDE = 1, 3
 # Shifts that are kept of each turn, the best within so many cells to each side.
-_SHIFTS, _APART = 3, 2
+SHIFTS, APART = 3, 2
 # Outlines that are correlated together: what they need stays in a processor's nearer memory.
 _TOGETHER = 32
 # What is no shift at all: less than any correlation.
-_NONE = -9.0
+NONE = -9.0
 
 
 @dataclass(frozen=True)
@@ -86,11 +85,11 @@ def _best(
     allowed = step[:, None].square() + step.square() <= (_SIGMAS * sigma_cells).square()
     spectrum = _spectrum(square.counts(*places)[0] / square.cell_px)
     split = zip(outlines.pixels.split(_TOGETHER), outlines.mask.split(_TOGETHER), strict=True)
-    peaks = (_peaks(_correlation(spectrum, square.counts(*some)), allowed) for some in split)
-    best, place = (torch.cat(values).flatten() for values in zip(*peaks, strict=True))
+    highest = (peaks(_correlation(spectrum, square.counts(*some)), allowed) for some in split)
+    best, place = (torch.cat(values).flatten() for values in zip(*highest, strict=True))
     chosen = best.topk(min(count, best.numel())).indices
     place = place[chosen]
-    return chosen // _SHIFTS, torch.stack([step[place % _SIDE], step[place // _SIDE]], -1)
+    return chosen // SHIFTS, torch.stack([step[place % _SIDE], step[place // _SIDE]], -1)
 
 
 def _spectrum(events: Float[Tensor, "h w"]) -> Tensor:
@@ -117,16 +116,10 @@ def _blurred(cells: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
     return avg_pool2d(avg_pool2d(cells[None], (side, 1), 1, (radius, 0)), (1, side), 1, (0, radius))[0]
 
 
-def _peaks(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
+@accelerable
+def peaks(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
     """The highest cells of each map, none of which is close to a higher one, and which they are; of cells that are allowed alone."""
-    if dispatch.apply_to(fit):
-        # Not at the top: Numba is an extra.
-        from torchtrack.backends.numba.hypotheses import peaks
-
-        best, place = fit.new_full((len(fit), _SHIFTS), _NONE), torch.empty(len(fit), _SHIFTS, dtype=torch.int64)
-        peaks(*as_arrays(fit, allowed), _APART, *as_arrays(best, place))
-        return best, place
-    fit = torch.where(allowed, fit, _NONE)
-    highest = fit >= max_pool2d(fit[:, None], 2 * _APART + 1, 1, _APART)[:, 0]
-    best, place = torch.where(highest, fit, _NONE).flatten(1).topk(_SHIFTS)
+    fit = torch.where(allowed, fit, NONE)
+    highest = fit >= max_pool2d(fit[:, None], 2 * APART + 1, 1, APART)[:, 0]
+    best, place = torch.where(highest, fit, NONE).flatten(1).topk(SHIFTS)
     return best, place

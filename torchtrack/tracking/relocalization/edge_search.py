@@ -9,21 +9,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import SolverConfig
-from torchtrack.core import dispatch
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.lie import difference_about
 from torchtrack.core.linalg import inverse
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 from torchtrack.tracking.estimation.terms import PoseProblem
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.event_image import BORDER_PX, look_up
+from torchtrack.tracking.relocalization.event_image import look_up
 
 # How far contour points look (px), a step of the solver each: of poses far off, and of those that were pulled nearer.
 FAR_PX, NEAR_PX = (12.0, 8.4, 5.9), (7.2, 5.0, 3.5)
 # Places that each looks at, on both sides.
-_LOOKS = 17
+LOOKS = 17
 # Standard deviation of what a contour point with one event finds (px), with its share of what all have in common.
 _FIND_PX = 10.0
 _SOLVER = SolverConfig(iterations=1, loss="huber")
@@ -56,26 +55,14 @@ def pulled(
     return T_cam_obj
 
 
+@accelerable
 def found(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
     """Where each contour point finds most events along its normal, rather near by, and how much that counts."""
-    if dispatch.apply_to(image):
-        return _found_by_kernel(outlines, image, reach_px)
-    steps_px = torch.linspace(-reach_px, reach_px, _LOOKS, dtype=image.dtype, device=image.device)
+    steps_px = torch.linspace(-reach_px, reach_px, LOOKS, dtype=image.dtype, device=image.device)
     looked_at = outlines.pixels[:, :, None] + steps_px[:, None] * outlines.normals[:, :, None]
     there = look_up(image, looked_at) * (1 - steps_px.abs() / (reach_px + 1))
     most, place = there.max(-1)
     return torch.addcmul(outlines.pixels, outlines.normals, steps_px[place][..., None]), most * outlines.mask
-
-
-def _found_by_kernel(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
-    """:func:`found`, point by point."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba.hypotheses import find
-
-    targets, weights = image.new_empty(*outlines.mask.shape, 2), image.new_empty(outlines.mask.shape)
-    points = as_arrays(outlines.pixels.transpose(1, 2), outlines.normals.transpose(1, 2), outlines.mask)
-    find(*points, *as_arrays(image), BORDER_PX, reach_px, _LOOKS, *as_arrays(targets, weights))
-    return targets, weights
 
 
 def _problem(

@@ -12,19 +12,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core import dispatch
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.lie import difference_about
-from torchtrack.tracking.contours.points import Contours, assemble, sampling_settings
+from torchtrack.tracking.contours.points import Contours, assemble
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.correlation import shifted
 from torchtrack.tracking.relocalization.edge_search import FAR_PX, NEAR_PX, pulled
-from torchtrack.tracking.relocalization.event_image import BORDER_PX, event_density, look_up
+from torchtrack.tracking.relocalization.event_image import event_density, look_up
 from torchtrack.tracking.relocalization.view_sphere import outlines_at, thinned
 
 # Events beside a contour are counted this far from it (px), and more than this many of them in one place say no more.
-_BESIDE_PX, ENOUGH_EVENTS = 4.0, 3.0
+BESIDE_PX, ENOUGH_EVENTS = 4.0, 3.0
 
 
 def promising(
@@ -103,6 +102,7 @@ def _normal(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tenso
         return normal
 
 
+@accelerable
 def mark(outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"], image: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
     """How much denser events are on the contours of one object at each of some poses than beside them.
 
@@ -112,26 +112,11 @@ def mark(outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Floa
         image: how many events there are at every pixel, as :mod:`torchtrack.tracking.relocalization.event_image` has it.
     """
     count = len(T_cam_obj)
-    if dispatch.apply_to(image):
-        return _marked_by_kernel(outlines, T_cam_obj, intrinsics, image)
     points, tangents, kind, mask = (
         values.expand(count, *values.shape[1:]) for values in (outlines.points_obj, outlines.tangents_obj, outlines.kind, outlines.mask)
     )
     moved = assemble(points, tangents, kind, mask, T_cam_obj, intrinsics.expand(count, 4))
     total = image.new_zeros(count)
-    for side_px, weight in ((0.0, 1.0), (_BESIDE_PX, -0.5), (-_BESIDE_PX, -0.5)):
+    for side_px, weight in ((0.0, 1.0), (BESIDE_PX, -0.5), (-BESIDE_PX, -0.5)):
         total = total + weight * (look_up(image, moved.pixels + side_px * moved.normals) * moved.mask).sum(-1)
     return total / moved.mask.sum(-1).clamp(min=1)
-
-
-def _marked_by_kernel(
-    outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"], image: Float[Tensor, "h w"]
-) -> Float[Tensor, "n"]:
-    """:func:`mark`, point by point."""
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba.contours import mark as by_kernel
-
-    marks = image.new_empty(len(T_cam_obj))
-    points = as_arrays(outlines.points_obj.transpose(1, 2), outlines.tangents_obj.transpose(1, 2), outlines.mask)
-    by_kernel(*points, *as_arrays(T_cam_obj, intrinsics[0]), sampling_settings(), *as_arrays(image), BORDER_PX, _BESIDE_PX, marks.numpy())
-    return marks

@@ -47,7 +47,7 @@ class Doubt:
         unseen_s: how long ago each was last seen well (s).
         strayed: which of those adrift merely explain less than when seen well.
         may_have_turned: which may be turned about an axis unseen: :mod:`torchtrack.tracking.relocalization.axis_rotation`.
-        off_in_depth, little: which are to be looked for all around where they were last seen well, and why: :mod:`torchtrack.tracking.relocalization.last_seen`.
+        off_in_depth, little: which are to be looked for all around where they were last seen well, and why: :mod:`relocalization.last_seen`.
     """
 
     sigma_px: Float[Tensor, "b"]

@@ -7,22 +7,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.backends.numba.parameters import QualitySettings
 from torchtrack.config.search import QualityConfig
-from torchtrack.core import dispatch
+from torchtrack.core.dispatch import accelerable
 from torchtrack.core.host_sync import none_of
 from torchtrack.core.image_velocity import MovingObjects, pixel_velocity
 from torchtrack.tracking.association.matches import Matches
-from torchtrack.tracking.association.weights import ON_CONTOUR_PX, PATCH_BITS, PATCHES, SMEAR_PX, on_and_around, patch, patch_sums
+from torchtrack.tracking.association.weights import ON_CONTOUR_PX, on_and_around, patch, patch_sums
 from torchtrack.tracking.contours.points import Contours
 
 # A patch explains its contours when this share of the observations near them are on them.
-_LEAST_SHARE = 0.5
+LEAST_SHARE = 0.5
 
 
 # Fewer moving contour points than this say nothing.
-_MIN_MOVING_POINTS = 16
+MIN_MOVING_POINTS = 16
 
 
 # What has not been seen well for so long may not be held by parallel lines alone; after so much more, hardly anything is asked (s).
@@ -34,7 +32,7 @@ _PARALLEL_FROM, _PARALLEL_TO = 0.1, 0.33
 
 
 # How far around a contour observations are that should gather on it (px).
-_AROUND_PX = 5.0
+AROUND_PX = 5.0
 
 
 def explained_share(
@@ -54,48 +52,22 @@ def measured_share(
     """
     counts = patch_sums(patch(matches.targets), on_and_around(matches.offsets, matches.near) * matches.as_expected[:, None])
     on, near = counts.gather(2, patch(contours.pixels)[:, None].expand(-1, 2, -1)).unbind(1)
-    explained = (on >= config.min_on_contour) & (on + 1 > _LEAST_SHARE * (near + 2))
+    explained = (on >= config.min_on_contour) & (on + 1 > LEAST_SHARE * (near + 2))
     speed = (contours.normals * contour_velocity).sum(-1).abs()
     moving = contours.mask & inside(contours.pixels, image_size) & (speed > config.min_speed_px_s)
     total = moving.sum(-1)
     share = (moving & explained).sum(-1).to(contours.pixels.dtype) / total.clamp(min=1)
-    return torch.where(total < _MIN_MOVING_POINTS, torch.nan, share)
+    return torch.where(total < MIN_MOVING_POINTS, torch.nan, share)
 
 
+@accelerable
 def shares(
     contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: QualityConfig
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """:func:`measured_share` of contours that move with their objects, :func:`gathered_share`, and :func:`directions_apart`."""
-    if not dispatch.apply_to(contours.pixels):
-        velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
-        measured = measured_share(contours, matches, velocity, image_size, config)
-        return measured, gathered_share(matches, config), directions_apart(matches)
-    # Not at the top: Numba is an extra.
-    from torchtrack.backends.numba.measures import shares as by_kernel
-
-    measured, gathered, apart = contours.pixels.new_empty(3, len(contours.mask))
-    shown = as_arrays(*(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask)
-    moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
-    matched = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
-    by_kernel(*shown, *moving, *matched, _settings(image_size, config), measured.numpy(), gathered.numpy(), apart.numpy())
-    return measured, gathered, apart
-
-
-def _settings(image_size: tuple[int, int], config: QualityConfig) -> QualitySettings:
-    """What a kernel goes by that tells shares as :func:`shares` does."""
-    return QualitySettings(
-        *image_size,
-        min_observations=config.min_observations,
-        min_on_contour=config.min_on_contour,
-        min_speed_px_s=config.min_speed_px_s,
-        least_share=_LEAST_SHARE,
-        min_moving_points=_MIN_MOVING_POINTS,
-        around_px=_AROUND_PX,
-        on_contour_px=ON_CONTOUR_PX,
-        smear_px=SMEAR_PX,
-        patch_bits=PATCH_BITS,
-        patches=PATCHES,
-    )
+    velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
+    measured = measured_share(contours, matches, velocity, image_size, config)
+    return measured, gathered_share(matches, config), directions_apart(matches)
 
 
 def gathered_share(matches: Matches, config: QualityConfig) -> Float[Tensor, "b"]:
@@ -104,7 +76,7 @@ def gathered_share(matches: Matches, config: QualityConfig) -> Float[Tensor, "b"
     Contours that slipped onto others are explained by events of those, but what is around them is no longer theirs alone.
     """
     offsets = matches.offsets.abs()
-    near = matches.near & (offsets < _AROUND_PX)
+    near = matches.near & (offsets < AROUND_PX)
     count = near.sum(-1)
     share = (near & (offsets < ON_CONTOUR_PX)).sum(-1).to(offsets.dtype) / count.clamp(min=1)
     return torch.where(count < config.min_observations, torch.nan, share)
@@ -153,14 +125,8 @@ def inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
     return (u >= 0) & (u < image_size[1]) & (v >= 0) & (v < image_size[0])
 
 
+@accelerable
 def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
     """Share of an object's contour points that lie in the image; zero without any."""
-    if dispatch.apply_to(contours.pixels):
-        # Not at the top: Numba is an extra.
-        from torchtrack.backends.numba.measures import visible
-
-        share = contours.pixels.new_empty(len(contours.mask))
-        visible(*as_arrays(contours.pixels.transpose(1, 2), contours.mask), *image_size, share.numpy())
-        return share
     seen = contours.mask & inside(contours.pixels, image_size)
     return seen.sum(-1) / contours.mask.sum(-1).clamp(min=1)

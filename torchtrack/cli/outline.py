@@ -8,14 +8,21 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from torchtrack.cli.console import output_console
+from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.core.camera import Camera, undistort
 from torchtrack.errors import MissingFileError, ModelError, UnknownFormatError
-from torchtrack.io.atomic import atomic_path
+from torchtrack.io import read_calibration
+from torchtrack.io.atomic import atomic_path, check_other_file
 
 # The picture is enlarged before it is thresholded: edges are then found to a fraction of a pixel.
 _ENLARGEMENT = 8
+
+
 # Pixels at the picture's border are no part of the scene in some cameras, and a shape cut off there has no edge there.
 _BORDER_PX = 2.5
+
+
 _MIN_AREA_PX = 30
 
 
@@ -98,3 +105,14 @@ def write_polylines(path: Path, lines: list[Float[ndarray, "_ 3"]]) -> None:
     with atomic_path(path) as temporary:
         rows = ",\n  ".join(json.dumps(np.round(line, 6).tolist()) for line in lines)
         temporary.write_text(f'{{"unit": "m", "polylines": [\n  {rows}\n]}}\n', encoding="utf-8")
+
+
+def outline(image: str, calibration: str, output: str, distance_m: float, width: int | None, height: int | None) -> int:
+    """Write a polyline model of the dark shapes of a picture; returns the exit code."""
+    for source in (image, calibration):
+        check_other_file(Path(source), Path(output))
+    camera = read_calibration(calibration, width, height)
+    lines = outline_dark_shapes(read_grey_image(Path(image)), camera, distance_m)
+    write_polylines(Path(output), lines)
+    output_console().print(f"{len(lines)} outlines are in {output}")
+    return ExitCode.DONE

@@ -1,26 +1,14 @@
-"""The command line: parse → config → call.
+"""The options of each command. What a command does is imported when it runs: ``torchtrack --help`` is not to wait for PyTorch."""
 
-Options of a command are typed with tyro. Any setting can be given by its dotted key, as in
-``--tracker.window.duration-us 3000``, on top of the config file; ``torchtrack settings`` lists them.
-"""
-
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-import tyro
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import Positional, arg
 
-from torchtrack.cli_io import Bench, Convert, Info, refuse_settings
+from torchtrack.cli.options_files import refuse_settings
 from torchtrack.config.executor import ExecutorName
-from torchtrack.config.load import load, typed
 from torchtrack.config.settings import CommandLineText
-from torchtrack.core.limits import Limits, limits
-from torchtrack.errors import ConfigError, TorchtrackError
-from torchtrack.exit_codes import ExitCode
-from torchtrack.run.interrupt import ended_in_good_order
-from torchtrack.standard_streams import flushed, report, take_any_text
+from torchtrack.errors import ConfigError
 
 
 def _option(metavar: str, *aliases: str) -> Any:
@@ -29,13 +17,22 @@ def _option(metavar: str, *aliases: str) -> Any:
 
 
 _Output = Annotated[str | None, _option("DIR", "-o")]
+
+
 _Preset = Annotated[str | None, _option("NAME")]
+
+
 _Models = Annotated[Literal["textured", "geometry"] | None, _option("textured|geometry")]
+
+
 _Number = Annotated[int | None, _option("N")]
+
+
 _Executor = Annotated[ExecutorName | None, _option("local|ray")]
+
+
 # Options that say how several sources are shared out.
 _OF_MANY = ("streams", "jobs", "executor")
-_SETTINGS_HINT = "Any setting can be given by its dotted key, e.g. --tracker.window.duration-us 3000; `torchtrack settings {}` lists them."
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,7 @@ class Track:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands import track, track_many
+        from torchtrack.cli.track import track, track_many
 
         if not self.configs:
             raise ConfigError("command line: track needs a config file or a source.")
@@ -117,7 +114,7 @@ class Evaluate:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands import evaluate, show_latency
+        from torchtrack.cli.evaluate import evaluate, show_latency
 
         if self.estimate_latency:
             refuse_settings(overrides)
@@ -160,7 +157,7 @@ class Simulate:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands import simulate, simulate_video
+        from torchtrack.cli.simulate import simulate, simulate_video
 
         if not self.output:
             raise ConfigError("command line: simulate needs an output, as in -o sequence.npz.")
@@ -192,7 +189,7 @@ class Demo:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands import demo
+        from torchtrack.cli.demo import demo
 
         return demo(self.config, _given(self, ("config", "quiet")) | overrides, quiet=self.quiet)
 
@@ -216,7 +213,7 @@ class Outline:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands import outline
+        from torchtrack.cli.outline import outline
 
         refuse_settings(overrides)
         return outline(self.image, self.calibration, self.output, self.distance_m, self.width, self.height)
@@ -228,85 +225,15 @@ class Settings:
 
     command: Positional[Literal["track", "evaluate", "demo", "simulate"]] = "track"
     """The command."""
+    markdown: bool = False
+    """Print Markdown."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands import list_settings
+        from torchtrack.cli.settings import list_settings
 
         refuse_settings(overrides)
-        return list_settings(self.command)
-
-
-_Command = (
-    Annotated[Track, subcommand("track", description=f"{Track.__doc__} {_SETTINGS_HINT.format('track')}")]
-    | Annotated[Evaluate, subcommand("evaluate", description=f"{Evaluate.__doc__} {_SETTINGS_HINT.format('evaluate')}")]
-    | Annotated[Simulate, subcommand("simulate")]
-    | Annotated[Demo, subcommand("demo")]
-    | Annotated[Outline, subcommand("outline")]
-    | Annotated[Info, subcommand("info")]
-    | Annotated[Convert, subcommand("convert")]
-    | Annotated[Bench, subcommand("bench")]
-    | Annotated[Settings, subcommand("settings")]
-)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns its :class:`ExitCode`."""
-    take_any_text()
-    try:
-        with ended_in_good_order():
-            return flushed(_run(sys.argv[1:] if arguments is None else arguments))
-    except SystemExit as ended:
-        # After a help text, or a mistake in the options.
-        raise SystemExit(flushed(ended.code)) from None
-
-
-def _run(arguments: Sequence[str]) -> int:
-    """Run one command; an error is told in one line."""
-    try:
-        options, overrides = split_overrides(arguments)
-        command = tyro.cli(_Command, prog="torchtrack", description="6DoF object pose tracking with an event camera.", args=options)
-        with limits(_limits(overrides)):
-            code: int = command.run(overrides)
-    except ConfigError as error:
-        return report(str(error), ExitCode.WRONG_SETTINGS)
-    except TorchtrackError as error:
-        return report(str(error), ExitCode.FAILED)
-    except OSError as error:
-        what = "the system refused" if error.filename is None else f"cannot use '{error.filename}'"
-        return report(f"{what}: {error.strerror or error}. Check that it is there, and may be read or written.", ExitCode.FAILED)
-    except KeyboardInterrupt:
-        return ExitCode.INTERRUPTED
-    return code
-
-
-def split_overrides(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
-    """Options of the command, and settings given by dotted key as ``--a.b VALUE`` or ``--a.b=VALUE``; dashes in keys count as underscores.
-
-    Raises:
-        ConfigError: if a setting has no value.
-    """
-    options: list[str] = []
-    overrides: dict[str, Any] = {}
-    rest = iter(arguments)
-    for argument in rest:
-        name, has_value, value = argument.removeprefix("--").partition("=")
-        if not argument.startswith("--") or "." not in name:
-            options.append(argument)
-            continue
-        if not has_value:
-            following = next(rest, None)
-            if following is None or following.startswith("--"):
-                raise ConfigError(f"command line: --{name} needs a value, as in --{name} VALUE.")
-            value = following
-        overrides[name.replace("-", "_")] = typed(value)
-    return options, overrides
-
-
-def _limits(overrides: dict[str, Any]) -> Limits:
-    """The limits of files that are given by dotted key; every command takes them."""
-    given = {key.removeprefix("limits."): value for key, value in overrides.items() if key.startswith("limits.")}
-    return load(Limits, None, given)
+        return list_settings(self.command, markdown=self.markdown)
 
 
 def _given(command: Any, without: tuple[str, ...]) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from typing import Any
 
 from rich.console import Console
 
+from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.errors import OutputError
-from torchtrack.exit_codes import ExitCode
 from torchtrack.io.atomic import writing
 
 _NAME = "standard output"
@@ -69,3 +69,18 @@ def report(text: str, code: int) -> int:
         console.print("error:", style="bold red", end=" ")
         console.print(text, markup=False)
     return code
+
+
+# Tables need this much where the output is no terminal, which says how wide it is.
+_FILE_WIDTH = 200
+
+
+def output_console() -> Console:
+    """Standard output, as wide as the terminal, or as tables need in a file or a pipe."""
+    console = OutputConsole(highlight=False, soft_wrap=True)
+    return console if console.is_terminal else OutputConsole(highlight=False, soft_wrap=True, width=_FILE_WIDTH)
+
+
+def tell_failure(text: str) -> None:
+    """Tell on stderr what failed while the rest went on."""
+    Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {text}", markup=False)

@@ -7,17 +7,16 @@ from pathlib import Path
 
 from rich.table import Table
 
-from torchtrack.commands import output_console
+from torchtrack.cli.console import OutputConsole, output_console
+from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.config.events import ReadingConfig
 from torchtrack.config.formats import OutputFormat
 from torchtrack.errors import TorchtrackWarning
-from torchtrack.exit_codes import ExitCode
 from torchtrack.io.convert import convert
 from torchtrack.io.event_file import DEFAULT_CHOICES, EventFile
 from torchtrack.io.formats import FORMAT_NAMES, open_events
 from torchtrack.io.info import EventInfo, as_plain
 from torchtrack.io.raw_file import RawFile
-from torchtrack.standard_streams import OutputConsole
 
 _ONE_POLARITY = " (all alike: polarity may be coded in another way, --polarity)"
 

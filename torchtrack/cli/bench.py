@@ -11,9 +11,9 @@ from rich.console import Console
 from torchtrack.bench.parts import Part
 from torchtrack.bench.results import Report, as_markdown, machine, older_medians, write_results
 from torchtrack.bench.setup import Setup
-from torchtrack.commands import output_console
+from torchtrack.cli.console import output_console
+from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.errors import ConfigError, MissingExtraError
-from torchtrack.exit_codes import ExitCode
 from torchtrack.io.atomic import check_writable
 from torchtrack.run.runner import threads
 

@@ -42,7 +42,7 @@ class Info:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands_io import Input, info
+        from torchtrack.cli.files import Input, info
 
         refuse_settings(overrides)
         choices = _choices(self.time_unit, self.polarity, self.topic)
@@ -74,7 +74,7 @@ class Convert:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.commands_io import Input, convert_file
+        from torchtrack.cli.files import Input, convert_file
 
         refuse_settings(overrides)
         choices = _choices(self.time_unit, self.polarity, self.topic)
@@ -107,8 +107,8 @@ class Bench:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.bench.command import bench, bench_device
         from torchtrack.bench.setup import Setup
+        from torchtrack.cli.bench import bench, bench_device
 
         refuse_settings(overrides)
         sequence, compare = (Path(text) if text is not None else None for text in (self.sequence, self.compare))

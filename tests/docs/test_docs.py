@@ -1,4 +1,4 @@
-"""The README is true: its Python runs, its commands parse, and whatever it names is there."""
+"""README and docs are true: their Python runs, their commands parse, and whatever they name is there."""
 
 import re
 import shlex
@@ -14,7 +14,9 @@ import tyro
 import yaml
 from tiny_sequence import write_tiny_sequence
 
-from torchtrack import cli
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.main import _Command, split_overrides
+from torchtrack.cli.settings import as_markdown
 from torchtrack.config.demo import DemoConfig
 from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.config.events import is_live
@@ -23,7 +25,6 @@ from torchtrack.config.formats import OutputFormat
 from torchtrack.config.load import load
 from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.run import RunConfig
-from torchtrack.exit_codes import ExitCode
 from torchtrack.io import read_calibration
 from torchtrack.run.sinks.poses import COLUMNS
 from torchtrack.sim import SceneConfig
@@ -31,7 +32,10 @@ from torchtrack.sim.suite import scenes_of
 from torchtrack.tracking.validation.status import Status
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+FRONT = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted((REPOSITORY / "docs").glob("*.md"))}
+# All but what is generated.
+README = "\n\n".join([FRONT, *(text for name, text in PAGES.items() if name != "settings.md")])
 SETTINGS = {"track": RunConfig, "evaluate": EvaluateConfig, "demo": DemoConfig, "simulate": SceneConfig}
 COMMANDS = ("track", "evaluate", "simulate", "demo", "outline", "info", "convert", "bench", "settings")
 BLOCKS = ("ACCURACY", "ABLATION", "PAPER TABLES", "SPEED")
@@ -44,7 +48,7 @@ def blocks(language):
 
 
 def commands():
-    """Every command line of the README, in blocks and in running text, without the program's name."""
+    """Every command line of README and docs, in blocks and in running text, without the program's name."""
     lines = [line.partition("#")[0] for block in blocks("bash") for line in block.splitlines()]
     quoted = re.findall(r"`(torchtrack [a-z]+ [^`]*)`", README.replace("\n", " "))
     words = [shlex.split(line) for line in (*lines, *quoted)]
@@ -82,8 +86,8 @@ def test_python_that_needs_data_names_what_is_there(code):
 
 @pytest.mark.parametrize("arguments", commands(), ids=" ".join)
 def test_command_lines_parse(arguments):
-    options, overrides = cli.split_overrides(arguments)
-    command = tyro.cli(cli._Command, args=options)
+    options, overrides = split_overrides(arguments)
+    command = tyro.cli(_Command, args=options)
     assert type(command).__name__.lower() == arguments[0]
     for key in overrides:
         assert is_key(key, SETTINGS[arguments[0]]), key
@@ -95,19 +99,19 @@ def test_every_command_is_shown():
 
 def test_commands_are_all_that_there_are(capsys):
     with pytest.raises(SystemExit):
-        tyro.cli(cli._Command, args=["--help"])
+        tyro.cli(_Command, args=["--help"])
     assert set(re.findall(r"• (\w+)", capsys.readouterr().out)) == set(COMMANDS)
 
 
 def test_options_in_running_text_exist(capsys):
-    options = {option for span in spans() for option in re.findall(r"(?<![\w-])--([a-z][\w.-]*)", span)}
+    options = {option for span in spans() if not span.startswith("scripts/") for option in re.findall(r"(?<![\w-])--([a-z][\w.-]*)", span)}
     with_dots = {option for option in options if "." in option}
     assert with_dots and options - with_dots
     for option in with_dots:
         assert is_key(option.replace("-", "_"), RunConfig), option
     for command in COMMANDS:
         with pytest.raises(SystemExit):
-            tyro.cli(cli._Command, args=[command, "--help"])
+            tyro.cli(_Command, args=[command, "--help"])
     helped = capsys.readouterr().out
     for option in options - with_dots:
         assert f"--{option}" in helped, option
@@ -131,7 +135,7 @@ def test_settings_named_alone_exist():
 
 
 def test_files_exist():
-    named = set(re.findall(r"[`(\s]((?:configs|scripts|tests|torchtrack|\.github)/[\w./-]*\w|LICENSE)", README))
+    named = set(re.findall(r"[`(\s]((?:configs|scripts|tests|torchtrack|docs|\.github)/[\w./-]*\w|LICENSE)", README))
     assert {"configs/demo.yaml", "scripts/demo", "torchtrack/tracking/tracker.py", "LICENSE"} <= named
     for path in named:
         assert (REPOSITORY / path).exists(), path
@@ -210,18 +214,28 @@ def test_statuses_columns_and_exit_codes_are_true():
 
 
 def test_pictures_are_few_and_small():
-    pictures = sorted((REPOSITORY / ".github" / "images").iterdir())
+    pictures = sorted((REPOSITORY / "docs" / "images").iterdir())
     assert 0 < len(pictures) <= 3
     for picture in pictures:
         assert picture.suffix == ".png" and picture.stat().st_size < 300_000
-        assert f"(.github/images/{picture.name})" in README
+        assert f"images/{picture.name})" in README
 
 
 def test_length_and_places():
-    assert len(README.splitlines()) <= 480
+    assert len(FRONT.encode()) <= 8192
     outside_blocks = re.sub(r"^```text.*?^```", "", README, flags=re.MULTILINE | re.DOTALL)
-    assert [line for line in outside_blocks.splitlines() if len(line) > 120] == []
+    assert [line for line in outside_blocks.splitlines() if len(line) > 120 and not line.startswith("|")] == []
     assert re.findall(r"(?<![\w.])/(?:work|home|tmp|root)/", README) == []
+
+
+def test_links_lead_somewhere():
+    for folder, text in ((REPOSITORY, FRONT), *((REPOSITORY / "docs", text) for text in PAGES.values())):
+        for target in re.findall(r"\]\(([^)#]+)", text):
+            assert target.startswith("https://") or (folder / target).exists(), target
+
+
+def test_settings_are_those_that_there_are():
+    assert PAGES["settings.md"].endswith(as_markdown("track")), "run scripts/docs"
 
 
 @pytest.mark.parametrize("code", blocks("python learn"))

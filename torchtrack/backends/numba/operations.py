@@ -1,0 +1,35 @@
+"""All that the kernels accelerate: importing this registers it."""
+
+from torchtrack.backends.numba import (
+    conclusion,
+    contour_table,
+    contours,
+    events,
+    filtering,
+    forecast,
+    hypotheses,
+    index,
+    limb_features,
+    measures,
+    rounds,
+    selection,
+    solving,
+    visibility,
+)
+
+__all__ = [
+    "conclusion",
+    "contour_table",
+    "contours",
+    "events",
+    "filtering",
+    "forecast",
+    "hypotheses",
+    "index",
+    "limb_features",
+    "measures",
+    "rounds",
+    "selection",
+    "solving",
+    "visibility",
+]

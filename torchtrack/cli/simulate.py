@@ -1,0 +1,58 @@
+"""``torchtrack simulate``: scenes, suites, and events of a video."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress
+
+from torchtrack.cli.console import output_console, tell_failure
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.config.executor import ExecutorName
+from torchtrack.config.load import load
+from torchtrack.core.files import naming
+from torchtrack.errors import ConfigError
+from torchtrack.sim import SceneConfig
+from torchtrack.sim.suite import is_suite, run_suite, scenes_of, simulate_to_file
+from torchtrack.sim.video import VideoConfig, write_video_events
+
+
+def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, jobs: int, executor: ExecutorName, preview: bool, quiet: bool) -> int:
+    """Simulate a scene into a sequence, or a suite into a folder; returns the exit code, which is not 0 where a scene failed."""
+    file, target = Path(config_file), Path(output)
+    if not is_suite(file) or (not file.is_dir() and "variant" in overrides):
+        if executor != "local":
+            raise ConfigError(f"command line: --executor {executor} is for several scenes, and '{config_file}' is one.")
+        scene = load(SceneConfig, file, overrides)
+        with naming(file):
+            path = simulated_to(scene, target if target.suffix else target / f"{scene.name}.npz", quiet, preview)
+        output_console().print(f"The sequence is in {path}")
+        return ExitCode.DONE
+    if target.suffix:
+        raise ConfigError(f"'{file}' holds several scenes: give a folder in place of '{target}', or choose one with --variant.")
+    scenes = scenes_of(file, overrides)
+    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
+        bars = {scene.name: progress.add_task(scene.name, total=1.0) for scene in scenes}
+        failures = run_suite(
+            scenes, target, jobs, lambda name, share: progress.update(bars[name], completed=share), preview=preview, executor=executor
+        )
+    output_console().print(f"{len(scenes) - len(failures)} of {len(scenes)} sequences are in {target}")
+    for failure in failures:
+        tell_failure(f"{failure.name}: {failure.reason}")
+    return ExitCode.FAILED if failures else ExitCode.DONE
+
+
+def simulate_video(given: Mapping[str, Any], output: str, overrides: Mapping[str, Any]) -> int:
+    """Turn a video, or a folder of images, into events; returns the exit code."""
+    config = load(VideoConfig, None, {**given, **overrides})
+    count = write_video_events(config, Path(output))
+    output_console().print(f"{count} events are in {output}")
+    return ExitCode.DONE
+
+
+def simulated_to(scene: SceneConfig, path: Path, quiet: bool, preview: bool = False) -> Path:
+    """Simulate a scene into a file, with a progress bar."""
+    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
+        bar = progress.add_task(f"simulating {scene.name}", total=1.0)
+        return simulate_to_file(scene, path, lambda share: progress.update(bar, completed=share), preview=preview)

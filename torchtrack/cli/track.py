@@ -1,0 +1,95 @@
+"""``torchtrack track``: settings in, one run or many, tables out."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress
+
+from torchtrack.cli.console import output_console, tell_failure
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.config.executor import ExecutorName
+from torchtrack.config.load import load
+from torchtrack.config.run import RunConfig
+from torchtrack.config.settings import CommandLineText
+from torchtrack.core.files import naming
+from torchtrack.eval.tables import run_headline, run_table
+from torchtrack.run.executor import TaskFailure
+from torchtrack.run.runner import run, run_many
+from torchtrack.run.session import open_session
+from torchtrack.run.sinks.folder import check_folder
+from torchtrack.run.sinks.progress import ProgressBar
+from torchtrack.run.sinks.resume import check_resumable, is_complete
+from torchtrack.run.sinks.summary import RunSummary
+
+
+def track(config_or_source: str, overrides: Mapping[str, Any], *, resume: bool = False, quiet: bool) -> int:
+    """Track one source, or go on with that, show the summary; returns the exit code."""
+    with naming(Path(config_or_source)):
+        return run_and_show(_run_config(config_or_source, overrides), quiet, resume)
+
+
+def track_many(
+    configs_or_sources: Sequence[str],
+    overrides: Mapping[str, Any],
+    *,
+    streams: int = 1,
+    jobs: int = 1,
+    executor: ExecutorName = "local",
+    resume: bool = False,
+    quiet: bool,
+) -> int:
+    """Track several sources, show the summary of each as it comes; returns the exit code, which is not 0 where one failed.
+
+    With ``resume`` those that are complete are left out, and those that ended early go on.
+    """
+    configs = [_in_own_folder(_run_config(text, overrides), Path(text).stem) for text in configs_or_sources]
+    console, codes = output_console(), [ExitCode.DONE]
+    for text in (text for text, config in zip(configs_or_sources, configs, strict=True) if resume and is_complete(config.output)):
+        console.print(f"{text}: complete already, left out", markup=False)
+    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
+        bar = progress.add_task("sources", total=len(configs))
+        for number, outcome in run_many(configs, streams=streams, jobs=jobs, executor=executor, resume=resume):
+            progress.advance(bar)
+            if isinstance(outcome, TaskFailure):
+                tell_failure(f"{configs_or_sources[number]}: {outcome.reason}")
+                codes.append(ExitCode.FAILED)
+            else:
+                codes.append(_show_run(console, outcome, configs[number].output))
+    return max(codes)
+
+
+def _in_own_folder(config: RunConfig, name: str) -> RunConfig:
+    return config.model_copy(update={"output": config.output / name})
+
+
+def _run_config(config_or_source: str, overrides: Mapping[str, Any]) -> RunConfig:
+    """The settings of a run, from a YAML file or for a source that needs none."""
+    if Path(config_or_source).suffix.lower() in (".yaml", ".yml"):
+        return load(RunConfig, Path(config_or_source), overrides)
+    return load(RunConfig, None, {"source": CommandLineText(config_or_source), **overrides})
+
+
+def run_and_show(config: RunConfig, quiet: bool, resume: bool = False) -> int:
+    """One run, and its table; returns the exit code."""
+    console = output_console()
+    if resume:
+        check_resumable(config)
+    check_folder(config.output)
+    session = open_session(config)
+    if config.compiled and not quiet:
+        Console(stderr=True).print("compiling the tracker, which takes a minute or two for the first time")
+    progress = [] if quiet else [ProgressBar(Console(stderr=True), session.name, session.known_duration_s)]
+    return _show_run(console, run(config, progress, session, resume=resume), config.output)
+
+
+def _show_run(console: Console, summary: RunSummary, output: Path) -> ExitCode:
+    """Show what came of a run; returns the exit code."""
+    console.print(run_headline(summary))
+    console.print(run_table(summary))
+    if summary.joined_windows or summary.dropped_windows:
+        left_out = f"{summary.dropped_windows} were dropped, {summary.dropped_events} events left out"
+        console.print(f"events came too fast: {summary.joined_windows} windows were joined with the next, {left_out}")
+    console.print(f"Results are in {output}")
+    return ExitCode.INTERRUPTED if summary.interrupted else ExitCode.DONE
