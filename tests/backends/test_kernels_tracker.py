@@ -39,9 +39,7 @@ SETTINGS = {
     "no hidden": {"contours": {"remove_hidden": False, "mid_window": False}},
     "no gathering": {"search": {"by_gathering": False}},
     "hold": {"motion": {"model": "hold", "without_events": "hold"}},
-    "model trust": {"model_trust": {"least_share": 0.5, "every": 1}},
     "steps": {"solver": {"iterations": 3, "loss": "huber"}},
-    "mutual": {"matching": {"mutual_px": 0.7}},
     "refreshed": {"contours": {"refresh_rounds": (0, 2)}},
     "no prior": {"solver": {"prior": False}},
 }
@@ -104,7 +102,7 @@ def test_scenes_of_several_objects_and_streams_are_the_same(scene, model):
 # ---- where kernels are used
 
 
-@pytest.mark.parametrize("name", ["steps", "mutual", "refreshed", "no prior"])
+@pytest.mark.parametrize("name", ["steps", "refreshed", "no prior"])
 def test_settings_that_the_kernel_does_not_know_go_without_it(name):
     assert knows(TrackerConfig())
     assert not knows(TrackerConfig.model_validate(SETTINGS[name]))

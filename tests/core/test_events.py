@@ -226,26 +226,6 @@ def test_windows_are_made_as_the_stream_comes():
     assert read == [5, 15, 25, 35, 45]
 
 
-@REPEATABLE
-@given(times, cut_places, st.lists(st.integers(1, 30), min_size=1), start_times)
-def test_each_window_is_as_long_as_is_asked_for_then(t_us, cuts, durations, start):
-    events, asked, taken = batch_at(t_us), [], []
-
-    def next_us():
-        assert len(asked) == len(taken)
-        asked.append(durations[len(asked) % len(durations)])
-        return asked[-1]
-
-    windows = windows_by_time(chunks_of(events, cuts), next_us, start)
-    while (window := next(windows, None)) is not None:
-        taken.append(window)
-    first_start = start if start is not None else (t_us[0] - 1 if t_us else 0)
-    assert [window.t_start_us for window in taken] == [first_start + sum(asked[:number]) for number in range(len(taken))]
-    assert [window.t_end_us - window.t_start_us for window in taken] == asked[: len(taken)]
-    assert [i for window in taken for i in window.events.x.tolist()] == [i for i, t in enumerate(t_us) if t > first_start]
-    assert all(window.t_start_us < t <= window.t_end_us for window in taken for t in window.events.t_us.tolist())
-
-
 # ---- windows by count
 
 

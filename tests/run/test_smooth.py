@@ -37,8 +37,8 @@ class Kept:
     def __init__(self, path):
         self.session, self.steps = open_session(RunConfig(source=path)), []
 
-    def windows(self, length):
-        return cut_windows(self.session.chunks(), self.session.start_us, length)
+    def windows(self, config):
+        return cut_windows(self.session.chunks(), self.session.start_us, config)
 
     def add(self, step):
         self.steps.append(step)

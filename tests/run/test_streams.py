@@ -63,22 +63,6 @@ def test_streams_are_tracked_as_each_alone_until_each_ends(paths, tmp_path, sett
         assert stored["windows"] == summaries[paths.index(path)].windows > 2
 
 
-@pytest.mark.parametrize("name", ["default", "line"])
-def test_each_stream_has_windows_of_its_own_length(paths, tmp_path, name):
-    """To the microsecond lengths hang on poses, whose rounding is not the same in a batch: later windows drift apart."""
-    tracker = {"window": {"mode": "adaptive", "motion_px": 0.2, "shortest_us": 1000}, "learning": {"points": 0}}
-    sources = list(zip(paths[::2], (None, 3_300), strict=True))
-    configs = [quick(path, tmp_path / "together", preset=name, tracker=tracker, start_us=start_us) for path, start_us in sources]
-    together = dict(run_many(configs, streams=2))
-    for number, config in enumerate(configs):
-        alone = run(config.model_copy(update={"output": tmp_path / "alone" / config.output.name}))
-        ends_us = [[int(t_us) for t_us, *_ in poses(tmp_path / folder / config.output.name)[0]] for folder in ("together", "alone")]
-        np.testing.assert_allclose(ends_us[0][:3], ends_us[1][:3], rtol=0, atol=100)
-        assert together[number].windows == len(ends_us[0]) == pytest.approx(alone.windows, abs=2)
-        assert 1000 <= np.diff(ends_us[0]).min() < np.diff(ends_us[0]).max() <= 7500
-        assert together[number].objects["box"].errors.max_rotation_deg < 2
-
-
 def test_images_of_different_sizes_and_settings_are_batches_of_their_own(paths, tmp_path):
     differing = [{}, {"events": {"region": (10, 5, 105, 80)}}, {"tracker": {"window": {"duration_us": 4000}}}]
     for path, settings in zip(paths, differing, strict=True):
@@ -109,8 +93,8 @@ class Counting:
         self.broken_after, self.full_after = broken_after, full_after
         self.steps, self.closed = [], False
 
-    def windows(self, length):
-        for number, window in enumerate(cut_windows(self.session.chunks(), self.session.start_us, length)):
+    def windows(self, config):
+        for number, window in enumerate(cut_windows(self.session.chunks(), self.session.start_us, config)):
             if number == self.broken_after:
                 raise EventDataError("time goes back")
             yield window

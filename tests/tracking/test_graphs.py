@@ -16,7 +16,7 @@ from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, tens
 from torchtrack import Tracker
 from torchtrack.config.run import RunConfig
 from torchtrack.config.search import SearchConfig
-from torchtrack.config.tracker import LearningConfig, ModelTrustConfig, TrackerConfig
+from torchtrack.config.tracker import LearningConfig, TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import ConfigError
@@ -112,20 +112,13 @@ def test_poses_of_a_smooth_object_are_those_of_a_step(graphs):
     assert torch.equal(compiled_state.last_event_us, state.last_event_us)
 
 
-@pytest.mark.parametrize("config", [LEARNING, TrackerConfig(model_trust=ModelTrustConfig(least_share=0.1, first_windows=0, every=3))])
-def test_windows_that_are_learned_from_are_taken_without_a_graph(graphs, config):
-    (state, _), (compiled_state, _) = both_ways(config)
-    if config is LEARNING:
-        # One call prepares the graph.
-        assert graphs.calls == [1 + sum(window % 3 > 0 for window in range(5, COUNT))]
-    learned = "learned" if config is LEARNING else "model_trust"
-    expected, found = (vars(getattr(of, learned)) for of in (state, compiled_state))
+def test_windows_that_are_learned_from_are_taken_without_a_graph(graphs):
+    (state, _), (compiled_state, _) = both_ways(LEARNING)
+    # One call prepares the graph.
+    assert graphs.calls == [1 + sum(window % 3 > 0 for window in range(5, COUNT))]
+    expected, found = (vars(of.learned) for of in (state, compiled_state))
     for name, value in expected.items():
-        if config is LEARNING:
-            assert torch.equal(found[name], value) if torch.is_tensor(value) else found[name] == value
-        else:
-            # Counts of what lies on contours at poses that agree to roundings.
-            torch.testing.assert_close(found[name], value, rtol=5e-6, atol=0)
+        assert torch.equal(found[name], value) if torch.is_tensor(value) else found[name] == value
 
 
 def test_the_graph_of_one_stream_is_prepared(graphs):

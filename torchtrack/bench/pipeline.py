@@ -10,7 +10,6 @@ from torchtrack.bench.setup import Setup
 from torchtrack.core.dispatch import backend_is_installed
 from torchtrack.core.events import EventBatch
 from torchtrack.run.stepping import cut_windows, steps
-from torchtrack.run.window_length import WindowLength
 
 # Targets (ms) of the median, and of the step that 95 % are faster than, on one thread of a CPU and on a large GPU.
 ONE_OBJECT_MS: dict[str, tuple[float | None, float | None]] = {"cpu": (4.0, 6.0), "cuda": (1.5, None)}
@@ -114,8 +113,8 @@ def _real_time(setup: Setup, compiled: bool) -> _Part:
     stream = scene.events.slice_time(start_us, scene.end_us)
     factors = []
     for _ in range(setup.repeats):
-        begun, length = setup.clock.now(), WindowLength(run.tracker.config.window)
-        for _ in steps(cut_windows(_chunks(stream), start_us, length), run.tracker, run.state, length):
+        begun = setup.clock.now()
+        for _ in steps(cut_windows(_chunks(stream), start_us, run.tracker.config.window), run.tracker, run.state):
             pass
         factors.append(1e-6 * (scene.end_us - start_us) / (setup.clock.now() - begun))
     return [Result(f"{name}, stream over work", "times", tuple(factors), 1.0)], f"{name}: {scene.mev_per_s:.1f} Mev/s, {run.quality(setup.clock)}"

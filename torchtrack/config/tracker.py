@@ -11,25 +11,12 @@ from torchtrack.config.settings import Settings
 class WindowConfig(Settings):
     """How the stream is cut into windows, one pose each."""
 
-    mode: Literal["time", "count", "adaptive"] = Field(
-        "time", description="Windows of equal duration, of an equal number of events, or as long as the fastest object takes to move on."
-    )
-    duration_us: int = Field(
-        5_000, ge=100, le=1_000_000, description="Length of a window in mode 'time'; in mode 'adaptive', while a motion is not known (µs)."
-    )
-    motion_px: float = Field(2.0, gt=0, description="In mode 'adaptive', a window is closed once contours should have moved on this far (px).")
-    shortest_us: int = Field(4_000, ge=100, description="Least length of a window in mode 'adaptive' (µs).")
-    longest_us: int = Field(7_500, ge=100, le=1_000_000, description="Greatest length of a window in mode 'adaptive' (µs).")
+    mode: Literal["time", "count"] = Field("time", description="Windows of equal duration, or of an equal number of events.")
+    duration_us: int = Field(5_000, ge=100, le=1_000_000, description="Length of a window in mode 'time' (µs).")
     count: int = Field(5_000, ge=10, description="Events of a window in mode 'count'.")
     parts: int = Field(4, ge=1, le=100, description="Parts in which a window is taken while an object's motion is not known; 1 for never.")
     max_unknown_px: float = Field(2.0, gt=0, description="Unknown part of a motion in a window from which it is taken in parts (px).")
     max_age_us: int = Field(20_000, ge=100, description="In mode 'count', a window is closed after this long (µs) with fewer events.")
-
-    @model_validator(mode="after")
-    def _lengths_in_order(self) -> "WindowConfig":
-        if self.longest_us < self.shortest_us:
-            raise ValueError(f"longest_us ({self.longest_us}) must not be less than shortest_us ({self.shortest_us})")
-        return self
 
 
 class SurfaceConfig(Settings):
@@ -102,9 +89,7 @@ class MatchingConfig(Settings):
     """Association of corners and events with contours."""
 
     along_flow: bool = Field(False, description="Corners search along their flow (the paper), instead of the nearest contour.")
-    residual: Literal["normal", "flow", "point"] = Field(
-        "normal", description="Distance normal to the contour, along the corner's flow, or to the matched point in both coordinates."
-    )
+    residual: Literal["normal", "point"] = Field("normal", description="Distance normal to the contour, or to the matched point in both coordinates.")
     gates_px: tuple[float, ...] = Field((5.0, 2.5, 1.5, 1.2), min_length=1, description="One round of matching and solving per gate (px).")
     max_gate_px: float = Field(16.0, gt=0, description="The first gate opens up to this where the prediction is uncertain (px).")
     gate_sigmas: float = Field(3.0, gt=0, description="Width of an uncertain object's first gate, in standard deviations of its prediction.")
@@ -132,12 +117,6 @@ class MatchingConfig(Settings):
     )
     polarity_gain: float = Field(1.5, ge=0, description="How fast trust falls with the majority of the others.")
     least_agreement: float = Field(0.05, ge=0, le=1, description="What an event of the wrong polarity still counts.")
-    mutual_px: float = Field(
-        0.0,
-        ge=0,
-        le=100,
-        description="Trust observations less that lie this far from the mean of their bit of contour (px), such as 0.7; 0 for not at all.",
-    )
     close_edges_px: float = Field(
         1.7, ge=0, le=10, description="Parallel edges closer than about this may be taken for each other, and tell less (px); 0 for never."
     )
@@ -220,17 +199,6 @@ class LearningConfig(Settings):
     every: int = Field(10, ge=1, description="After them, one window of this many is.")
 
 
-class ModelTrustConfig(Settings):
-    """Creases, segments and print of a model that events do not show where they should: learned online, and left out."""
-
-    least_share: float = Field(
-        0.0, ge=0, le=1, description="A part of the model is left out below this share of what should be seen of it, such as 0.5; 0 for never."
-    )
-    memory: float = Field(200.0, gt=0, description="Observations that are remembered of each part of the model.")
-    first_windows: int = Field(20, ge=0, description="The first windows are all learned from.")
-    every: int = Field(10, ge=1, description="After them, one window of this many is.")
-
-
 class SmoothingConfig(Settings):
     """Poses of a recording refined by what came after them, see :mod:`torchtrack.tracking.motion.smoother` and :mod:`torchtrack.run.retracing`."""
 
@@ -259,7 +227,6 @@ class TrackerConfig(Settings):
     solver: SolverConfig = SolverConfig()
     motion: MotionConfig = MotionConfig()
     learning: LearningConfig = LearningConfig()
-    model_trust: ModelTrustConfig = ModelTrustConfig()
     search: SearchConfig = SearchConfig()
     quality: QualityConfig = QualityConfig()
     smoothing: SmoothingConfig = SmoothingConfig()

@@ -3,7 +3,7 @@
 Windows are half open on the left, ``t_start_us < t <= t_end_us``: an event at a window's end belongs to it.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -30,17 +30,17 @@ class EventWindow:
     after_gap: bool = False
 
 
-def windows_by_time(chunks: Iterable[EventBatch], duration_us: int | Callable[[], int], t_start_us: int | None = None) -> Iterator[EventWindow]:
+def windows_by_time(chunks: Iterable[EventBatch], duration_us: int, t_start_us: int | None = None) -> Iterator[EventWindow]:
     """Cut a stream into windows of given durations, in constant memory; windows without events are yielded too.
 
     After :data:`LONGEST_SILENCE_US` without events, time is passed over up to the next one.
 
     Args:
         chunks: the events of one stream in time order, cut anywhere.
-        duration_us: length of a window; or what is asked for that of the next one, once the last one was taken.
+        duration_us: length of a window.
         t_start_us: where the first window starts; just before the first event when not given.
     """
-    if not callable(duration_us) and duration_us < 1:
+    if duration_us < 1:
         raise EventDataError(f"a window must last at least 1 µs, got {duration_us}.")
     pending: list[EventBatch] = []
     end_us, heard_us, after_gap = None, None, False
@@ -50,7 +50,7 @@ def windows_by_time(chunks: Iterable[EventBatch], duration_us: int | Callable[[]
         if t_start_us is None:
             t_start_us = int(chunk.t_us[0]) - 1
         if end_us is None:
-            heard_us, end_us = t_start_us, t_start_us + _next(duration_us)
+            heard_us, end_us = t_start_us, t_start_us + duration_us
         newest_us = int(chunk.t_us[-1])
         # Only what is after the start counts; later on, nothing else is left.
         left = chunk[int(torch.searchsorted(chunk.t_us, t_start_us, right=True)) :]
@@ -61,7 +61,7 @@ def windows_by_time(chunks: Iterable[EventBatch], duration_us: int | Callable[[]
             yield EventWindow(concatenate([*pending, left[:cut]]) if pending else left[:cut], t_start_us, end_us, after_gap)
             pending, left, t_start_us = [], left[cut:], end_us
             t_start_us, after_gap = _after_silence(left, t_start_us, heard_us)
-            end_us = t_start_us + _next(duration_us)
+            end_us = t_start_us + duration_us
         pending += [left] if len(left) else []
     if pending and t_start_us is not None and end_us is not None:
         yield EventWindow(concatenate(pending) if len(pending) > 1 else pending[0], t_start_us, end_us, after_gap)
@@ -73,11 +73,6 @@ def _after_silence(left: EventBatch, t_start_us: int, heard_us: int | None) -> t
         return t_start_us, False
     next_us = int(left.t_us[0])
     return (next_us - 1, True) if next_us - t_start_us > LONGEST_SILENCE_US else (t_start_us, False)
-
-
-def _next(duration_us: int | Callable[[], int]) -> int:
-    """The duration of the next window."""
-    return duration_us() if callable(duration_us) else duration_us
 
 
 def windows_by_count(chunks: Iterable[EventBatch], count: int, max_age_us: int | None = None, t_start_us: int | None = None) -> Iterator[EventWindow]:

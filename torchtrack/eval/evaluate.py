@@ -8,6 +8,7 @@ from pathlib import Path
 from torchtrack.baselines import unsuitable
 from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
 from torchtrack.config.run import RunConfig
+from torchtrack.config.tracker import WindowConfig
 from torchtrack.core.limits import limits as file_limits
 from torchtrack.core.windows import EventWindow
 from torchtrack.errors import EventDataError
@@ -27,7 +28,6 @@ from torchtrack.run.session import open_session
 from torchtrack.run.sinks.record import ObjectRecord, Record
 from torchtrack.run.stepping import Step, cut_windows
 from torchtrack.run.streams import follow
-from torchtrack.run.window_length import WindowLength
 from torchtrack.sim.suite import Told
 from torchtrack.tracking.validation.status import Status
 
@@ -172,9 +172,9 @@ class _Measurement:
         self.session = session.with_objects([number for number, reason in enumerate(reasons) if reason is None])
         self._record, self._job, self._limits = Record(self.session.ground_truth, self.session.models), job, limits
 
-    def windows(self, length: WindowLength) -> Iterator[EventWindow]:
+    def windows(self, config: WindowConfig) -> Iterator[EventWindow]:
         """The windows of the sequence."""
-        return cut_windows(self.session.chunks(), self.session.start_us, length)
+        return cut_windows(self.session.chunks(), self.session.start_us, config)
 
     def add(self, step: Step) -> None:
         """Remember one step."""

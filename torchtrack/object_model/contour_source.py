@@ -1,8 +1,4 @@
-"""What contours are made from: the constant tensors of an object's model, and the elements that it is made of.
-
-An element is a part of the model that may turn out not to be seen (:mod:`torchtrack.tracking.adaptation.model_trust`): a long crease, the short
-ones of one place, all short ones that are bent but little, a segment, the print in one place.
-"""
+"""What contours are made from: the constant tensors of an object's model."""
 
 from collections.abc import Sequence
 from enum import IntEnum
@@ -10,18 +6,15 @@ from math import ceil
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.object_model import ObjectModel
 
 # Faces that meet at more than 60° make a sharp edge, whatever its scale; a scanned mesh is rough at smaller angles.
 _SHARP_COSINE = 0.5
-# Places on an object are told apart by this share of its diameter.
-_PLACE = 0.04
 # Directions that a model is looked at from, and how many times more points may face a camera between two of them, or near it.
 _VIEWS, _MORE_FACING = 512, 1.1
 
@@ -53,9 +46,6 @@ class ContourModel(nn.Module):
     triangles: Tensor
     triangle_normals: Tensor
     is_bent: Tensor
-    edge_element: Tensor
-    texture_element: Tensor
-    element_group: Tensor
     members: Tensor
 
     def __init__(self, model: ObjectModel, members: Sequence[int], config: ContourConfig) -> None:
@@ -79,35 +69,21 @@ class ContourModel(nn.Module):
             self.register_buffer(name, getattr(model, name)[spread].clone())
         self.texture_spacing_m = _spacing(self.texture_points)
         self.most_texture_facing = _most_facing(self.texture_normals)
-        edges = _edge_table(points, normals, is_segment)
-        self.register_buffer("edges", edges)
-        self.register_buffer("is_bent", edges[-1] == int(ContourKind.LIMB))
-        place_m = _PLACE * model.diameter_m
-        parts = _edge_parts(points, edges[-1], place_m)[self.is_crease | self.is_segment], _print_parts(self.texture_points, place_m)
-        elements, element = torch.cat(parts).unique(dim=0, return_inverse=True)
-        of_edges, of_print = (element + 1).split([len(part) for part in parts])
-        edge_element = torch.zeros(len(points), dtype=torch.int64).masked_scatter(self.is_crease | self.is_segment, of_edges)
-        self.register_buffer("edge_element", edge_element)
-        self.register_buffer("texture_element", of_print)
-        # Of the kind of each; the first, which stands for all the rest of the model, has a group of its own.
-        self.register_buffer("element_group", pad(elements[:, -1].long() + 1, (1, 0)))
+        self.register_buffer("edges", _edge_table(points, normals, is_segment))
+        # Edges that may be the limb of what is smooth in reality.
+        self.register_buffer("is_bent", self.edges[-1] == int(ContourKind.LIMB))
         self.register_buffer("surface_points", _in_rows(model.surface_points))
         exact = len(model.triangles) <= config.exact_faces
         triangles = model.triangles if exact else model.triangles[:0]
         self.register_buffer("triangles", triangles.clone())
         self.register_buffer("triangle_normals", _normals(triangles))
 
-    def active_edges(self, camera_obj: Float[Tensor, "b 3"], occluding: bool) -> tuple[Bool[Tensor, "b e"], Bool[Tensor, "b e"]]:
-        """Which edges are contours for a camera at ``camera_obj`` (object frame), and which are on the limb."""
+    def active_edges(self, camera_obj: Float[Tensor, "b 3"], occluding: bool) -> Bool[Tensor, "b e"]:
+        """Which edges are contours for a camera at ``camera_obj`` (object frame)."""
         facing = torch.einsum("esk,bk->bes", self.face_normals, camera_obj) > self.face_offsets
         front, back = facing.unbind(-1)
-        limb = front != back
         active = self.is_crease & (front | back) | self.is_segment
-        return active | limb if occluding else active, limb
-
-    def elements_of_edges(self, limb: Bool[Tensor, "b e"]) -> Int[Tensor, "b e"]:
-        """The element of each edge; 0 on the limb of what may be smooth: it shows, whether or not its facets do."""
-        return self.edge_element * ~(limb & self.is_bent)
+        return active | (front != back) if occluding else active
 
 
 def _in_rows(values: Float[Tensor, "n *c"]) -> Float[Tensor, "n *c"]:
@@ -130,20 +106,6 @@ def _edge_table(points: Float[Tensor, "e 2 3"], face_normals: Float[Tensor, "e 2
     turning = torch.linalg.cross(vector, face_normals.sum(1), dim=-1)
     direction = torch.nn.functional.normalize(vector, dim=-1)
     return torch.cat([start, vector, direction, turning, kind[:, None].to(start.dtype)], -1).T.contiguous()
-
-
-def _edge_parts(points: Float[Tensor, "e 2 3"], kind: Float[Tensor, "e"], place_m: float) -> Float[Tensor, "e 5"]:
-    """What tells the elements of edges apart: place, number and kind, where they count."""
-    short = (points[:, 1] - points[:, 0]).norm(dim=-1) < place_m
-    # Facets of what is smooth in reality are all alike.
-    placed = short & (kind != int(ContourKind.LIMB))
-    number = torch.arange(1, len(points) + 1) * ~short
-    return torch.cat([(points.mean(1) / place_m).round() * placed[:, None], number[:, None], kind[:, None]], -1)
-
-
-def _print_parts(points: Float[Tensor, "n 3"], place_m: float) -> Float[Tensor, "n 5"]:
-    """The same of points of print."""
-    return pad(pad((points / place_m).round(), (0, 1)), (0, 1), value=float(ContourKind.TEXTURE))
 
 
 def _normals(triangles: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3"]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from torchtrack.config.load import as_yaml
 from torchtrack.config.run import RunConfig
+from torchtrack.config.tracker import WindowConfig
 from torchtrack.core.windows import EventWindow
 from torchtrack.errors import EventDataError, MissingFileError, OutputError, TorchtrackError, UnknownFormatError
 from torchtrack.io.atomic import writing
@@ -24,7 +25,6 @@ from torchtrack.run.sinks.record import Record
 from torchtrack.run.sinks.resume import check_resumable, take_up
 from torchtrack.run.sinks.summary import Ended, Facts, RunSummary, summarise_run, write_summary
 from torchtrack.run.stepping import Step, cut_windows
-from torchtrack.run.window_length import WindowLength
 
 
 class RunOutputs:
@@ -74,9 +74,9 @@ class RunOutputs:
             self._resumed_us = int(earlier.t_us[-1])
             self.session = replace(self.session, T_cam_obj=earlier.T_cam_obj[-1], start_us=self._resumed_us)
 
-    def windows(self, length: WindowLength) -> Iterator[EventWindow]:
+    def windows(self, config: WindowConfig) -> Iterator[EventWindow]:
         """The windows of the session; those of a live one that come too fast are joined, and it ends at an interrupt."""
-        windows = cut_windows(self.session.chunks(), self.session.start_us, length)
+        windows = cut_windows(self.session.chunks(), self.session.start_us, config)
         self._keep_up = self.session.keep_up(windows)
         return self._beginning(self._keep_up.until(lambda: self._interrupt.requested) if self._keep_up else windows)
 

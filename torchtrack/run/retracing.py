@@ -95,7 +95,6 @@ def _turned(state: TrackerState, number: int, alone: Tracker) -> TrackerState:
     """What is known of one object, as the state of a tracker of it alone for which time runs backwards."""
     known = take_part(state, slice(number, number + 1), slice(0, 1))
     fresh = first_state(alone, known.T_cam_obj, known.t_us)
-    trust = known.model_trust and known.model_trust.of_width(alone.element_groups.shape[1])
     return replace(
         known,
         velocity=-known.velocity,
@@ -106,7 +105,6 @@ def _turned(state: TrackerState, number: int, alone: Tracker) -> TrackerState:
         last_event_us=fresh.last_event_us,
         burst_age_us=fresh.burst_age_us,
         probation=fresh.probation,
-        model_trust=trust,
     )
 
 

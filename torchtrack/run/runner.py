@@ -33,7 +33,6 @@ from torchtrack.run.sinks.summary import RunSummary
 from torchtrack.run.smooth import SmoothedObjects
 from torchtrack.run.stepping import cut_windows, steps
 from torchtrack.run.streams import follow
-from torchtrack.run.window_length import WindowLength
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.tracker import Tracker
 
@@ -69,9 +68,9 @@ def track(
     if not isinstance(source, EventStream):
         camera = tracker.cameras[0]
         chunks = mended_batches(chunks, camera.width, camera.height, problems or Problems("the stream", strict=False))
-    seen, length = False, WindowLength(window or tracker.config.window)
+    seen, config = False, window or tracker.config.window
     objects = SmoothedObjects(tracker.centre_obj.double().cpu(), tracker.diameter_m.double().cpu(), tracker.intrinsics.double().cpu())
-    taken = steps(cut_windows(clipped(chunks, start_us), start_us, length), tracker, state, length)
+    taken = steps(cut_windows(clipped(chunks, start_us), start_us, config), tracker, state)
     refinement = Refinement(objects, tracker.config, tracker.alone)
     for step in taken if isinstance(source, LiveSource) else refined_steps(taken, refinement):
         seen = True

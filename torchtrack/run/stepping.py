@@ -1,16 +1,16 @@
 """The loop itself: a stream cut into windows, one tracker step each, in constant memory."""
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from torchtrack.config.tracker import WindowConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.windows import EventWindow, windows_by_count, windows_by_time
-from torchtrack.run.window_length import WindowLength, tell_lengths
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US
 from torchtrack.tracking.motion.model import initial_covariance
 from torchtrack.tracking.state import StepResult, TrackerState
@@ -30,20 +30,19 @@ class Step:
     seconds: float
 
 
-def cut_windows(chunks: Iterable[EventBatch], t_start_us: int, length: WindowLength) -> Iterator[EventWindow]:
-    """The windows of a stream, by count, or by time as ``length`` says at the start of each one."""
-    config = length.config
+def cut_windows(chunks: Iterable[EventBatch], t_start_us: int, config: WindowConfig) -> Iterator[EventWindow]:
+    """The windows of a stream, by count or by time."""
     if config.mode == "count":
         return windows_by_count(chunks, config.count, config.max_age_us, t_start_us)
-    return windows_by_time(chunks, length, t_start_us)
+    return windows_by_time(chunks, config.duration_us, t_start_us)
 
 
-def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState, length: WindowLength) -> Iterator[Step]:
-    """One step per window, which says how long the next one is to last; nothing is recorded for gradients."""
+def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState) -> Iterator[Step]:
+    """One step per window; nothing is recorded for gradients."""
     for window in windows:
         if window.after_gap:
             state = passed_over(tracker, state, torch.full_like(state.t_us, window.t_start_us))
-        state, result, seconds = timed_step(tracker, state, window.events, window.t_end_us, [length])
+        state, result, seconds = timed_step(tracker, state, window.events, window.t_end_us)
         yield Step(window, state, result, seconds)
 
 
@@ -65,15 +64,12 @@ def passed_over(tracker: Tracker, state: TrackerState, t_us: Int[Tensor, "s"]) -
     )
 
 
-def timed_step(
-    tracker: Tracker, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"], lengths: Sequence[WindowLength]
-) -> tuple[TrackerState, StepResult, float]:
-    """State and result of one window, and how long that took (s); each stream is told how long its next one is to last."""
+def timed_step(tracker: Tracker, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, float]:
+    """State and result of one window, and how long that took (s)."""
     device = state.T_cam_obj.device
     begun = time.perf_counter()
     with torch.inference_mode():
         next_state, result = tracker.step(state, events.to(device), t_end_us)
-        tell_lengths(lengths, tracker, state, result)
         if device.type == "cuda":
             # Work on the GPU is queued: without waiting, the time measured is that of queueing.
             torch.cuda.synchronize(device)

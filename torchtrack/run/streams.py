@@ -14,6 +14,7 @@ import torch
 
 from torchtrack.baselines import tracker_class
 from torchtrack.config.run import TrackingConfig
+from torchtrack.config.tracker import WindowConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.windows import EventWindow
 from torchtrack.errors import ConfigError, TorchtrackError
@@ -22,7 +23,6 @@ from torchtrack.run.refine import Refinement
 from torchtrack.run.session import Session
 from torchtrack.run.smooth import SmoothedObjects
 from torchtrack.run.stepping import Step, passed_over, timed_step
-from torchtrack.run.window_length import WindowLength
 from torchtrack.tracking.state import StepResult, TrackerState, joined, take_part
 from torchtrack.tracking.tracker import Tracker
 
@@ -39,8 +39,8 @@ class Follower(Protocol[R_co]):
         """What is tracked."""
         ...
 
-    def windows(self, length: WindowLength) -> Iterator[EventWindow]:
-        """The windows of the session, as long as ``length`` says."""
+    def windows(self, config: WindowConfig) -> Iterator[EventWindow]:
+        """The windows of the session."""
         ...
 
     def add(self, step: Step) -> None:
@@ -187,7 +187,6 @@ class _Stream:
     number: int
     session: Session
     windows: Iterator[EventWindow]
-    length: WindowLength
     state: TrackerState
 
 
@@ -209,8 +208,8 @@ def _steps(followers: Mapping[int, Follower[R]], config: TrackingConfig) -> Iter
         except TorchtrackError as error:
             yield number, Ended(error)
         else:
-            size, length = (session.camera.width, session.camera.height), WindowLength(config.tracker.window)
-            batches.setdefault(size, []).append(_Stream(number, session, follower.windows(length), length, state))
+            size = session.camera.width, session.camera.height
+            batches.setdefault(size, []).append(_Stream(number, session, follower.windows(config.tracker.window), state))
     for streams in batches.values():
         yield from _one_batch(streams, config)
 
@@ -238,7 +237,7 @@ def _one_batch(streams: Sequence[_Stream], config: TrackingConfig) -> Iterator[t
             starts_us = [window.t_start_us if window.after_gap else 0 for _, window in due]
             state = passed_over(tracker, state, torch.tensor(starts_us, device=config.device))
         taker = pace.tracker([window for _, window in due], result)
-        state, result, seconds = timed_step(taker, state, events, t_end_us, [stream.length for stream in streams])
+        state, result, seconds = timed_step(taker, state, events, t_end_us)
         for (stream, window), own in zip(due, rows, strict=True):
             stream.state = take_part(state, *own)
             yield stream.number, Step(window, stream.state, take_part(result, *own), seconds / len(due))

@@ -29,7 +29,7 @@ from torchtrack.core import host_sync
 from torchtrack.core.constants import cells_within
 from torchtrack.core.events import EventBatch, check_on_sensor, pad_streams
 from torchtrack.errors import ConfigError
-from torchtrack.tracking.adapt import due_lessons
+from torchtrack.tracking.adapt import learns_next
 from torchtrack.tracking.cuda_graphs import CudaGraphs
 from torchtrack.tracking.frontend.bursts import update_bursts
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
@@ -37,8 +37,6 @@ from torchtrack.tracking.state import S, StepResult, TrackerState, each_tensor
 
 P, R = ParamSpec("P"), TypeVar("R")
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
-# Of the model's parts, and of contours that it lacks.
-_Lessons = tuple[bool, bool]
 # At a start, it is looked at more than later on which contours a model lacks.
 _FIRST_WINDOWS = 5
 # Of more events than this, those that are near no object are left out first.
@@ -96,7 +94,7 @@ class CompiledStep:
             raise ConfigError(f"compiled: PyTorch {torch.__version__} cannot compile a tracker. Update it to 2.13 or later, or go without.")
         self._tracker, self._compiles = tracker, compiles
         # By how many events a stream has at most, where there are several, and by what is learned.
-        self._graphs: dict[tuple[int | None, _Lessons | None], _Graph] = {}
+        self._graphs: dict[tuple[int | None, bool], _Graph] = {}
         self._near_tiles: Callable[[TrackerState, Tensor], Tensor | None] | None = None
 
     def __call__(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult] | None:
@@ -104,8 +102,8 @@ class CompiledStep:
         if not self._are_for(t_us):
             return None
         starts = state.learned is not None and state.learned.windows < _FIRST_WINDOWS
-        lessons = due_lessons(state, self._tracker.on_surfaces, self._tracker.config)
-        if starts or (lessons is not None and not host_sync.on_gpu(t_us)):
+        learns = learns_next(state, self._tracker.on_surfaces, self._tracker.config)
+        if starts or (learns and not host_sync.on_gpu(t_us)):
             return None
         with torch.inference_mode():
             # CUDA graphs copy whatever they are given.
@@ -113,7 +111,7 @@ class CompiledStep:
             nearby = self._near(plain, events, t_us) if len(events) > _MANY else NearbyEvents(events)
             if len(nearby.events) < 2:
                 return None
-            next_state, result, wrong = self._taken(self._tracker.opened(plain, events), nearby, t_us, lessons)
+            next_state, result, wrong = self._taken(self._tracker.opened(plain, events), nearby, t_us, learns)
             is_wrong = host_sync.Answer.to(wrong[None])
         return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
@@ -152,16 +150,14 @@ class CompiledStep:
             near = self._near_tiles(state, t_us)
         return NearbyEvents(events) if near is None else tiles.keep(events, near)
 
-    def _taken(
-        self, opened: TrackerState, nearby: NearbyEvents, t_us: Tensor, lessons: _Lessons | None = None
-    ) -> tuple[TrackerState, StepResult, Tensor]:
+    def _taken(self, opened: TrackerState, nearby: NearbyEvents, t_us: Tensor, learns: bool = False) -> tuple[TrackerState, StepResult, Tensor]:
         """What the graph makes of a window, and whether that does not hold."""
         filled = _filled(nearby, len(t_us))
         if t_us.device.type == "cpu":
             opened, filled = _in_bursts(opened, filled, t_us, self._tracker.config.matching.burst_us)
-        kind = filled.events.most_of_one, lessons
+        kind = filled.events.most_of_one, learns
         if kind not in self._graphs:
-            self._graphs[kind] = self._graph(t_us.device, learns=lessons is not None)
+            self._graphs[kind] = self._graph(t_us.device, learns=learns)
             if self._compiles:
                 return _for_the_first_time(self._graphs[kind], opened, _of_any_number(filled), t_us)
         return self._graphs[kind](opened, filled, t_us)

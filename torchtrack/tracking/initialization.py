@@ -15,7 +15,6 @@ from torchtrack.core.events import EventBatch, stream_bounds
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import PoseError
 from torchtrack.tracking.adaptation.learned_contours import LearnedContours
-from torchtrack.tracking.adaptation.model_trust import ModelTrust
 from torchtrack.tracking.adaptation.pixel_latency import unknown_circuits
 from torchtrack.tracking.association.polarity import nothing_remembered
 from torchtrack.tracking.contours.objects import ObjectBatch
@@ -35,7 +34,6 @@ def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us
     last_event_us, burst_age_us = (empty(tracked.streams, *tracked.image_size, T_cam_obj.device) for empty in (empty_last_event, no_bursts))
     learns = config.learning.points and config.contours.source == "mesh"
     learned = LearnedContours.none(len(at_rest), config.learning, at_rest) if learns else None
-    trust = ModelTrust.none(tracked.element_groups, at_rest) if tracked.judges else None
     return TrackerState(
         T_cam_obj.clone(),
         *(at_rest, at_rest, covariance),
@@ -44,7 +42,6 @@ def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us
         *(t_us, last_event_us, burst_age_us),
         Probation.none(T_cam_obj, covariance),
         learned,
-        trust,
     )
 
 

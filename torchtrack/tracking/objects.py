@@ -12,7 +12,6 @@ from torchtrack.errors import ModelError
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourModel, group_by_model
 from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, stacked, symmetry_planes, turning_axis
-from torchtrack.tracking.adaptation.model_trust import element_groups
 from torchtrack.tracking.association.weighting_network import LimbTrust, TrustNetwork, shipped_weigher
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
@@ -31,7 +30,6 @@ class TrackedObjects(nn.Module):
     sensor_pixels: Tensor
     sensor_numbers: Tensor
     stream_index: Tensor
-    element_groups: Tensor
     centre_obj: Tensor
     half_extent: Tensor
     diameter_m: Tensor
@@ -65,7 +63,6 @@ class TrackedObjects(nn.Module):
         self.image_size = (max(c.height for c in cameras), max(c.width for c in cameras))
         self.groups = nn.ModuleList(group_by_model(objects, self.config.contours))
         self.register_buffer("stream_index", torch.tensor(streams))
-        self.register_buffer("element_groups", element_groups(self.models, len(objects)))
         self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
         for name, table in zip(("ideal_pixels", "sensor_pixels", "sensor_numbers"), sensor_tables(cameras), strict=True):
             self.register_buffer(name, table)
@@ -137,12 +134,6 @@ class TrackedObjects(nn.Module):
     def looks_back(self) -> bool:
         """Whether anything needs the events of earlier windows: they are not kept for nothing."""
         return self.config.corners.max_corners > 0 or self.weigher is not None
-
-    @property
-    def judges(self) -> bool:
-        """Whether parts of the models may be left out."""
-        config = self.config
-        return config.model_trust.least_share > 0 and config.matching.max_events > 0 and config.contours.source == "mesh"
 
     @property
     def streams(self) -> int:

@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.tracking.adaptation.learned_contours import LearnedContours
-from torchtrack.tracking.adaptation.model_trust import ModelTrust
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import MotionState
@@ -61,7 +60,6 @@ class TrackerState:
         burst_age_us: how long ago the newest burst of every sensor pixel and polarity began (µs).
         probation: which finds are not certain yet.
         learned: contours learned on the objects; none where that is switched off.
-        model_trust: which parts of the models are seen; none where that is switched off.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]
@@ -84,7 +82,6 @@ class TrackerState:
     burst_age_us: Int[Tensor, "s 2 h w"]
     probation: Probation
     learned: LearnedContours | None = None
-    model_trust: ModelTrust | None = None
 
     @property
     def motion(self) -> MotionState:
@@ -93,12 +90,10 @@ class TrackerState:
 
     def numbered(self, before: "TrackerState", more: int = 0) -> "TrackerState":
         """The state with as many windows taken as ``before``, and some more."""
-        learned, trust = self.learned, self.model_trust
+        learned = self.learned
         if learned is not None and before.learned is not None:
             learned = replace(learned, windows=before.learned.windows + more)
-        if trust is not None and before.model_trust is not None:
-            trust = replace(trust, windows=before.model_trust.windows + more)
-        return replace(self, learned=learned, model_trust=trust)
+        return replace(self, learned=learned)
 
     def without_maps(self) -> "TrackerState":
         """The state without what is known of every pixel of the sensors, which is most of it: to be looked at, not to go on from."""
@@ -170,8 +165,6 @@ def each_tensor(change: Callable[[Tensor], Tensor], value: D) -> D:
 
 def joined(states: Sequence[TrackerState]) -> TrackerState:
     """One state of the objects and streams of several, one after the other."""
-    elements = max(0 if state.model_trust is None else state.model_trust.explained.shape[1] for state in states)
-    states = [state if state.model_trust is None else replace(state, model_trust=state.model_trust.of_width(elements)) for state in states]
     state: TrackerState = _mapped(lambda *rows: torch.cat(rows), lambda *rows: torch.cat(rows), *states)
     return state
 

@@ -312,7 +312,7 @@ class Tracker(TrackedObjects):
 
     def _predict(self, state: TrackerState, dt_s: Tensor) -> Prediction:
         """Predicted pose and motion, and how certain they are."""
-        objects = objects_as_known(self.objects, state, self.element_groups, self.on_surfaces is not None, self.config)
+        objects = objects_as_known(self.objects, state, self.on_surfaces is not None, self.config)
         return forecast(
             state.motion, dt_s, objects, self.revolution_axes if self.revolves and self.config.motion.spin_fades else None, self.far_pose, self.config
         )

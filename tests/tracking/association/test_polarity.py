@@ -192,7 +192,7 @@ def test_nothing_is_remembered_where_it_is_switched_off():
 
 
 def known(tracker, state):
-    return objects_as_known(tracker.objects, state, tracker.element_groups, False, tracker.config)
+    return objects_as_known(tracker.objects, state, False, tracker.config)
 
 
 def test_nothing_is_asked_of_events_while_all_is_seen():

@@ -334,15 +334,8 @@ def sampling_settings(config: ContourConfig = _TO_SHOW) -> SamplingSettings:
     )
 
 
-def _all_are_shown(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> bool:
-    """Whether no elements are left out."""
-    return shown is None
-
-
-@accelerates(points.mesh_points, supports=_all_are_shown)
-def mesh_points_numba(
-    models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None
-) -> tuple[Tensor, ...]:
+@accelerates(points.mesh_points)
+def mesh_points_numba(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, ...]:
     """Edge by edge."""
     settings, batch = sampling_settings(config), len(T_cam_obj)
     room = settings.max_edge_points + max(len(model.texture_points) for model in models)

@@ -166,7 +166,7 @@ def knows(config: TrackerConfig) -> bool:
     """Whether the kernel does all that is set: the settings of the preset ``default``, and most beside them."""
     matching, solver = config.matching, config.solver
     usual = solver.prior and solver.iterations == 1 and solver.loss == "tukey" and not any(config.contours.refresh_rounds)
-    return usual and not matching.along_flow and matching.residual == "normal" and not matching.mutual_px
+    return usual and not matching.along_flow and matching.residual == "normal"
 
 
 @accelerates(rounds.align_rounds, supports=lambda start, table, observations, gates, config: knows(config))

@@ -93,7 +93,6 @@ def judge_model(
     config: TrackerConfig,
     *,
     any_count: bool,
-    taken_share: Float[Tensor, "b"] | None = None,
 ) -> LearnedContours:
     """Whether a model's own contours explain what is seen, after a window's fit.
 
@@ -103,12 +102,9 @@ def judge_model(
     Args:
         velocity: gives the image velocity of contours (px/s).
         any_count: whether any learned contours were among those of the fit.
-        taken_share: share of the model's contours that are taken; all when not given.
     """
     contours = found.fit.contours
     share = _share_of_own(found, velocity(contours), image_size, config) if any_count else found.measured
-    # What is left out of the model explains nothing.
-    share = share if taken_share is None else share * taken_share
     known = torch.isfinite(share) & (found.count > 0)
     share = torch.where(known, torch.lerp(learned.model_share, share, _SHARE_GAIN), learned.model_share)
     enough = share > config.learning.below_share + _MORE_SHARE

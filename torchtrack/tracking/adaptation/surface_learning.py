@@ -59,7 +59,6 @@ class Surroundings:
         window_s: duration of each object's window.
         contours: visible contours, with the learned ones that count.
         learning: which objects may learn: their poses are to be trusted.
-        taken_share: share of the contours of each object's model that are taken; all when not given.
     """
 
     objects: ObjectBatch
@@ -68,7 +67,6 @@ class Surroundings:
     window_s: Float[Tensor, "b"]
     contours: Contours
     learning: Bool[Tensor, "b"]
-    taken_share: Float[Tensor, "b"] | None = None
 
     @property
     def centre_cam(self) -> Float[Tensor, "b 3"]:
@@ -110,7 +108,7 @@ def learn_after(
         wanted: objects to learn of, from the state before the window; none where the window is not due.
     """
     velocity, image_size, any_count = around.contour_velocity, around.objects.image_size, around.objects.learned is not None
-    learned = judge_model(learned, found, velocity, image_size, config, any_count=any_count, taken_share=around.taken_share)
+    learned = judge_model(learned, found, velocity, image_size, config, any_count=any_count)
     if wanted is None or host_sync.none_of(wanted):
         return learned
     return learned.but_of(wanted, learn(learned, around, events.rows(), config))

@@ -31,7 +31,7 @@ def match_along_flow(observations: Observations, contours: Contours, objects: Mo
     distance, contour = torch.where(allowed, along.square() + across.square(), torch.inf).min(-1)
     points_obj = take_points(contours.points_obj, contour)
     targets = torch.addcmul(observations.pixels, objects.show(points_obj)[1], observations.age_s[..., None])
-    directions = heading if config.residual == "flow" else take_points(contours.normals, contour)
+    directions = take_points(contours.normals, contour)
     mask = observations.mask & observations.has_flow & torch.isfinite(distance)
     offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
     limb = (contours.kind == int(ContourKind.LIMB)).gather(1, contour).to(offsets.dtype)

@@ -20,7 +20,6 @@ from torchtrack.tracking.association.weights import (
     leading_side,
     match_weights,
     mistaken_px2,
-    mutual_agreement,
 )
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
@@ -108,8 +107,6 @@ def match_nearest(
     offsets = vecdot(difference, normals) / wider[:, None]
     as_expected, dark = agreeing(dark * expected, config), dark * oriented
     weights, beside = match_weights(offsets, targets, near, dark, as_expected, config)
-    if config.mutual_px:
-        weights = weights * mutual_agreement(pixels, offsets, matched, config.mutual_px)
     matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb, beside, mistaken, dark, as_expected)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)

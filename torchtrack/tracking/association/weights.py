@@ -94,10 +94,6 @@ SLOW_PX_S = 10.0
 PATCH_BITS, PATCHES, SMEAR_PX, ON_CONTOUR_PX = 4, 64, 3.0, 0.8
 
 
-# Mutual agreement: side of a bit of contour (8 px, as a power of two), and how many others there make its mean count in full.
-_PIECE_BITS, _MANY_OTHERS = 3, 3
-
-
 def leading_side(speed_px_s: Tensor) -> Tensor:
     """Whether a contour moves along its normal or against it: 1 or -1, and less where it is slow."""
     return speed_px_s / (speed_px_s.abs() + constant((SLOW_PX_S,), speed_px_s.dtype, speed_px_s.device))
@@ -148,29 +144,6 @@ def polarity_agreement(
 def agreeing(agreement: Tensor, config: MatchingConfig) -> Tensor:
     """Trust in events whose polarity is what it should be, 1, or the opposite, -1, as far as that is known."""
     return torch.add(one(agreement), agreement, alpha=config.polarity_gain).clamp_(config.least_agreement, 1)
-
-
-def mutual_agreement(
-    pixels: Float[Tensor, "b n 2"], offsets: Float[Tensor, "b n"], matched: Bool[Tensor, "b n"], spread_px: float
-) -> Float[Tensor, "b n"]:
-    """How far each observation lies where the others of its bit of contour do, 0 to 1: Cauchy's weight of its distance from their mean.
-
-    Events of one edge lie side by side, on the contour or, as a pose begins to slip, beside it. One that lies elsewhere
-    than they do is of another edge, or noise. Not the pose but the mean is what it is measured against, so that nothing
-    keeps a contour from being pulled to where all its events are.
-
-    Args:
-        pixels: the contour point of each.
-        offsets: from it, along its normal (px).
-        matched: which of them count; one on its own is trusted.
-        spread_px: distance from the mean at which trust is a half, among many.
-    """
-    cell, counted = patch(pixels, _PIECE_BITS), matched.to(offsets.dtype)
-    sums = patch_sums(cell, torch.stack([counted, counted * offsets], 1))
-    count, total = sums.gather(2, cell[:, None].expand(-1, 2, -1)).unbind(1)
-    relative = (offsets - total / count.clamp(min=1)) / spread_px
-    known = (count - one(count)).clamp_(0, _MANY_OTHERS) / _MANY_OTHERS
-    return torch.addcmul(one(known), known, relative * relative).reciprocal()
 
 
 def two_of(like: Tensor) -> Tensor:

@@ -8,12 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.linalg import vecdot
-from torch.nn.functional import pad
 
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
-from torchtrack.tracking.contours.points import Contours, assemble, joined, mesh_contours, mesh_elements
+from torchtrack.tracking.contours.points import Contours, assemble, joined, mesh_contours
 from torchtrack.tracking.contours.splat import splat_contours
 from torchtrack.tracking.contours.visibility import Scene, remove_hidden
 
@@ -52,7 +51,6 @@ class ObjectBatch:
         image_shape: streams, height and width of the image.
         shared: whether any stream has more than one object.
         learned: contour points beside those of the models; none when not given.
-        shown: which elements of the models are taken for contours; all when not given.
         polarity: the darker side expected of contours, by the octant that they face (:mod:`tracking.association.polarity`); nothing when not given.
     """
 
@@ -65,7 +63,6 @@ class ObjectBatch:
     image_shape: tuple[int, int, int]
     shared: bool
     learned: LearnedPoints | None = None
-    shown: Bool[Tensor, "b k"] | None = None
     polarity: Float[Tensor, "b 8"] | None = None
 
     @property
@@ -90,15 +87,7 @@ class ObjectBatch:
         """Visible contours at given poses."""
         if config.source == "splat":
             return splat_contours(self.models, T_cam_obj, self.intrinsics, config)
-        return self._visible_with_learned(mesh_contours(self.models, T_cam_obj, self.intrinsics, config, self.shown), T_cam_obj, config)
-
-    def contours_of(
-        self, elements: Bool[Tensor, "b k"], T_cam_obj: Float[Tensor, "b 4 4"], config: ContourConfig
-    ) -> tuple[Contours, Int[Tensor, "b m"]]:
-        """Visible contours of some elements of the models, whether shown or not, and the element of each point; of learned ones, 0."""
-        contours, element = mesh_elements(self.models, T_cam_obj, self.intrinsics, config, elements)
-        contours = self._visible_with_learned(contours, T_cam_obj, config)
-        return contours, pad(element, (0, contours.mask.shape[1] - element.shape[1]))
+        return self._visible_with_learned(mesh_contours(self.models, T_cam_obj, self.intrinsics, config), T_cam_obj, config)
 
     def _visible_with_learned(self, contours: Contours, T_cam_obj: Tensor, config: ContourConfig) -> Contours:
         """Contours of the models joined with those that were learned, without hidden parts."""
@@ -123,9 +112,9 @@ class ObjectBatch:
         own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m
         intrinsics, centre_obj, half_extent, diameter_m = (repeat_row(value, number, count) for value in own)
         learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))
-        shown, polarity = (None if values is None else repeat_row(values, number, count) for values in (self.shown, self.polarity))
+        polarity = None if self.polarity is None else repeat_row(self.polarity, number, count)
         size = (count, *self.image_size)
-        return ObjectBatch([model], intrinsics, centre_obj, half_extent, diameter_m, streams, size, False, learned, shown, polarity)
+        return ObjectBatch([model], intrinsics, centre_obj, half_extent, diameter_m, streams, size, False, learned, polarity)
 
 
 def repeat_row(values: Tensor, number: int, count: int) -> Tensor:

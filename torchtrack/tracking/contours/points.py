@@ -35,7 +35,7 @@ MIN_PX_PER_M = 1e-3
 MIN_TEXTURE_COSINE = 0.02
 
 
-# Points and tangents (object frame), kinds and mask; where it was said which elements are shown, the element of each as well.
+# Points and tangents (object frame), kinds and mask.
 _Points = tuple[Tensor, ...]
 
 
@@ -74,21 +74,16 @@ class Contours:
         return Contours(*(_widened(value, count) for value in vars(self).values()))
 
 
-def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
+def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> _Points:
     """Points on the active edges, spread evenly in the image."""
     batch = len(T_cam_obj)
     camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])
-    active, limb = model.active_edges(camera_obj[..., 0], config.occluding)
-    element = None
-    if shown is not None:
-        element = model.elements_of_edges(limb)
-        active = active & shown.gather(1, element)
+    active = model.active_edges(camera_obj[..., 0], config.occluding)
     ends, edges = model.edge_ends.expand(batch, -1, -1, -1), model.edges.expand(batch, -1, -1)
     places = _places_for(active)
     if places < active.shape[1]:
         chosen, active = select_ranked(active, places)
         ends, edges = model.edge_ends[chosen], model.edges[:, chosen].transpose(0, 1)
-        element = None if element is None else element.gather(1, chosen)
     lengths, start_z, end_z = _lengths_px(ends, T_cam_obj, intrinsics)
     lengths = lengths * active
     cumulative = lengths.cumsum(-1)
@@ -107,8 +102,7 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     # The normal in the image is to point out of the object: tangents turn with it on their right.
     side = (turning * (points - camera_obj)).sum(1, keepdim=True)
     tangents = torch.where(side > 0, direction, -direction)
-    made = points.transpose(1, 2), tangents.transpose(1, 2), kind[:, 0].long(), number < counts
-    return made if element is None else (*made, element.gather(1, edge[:, 0]))
+    return points.transpose(1, 2), tangents.transpose(1, 2), kind[:, 0].long(), number < counts
 
 
 def _places_for(active: Bool[Tensor, "b e"]) -> int:
@@ -135,41 +129,37 @@ def _texture_mask(model: ContourModel, T_cam_obj: Tensor) -> Tensor:
     return (normals * points).sum(-1) < -MIN_TEXTURE_COSINE * points.square().sum(-1).sqrt()
 
 
-def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
+def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> _Points:
     """Points of the texture that looks at the camera."""
     spacing_px = model.texture_spacing_m * intrinsics[:, 0] / T_cam_obj[:, 2, 3].clamp(min=MIN_DEPTH_M)
     # Every second, third and so on, where they lie closer than need be.
     every = (config.spacing_px / spacing_px).floor().clamp(1, len(model.texture_points)).long()
     number = torch.arange(len(model.texture_points), device=every.device)
     facing = _texture_mask(model, T_cam_obj) & (number % every[:, None] == 0)
-    if shown is not None:
-        facing = facing & shown[:, model.texture_element]
     # On a GPU, which would have to be waited for to know how many there are, there are places for as many as there can be.
     count = int(facing.sum(1).amax()) if host_sync.read_at_once(facing) else model.most_texture_facing
     chosen, mask = select_ranked(facing, count)
     points, tangents = (values.T[:, chosen].permute(1, 2, 0) for values in (model.texture_points, model.texture_tangents))
-    made = points, tangents, torch.full_like(chosen, int(ContourKind.TEXTURE)), mask
-    return made if shown is None else (*made, model.texture_element[chosen])
+    return points, tangents, torch.full_like(chosen, int(ContourKind.TEXTURE)), mask
 
 
-def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
+def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> _Points:
     """Contour points of objects that share a model, before hidden parts are removed."""
-    parts = [_no_points(T_cam_obj, shown)]
+    parts = [_no_points(T_cam_obj)]
     if len(model.edge_ends):
-        parts.append(_edge_points(model, T_cam_obj, intrinsics, config, shown))
+        parts.append(_edge_points(model, T_cam_obj, intrinsics, config))
     if len(model.texture_points):
-        parts.append(_texture_points(model, T_cam_obj, intrinsics, config, shown))
+        parts.append(_texture_points(model, T_cam_obj, intrinsics, config))
     if len(parts) == 2:
         return parts[1]
     return tuple(torch.cat(column, 1) for column in zip(*parts, strict=True))
 
 
-def _no_points(T_cam_obj: Tensor, shown: Tensor | None) -> _Points:
+def _no_points(T_cam_obj: Tensor) -> _Points:
     """One place of contours, and nothing there: what selects from contours needs a place to point at."""
     nowhere = T_cam_obj.new_zeros(len(T_cam_obj), 1, 3)
     nothing = torch.zeros(len(T_cam_obj), 1, dtype=torch.int64, device=T_cam_obj.device)
-    made = nowhere, nowhere, nothing, nothing.bool()
-    return made if shown is None else (*made, nothing)
+    return nowhere, nowhere, nothing, nothing.bool()
 
 
 def image_normals(
@@ -210,39 +200,19 @@ def mesh_contours(
     T_cam_obj: Float[Tensor, "b 4 4"],
     intrinsics: Float[Tensor, "b 4"],
     config: ContourConfig,
-    shown: Bool[Tensor, "b k"] | None = None,
 ) -> Contours:
-    """Contours of each object at its pose, hidden parts included.
-
-    Args:
-        shown: which elements of each object's model are taken; all when not given.
-    """
-    points, tangents, kind, mask, *_ = mesh_points(models, T_cam_obj, intrinsics, config, shown)
+    """Contours of each object at its pose, hidden parts included."""
+    points, tangents, kind, mask = mesh_points(models, T_cam_obj, intrinsics, config)
     return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics)
 
 
-def mesh_elements(
-    models: Sequence[ContourModel],
-    T_cam_obj: Float[Tensor, "b 4 4"],
-    intrinsics: Float[Tensor, "b 4"],
-    config: ContourConfig,
-    shown: Bool[Tensor, "b k"],
-) -> tuple[Contours, Int[Tensor, "b m"]]:
-    """:func:`mesh_contours`, and the element of the model that each point is on (:mod:`torchtrack.object_model.contour_source`)."""
-    points, tangents, kind, mask, element = mesh_points(models, T_cam_obj, intrinsics, config, shown)
-    return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics), element
-
-
 @accelerable
-def mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig, shown: Tensor | None) -> _Points:
+def mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> _Points:
     """Contour points of all objects, in places of their own, before hidden parts are removed."""
     if len(models) == 1:
-        return _model_contours(models[0], T_cam_obj, intrinsics, config, shown)
-    parts = [
-        _model_contours(model, T_cam_obj[model.members], intrinsics[model.members], config, None if shown is None else shown[model.members])
-        for model in models
-    ]
-    width = max(mask.shape[1] for _, _, _, mask, *_ in parts)
+        return _model_contours(models[0], T_cam_obj, intrinsics, config)
+    parts = [_model_contours(model, T_cam_obj[model.members], intrinsics[model.members], config) for model in models]
+    width = max(mask.shape[1] for _, _, _, mask in parts)
     order = torch.cat([model.members for model in models]).argsort()
     return tuple(torch.cat([_widened(value, width) for value in column])[order] for column in zip(*parts, strict=True))
 
