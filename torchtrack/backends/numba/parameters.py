@@ -1,5 +1,7 @@
 """What kernels go by: settings and constants of the pipeline, as plain numbers. Making them takes no Numba."""
 
+from functools import cache
+from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 
@@ -290,7 +292,7 @@ class PatchSettings(NamedTuple):
 T = TypeVar("T")
 
 
-def filled(kind: type[T], *sources: object, **more: Any) -> T:
+def filled(kind: type[T], *sources: Any, **more: Any) -> T:
     """Parameters of a kernel by the names of its fields: what is given, else an attribute of the first source that has one.
 
     Args:
@@ -298,14 +300,22 @@ def filled(kind: type[T], *sources: object, **more: Any) -> T:
         sources: settings, or modules with constants, whose names are those of the fields in capitals.
         more: fields that no source has.
     """
-    names: tuple[str, ...] = kind._fields  # type: ignore[attr-defined]
-    made: T = kind(*(more[name] if name in more else _looked_up(name, sources) for name in names))
+    kinds: Any = kind
+    plan = _plan(kinds, tuple(source if isinstance(source, ModuleType) else type(source) for source in sources), tuple(more))
+    made: T = kind(*(more[name] if place is None else getattr(sources[place], name) for place, name in plan))
     return made
 
 
-def _looked_up(name: str, sources: tuple[object, ...]) -> Any:
-    for source in sources:
+@cache
+def _plan(kind: type[Any], sources: tuple[Any, ...], given: tuple[str, ...]) -> tuple[tuple[int | None, str], ...]:
+    """Of every field, the number of its source and its name there; no source where it is given. Looked up once: settings are slow to say no."""
+    return tuple((None, name) if name in given else _place(name, sources) for name in kind._fields)
+
+
+def _place(name: str, sources: tuple[Any, ...]) -> tuple[int, str]:
+    for number, source in enumerate(sources):
+        known = source.model_fields if hasattr(source, "model_fields") else vars(source)
         for spelled in (name, name.upper()):
-            if hasattr(source, spelled):
-                return getattr(source, spelled)
+            if spelled in known:
+                return number, spelled
     raise AttributeError(f"no source has '{name}'")
