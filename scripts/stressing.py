@@ -121,10 +121,10 @@ def main() -> int:
     duration_us = round(60e6 * given.minutes)
     per_minute = round(60e6 * given.first) // WINDOW_US
     warnings.simplefilter("ignore", TorchtrackWarning)
-    tracked, seconds, table, begun = 0, [], [], time.perf_counter()
+    tracked, seconds, table, begun = 0, [], [], time.process_time()
     for count, result in enumerate(torchtrack.track(faults.of(swinging(scene), duration_us), tracker, state, window, problems), 1):
-        seconds.append(time.perf_counter() - begun)
-        begun = time.perf_counter()
+        seconds.append(time.process_time() - begun)
+        begun = time.process_time()
         tracked += int(result.status[0]) == int(Status.TRACKING)
         if count % per_minute == 0:
             table.append((count * WINDOW_US / 6e7, 1e3 * float(np.median(seconds)), resident_mb()))
