@@ -38,36 +38,63 @@ def counts(waiting: WaitingWindows) -> tuple[int, int, int]:
 
 def test_a_window_that_waits_alone_is_taken_as_it_is():
     waiting = WaitingWindows(5)
-    for number in range(3):
-        waiting.put(one := window(number))
-        assert waiting.take() is one
+    for number in range(200):
+        waiting.put(single := window(number))
+        taken = waiting.take()
+        assert (taken.events, taken.t_start_us, taken.t_end_us) == (single.events, single.t_start_us, single.t_end_us)
+    assert taken is single
     assert counts(waiting) == (0, 0, 0)
 
 
-def test_what_waits_is_taken_as_one():
+def came(waiting: WaitingWindows, first: int, count: int, events: int = 10) -> EventWindow:
+    """What is taken after so many more windows."""
+    for number in range(first, first + count):
+        waiting.put(window(number, events))
+    return waiting.take()
+
+
+def test_at_a_constant_speed_as_many_are_joined_as_come_during_a_step():
     waiting = WaitingWindows(50)
-    for number in range(MOST_JOINED + 3):
-        waiting.put(window(number))
-    first, second = waiting.take(), waiting.take()
-    assert not waiting
-    assert (first.t_start_us, first.t_end_us, second.t_start_us, second.t_end_us) == (0, 12_000, 12_000, 15_000)
-    # Few events are all kept, in order.
-    assert len(first.events) == 10 * MOST_JOINED
-    assert len(second.events) == 30
-    assert bool((torch.diff(first.events.t_us) >= 0).all())
-    assert counts(waiting) == (MOST_JOINED - 1 + 2, 0, 0)
+    came(waiting, 0, 1)
+    taken = [came(waiting, first, 4) for first in range(1, 61, 4)]
+    assert [one.t_end_us - one.t_start_us for one in taken[4:]] == [4000] * 11
+    assert len(waiting) <= 8
+
+
+def test_after_a_pause_what_waits_is_caught_up_with_by_few_more_at_a_time():
+    waiting = WaitingWindows(50)
+    taken = [came(waiting, 0, 1), came(waiting, 1, 31)]
+    first = 32
+    while waiting:
+        taken.append(came(waiting, first, 1))
+        first += 1
+    lengths = [(one.t_end_us - one.t_start_us) // 1000 for one in taken]
+    assert lengths[:4] == [1, 2, 4, 5]
+    assert max(lengths) == 5
+    assert lengths[-1] <= 2
+    assert [one.t_start_us for one in taken] == [0, *(one.t_end_us for one in taken[:-1])]
+    assert counts(waiting) == (first - len(taken), 0, 0)
+
+
+def test_no_more_are_joined_than_a_bound_and_than_twice_as_many_as_before():
+    waiting = WaitingWindows(500)
+    taken = [came(waiting, first, 20) for first in range(0, 100, 20)]
+    assert [(one.t_end_us - one.t_start_us) // 1000 for one in taken] == [2, 4, 8, MOST_JOINED, MOST_JOINED]
 
 
 def test_joined_windows_have_as_many_events_as_one_spread_evenly_with_the_newest():
     waiting = WaitingWindows(50)
-    for number in range(4):
-        waiting.put(window(number, 3 * FEWEST_EVENTS))
-    events = waiting.take().events
+    came(waiting, 0, 2)
+    events = came(waiting, 2, 4, 3 * FEWEST_EVENTS).events
     assert len(events) == 3 * FEWEST_EVENTS
     assert waiting.dropped_events == 9 * FEWEST_EVENTS
-    assert int(events.t_us[-1]) == 4000
-    of_each = torch.bincount((events.t_us - 1) // 1000)
+    assert int(events.t_us[-1]) == 6000
+    of_each = torch.bincount((events.t_us - 2001) // 1000)
     assert bool(((of_each - 0.75 * FEWEST_EVENTS).abs() <= 1).all())
+    # Few events are all kept, in order.
+    few = came(waiting, 6, 4)
+    assert len(few.events) == 40
+    assert bool((torch.diff(few.events.t_us) >= 0).all())
 
 
 def test_of_too_many_the_oldest_are_joined_and_no_time_is_lost():
@@ -75,9 +102,12 @@ def test_of_too_many_the_oldest_are_joined_and_no_time_is_lost():
     for number in range(100):
         waiting.put(window(number))
         assert len(waiting) <= 5
-    only = waiting.take()
-    assert (only.t_start_us, only.t_end_us) == (0, 100_000)
-    assert (waiting.joined_windows, waiting.dropped_windows, waiting.dropped_events) == (99, 0, 0)
+    taken = []
+    while waiting:
+        taken.append(waiting.take())
+    assert [one.t_start_us for one in taken] == [0, *(one.t_end_us for one in taken[:-1])]
+    assert taken[-1].t_end_us == 100_000
+    assert (waiting.joined_windows, waiting.dropped_windows, waiting.dropped_events) == (100 - len(taken), 0, 0)
 
 
 def test_what_has_waited_for_very_long_is_dropped_whole_and_counted():
@@ -90,16 +120,13 @@ def test_what_has_waited_for_very_long_is_dropped_whole_and_counted():
     assert counts(waiting) == (3, 2, 40)
 
 
-def test_haste_ends_a_while_after_the_last_joined_window():
+def test_a_start_is_in_haste_and_haste_ends_a_while_after_the_last_joined_window():
     waiting = WaitingWindows(5)
-    waiting.put(window(0))
-    waiting.put(window(1))
-    taken = [waiting.take()]
-    for number in range(2, 200):
-        waiting.put(window(number))
-        taken.append(waiting.take())
+    taken = [came(waiting, number, 1) for number in range(150)]
+    taken.append(came(waiting, 150, 2))
+    taken += [came(waiting, number, 1) for number in range(152, 400)]
     hasty = [one.t_end_us for one in taken if isinstance(one, HastyWindow)]
-    assert hasty == [2000, *range(3000, 103_000, 1000)]
+    assert hasty == [*range(1000, 102_000, 1000), 152_000, *range(153_000, 253_000, 1000)]
 
 
 # ---- who tracks them
@@ -112,10 +139,8 @@ def test_in_haste_no_other_poses_are_tried_and_few_to_find_what_is_lost():
     assert 0 < few.search.hypotheses < usual.search.hypotheses
     assert few.search.drawn < usual.search.drawn
     assert not few.search.at_start
-    assert none.window.parts == few.window.parts == 2
+    assert none.window.parts == few.window.parts == 1
     assert none.matching == few.matching == usual.matching
-    alone = usual.model_copy(update={"window": usual.window.model_copy(update={"parts": 1})})
-    assert in_haste(alone, searches=False).window.parts == 1
 
 
 def test_what_is_lost_is_searched_for_once_in_a_while():
@@ -154,14 +179,13 @@ def test_a_slow_tracker_follows_the_whole_stream_with_a_bounded_lag(windows_a_st
                 came += 1
             one = waiting.take()
             state, result = pace.tracker([one], result).step(state, one.events, one.t_end_us)
-            # Parts of a window are steps, too.
-            now_us += windows_a_step * WINDOW_US * (2 if isinstance(one, HastyWindow) else 1)
+            now_us += windows_a_step * WINDOW_US
             lags_us.append(now_us - one.t_end_us)
             found = result.T_cam_obj[0]
             true = trajectory.at(torch.tensor([one.t_end_us]))[0]
             if result.status[0] <= int(Status.UNCERTAIN) and rotation_angle_deg(found[:3, :3], true[:3, :3]) < 2:
                 tracked_us += one.t_end_us - one.t_start_us
     assert tracked_us >= 0.95 * count * WINDOW_US
-    assert max(lags_us) <= (CAPACITY + 2 * windows_a_step) * WINDOW_US
+    assert max(lags_us) <= (CAPACITY + windows_a_step) * WINDOW_US
     assert waiting.dropped_windows == 0
     assert len(lags_us) + waiting.joined_windows == count

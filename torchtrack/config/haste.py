@@ -5,17 +5,16 @@ from torchtrack.config.tracker import TrackerConfig
 
 # A search that takes about as long as ten windows, where one takes as long as a hundred.
 _HYPOTHESES, _DRAWN, _TURNS, _KEPT, _PULLED = 8, 300, 60, 30, 8
-_PARTS = 2
 
 
 def in_haste(config: TrackerConfig, *, searches: bool) -> TrackerConfig:
-    """The settings, with no time for what can wait: fewer parts of a window, and few other poses are tried or none.
+    """The settings, with no time for what can wait: windows are not taken in parts, and few other poses are tried or none.
 
     Args:
         config: of the tracker when it keeps up.
         searches: whether objects that are lost are searched for, by fewer poses than otherwise.
     """
-    window = config.window.model_copy(update={"parts": min(config.window.parts, _PARTS)})
+    window = config.window.model_copy(update={"parts": 1})
     return config.model_copy(update={"window": window, "search": _brief(config.search) if searches else _without(config.search)})
 
 
