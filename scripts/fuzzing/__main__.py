@@ -43,6 +43,8 @@ class Arguments:
     """Read also those that are made by hand."""
     jobs: Annotated[int, tyro.conf.arg(metavar="N", aliases=["-j"])] = 2
     """Processes."""
+    each: bool = False
+    """Show how many mutated files of each seed gave a result."""
     slowest: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Show the slowest of them."""
 
@@ -66,6 +68,8 @@ def main(arguments: Arguments) -> int:
         told = [_told(outcome, console) for outcome in outcomes(inputs, folder, arguments.jobs)]
     for outcome in sorted(told, key=lambda outcome: -outcome.seconds)[: arguments.slowest]:
         console.print(f"{outcome.seconds:6.1f} s  {outcome.name}: {outcome.kind}")
+    if arguments.each:
+        _show_each(told, seeds, console)
     counts = Counter(outcome.kind for outcome in told)
     console.print(", ".join(f"{counts[kind]} {kind}" for kind in ("result", "clear error", *FAULTS)) + f", of {len(told)}")
     return int(any(counts[kind] for kind in FAULTS))
@@ -108,6 +112,14 @@ def _put(number: int, seed: Seed, seeds: list[Seed], folder: Path, target: Path)
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content if file == seed.folder / seed.mutated else file.read_bytes())
     return own / seed.opened
+
+
+def _show_each(told: list[Outcome], seeds: list[Seed], console: Console) -> None:
+    mutated = [outcome for outcome in told if outcome.name.isdigit()]
+    total = Counter(seeds[int(outcome.name) % len(seeds)].name for outcome in mutated)
+    read = Counter(seeds[int(outcome.name) % len(seeds)].name for outcome in mutated if outcome.kind == "result")
+    for name, count in total.items():
+        console.print(f"{name}: {read[name]} of {count} were read")
 
 
 def _told(outcome: Outcome, console: Console) -> Outcome:

@@ -93,6 +93,13 @@ def test_times_can_come_from_a_file(folder, tmp_path):
     times.write_text("soon\n")
     with pytest.raises(EventDataError, match="time in seconds"):
         list(video_frames(config))
+    for wild in ("nan", "inf", "-inf", "1e300"):
+        times.write_text(f"0.0\n{wild}\n2.0\n" + "".join(f"{n}\n" for n in range(3, 8)))
+        with pytest.raises(EventDataError, match=r"times\.txt' has a time of .* s\. Give each frame's time in seconds"):
+            list(video_frames(config))
+    times.write_bytes(b"0.0\n\xff\n")
+    with pytest.raises(EventDataError, match=r"times\.txt': every line must start with a time in seconds"):
+        list(video_frames(config))
     with pytest.raises(MissingFileError, match="times"):
         list(video_frames(config.model_copy(update={"timestamps": tmp_path / "nowhere.txt"})))
     with pytest.raises(ValidationError, match="not both"):

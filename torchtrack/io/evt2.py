@@ -9,37 +9,24 @@ Reference: docs.prophesee.ai, EVT 2.0 format. A fall of the time high by half of
 import numpy as np
 
 from torchtrack.io.columns import Columns
+from torchtrack.io.held_back import HoldingDecoder
 from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.time_high import HighClock, spread
 
 TIME_HIGH_BITS, TIME_LOW_BITS = 28, 6
-# A time high word comes at least every so many words.
-MOST_HELD_WORDS = 1 << 16
 _TIME_HIGH = 8
 _FIRST_OTHER = np.uint32(2 << 28)
 _KNOWN = np.isin(np.arange(16), (0, 1, 8, 10, 14, 15))
 
 
-class Evt2Decoder:
+class Evt2Decoder(HoldingDecoder):
     """Decoder of EVT 2.0 words; faults are counted in ``problems``."""
 
     dtype = np.dtype("<u4")
 
     def __init__(self, problems: Problems) -> None:
         self._problems = problems
-        self._clock = HighClock(TIME_HIGH_BITS, 1 << TIME_LOW_BITS, problems)
-        self._rest = np.zeros(0, self.dtype)
-
-    def feed(self, words: np.ndarray) -> Columns:
-        """The events of the next words; those before the first time are left out.
-
-        Words from a leap of the clock on are held back until the next time high word tells whether it is one.
-        """
-        return self._decoded(np.concatenate([self._rest, words]) if len(self._rest) else words)
-
-    def finish(self) -> Columns:
-        """The events of words that are held back, when no more come."""
-        return self._decoded(self._rest, is_last=True)
+        super().__init__(HighClock(TIME_HIGH_BITS, 1 << TIME_LOW_BITS, problems))
 
     def _decoded(self, words: np.ndarray, *, is_last: bool = False) -> Columns:
         is_event = words < _FIRST_OTHER
@@ -47,11 +34,7 @@ class Evt2Decoder:
         kinds = words[others] >> 28
         at = others[kinds == _TIME_HIGH]
         shown = words[at] & 0x0FFFFFFF
-        self._rest = words[:0]
-        if not is_last and self._clock.doubts(shown) and len(words) - at[-1] < MOST_HELD_WORDS:
-            until = int(at[-1])
-            sure = self._decoded(words[:until], is_last=True)
-            self._rest = words[until:].copy()
+        if not is_last and (sure := self._sure(words, at, shown)) is not None:
             return sure
         count_unknown(kinds, _KNOWN, self._problems)
         events = words[is_event]

@@ -10,7 +10,8 @@ Reference: docs.prophesee.ai, EVT 2.1 format.
 import numpy as np
 
 from torchtrack.io.columns import Columns
-from torchtrack.io.evt2 import MOST_HELD_WORDS, TIME_HIGH_BITS, TIME_LOW_BITS, count_unknown, headless, reached_us
+from torchtrack.io.evt2 import TIME_HIGH_BITS, TIME_LOW_BITS, count_unknown, headless, reached_us
+from torchtrack.io.held_back import HoldingDecoder
 from torchtrack.io.problems import Problems
 from torchtrack.io.time_high import HighClock, spread
 
@@ -18,7 +19,7 @@ _TIME_HIGH = 8
 _KNOWN = np.isin(np.arange(16), (0, 1, 8, 10, 14, 15))
 
 
-class Evt21Decoder:
+class Evt21Decoder(HoldingDecoder):
     """Decoder of EVT 2.1 words; faults are counted in ``problems``."""
 
     dtype = np.dtype("<u8")
@@ -26,27 +27,14 @@ class Evt21Decoder:
     def __init__(self, problems: Problems, legacy: bool = False) -> None:
         self._problems = problems
         self._legacy = legacy
-        self._clock = HighClock(TIME_HIGH_BITS, 1 << TIME_LOW_BITS, problems)
-        self._rest = np.zeros(0, self.dtype)
-
-    def feed(self, words: np.ndarray) -> Columns:
-        """The events of the next words; those before the first time are left out, those after a leap come later, as in EVT 2.0."""
-        return self._decoded(np.concatenate([self._rest, words]) if len(self._rest) else words)
-
-    def finish(self) -> Columns:
-        """The events of words that are held back, when no more come."""
-        return self._decoded(self._rest, is_last=True)
+        super().__init__(HighClock(TIME_HIGH_BITS, 1 << TIME_LOW_BITS, problems))
 
     def _decoded(self, words: np.ndarray, *, is_last: bool = False) -> Columns:
         address, valid = self._halves(words)
         kinds = address >> 28
         at = np.flatnonzero(kinds == _TIME_HIGH)
         shown = address[at] & 0x0FFFFFFF
-        self._rest = words[:0]
-        if not is_last and self._clock.doubts(shown) and len(words) - at[-1] < MOST_HELD_WORDS:
-            until = int(at[-1])
-            sure = self._decoded(words[:until], is_last=True)
-            self._rest = words[until:].copy()
+        if not is_last and (sure := self._sure(words, at, shown)) is not None:
             return sure
         count_unknown(kinds, _KNOWN, self._problems)
         is_event = kinds < 2

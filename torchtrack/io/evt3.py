@@ -22,7 +22,8 @@ Reference: docs.prophesee.ai, EVT 3.0 format.
 import numpy as np
 
 from torchtrack.io.columns import Columns
-from torchtrack.io.evt2 import MOST_HELD_WORDS, count_unknown
+from torchtrack.io.evt2 import count_unknown
+from torchtrack.io.held_back import MOST_HELD_WORDS
 from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.time_high import HighClock, spread
 

@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 
 from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.core.events import EventBatch, concatenate
+from torchtrack.core.files import read_bytes
 from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
 from torchtrack.io.atomic import atomic_path, check_writable
 from torchtrack.sim.event_camera import EventCamera
@@ -30,6 +31,8 @@ _LUMA_BGR = np.array([0.0722, 0.7152, 0.2126], dtype=np.float32)
 _LINEAR = grey_reflectance(np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)).astype(np.float32)
 # Of all pixels, this share may move further than the way that is set: a single wrong flow vector should not cost frames.
 _FLOW_PERCENTILE = 99.0
+# Later than any clock, since 1970 or since the start.
+_LARGEST_S = 1e11
 
 Timed = tuple[int, Float[ndarray, "h w"]]
 
@@ -113,14 +116,18 @@ def _times_us(config: VideoConfig) -> Iterator[int]:
         while True:
             yield round(1e6 * number / rate)
             number += 1
-    if not config.timestamps.is_file():
-        raise MissingFileError(f"the file of times '{config.timestamps}' does not exist.")
-    lines = [line.split() for line in config.timestamps.read_text(encoding="utf-8").splitlines()]
+    content = read_bytes(config.timestamps, "file of times", "text_bytes")
     try:
-        seconds = [float(words[0]) for words in lines if words and not words[0].startswith("#")]
+        lines = [line.split() for line in content.decode("utf-8").splitlines()]
+        seconds = np.array([float(words[0]) for words in lines if words and not words[0].startswith("#")])
     except ValueError as error:
         raise EventDataError(f"'{config.timestamps}': every line must start with a time in seconds ({error}).") from error
-    yield from (round(1e6 * (second - seconds[0])) for second in seconds)
+    unsound: np.ndarray = ~(np.abs(seconds) <= _LARGEST_S)
+    if unsound.any():
+        raise EventDataError(
+            f"'{config.timestamps}' has a time of {seconds[unsound][0]} s. Give each frame's time in seconds, as a number up to {_LARGEST_S:g}."
+        )
+    yield from (round(1e6 * (second - seconds[0])) for second in seconds.tolist())
 
 
 def _rate_of(path: Path) -> float:
