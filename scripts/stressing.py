@@ -56,7 +56,7 @@ class Faults:
         self._random = np.random.default_rng(0)
         self._hot = self._random.integers(0, (self._width, self._height), (HOT_PIXELS, 2))
 
-    def of(self, packets: Iterator[Packet], duration_us: int) -> Iterator[EventBatch]:
+    def applied_to(self, packets: Iterator[Packet], duration_us: int) -> Iterator[EventBatch]:
         """The packets of a time, as they come."""
         held: EventBatch | None = None
         for number, packet in enumerate(packets, 1):
@@ -122,7 +122,7 @@ def main() -> int:
     per_minute = round(60e6 * given.first) // WINDOW_US
     warnings.simplefilter("ignore", TorchtrackWarning)
     tracked, seconds, table, begun = 0, [], [], time.process_time()
-    for count, result in enumerate(torchtrack.track(faults.of(swinging(scene), duration_us), tracker, state, window, problems), 1):
+    for count, result in enumerate(torchtrack.track(faults.applied_to(swinging(scene), duration_us), tracker, state, window, problems), 1):
         seconds.append(time.process_time() - begun)
         begun = time.process_time()
         tracked += int(result.status[0]) == int(Status.TRACKING)

@@ -45,11 +45,11 @@ def room_of(module: str) -> str:
 
 def modules() -> dict[str, ast.Module]:
     """Every module by its name within the package, and what stands in it."""
-    found = {}
+    parsed = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
-        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = ast.parse(path.read_text(encoding="utf-8"))
-    return found
+        parsed[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = ast.parse(path.read_text(encoding="utf-8"))
+    return parsed
 
 
 MODULES = modules()

@@ -33,10 +33,10 @@ def numbers_of(value: Any, name: str = "") -> dict[str, torch.Tensor]:
         return {name: value}
     if isinstance(value, bool | int | float):
         return {name: torch.tensor(value)}
-    found = {}
+    numbers = {}
     for field in fields(value) if is_dataclass(value) else ():
-        found |= numbers_of(getattr(value, field.name), f"{name}.{field.name}" if name else field.name)
-    return found
+        numbers |= numbers_of(getattr(value, field.name), f"{name}.{field.name}" if name else field.name)
+    return numbers
 
 
 class Scene:

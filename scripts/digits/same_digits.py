@@ -127,12 +127,12 @@ def compare(runs: list[Run], base_tree: Path, folder: Path) -> None:
             if difference:
                 _say(f"{run} DIFFERENT in window {difference.window} of {len(ours)}, field {difference.field}:\n    {difference.what}")
                 raise SystemExit(1)
-            found = ""
+            note = ""
             if SCENES[run.scene].is_searched and run.preset == "default" and not run.refined:
                 if not is_searched_for(ours, SCENES[run.scene].cameras[0].focal_px):
                     raise SystemExit(f"same_digits: {run.scene}: the object was not found by a search, for which this scene is there.")
-                found = ", found by a search"
-            _say(f"{run} {len(ours)} windows, {len(ours[0])} fields: equal{found}")
+                note = ", found by a search"
+            _say(f"{run} {len(ours)} windows, {len(ours[0])} fields: equal{note}")
 
 
 def _say(text: str) -> None:

@@ -121,10 +121,10 @@ def write_scenes(folder: Path, names: Sequence[str], duration_us: int = DURATION
         scene = SCENES[name]
         arrays = {"T_start": np.stack([body.T_cam_obj(0.0) for _, body in scene.objects])}
         for stream, camera in enumerate(scene.cameras):
-            bodies = [body for of, body in (*scene.objects, *scene.others) if of == stream]
+            bodies = [body for index, body in (*scene.objects, *scene.others) if index == stream]
             arrays |= {f"{key}_{stream}": values for key, values in fired(bodies, camera, duration_us, seed=10 * number + stream).items()}
         np.savez(folder / f"{name}.npz", **arrays)
-        said = {"cameras": [asdict(camera) for camera in scene.cameras], "streams": [of for of, _ in scene.objects], "models": scene.models}
+        said = {"cameras": [asdict(camera) for camera in scene.cameras], "streams": [index for index, _ in scene.objects], "models": scene.models}
         (folder / f"{name}.json").write_text(json.dumps(said))
 
 

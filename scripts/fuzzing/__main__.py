@@ -65,13 +65,13 @@ def main(arguments: Arguments) -> int:
             arguments.keep.mkdir(parents=True)
             console.print(f"{inputs[0].prepare(arguments.keep)}")
             return 0
-        told = [_told(outcome, console) for outcome in outcomes(inputs, folder, arguments.jobs)]
-    for outcome in sorted(told, key=lambda outcome: -outcome.seconds)[: arguments.slowest]:
+        shown = [_told(outcome, console) for outcome in outcomes(inputs, folder, arguments.jobs)]
+    for outcome in sorted(shown, key=lambda outcome: -outcome.seconds)[: arguments.slowest]:
         console.print(f"{outcome.seconds:6.1f} s  {outcome.name}: {outcome.kind}")
     if arguments.each:
-        _show_each(told, seeds, console)
-    counts = Counter(outcome.kind for outcome in told)
-    console.print(", ".join(f"{counts[kind]} {kind}" for kind in ("result", "clear error", *FAULTS)) + f", of {len(told)}")
+        _show_each(shown, seeds, console)
+    counts = Counter(outcome.kind for outcome in shown)
+    console.print(", ".join(f"{counts[kind]} {kind}" for kind in ("result", "clear error", *FAULTS)) + f", of {len(shown)}")
     return int(any(counts[kind] for kind in FAULTS))
 
 
@@ -81,10 +81,10 @@ def _chosen(arguments: Arguments, seeds: list[Seed], folder: Path) -> list[Input
     if wanted is not None and wanted.isdigit():
         return [_mutation(int(wanted), seeds, folder)]
     if wanted is not None:
-        found = [item for item in hostile if item.name == wanted or (wanted.endswith("*") and item.name.startswith(wanted[:-1]))]
-        if not found:
+        matches = [item for item in hostile if item.name == wanted or (wanted.endswith("*") and item.name.startswith(wanted[:-1]))]
+        if not matches:
             sys.exit(f"no hostile input is called '{wanted}'; there are {', '.join(item.name for item in hostile)}")
-        return found
+        return matches
     numbers = range(arguments.first, arguments.first + arguments.count)
     return [*(hostile if arguments.hostile and arguments.kind is None else ()), *(_mutation(number, seeds, folder) for number in numbers)]
 
@@ -114,8 +114,8 @@ def _put(number: int, seed: Seed, seeds: list[Seed], folder: Path, target: Path)
     return own / seed.opened
 
 
-def _show_each(told: list[Outcome], seeds: list[Seed], console: Console) -> None:
-    mutated = [outcome for outcome in told if outcome.name.isdigit()]
+def _show_each(shown: list[Outcome], seeds: list[Seed], console: Console) -> None:
+    mutated = [outcome for outcome in shown if outcome.name.isdigit()]
     total = Counter(seeds[int(outcome.name) % len(seeds)].name for outcome in mutated)
     read = Counter(seeds[int(outcome.name) % len(seeds)].name for outcome in mutated if outcome.kind == "result")
     for name, count in total.items():

@@ -87,21 +87,21 @@ def _spliced(content: bytes, other: bytes, random: np.random.Generator) -> bytes
 
 
 def _text_number(content: bytes, other: bytes, random: np.random.Generator) -> bytes:
-    found = list(_NUMBER.finditer(content))
-    if not found:
+    matches = list(_NUMBER.finditer(content))
+    if not matches:
         return _text_put(content, other, random)
-    match = found[int(random.integers(len(found)))]
+    match = matches[int(random.integers(len(matches)))]
     odd = [str(number) for number in _ODD] + list(_ODD_TEXT)
     return content[: match.start()] + _encoded(odd[int(random.integers(len(odd)))]) + content[match.end() :]
 
 
 def _text_word(content: bytes, other: bytes, random: np.random.Generator) -> bytes:
     """A word becomes another word of these files, or an odd one."""
-    found = list(_WORD.finditer(content))
-    if not found:
+    matches = list(_WORD.finditer(content))
+    if not matches:
         return _text_put(content, other, random)
-    match = found[int(random.integers(len(found)))]
-    words = [word.group() for word in (*found, *_WORD.finditer(other[:20_000]))]
+    match = matches[int(random.integers(len(matches)))]
+    words = [word.group() for word in (*matches, *_WORD.finditer(other[:20_000]))]
     new = words[int(random.integers(len(words)))] if random.random() < 0.5 else _encoded(_ODD_TEXT[int(random.integers(len(_ODD_TEXT)))])
     return content[: match.start()] + new + content[match.end() :]
 

@@ -56,10 +56,10 @@ def test_what_is_missing_is_named_and_the_rest_measured(tiny, nothing_installed,
     for expected in ("B=2: torchtrack", "B=2: SciPy", "B=2: OpenCV, over ours", "guided filter 64x48: kornia", "Harris 64x48: OpenCV"):
         assert expected in names
     assert not any(missing in name for name in names for missing in ("PyPose", "Theseus", "tonic", "dv-processing", "rapid"))
-    told = "\n".join(content["notes"])
+    text = "\n".join(content["notes"])
     for package in ("pypose", "theseus-ai", "tonic", "dv-processing", "opencv-contrib-python-headless"):
-        assert f"pip install {package}" in told
-    assert told.count("pip install pypose") == 1
+        assert f"pip install {package}" in text
+    assert text.count("pip install pypose") == 1
     assert (tmp_path / "bench_peers_poses.png").is_file()
 
 
@@ -67,9 +67,9 @@ def test_all_that_are_here_find_the_same_poses(tiny):
     comparison = Comparison(QUICK)
     poses.compare(comparison)
     assert {"B=1: SciPy", "B=2: OpenCV"} <= set(names_of(comparison))
-    told = [note for note in comparison.notes if "poses" in note]
-    assert len(told) >= 4
-    assert all("the same poses as ours" in note for note in told)
+    notes = [note for note in comparison.notes if "poses" in note]
+    assert len(notes) >= 4
+    assert all("the same poses as ours" in note for note in notes)
 
 
 def test_poses_that_differ_are_told(tiny, monkeypatch):
@@ -103,7 +103,7 @@ def test_surfaces_of_others(tiny, library, package, note):
     pytest.importorskip(library, reason=f"{library} is not installed: pip install {package}", exc_type=ImportError)
     comparison = Comparison(QUICK)
     surfaces.compare(comparison)
-    assert any(note in told for told in comparison.notes)
+    assert any(note in line for line in comparison.notes)
 
 
 def test_rapid_tracks_beside_ours(tiny):

@@ -52,9 +52,9 @@ def test_a_sequence_can_be_tracked_without_a_config(sequence_path, tmp_path, cap
 
 def test_a_method_that_cannot_be_compiled_is_told(sequence_path, tmp_path, capsys):
     assert command("track", sequence_path, "--compiled", "--preset", "line", "-o", tmp_path / "out") == 2
-    told = capsys.readouterr().err
-    assert "compiling the tracker" in told
-    assert "compiled: the method 'line' cannot be compiled" in told
+    shown = capsys.readouterr().err
+    assert "compiling the tracker" in shown
+    assert "compiled: the method 'line' cannot be compiled" in shown
     assert not (tmp_path / "out").exists()
 
 

@@ -124,8 +124,8 @@ def test_an_output_that_cannot_be_is_one_line(sequence_path, tmp_path, capsys, a
     before = sequence_path.read_bytes()
     named = {"sequence": sequence_path, "file": tmp_path / "file", "folder": tmp_path / "folder", "scene": tmp_path / "scene.yaml"}
     assert main([argument.format(**named) for argument in arguments]) == ExitCode.FAILED
-    told = capsys.readouterr().err
-    assert told.startswith("error: cannot write to '") and told.count("\n") == 1
+    shown = capsys.readouterr().err
+    assert shown.startswith("error: cannot write to '") and shown.count("\n") == 1
     assert (tmp_path / "file").read_text() == "mine" and sequence_path.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.h5", "scene.yaml"]
 
@@ -154,8 +154,8 @@ def test_a_full_disk_behind_standard_output_is_one_line(sequence_path, monkeypat
         except SystemExit as exit:
             code = exit.code
     assert code == ExitCode.FAILED
-    told = capsys.readouterr().err
-    assert told == "error: cannot write to 'standard output': No space left on device.\n"
+    shown = capsys.readouterr().err
+    assert shown == "error: cannot write to 'standard output': No space left on device.\n"
 
 
 @pytest.mark.parametrize("arguments", [["settings"], ["--help"]])

@@ -97,8 +97,8 @@ def test_simulate_gives_the_same_on_a_ray_cluster(cluster, tmp_path):
     assert main([*arguments, "--jobs", "1", "-o", str(tmp_path / "local")]) == ExitCode.DONE
     assert main([*arguments, "--executor", "ray", "-o", str(tmp_path / "ray")]) == ExitCode.DONE
     for name in "ab":
-        expected, found = (dict(np.load(tmp_path / where / f"{name}.npz")) for where in ("local", "ray"))
-        assert all(np.array_equal(found[key], expected[key]) for key in ("t", "x", "y", "p", "poses"))
+        expected, by_ray = (dict(np.load(tmp_path / where / f"{name}.npz")) for where in ("local", "ray"))
+        assert all(np.array_equal(by_ray[key], expected[key]) for key in ("t", "x", "y", "p", "poses"))
 
 
 def test_ray_that_is_missing_is_told(folder, tmp_path, monkeypatch, capsys):

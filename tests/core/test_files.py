@@ -36,9 +36,9 @@ def test_a_file_is_read_up_to_a_limit(tmp_path):
 
 
 def test_an_error_is_told_with_its_file_once(tmp_path):
-    for told in ("it is cut off", f"'{tmp_path / 'a.npz'}': it is cut off"):
+    for message in ("it is cut off", f"'{tmp_path / 'a.npz'}': it is cut off"):
         with pytest.raises(EventDataError) as caught, naming(tmp_path / "a.npz"):
-            raise EventDataError(told)
+            raise EventDataError(message)
         assert str(caught.value) == f"'{tmp_path / 'a.npz'}': it is cut off"
     with pytest.raises(EventDataError, match=r"^it is cut off$"), naming(None):
         raise EventDataError("it is cut off")

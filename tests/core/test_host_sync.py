@@ -1,4 +1,4 @@
-"""Sizes that do not hang on values give what exact ones give; answers, constants, and what is known of events without reading them."""
+"""Sizes that do not hang on values give what exact ones give; values on their way, constants, and what is known of events without reading them."""
 
 from dataclasses import replace
 
@@ -29,15 +29,15 @@ def nothing_is_read(monkeypatch):
     return lambda: monkeypatch.setattr(host_sync, "read_at_once", lambda values: False)
 
 
-# ---- answers and constants
+# ---- values on their way, and constants
 
 
 def test_an_answer_gives_the_values():
-    answer = host_sync.Answer.to(torch.tensor([7, 18]))
-    assert answer.numbers() == [7, 18]
-    assert answer.any()
-    assert not host_sync.Answer.to(torch.zeros(3, dtype=torch.bool)).any()
-    assert not host_sync.Answer.to(torch.zeros(0, dtype=torch.bool)).any()
+    value = host_sync.AsyncValue.to(torch.tensor([7, 18]))
+    assert value.numbers() == [7, 18]
+    assert value.any()
+    assert not host_sync.AsyncValue.to(torch.zeros(3, dtype=torch.bool)).any()
+    assert not host_sync.AsyncValue.to(torch.zeros(0, dtype=torch.bool)).any()
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (4,), (2, 3)])
@@ -53,7 +53,7 @@ def test_it_is_certain_that_none_is_true_where_none_is(shape, nothing_is_read):
 
 
 def test_an_answer_is_a_constant():
-    assert not host_sync.Answer.to(torch.ones(2, requires_grad=True)).on_device.requires_grad
+    assert not host_sync.AsyncValue.to(torch.ones(2, requires_grad=True)).on_device.requires_grad
 
 
 def test_a_constant_is_made_once_for_each_type():
@@ -188,12 +188,12 @@ def test_a_tracker_that_reads_nothing_finds_the_same(nothing_is_read, monkeypatc
         _, exact = follow(boxes, begin, cut)
         nothing_is_read()
         _, bounded = follow(boxes, begin, cut)
-    for one, other in zip(exact, bounded, strict=True):
-        torch.testing.assert_close(other.T_cam_obj, one.T_cam_obj, rtol=0, atol=1e-9)
-        torch.testing.assert_close(other.covariance, one.covariance, rtol=1e-6, atol=0)
-        torch.testing.assert_close(other.quality, one.quality, rtol=0, atol=1e-9)
-        assert torch.equal(other.status, one.status)
-        assert torch.equal(other.observation_count, one.observation_count)
+    for result, other in zip(exact, bounded, strict=True):
+        torch.testing.assert_close(other.T_cam_obj, result.T_cam_obj, rtol=0, atol=1e-9)
+        torch.testing.assert_close(other.covariance, result.covariance, rtol=1e-6, atol=0)
+        torch.testing.assert_close(other.quality, result.quality, rtol=0, atol=1e-9)
+        assert torch.equal(other.status, result.status)
+        assert torch.equal(other.observation_count, result.observation_count)
 
 
 # ---- steady steps
@@ -210,8 +210,8 @@ def test_a_steady_step_is_a_step(nothing_is_read, scene, reading):
             nothing_is_read()
         *steady, wrong = boxes.steady_step(state, *cut[-1])
         assert not wrong
-        for one, other in zip(steady, boxes.step(state, *cut[-1]), strict=True):
-            assert_same(one, other)
+        for result, other in zip(steady, boxes.step(state, *cut[-1]), strict=True):
+            assert_same(result, other)
 
 
 @pytest.mark.parametrize("reading", [True, False])

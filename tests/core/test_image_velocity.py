@@ -81,8 +81,8 @@ def test_motions_that_are_known_by_heart(velocity, expected):
     twist = torch.tensor([velocity], dtype=torch.float64)
     of_plane = object_plane_velocity(pixels, twist, centre, intrinsics(1))
     of_points = pixel_velocity(at_depth(pixels, centre[:, 2]), twist, centre, intrinsics(1))
-    for found in (of_plane, of_points):
-        torch.testing.assert_close(found[0], torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-9)
+    for moments in (of_plane, of_points):
+        torch.testing.assert_close(moments[0], torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-9)
 
 
 def test_velocities_are_linear_in_the_motion():
@@ -101,8 +101,8 @@ def test_a_batch_is_its_elements(dtype):
         together = velocity_of(places, velocity, centre, intrinsics(dtype=dtype))
         assert together.shape == (3, 10, 2)
         for number in range(3):
-            one = slice(number, number + 1)
-            torch.testing.assert_close(together[one], velocity_of(places[one], velocity[one], centre[one], intrinsics(1, dtype)))
+            row = slice(number, number + 1)
+            torch.testing.assert_close(together[row], velocity_of(places[row], velocity[row], centre[row], intrinsics(1, dtype)))
 
 
 @pytest.mark.parametrize("depth_m", [0.0, -0.3, MIN_DEPTH_M / 2])

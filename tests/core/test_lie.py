@@ -122,9 +122,9 @@ def test_transform_points_is_the_homogeneous_product():
 def test_interpolation_starts_at_the_start_and_ends_at_the_end(angle):
     T_start = random_pose(6)
     T_end = lie.se3_exp(twists(angle, 6, seed=4)) @ T_start
-    zero, one = torch.zeros(6, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
+    zero, whole = torch.zeros(6, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
     assert far_from(lie.se3_interpolate(T_start, T_end, zero), T_start) == 0
-    assert far_from(lie.se3_interpolate(T_start, T_end, one), T_end) < 1e-12
+    assert far_from(lie.se3_interpolate(T_start, T_end, whole), T_end) < 1e-12
 
 
 def test_interpolation_moves_with_constant_twist():

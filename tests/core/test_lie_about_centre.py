@@ -95,10 +95,10 @@ def test_cayley_turns_by_twice_the_arc_tangent_of_half_the_angle(dtype):
         assert far_from(turned, torch.full_like(turned, 2 * math.atan(angle / 2))) < 5 * TOLERANCE[dtype]
 
 
-@pytest.mark.parametrize("of", [lie.cayley, lambda phi: lie.chord(lie.so3_exp(phi))], ids=["cayley", "chord"])
+@pytest.mark.parametrize("function", [lie.cayley, lambda phi: lie.chord(lie.so3_exp(phi))], ids=["cayley", "chord"])
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.01, 1.0])
-def test_gradients_of_the_solvers_shortcuts_are_right(of, angle):
-    assert gradcheck(of, rotation_vectors(angle, 3).requires_grad_(), atol=1e-7)
+def test_gradients_of_the_solvers_shortcuts_are_right(function, angle):
+    assert gradcheck(function, rotation_vectors(angle, 3).requires_grad_(), atol=1e-7)
 
 
 @pytest.mark.parametrize("batch", BATCHES)

@@ -29,19 +29,19 @@ def late(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(late):
+def estimate(late):
     return estimate_latency(open_session(RunConfig(source=late)))
 
 
-def test_the_latency_of_the_sensor_is_found(found):
-    assert found.latency_us == pytest.approx(LATENCY_US, abs=min(1500, 2 * found.deviation_us))
-    assert found.after_px < 0.6 * found.before_px
-    assert found.events > 1000
+def test_the_latency_of_the_sensor_is_found(estimate):
+    assert estimate.latency_us == pytest.approx(LATENCY_US, abs=min(1500, 2 * estimate.deviation_us))
+    assert estimate.after_px < 0.6 * estimate.before_px
+    assert estimate.events > 1000
 
 
-def test_a_latency_that_is_taken_off_is_gone(late, found):
+def test_a_latency_that_is_taken_off_is_gone(late, estimate):
     rest = estimate_latency(open_session(RunConfig(source=late, sensor_latency_us=LATENCY_US)))
-    assert found.latency_us - rest.latency_us == pytest.approx(LATENCY_US, abs=150)
+    assert estimate.latency_us - rest.latency_us == pytest.approx(LATENCY_US, abs=150)
 
 
 def test_a_latency_shifts_the_stream_and_nothing_else(late):
@@ -69,10 +69,10 @@ def test_without_truth_or_motion_there_is_nothing_to_find(late, tmp_path):
         estimate_latency(open_session(RunConfig(source=write(simulate(scene), tmp_path / "still.npz"))))
 
 
-def test_the_command_shows_a_row_per_sequence(late, found, capsys, monkeypatch):
-    monkeypatch.setattr("torchtrack.cli.evaluate.estimate_latency", lambda session: found)
+def test_the_command_shows_a_row_per_sequence(late, estimate, capsys, monkeypatch):
+    monkeypatch.setattr("torchtrack.cli.evaluate.estimate_latency", lambda session: estimate)
     assert main(["evaluate", str(late), "--estimate-latency"]) == ExitCode.DONE
     shown = capsys.readouterr().out
     assert "late" in shown
-    assert f"{found.latency_us:.0f}" in shown
+    assert f"{estimate.latency_us:.0f}" in shown
     assert "sensor_latency_us" in shown

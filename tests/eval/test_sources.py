@@ -39,12 +39,12 @@ def test_scenes_are_simulated_once_and_one_that_fails_stops_no_other(scene, tmp_
     pytest.importorskip("numba", reason="the simulator needs the extra 'sim'")
     broken = {"name": "broken", "background": {"image": str(tmp_path / "none.png")}}
     cells = {"13": CellConfig(scene=scene), "14": CellConfig(scene=scene), "15": CellConfig(scene=scene, overrides=broken)}
-    told = []
-    paths, failures = cell_sequences(cells, tmp_path / "cache", 1, lambda name, share: told.append((name, share)))
+    progress = []
+    paths, failures = cell_sequences(cells, tmp_path / "cache", 1, lambda name, share: progress.append((name, share)))
     assert [path.stem for path in paths.values()] == ["small", "small", "broken"]
     assert read_sequence(paths["13"]).objects[0].label == "cube"
     assert [(failure.sequence, failure.method) for failure in failures] == [("broken", "simulation")]
-    assert "none.png" in failures[0].reason and ("small", 1.0) in told
+    assert "none.png" in failures[0].reason and ("small", 1.0) in progress
     before = paths["13"].stat().st_mtime_ns
     assert cell_sequences({"13": CellConfig(scene=scene)}, tmp_path / "cache", 1) == ({"13": paths["13"]}, ())
     assert paths["13"].stat().st_mtime_ns == before

@@ -21,7 +21,7 @@ PARALLEL = ["local", pytest.param("ray", marks=needs_ray)]
 @pytest.fixture(scope="module", params=PARALLEL)
 def mixed(request, tmp_path_factory):
     """Many kinds of tasks at once: their outcomes by kind, what was told, and the folder of the marks."""
-    folder, told = tmp_path_factory.mktemp("marks"), []
+    folder, progress = tmp_path_factory.mktemp("marks"), []
     tasks = {
         "killed": folder / "tries",
         "error": "too bad",
@@ -34,8 +34,8 @@ def mixed(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         # Ray's workers do not know the folder of the tests.
         patch.setenv("PYTHONPATH", os.pathsep.join([str(REPOSITORY / "tests" / "support"), str(REPOSITORY)]))
-        found = run_tasks(odd_tasks.do, list(tasks.items()), request.param, 2, lambda number, share: told.append((number, share)))
-        return {kinds[number]: outcome for number, outcome in found}, told, folder
+        ended = run_tasks(odd_tasks.do, list(tasks.items()), request.param, 2, lambda number, share: progress.append((number, share)))
+        return {kinds[number]: outcome for number, outcome in ended}, progress, folder
 
 
 def test_every_task_has_an_outcome(mixed):
@@ -63,17 +63,17 @@ def test_a_task_that_no_process_survives_fails_in_the_end(mixed):
 
 
 def test_progress_is_told(mixed):
-    outcomes, told, _ = mixed
-    assert told == [(4, 0.25), (4, 0.5)]
+    outcomes, progress, _ = mixed
+    assert progress == [(4, 0.25), (4, 0.5)]
     assert outcomes["tell"] != os.getpid()
 
 
 def test_one_process_is_this_one():
-    told = []
+    progress = []
     tasks = [("tell", (0.5,)), ("error", "too bad"), ("double", 1)]
-    outcomes = run_tasks(odd_tasks.do, tasks, "local", 1, lambda number, share: told.append((number, share)))
+    outcomes = run_tasks(odd_tasks.do, tasks, "local", 1, lambda number, share: progress.append((number, share)))
     assert list(outcomes) == [(0, os.getpid()), (1, TaskFailure("too bad")), (2, 2)]
-    assert told == [(0, 0.5)]
+    assert progress == [(0, 0.5)]
 
 
 @pytest.mark.parametrize("executor", PARALLEL)
@@ -130,5 +130,5 @@ def test_what_becomes_of_a_group_becomes_of_its_items():
             raise ConfigError("too bad")
         return [item.upper() for item in items]
 
-    found = list(run_in_groups(work, ["a", "bad", "b", "c", "d"], [0, 1, 0, 1, 0], 2, "local", 1))
-    assert found == [([0, 2], ["A", "B"]), ([1, 3], [TaskFailure("too bad")] * 2), ([4], ["D"])]
+    outcomes = list(run_in_groups(work, ["a", "bad", "b", "c", "d"], [0, 1, 0, 1, 0], 2, "local", 1))
+    assert outcomes == [([0, 2], ["A", "B"]), ([1, 3], [TaskFailure("too bad")] * 2), ([4], ["D"])]

@@ -18,8 +18,8 @@ def test_files_hold_the_events_that_are_measured(tmp_path, name):
     path = tmp_path / ("e.txt" if name == "davis" else "e.bin")
     write_events(path, name, 3000)
     expected = concatenate(synthetic(3000))
-    found = everything(open_events(path, WIDTH, HEIGHT))
-    assert all(bool((getattr(found, field) == getattr(expected, field)).all()) for field in ("x", "y", "t_us", "polarity"))
+    batch = everything(open_events(path, WIDTH, HEIGHT))
+    assert all(bool((getattr(batch, field) == getattr(expected, field)).all()) for field in ("x", "y", "t_us", "polarity"))
 
 
 def test_every_format_is_measured():

@@ -100,12 +100,12 @@ def test_another_decoder_reads_what_is_written(tmp_path):
 
 def test_writers_refuse_what_is_wrong(tmp_path, kind):
     writer = WRITERS[kind](tmp_path / f"e{SUFFIX[kind]}", 64, 48)
-    one = np.array([1])
-    writer.write(EventBatch.from_numpy(one, one, one * 100, one))
+    values = np.array([1])
+    writer.write(EventBatch.from_numpy(values, values, values * 100, values))
     with pytest.raises(EventDataError, match="time goes back from 100 to 99 µs at event 1"):
-        writer.write(EventBatch.from_numpy(one, one, one * 99, one))
+        writer.write(EventBatch.from_numpy(values, values, values * 99, values))
     with pytest.raises(EventDataError, match=r"event 1 is at \(64, 1\), outside the sensor of 64x48"):
-        writer.write(EventBatch.from_numpy(one * 64, one, one * 100, one))
+        writer.write(EventBatch.from_numpy(values * 64, values, values * 100, values))
     writer.close()
 
 

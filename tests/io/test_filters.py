@@ -35,13 +35,13 @@ def source(tmp_path):
     return open_events(save_npz(tmp_path / "e.npz", random_events(3000, **SIZE)))
 
 
-def of(rows) -> EventBatch:
+def batch_of(rows) -> EventBatch:
     t_us, x, y, p = np.array(rows, dtype=np.int64).reshape(-1, 4).T
     return EventBatch.from_numpy(x, y, t_us, p)
 
 
 def stream(folder, rows):
-    return open_events(save_npz(folder / "rows.npz", of(rows)))
+    return open_events(save_npz(folder / "rows.npz", batch_of(rows)))
 
 
 # ---- the common interface
@@ -97,20 +97,20 @@ def test_the_peak_of_a_short_recording_is_not_below_its_mean(tmp_path, times):
 def test_a_region(source):
     events, region = everything(source), Region(source, 10, 5, 20, 30)
     inside = (events.x >= 10) & (events.x < 30) & (events.y >= 5) & (events.y < 35)
-    found = everything(region)
+    filtered = everything(region)
     assert (region.width, region.height) == (20, 30)
-    assert torch.equal(found.x, events.x[inside] - 10)
-    assert torch.equal(found.y, events.y[inside] - 5)
-    assert torch.equal(found.t_us, events.t_us[inside])
+    assert torch.equal(filtered.x, events.x[inside] - 10)
+    assert torch.equal(filtered.y, events.y[inside] - 5)
+    assert torch.equal(filtered.t_us, events.t_us[inside])
 
 
 def test_down_scaling_leaves_out_what_is_over_at_the_border(source):
     scaled, events = Downscaled(source, 5), everything(source)
     assert (scaled.width, scaled.height) == (12, 9)
-    found = everything(scaled)
+    filtered = everything(scaled)
     inside = (events.x < 60) & (events.y < 45)
-    assert torch.equal(found.x, events.x[inside] // 5)
-    assert torch.equal(found.y, events.y[inside] // 5)
+    assert torch.equal(filtered.x, events.x[inside] // 5)
+    assert torch.equal(filtered.y, events.y[inside] // 5)
 
 
 @settings(max_examples=30, deadline=None)
@@ -145,12 +145,12 @@ def test_hot_pixels_are_found_and_left_out(tmp_path):
     # An edge: all of a column fires, often.
     edge = [(t, 20, y, 0) for t in range(100_000, 110_000, 200) for y in range(48)]
     source = stream(tmp_path, sorted(noise + hot + edge))
-    found = find_hot_pixels(source)
-    assert [(x, y) for y, x in torch.nonzero(found).tolist()] == [(40, 0), (41, 0), (5, 7)]
-    kept = everything(HotPixelFilter(source, found))
-    assert len(kept) == int((~found[everything(source).y.long(), everything(source).x.long()]).sum())
+    hot_pixels = find_hot_pixels(source)
+    assert [(x, y) for y, x in torch.nonzero(hot_pixels).tolist()] == [(40, 0), (41, 0), (5, 7)]
+    kept = everything(HotPixelFilter(source, hot_pixels))
+    assert len(kept) == int((~hot_pixels[everything(source).y.long(), everything(source).x.long()]).sum())
     with pytest.raises(EventDataError, match=r"must be \[48, 64\]"):
-        HotPixelFilter(source, found.T)
+        HotPixelFilter(source, hot_pixels.T)
 
 
 def test_a_stream_without_events_has_no_hot_pixels(tmp_path):
@@ -178,7 +178,7 @@ def supported(rows, max_age_us: int, min_support: int) -> list[bool]:
 )
 def test_events_stay_where_neighbours_fired(tmp_path_factory, rows, age, support, size):
     source = stream(tmp_path_factory.mktemp("rows"), rows)
-    expected = of([row for row, kept in zip(rows, supported(rows, age, support), strict=True) if kept])
+    expected = batch_of([row for row, kept in zip(rows, supported(rows, age, support), strict=True) if kept])
     assert_same(concatenate(BackgroundFilter(source, age, support).chunks(size)), expected)
 
 

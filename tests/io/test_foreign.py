@@ -218,11 +218,11 @@ def test_camera_infos_that_differ(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("more", "told"),
+    ("more", "warning"),
     [("binning_x: 2\nbinning_y: 2\n", "binning is said"), ("roi: {x_offset: 8, width: 100}\n", "a region of interest .roi. is said")],
 )
-def test_parts_of_a_sensor_are_told(tmp_path, more, told):
-    with pytest.warns(TorchtrackWarning, match=told):
+def test_parts_of_a_sensor_are_told(tmp_path, more, warning):
+    with pytest.warns(TorchtrackWarning, match=warning):
         assert read_calibration(saved(tmp_path, ros2(more=more))) == EXPECTED
 
 

@@ -91,8 +91,8 @@ def test_a_damaged_packet_costs_that_packet(tmp_path):
         everything(open_events(path, strict=True))
     source = open_events(path)
     with pytest.warns(TorchtrackWarning, match="damaged"):
-        found = everything(source)
-    assert 30_000 <= len(found) < 50_000
+        events_read = everything(source)
+    assert 30_000 <= len(events_read) < 50_000
 
 
 def test_a_truncated_file_gives_what_is_there(tmp_path):
@@ -194,5 +194,5 @@ def test_a_wild_time_at_the_end_of_a_part_costs_one_event(tmp_path, size):
 
 def test_columns_of_a_batch():
     events = random_events(10, **SIZE)
-    assert_same(Columns.of(events).batch(), events)
+    assert_same(Columns.from_batch(events).batch(), events)
     assert len(Columns.empty()) == 0

@@ -57,7 +57,7 @@ def test_at_a_constant_speed_as_many_are_joined_as_come_during_a_step():
     waiting = WaitingWindows(50)
     came(waiting, 0, 1)
     taken = [came(waiting, first, 4) for first in range(1, 61, 4)]
-    assert [one.t_end_us - one.t_start_us for one in taken[4:]] == [4000] * 11
+    assert [taken_window.t_end_us - taken_window.t_start_us for taken_window in taken[4:]] == [4000] * 11
     assert len(waiting) <= 8
 
 
@@ -68,18 +68,18 @@ def test_after_a_pause_what_waits_is_caught_up_with_by_few_more_at_a_time():
     while waiting:
         taken.append(came(waiting, first, 1))
         first += 1
-    lengths = [(one.t_end_us - one.t_start_us) // 1000 for one in taken]
+    lengths = [(taken_window.t_end_us - taken_window.t_start_us) // 1000 for taken_window in taken]
     assert lengths[:4] == [1, 2, 4, 5]
     assert max(lengths) == 5
     assert lengths[-1] <= 2
-    assert [one.t_start_us for one in taken] == [0, *(one.t_end_us for one in taken[:-1])]
+    assert [taken_window.t_start_us for taken_window in taken] == [0, *(taken_window.t_end_us for taken_window in taken[:-1])]
     assert counts(waiting) == (first - len(taken), 0, 0)
 
 
 def test_no_more_are_joined_than_a_bound_and_than_twice_as_many_as_before():
     waiting = WaitingWindows(500)
     taken = [came(waiting, first, 20) for first in range(0, 100, 20)]
-    assert [(one.t_end_us - one.t_start_us) // 1000 for one in taken] == [2, 4, 8, MOST_JOINED, MOST_JOINED]
+    assert [(taken_window.t_end_us - taken_window.t_start_us) // 1000 for taken_window in taken] == [2, 4, 8, MOST_JOINED, MOST_JOINED]
 
 
 def test_joined_windows_have_as_many_events_as_one_spread_evenly_with_the_newest():
@@ -105,7 +105,7 @@ def test_of_too_many_the_oldest_are_joined_and_no_time_is_lost():
     taken = []
     while waiting:
         taken.append(waiting.take())
-    assert [one.t_start_us for one in taken] == [0, *(one.t_end_us for one in taken[:-1])]
+    assert [taken_window.t_start_us for taken_window in taken] == [0, *(taken_window.t_end_us for taken_window in taken[:-1])]
     assert taken[-1].t_end_us == 100_000
     assert (waiting.joined_windows, waiting.dropped_windows, waiting.dropped_events) == (100 - len(taken), 0, 0)
 
@@ -125,7 +125,7 @@ def test_a_start_is_in_haste_and_haste_ends_a_while_after_the_last_joined_window
     taken = [came(waiting, number, 1) for number in range(150)]
     taken.append(came(waiting, 150, 2))
     taken += [came(waiting, number, 1) for number in range(152, 400)]
-    hasty = [one.t_end_us for one in taken if isinstance(one, HastyWindow)]
+    hasty = [taken_window.t_end_us for taken_window in taken if isinstance(taken_window, HastyWindow)]
     assert hasty == [*range(1000, 102_000, 1000), 152_000, *range(153_000, 253_000, 1000)]
 
 
@@ -177,14 +177,14 @@ def test_a_slow_tracker_follows_the_whole_stream_with_a_bounded_lag(windows_a_st
                 now_us = max(now_us, stream[came].t_end_us)
                 waiting.put(stream[came])
                 came += 1
-            one = waiting.take()
-            state, result = pace.tracker([one], result).step(state, one.events, one.t_end_us)
+            taken_window = waiting.take()
+            state, result = pace.tracker([taken_window], result).step(state, taken_window.events, taken_window.t_end_us)
             now_us += windows_a_step * WINDOW_US
-            lags_us.append(now_us - one.t_end_us)
-            found = result.T_cam_obj[0]
-            true = trajectory.at(torch.tensor([one.t_end_us]))[0]
-            if result.status[0] <= int(Status.UNCERTAIN) and rotation_angle_deg(found[:3, :3], true[:3, :3]) < 2:
-                tracked_us += one.t_end_us - one.t_start_us
+            lags_us.append(now_us - taken_window.t_end_us)
+            T_found = result.T_cam_obj[0]
+            true = trajectory.at(torch.tensor([taken_window.t_end_us]))[0]
+            if result.status[0] <= int(Status.UNCERTAIN) and rotation_angle_deg(T_found[:3, :3], true[:3, :3]) < 2:
+                tracked_us += taken_window.t_end_us - taken_window.t_start_us
     assert tracked_us >= 0.95 * count * WINDOW_US
     assert max(lags_us) <= (CAPACITY + windows_a_step) * WINDOW_US
     assert waiting.dropped_windows == 0

@@ -61,23 +61,23 @@ def test_what_is_in_order_passes_through_untouched(part, waits):
     events = stream()
     mender = Mender(Problems("made", strict=True), waits=waits)
     given = [events[start : start + part] for start in range(0, COUNT, part)]
-    pieces = [piece for one in given for piece in mender.add(one)] + mender.rest()
+    pieces = [piece for packet in given for piece in mender.add(packet)] + mender.rest()
     assert len(pieces) == len(given)
-    assert all(piece is one for piece, one in zip(pieces, given, strict=True))
+    assert all(piece is packet for piece, packet in zip(pieces, given, strict=True))
 
 
 @parts
 def test_late_packets_are_sorted_in(part):
-    found, problems = mended(late_packets(), part)
-    assert found.t_us.tolist() == stream().t_us.tolist()
-    assert found.x.sum() == stream().x.sum()
+    mended_events, problems = mended(late_packets(), part)
+    assert mended_events.t_us.tolist() == stream().t_us.tolist()
+    assert mended_events.x.sum() == stream().x.sum()
     assert set(problems.counts) == {Problem.SORTED}
 
 
 def test_a_live_stream_waits_once_packets_came_late():
-    found, problems = mended(late_packets(), 100, waits=False)
-    assert problems.counts[Problem.BACK] == COUNT - len(found) < len(packets(1000)[0]) + 1
-    assert (np.diff(found.t_us) >= 0).all()
+    mended_events, problems = mended(late_packets(), 100, waits=False)
+    assert problems.counts[Problem.BACK] == COUNT - len(mended_events) < len(packets(1000)[0]) + 1
+    assert (np.diff(mended_events.t_us) >= 0).all()
 
 
 @parts
@@ -85,19 +85,19 @@ def test_a_live_stream_waits_once_packets_came_late():
 def test_packets_that_are_sent_twice_count_once(part, span_us, waits):
     order = [np.tile(packet, 2) if number % 3 == 0 else packet for number, packet in enumerate(packets(span_us))]
     twice = stream()[np.concatenate(order)]
-    found, problems = mended(twice, part, waits)
+    mended_events, problems = mended(twice, part, waits)
     # Of those at the very time where a packet ends, one or another stays.
-    assert COUNT <= len(found) <= COUNT + 10
-    assert problems.counts == {Problem.REPEATED: len(twice) - len(found)}
+    assert COUNT <= len(mended_events) <= COUNT + 10
+    assert problems.counts == {Problem.REPEATED: len(twice) - len(mended_events)}
 
 
 @parts
 @pytest.mark.parametrize("waits", [False, True])
 @pytest.mark.parametrize("back_us", [30_000, 100_000, 1_000_000_000])
 def test_after_a_jump_back_time_goes_on(part, waits, back_us):
-    found, problems = mended(at(moved(-back_us)), part, waits)
-    assert len(found) == COUNT
-    assert np.abs(found.t_us - stream().t_us).max() < 50
+    mended_events, problems = mended(at(moved(-back_us)), part, waits)
+    assert len(mended_events) == COUNT
+    assert np.abs(mended_events.t_us - stream().t_us).max() < 50
     assert problems.counts == {Problem.RESET: 1}
     (change,) = problems.clock_changes
     before = int(stream().t_us[MIDDLE - 1])
@@ -112,8 +112,8 @@ def test_after_a_jump_back_time_goes_on(part, waits, back_us):
 def test_counters_that_begin_again_are_unwrapped(part, dtype, bits, begins):
     shown = (stream().t_us + begins) % 2**bits
     shown = shown.astype(np.uint32).view(np.int32) if dtype == np.int32 else shown.astype(dtype)
-    found, problems = mended(at(shown), part)
-    assert found.t_us.tolist() == (stream().t_us + begins).tolist()
+    mended_events, problems = mended(at(shown), part)
+    assert mended_events.t_us.tolist() == (stream().t_us + begins).tolist()
     assert problems.counts == {Problem.WRAPPED: 1}
     assert problems.clock_changes[0].kind == "wrap"
 
@@ -124,30 +124,30 @@ def test_counters_that_begin_again_are_unwrapped(part, dtype, bits, begins):
 def test_wild_times_cost_their_events(part, waits, ahead_us):
     t_us = stream().t_us.copy()
     t_us[::1999] += ahead_us
-    found, problems = mended(at(t_us), part, waits)
+    mended_events, problems = mended(at(t_us), part, waits)
     kept = np.arange(COUNT) % 1999 > 0
-    assert found.t_us.tolist() == stream().t_us[kept].tolist()
+    assert mended_events.t_us.tolist() == stream().t_us[kept].tolist()
     assert problems.counts == {Problem.WILD: COUNT - kept.sum()}
 
 
 def test_a_leap_forward_that_lasts_is_a_gap():
-    found, problems = mended(at(moved(3_600_000_000)), 1000)
-    assert found.t_us.tolist() == moved(3_600_000_000).tolist()
+    mended_events, problems = mended(at(moved(3_600_000_000)), 1000)
+    assert mended_events.t_us.tolist() == moved(3_600_000_000).tolist()
     assert not problems.counts
 
 
 def test_what_comes_far_too_late_is_left_out():
     numbers = packets(5000)
     order = np.concatenate([*numbers[:10], *numbers[11:20], numbers[10], *numbers[20:]])
-    found, problems = mended(stream()[order], 1000)
-    assert len(found) == COUNT - len(numbers[10])
+    mended_events, problems = mended(stream()[order], 1000)
+    assert len(mended_events) == COUNT - len(numbers[10])
     assert problems.counts == {Problem.BACK: len(numbers[10])}
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_times_in_no_order_come_to_an_end(seed):
-    found, problems = mended(at(np.random.default_rng(seed).permutation(stream().t_us)), 5000)
-    assert (np.diff(found.t_us) >= 0).all()
+    mended_events, problems = mended(at(np.random.default_rng(seed).permutation(stream().t_us)), 5000)
+    assert (np.diff(mended_events.t_us) >= 0).all()
     assert problems.counts[Problem.BACK] > COUNT // 2
 
 
@@ -206,9 +206,9 @@ def hdf5(path, events: Columns):
 def test_every_reader_mends(tmp_path, write, events, problem):
     source = open_events(write(tmp_path / "e", events))
     with pytest.warns(TorchtrackWarning, match=f"e.*: it was mended. First of .* {problem.value}"):
-        found = everything(source, 3000)
-    assert len(found) == COUNT
-    assert np.abs(np.diff(found.t_us.numpy()) - np.diff(stream().t_us)).max() < 50
+        mended_events = everything(source, 3000)
+    assert len(mended_events) == COUNT
+    assert np.abs(np.diff(mended_events.t_us.numpy()) - np.diff(stream().t_us)).max() < 50
     assert set(source.problems.counts) == {problem}
 
 
@@ -217,8 +217,8 @@ def test_batches_of_ones_own_are_mended():
     batches = [events[start : start + 100].batch() for start in range(0, COUNT, 100)]
     problems = Problems("the stream", strict=False)
     with pytest.warns(TorchtrackWarning, match="the stream: it was mended"):
-        found = concatenate(mended_batches(batches, 64, 48, problems))
-    assert len(found) == COUNT
+        mended_events = concatenate(mended_batches(batches, 64, 48, problems))
+    assert len(mended_events) == COUNT
     assert problems.counts == {Problem.RESET: 1}
 
 

@@ -11,10 +11,10 @@ TIMES_US = np.sort(np.random.default_rng(0).integers(0, 10_000, 3000))
 UNIX_US = 1_700_000_000_000_000
 
 
-def silent(numbers, custom, told=None):
+def silent(numbers, custom, stated=None):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return settled_unit(np.asarray(numbers), custom, told, "file")
+        return settled_unit(np.asarray(numbers), custom, stated, "file")
 
 
 @pytest.mark.parametrize("start_us", [0, UNIX_US, 40 * 86_400_000_000])
@@ -56,8 +56,8 @@ def test_a_rate_that_is_unusual_is_told():
 
 
 def test_what_was_told_is_not_questioned():
-    assert silent(TIMES_US.astype(float), "s", told="s") == "s"
-    assert silent(TIMES_US * 1000, "us", told="ns") == "ns"
+    assert silent(TIMES_US.astype(float), "s", stated="s") == "s"
+    assert silent(TIMES_US * 1000, "us", stated="ns") == "ns"
 
 
 def test_few_events_and_equal_times_say_nothing():
@@ -70,7 +70,7 @@ def test_few_events_and_equal_times_say_nothing():
 def test_a_jump_of_the_clock_does_not_change_the_rate():
     jumped = np.concatenate([TIMES_US[:1000], TIMES_US[1000:] + 3_000_000_000])
     assert silent(jumped, "us") == "us"
-    plain, with_jump = (TimeNumbers.of(numbers, EVENTS.fewest) for numbers in (TIMES_US, jumped))
+    plain, with_jump = (TimeNumbers.from_values(numbers, EVENTS.fewest) for numbers in (TIMES_US, jumped))
     assert with_jump.rate == pytest.approx(plain.rate, rel=0.2)
 
 

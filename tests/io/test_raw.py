@@ -72,11 +72,11 @@ WORDS = st.builds(
 
 def forward(words: list[int], longest: int) -> list[int]:
     """The same words, with times that go on by less than ``longest`` from one time high to the next."""
-    high, found = 4090, []
+    high, spread = 4090, []
     for word in words:
         high += (word & 0xFFF) % longest if word & 0xF000 == HIGH else 0
-        found.append(HIGH | high % 4096 if word & 0xF000 == HIGH else word)
-    return found
+        spread.append(HIGH | high % 4096 if word & 0xF000 == HIGH else word)
+    return spread
 
 
 @settings(max_examples=150, deadline=None)
@@ -165,7 +165,7 @@ def test_evt21_words(tmp_path, legacy):
     for name, header in (("said", f"% format EVT21;endianness={'legacy' if legacy else 'little'};height=320;width=320"), ("seen", "% evt 2.1")):
         path = tmp_path / f"{name}.raw"
         path.write_bytes(f"{header}\n% end\n".encode() + sent.tobytes())
-        assert plain(Columns.of(everything(open_events(path, strict=True)))) == expected
+        assert plain(Columns.from_batch(everything(open_events(path, strict=True)))) == expected
 
 
 # ---- files
@@ -267,7 +267,7 @@ def test_a_flipped_bit_in_a_time_word_costs_no_more_than_lies_between_two_words(
         parts = [decoder.feed(broken[start : start + block]) for start in range(0, len(broken), block)]
         problems = Problems("words", strict=False)
         mender = Mender(problems, waits=True)
-        found = join([piece for part in [*parts, decoder.finish()] for piece in mender.add(part)] + mender.rest())
-        assert len(found) >= 25_000 - 16
-        assert np.isin(found.t_us, np.arange(0, 200_000, 8)).mean() > 0.999
-        assert (found.t_us[-1], problems.clock_changes) == (199_992, [])
+        mended_events = join([piece for part in [*parts, decoder.finish()] for piece in mender.add(part)] + mender.rest())
+        assert len(mended_events) >= 25_000 - 16
+        assert np.isin(mended_events.t_us, np.arange(0, 200_000, 8)).mean() > 0.999
+        assert (mended_events.t_us[-1], problems.clock_changes) == (199_992, [])

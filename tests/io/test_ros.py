@@ -78,8 +78,8 @@ def test_packets_count_from_their_own_time(encode, ros2):
 
 def test_vectors_of_libcaer_stand_upright():
     words = np.array([0, 1 << 12 | 5, 2 << 12 | 9, 4 << 12 | 1 << 11 | 20, 5 << 12 | 0b101], "<u2")
-    found = MessageDecoder("EventPacket", True, Problems("bag", strict=True)).events([event_packet("libcaer_cmp", words.tobytes(), 0, True)])
-    assert (found.x.tolist(), found.y.tolist(), found.t_us.tolist(), found.polarity.tolist()) == ([9, 9], [20, 22], [5, 5], [True, True])
+    decoded = MessageDecoder("EventPacket", True, Problems("bag", strict=True)).events([event_packet("libcaer_cmp", words.tobytes(), 0, True)])
+    assert (decoded.x.tolist(), decoded.y.tolist(), decoded.t_us.tolist(), decoded.polarity.tolist()) == ([9, 9], [20, 22], [5, 5], [True, True])
 
 
 @pytest.mark.parametrize(("encoding", "content", "reason"), [("evt9", b"", "'evt9' is not known"), ("evt3", b"abc", "no multiple of 2")])

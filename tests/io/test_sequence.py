@@ -122,13 +122,13 @@ def test_what_is_written_is_read(tmp_path, objects, camera):
 def test_it_has_the_layout_of_the_shared_sequences(tmp_path):
     write_sequence(tmp_path / "one.npz", **contents(1))
     write_sequence(tmp_path / "two.npz", **contents(2))
-    with np.load(tmp_path / "one.npz", allow_pickle=False) as one, np.load(tmp_path / "two.npz", allow_pickle=False) as two:
-        assert [str(one[key].dtype) for key in "txyp"] == ["int64", "uint16", "uint16", "uint8"]
-        assert one["poses"].shape == (3, 4, 4)
+    with np.load(tmp_path / "one.npz", allow_pickle=False) as first, np.load(tmp_path / "two.npz", allow_pickle=False) as two:
+        assert [str(first[key].dtype) for key in "txyp"] == ["int64", "uint16", "uint16", "uint8"]
+        assert first["poses"].shape == (3, 4, 4)
         assert two["poses"].shape == (2, 3, 4, 4)
-        assert one["pose_t"].tolist() == TIMES.tolist()
+        assert first["pose_t"].tolist() == TIMES.tolist()
         assert two["mesh_files"].tolist() == ["two_object0.ply", "two_object1.ply"]
-        assert json.loads(str(one["meta"]))["speed"] == "slow"
+        assert json.loads(str(first["meta"]))["speed"] == "slow"
 
 
 def test_textured_models_lie_beside_it(tmp_path):
@@ -230,8 +230,8 @@ def test_unsorted_events_are_found_as_they_are_streamed(written):
     with pytest.raises(EventDataError, match="time goes back"):
         list(read_sequence(path, strict=True).events.chunks())
     with pytest.warns(TorchtrackWarning, match="499 events that came late, sorted in"):
-        found = everything(read_sequence(path).events)
-    assert found.t_us.tolist() == list(range(500))
+        events = everything(read_sequence(path).events)
+    assert events.t_us.tolist() == list(range(500))
 
 
 @pytest.mark.parametrize(

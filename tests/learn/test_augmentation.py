@@ -23,13 +23,13 @@ def a_sample(count=2000):
 
 def changed(before, after):
     """Names of the fields that differ."""
-    found = set()
+    names = set()
     for name, value in vars(before).items():
         other = getattr(after, name)
         pairs = zip(tensors_of(value), tensors_of(other), strict=True) if isinstance(value, EventBatch) else [(value, other)]
         if not all(torch.equal(torch.as_tensor(a), torch.as_tensor(b)) for a, b in pairs):
-            found.add(name)
-    return found
+            names.add(name)
+    return names
 
 
 def test_flipped_polarity_is_the_other_one():

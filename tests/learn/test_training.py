@@ -30,8 +30,8 @@ def sequence(tmp_path_factory):
     return write_tiny_sequence(tmp_path_factory.mktemp("sequence"))
 
 
-def trainer(sequence, told=None, **changes):
-    return Trainer([sequence], SMALL.model_copy(update=changes), (told if told is not None else []).append)
+def trainer(sequence, lines=None, **changes):
+    return Trainer([sequence], SMALL.model_copy(update=changes), (lines if lines is not None else []).append)
 
 
 @pytest.fixture(scope="module")
@@ -54,13 +54,13 @@ def test_the_first_stage_learns_to_tell_them_apart(sequence, gathered):
 
 
 def test_the_second_stage_moves_every_weight_by_finite_steps(sequence):
-    told = []
-    training = trainer(sequence, told, pose_share=1.0)
+    lines = []
+    training = trainer(sequence, lines, pose_share=1.0)
     before = {name: value.clone() for name, value in training.network.named_parameters()}
     training.train_through_tracker(0)
     for name, value in training.network.named_parameters():
         assert torch.isfinite(value).all() and not torch.equal(value, before[name]), name
-    assert len(told) == 1 and told[0].startswith("epoch 1: labels ") and "px" in told[0]
+    assert len(lines) == 1 and lines[0].startswith("epoch 1: labels ") and "px" in lines[0]
 
 
 def test_the_same_seed_gives_the_same_weights(sequence):

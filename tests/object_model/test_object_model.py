@@ -108,8 +108,8 @@ def test_silhouette_of_every_view_is_among_the_edges():
         expected = mesh.vertices[mesh.face_adjacency_edges[visible]].mean(1)
         to_eye = torch.tensor(eye, dtype=torch.float32) - model.edge_points[:, 0]
         facing = (model.edge_normals * to_eye[:, None]).sum(-1) > 0
-        found = model.edge_points[facing[:, 0] != facing[:, 1]].mean(1).double().numpy()
-        distance = np.linalg.norm(found[:, None] - expected[None], axis=-1)
+        middles = model.edge_points[facing[:, 0] != facing[:, 1]].mean(1).double().numpy()
+        distance = np.linalg.norm(middles[:, None] - expected[None], axis=-1)
         assert distance.min(0).max() < 1e-6
         assert distance.min(1).max() < 1e-6
 

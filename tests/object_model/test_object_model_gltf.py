@@ -198,10 +198,10 @@ def test_parts_that_are_lost_are_told(tmp_path: Path):
         with_mesh[0]["extensions"] = {"KHR_node_visibility": {"visible": False}}
         tree["scenes"].append({"nodes": []})
 
-    with pytest.warns(TorchtrackWarning) as told:
+    with pytest.warns(TorchtrackWarning) as caught:
         model = ObjectModel.from_file(rewrite(tmp_path, scene, change))
     assert len(model.triangles) == 2
-    text = "\n".join(str(warning.message) for warning in told)
+    text = "\n".join(str(warning.message) for warning in caught)
     for expected in (
         "2 scenes",
         "not in its scene.*'spare'",

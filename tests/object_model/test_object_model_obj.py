@@ -77,14 +77,14 @@ def test_library_with_blanks_among_several_and_images_beside_it(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("use", "told"),
+    ("use", "message"),
     [
         ("", r"names the textures 'card\.png' \('ink'\), and no face uses them.*usemtl"),
         ("usemtl ink.001", r"uses the material 'ink\.001', which 'card\.mtl' does not define"),
     ],
 )
-def test_texture_that_no_face_uses(tmp_path: Path, use: str, told: str):
-    with pytest.warns(TorchtrackWarning, match=told):
+def test_texture_that_no_face_uses(tmp_path: Path, use: str, message: str):
+    with pytest.warns(TorchtrackWarning, match=message):
         model = ObjectModel.from_file(card(tmp_path, use=use))
     assert len(model.texture_points) == 0
 
@@ -157,7 +157,7 @@ def test_polygons(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("line", "told"),
+    ("line", "message"),
     [
         ("f 1 2 9", r'line 21 of .*\("f 1 2 9"\) names vertex 9, and the file has 8'),
         ("f 1 2 0", r"line 21 of .* names v 0, which is not there"),
@@ -169,8 +169,8 @@ def test_polygons(tmp_path: Path):
         ("v 0 0 nan\nf 1 2 9", "not finite"),
     ],
 )
-def test_damaged_lines(tmp_path: Path, line: str, told: str):
-    with pytest.raises(ModelError, match=told):
+def test_damaged_lines(tmp_path: Path, line: str, message: str):
+    with pytest.raises(ModelError, match=message):
         ObjectModel.from_file(write(tmp_path / "box.obj", "\n".join([*box_lines(), line]) + "\n"))
 
 

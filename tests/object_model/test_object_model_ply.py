@@ -136,7 +136,7 @@ def test_indices_out_of_range(tmp_path: Path, corner: int, kind: str):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "error", "told"),
+    ("old", "new", "error", "message"),
     [
         (b"element face 6", b"element face 10000000", LimitError, r"10,000,000 faces.*limits\.faces"),
         (b"element face 6", b"element face 1000000", ModelError, "declares .*1000000 of 'face'.*cut short"),
@@ -150,8 +150,8 @@ def test_indices_out_of_range(tmp_path: Path, corner: int, kind: str):
         (b"property float y", b"property float x", ModelError, "do not fit its header"),
     ],
 )
-def test_damaged_headers(tmp_path: Path, old: bytes, new: bytes, error: type[Exception], told: str):
-    with pytest.raises(error, match=told):
+def test_damaged_headers(tmp_path: Path, old: bytes, new: bytes, error: type[Exception], message: str):
+    with pytest.raises(error, match=message):
         read(tmp_path, ply(QUADS).replace(old, new))
 
 

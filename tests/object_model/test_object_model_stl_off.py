@@ -30,7 +30,7 @@ def test_stl_with_bytes_at_its_end(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("data", "told"),
+    ("data", "message"),
     [
         (STL[:-1], "declares 12 triangles, and 11 follow it: it was cut short"),
         (STL[:80] + b"\xff\xff\xff\xff" + STL[84:], "declares 4294967295 triangles, and 12 follow"),
@@ -42,8 +42,8 @@ def test_stl_with_bytes_at_its_end(tmp_path: Path):
         (STL[:84], "has no triangles|declares 12 triangles, and 0 follow"),
     ],
 )
-def test_damaged_stl(tmp_path: Path, data: bytes | str, told: str):
-    with pytest.raises(ModelError, match=rf"box\.stl'.*({told})"):
+def test_damaged_stl(tmp_path: Path, data: bytes | str, message: str):
+    with pytest.raises(ModelError, match=rf"box\.stl'.*({message})"):
         read(tmp_path, "box.stl", data)
 
 
@@ -57,7 +57,7 @@ def test_off(tmp_path: Path, start: str):
 
 
 @pytest.mark.parametrize(
-    ("data", "told"),
+    ("data", "message"),
     [
         (OFF[: len(OFF) // 2], "declares 8 vertices and 12 faces, and .* lines follow: it was cut short"),
         (OFF.replace("8 12", "8 13"), "8 vertices and 13 faces"),
@@ -71,8 +71,8 @@ def test_off(tmp_path: Path, start: str):
         (OFF.rstrip()[:-1] + "9", "outside the range"),
     ],
 )
-def test_damaged_off(tmp_path: Path, data: str, told: str):
-    with pytest.raises(ModelError, match=told):
+def test_damaged_off(tmp_path: Path, data: str, message: str):
+    with pytest.raises(ModelError, match=message):
         read(tmp_path, "box.off", data)
 
 

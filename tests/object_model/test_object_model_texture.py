@@ -109,12 +109,14 @@ def test_number_of_points_is_limited(most: int):
         assert (quadrant.mean(0) - 0.5).abs().max() < 0.15
 
 
-@pytest.mark.parametrize(("bright", "found"), [(120, True), (72, False)])
-def test_contrast_decides(bright: int, found: bool):
-    told = nullcontext() if found else pytest.warns(TorchtrackWarning, match=r"gives no edges.*differ by 0\.5 in log luminance.*texture_contrast")
-    with told:
+@pytest.mark.parametrize(("bright", "has_edges"), [(120, True), (72, False)])
+def test_contrast_decides(bright: int, has_edges: bool):
+    expected_warning = (
+        nullcontext() if has_edges else pytest.warns(TorchtrackWarning, match=r"gives no edges.*differ by 0\.5 in log luminance.*texture_contrast")
+    )
+    with expected_warning:
         model = ObjectModel.from_mesh(card(two_tone(dark=60, bright=bright)))
-    assert (len(model.texture_points) > 0) == found
+    assert (len(model.texture_points) > 0) == has_edges
     assert len(ObjectModel.from_mesh(card(two_tone(dark=60, bright=72)), settings=ModelSettings(texture_contrast=0.1)).texture_points) > 0
 
 
@@ -205,10 +207,10 @@ def test_image_edges_of_a_slanted_step():
     normal = np.array([np.cos(angle), np.sin(angle)])
     v, u = np.mgrid[:80, :80]
     distance = (u - 40) * normal[0] + (v - 40) * normal[1] - offset
-    found = image_edges(np.clip(distance + 0.5, 0, 1), blur_px=1.5, contrast=0.5)
-    inner = (np.abs(found.pixels - 40) < 30).all(1)
-    assert np.abs((found.pixels[inner] - 40) @ normal - offset).max() < 0.05
-    np.testing.assert_allclose(found.gradients[inner], np.tile(normal, (inner.sum(), 1)), atol=0.03)
+    edges = image_edges(np.clip(distance + 0.5, 0, 1), blur_px=1.5, contrast=0.5)
+    inner = (np.abs(edges.pixels - 40) < 30).all(1)
+    assert np.abs((edges.pixels[inner] - 40) @ normal - offset).max() < 0.05
+    np.testing.assert_allclose(edges.gradients[inner], np.tile(normal, (inner.sum(), 1)), atol=0.03)
 
 
 def test_thinning_keeps_both_sides_of_a_stroke():
@@ -241,8 +243,8 @@ def test_colours_of_materials():
     assert (model.texture_points[:, 0] - SIZE).abs().max() < 1e-6
 
 
-@pytest.mark.parametrize(("cells", "found"), [(100, True), (4, False)])
-def test_colours_of_vertices(cells: int, found: bool):
+@pytest.mark.parametrize(("cells", "has_edges"), [(100, True), (4, False)])
+def test_colours_of_vertices(cells: int, has_edges: bool):
     """A change between neighbouring vertices is an edge if they are near, a shade if they are far."""
     at = np.linspace(0, SIZE, cells + 1)
     grid = np.stack([*np.meshgrid(at, at, indexing="ij"), np.zeros((cells + 1, cells + 1))], -1).reshape(-1, 3)
@@ -250,8 +252,8 @@ def test_colours_of_vertices(cells: int, found: bool):
     faces = np.concatenate([np.stack([first, first + cells + 1, first + cells + 2], 1), np.stack([first, first + cells + 2, first + 1], 1)])
     grey = np.where(grid[:, 0] < 0.06 - 1e-9, 20, 230).astype(np.uint8)
     model = ObjectModel.from_mesh(trimesh.Trimesh(grid, faces, vertex_colors=np.stack([grey] * 3, 1), process=False))
-    assert (len(model.texture_points) > 0) == found
-    if found:
+    assert (len(model.texture_points) > 0) == has_edges
+    if has_edges:
         torch.testing.assert_close(model.texture_points[:, 0], torch.full((len(model.texture_points),), 0.0595), atol=1e-6, rtol=0)
         assert model.texture_points[:, 1].amin() < 0.002
         assert model.texture_points[:, 1].amax() > 0.098
@@ -260,10 +262,10 @@ def test_colours_of_vertices(cells: int, found: bool):
 @pytest.mark.parametrize(("sequence", "label"), [("book_normal", "book"), ("cube_slow", "cube"), ("three_normal", "cube")])
 def test_print_lies_on_the_events(data_dir: Path, sequence: str, label: str):
     """Texture points at the true pose lie on events of the next milliseconds, to less than a pixel."""
-    found = read_sequence(data_dir / "sequences" / f"{sequence}.npz")
-    thing = next(thing for thing in found.objects if thing.label == label)
+    sequence_read = read_sequence(data_dir / "sequences" / f"{sequence}.npz")
+    thing = next(thing for thing in sequence_read.objects if thing.label == label)
     model = ObjectModel.from_file(thing.model_path("textured"))
-    events = next(iter(found.events.chunks(max_events=120_000)))
+    events = next(iter(sequence_read.events.chunks(max_events=120_000)))
     middle = len(events.t_us) // 2
     t_us = events.t_us[middle : middle + 1]
     near = (events.t_us - t_us).abs() < 5000
@@ -271,7 +273,7 @@ def test_print_lies_on_the_events(data_dir: Path, sequence: str, label: str):
     points = transform_points(T, model.texture_points.double())
     normals = model.texture_normals.double() @ T[:3, :3].T
     front = ((normals * points).sum(-1) / points.norm(dim=-1)) < -0.3
-    pixels = (points[front] @ torch.from_numpy(found.camera.matrix).T).double()
+    pixels = (points[front] @ torch.from_numpy(sequence_read.camera.matrix).T).double()
     pixels = pixels[:, :2] / pixels[:, 2:]
     where = torch.stack([events.x[near], events.y[near]], -1).double()
     distance = torch.cdist(pixels, where).amin(1)

@@ -73,14 +73,14 @@ def test_a_step_never_waits_for_the_gpu(cuda, sync_is_an_error, scene, by_graph,
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("mode", [torch.enable_grad, torch.inference_mode], ids=["without graphs", "by graphs"])
 def test_the_gpu_finds_the_poses_of_the_cpu(cuda, scene, mode):
-    found = []
+    poses = []
     for device in (torch.device("cpu"), cuda):
         tracker, state, ready = set_up(scene, device)
         with mode():
             _, results = follow(tracker, state, ready)
         assert (len(tracker.graphs) > 0) == (device == cuda and mode is torch.inference_mode)
-        found.append(torch.stack([result.T_cam_obj.cpu() for result in results]))
-    degrees, millimetres = pose_errors(found[1], found[0])
+        poses.append(torch.stack([result.T_cam_obj.cpu() for result in results]))
+    degrees, millimetres = pose_errors(poses[1], poses[0])
     assert float(degrees.max()) < 0.02
     assert float(millimetres.max()) < 0.1
 
@@ -127,20 +127,20 @@ def test_a_cuda_graph_holds_a_steady_step(cuda, scene):
     ],
 )
 def test_what_waits_is_found(wait, mode):
-    with mode(), host_reads() as found:
+    with mode(), host_reads() as reads:
         wait(torch.ones(3))
-    assert len(found) >= 1
+    assert len(reads) >= 1
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_what_does_not_wait_is_not_found(mode):
     x, places = torch.ones(3), torch.tensor([0, 2])
-    with mode(), host_reads() as found:
+    with mode(), host_reads() as reads:
         y = torch.where(x > 0, x, 0.5).clamp(min=0)[places]
         y[0] = 2.0
         y = y.new_zeros(3).scatter_reduce(0, torch.zeros(2, dtype=torch.int64, device=y.device), y, "amax") + torch.arange(3)
         torch.linalg.cholesky_ex(torch.eye(3).repeat_interleave(1, 0))
-    assert found == []
+    assert reads == []
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -151,23 +151,23 @@ def test_a_step_reads_nothing_back(monkeypatch, scene, config):
     tracker, state, ready = set_up(scene, torch.device("cpu"), config)
     with torch.inference_mode():
         state, _ = follow(tracker, state, ready[:-1])
-        with host_reads() as found:
+        with host_reads() as reads:
             _, result = tracker.step(state, *ready[-1])
-    assert found == []
+    assert reads == []
     assert (result.status == int(Status.TRACKING)).all()
 
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_ways_of_a_gpu_lead_to_the_poses_of_the_cpu(monkeypatch, scene):
     """On the CPU: sums in the place of thin products, triangular systems, sizes that hang on no value."""
-    found = []
+    poses = []
     for as_on_gpu in (False, True):
         tracker, state, ready = set_up(scene, torch.device("cpu"))
         monkeypatch.setattr(host_sync, "on_gpu", lambda values, answer=as_on_gpu: answer)
         monkeypatch.setattr(host_sync, "read_at_once", lambda values, answer=as_on_gpu: not answer)
         _, results = follow(tracker, state, ready)
-        found.append(torch.stack([result.T_cam_obj for result in results]))
-    degrees, millimetres = pose_errors(found[1], found[0])
+        poses.append(torch.stack([result.T_cam_obj for result in results]))
+    degrees, millimetres = pose_errors(poses[1], poses[0])
     assert float(degrees.max()) < 0.02
     assert float(millimetres.max()) < 0.1
 
@@ -180,7 +180,7 @@ def test_a_steady_step_asks_for_nothing(monkeypatch, scene, model):
     tracker, state, ready = set_up(scene, torch.device("cpu"), model=model)
     with torch.inference_mode():
         state, _ = follow(tracker, state, ready[:-1])
-        monkeypatch.setattr(host_sync.Answer, "to", None)
-        with host_reads() as found:
+        monkeypatch.setattr(host_sync.AsyncValue, "to", None)
+        with host_reads() as reads:
             tracker.steady_step(state, *ready[-1])
-    assert found == []
+    assert reads == []

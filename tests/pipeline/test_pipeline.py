@@ -261,14 +261,14 @@ def test_precisions_agree_on_a_recording(lbracket):
     model, camera, truth, events, start_us = lbracket
     trackers = {dtype: Tracker([model], camera, dtype=dtype) for dtype in (torch.float64, torch.float32)}
     states = {dtype: tracker.init(truth.at(torch.tensor([start_us])), start_us) for dtype, tracker in trackers.items()}
-    found = {dtype: [] for dtype in trackers}
+    poses_by_type = {dtype: [] for dtype in trackers}
     for end_us in range(start_us + 5000, start_us + 200_001, 5000):
         window = events.slice_time(end_us - 5000, end_us)
         rounded = with_dtypes_of(states[torch.float64], states[torch.float32])
         for dtype, state in ((torch.float32, rounded), (torch.float64, states[torch.float64])):
             states[dtype], result = trackers[dtype].step(state, window, end_us)
-            found[dtype].append(result.T_cam_obj)
-    degrees, millimetres = pose_errors(torch.cat(found[torch.float32]), torch.cat(found[torch.float64]))
+            poses_by_type[dtype].append(result.T_cam_obj)
+    degrees, millimetres = pose_errors(torch.cat(poses_by_type[torch.float32]), torch.cat(poses_by_type[torch.float64]))
     assert len(degrees) == 40
     assert float(degrees.max()) < 0.02
     assert float(millimetres.max()) < 0.1

@@ -47,7 +47,7 @@ def astray(step, number, tracker, *, lost=True, by=OFF):
 
 
 @pytest.fixture(scope="module", params=[torch.float32, torch.float64], ids=["float32", "float64"])
-def one(request):
+def followed(request):
     """A tracker of one box, its steps, and its true poses."""
     trajectory, events = moving_box(pose(), COUNT)
     tracker = Tracker([box_model()], SMALL_CAMERA, preset("causal"), dtype=request.param)
@@ -69,10 +69,10 @@ def lost_for_a_while(steps, tracker, number=0):
 
 def errors_m(steps, trajectory):
     true = trajectory.at(torch.tensor([step.window.t_end_us for step in steps]))
-    found = torch.stack([step.result.T_cam_obj[0] for step in steps])
+    T_estimated = torch.stack([step.result.T_cam_obj[0] for step in steps])
     # Of a point 5 cm beside the centre, so that turns count too.
     aside = torch.tensor([0.05, 0.05, 0.05, 1.0], dtype=torch.float64)
-    return ((found - true) @ aside)[:, :3].norm(dim=-1)
+    return ((T_estimated - true) @ aside)[:, :3].norm(dim=-1)
 
 
 def retracer_of(tracker, config):
@@ -95,8 +95,8 @@ def test_a_window_in_reverse_is_one_of_the_other_end():
     assert torch.equal((20_001 - reverse.t_us).flip(0), window.events.t_us)
 
 
-def test_an_object_is_followed_back_through_where_it_was_lost(one):
-    tracker, steps, trajectory = one
+def test_an_object_is_followed_back_through_where_it_was_lost(followed):
+    tracker, steps, trajectory = followed
     with torch.inference_mode():
         after = retraced(lost_for_a_while(steps, tracker), 0, Gap(FIRST, SEEN), tracker.alone(0))
     error_m = errors_m(after, trajectory)
@@ -109,8 +109,8 @@ def test_an_object_is_followed_back_through_where_it_was_lost(one):
         assert step.result.quality[0] > 0.5
 
 
-def test_velocities_and_covariances_are_of_time_running_forwards(one):
-    tracker, steps, _ = one
+def test_velocities_and_covariances_are_of_time_running_forwards(followed):
+    tracker, steps, _ = followed
     with torch.inference_mode():
         after = retraced(lost_for_a_while(steps, tracker), 0, Gap(FIRST, SEEN), tracker.alone(0))
     torch.testing.assert_close(after[12].state.velocity, steps[12].state.velocity, rtol=0.2, atol=0.05)
@@ -121,8 +121,8 @@ def test_velocities_and_covariances_are_of_time_running_forwards(one):
     assert torch.equal(along[0], -along[1])
 
 
-def test_contours_are_those_of_the_new_pose(one):
-    tracker, steps, _ = one
+def test_contours_are_those_of_the_new_pose(followed):
+    tracker, steps, _ = followed
     with torch.inference_mode():
         step = retraced(lost_for_a_while(steps, tracker), 0, Gap(FIRST, SEEN), tracker.alone(0))[12]
     contours, mask = step.result.contours, step.result.contours.mask[0]
@@ -131,8 +131,8 @@ def test_contours_are_those_of_the_new_pose(one):
     torch.testing.assert_close(contours.points_cam[0][mask].double(), seen, rtol=0, atol=1e-5)
 
 
-def test_where_it_was_not_lost_yet_a_pose_has_to_explain_clearly_more(one):
-    tracker, steps, trajectory = one
+def test_where_it_was_not_lost_yet_a_pose_has_to_explain_clearly_more(followed):
+    tracker, steps, trajectory = followed
     strayed = [astray(step, 0, tracker, lost=False) if 4 <= at < SEEN - 4 else step for at, step in enumerate(steps)]
     with torch.inference_mode():
         after = retraced(strayed, 0, Gap(12, SEEN), tracker.alone(0))
@@ -140,8 +140,8 @@ def test_where_it_was_not_lost_yet_a_pose_has_to_explain_clearly_more(one):
     assert all(after[at] is strayed[at] for at in (0, 1, 2, 3))
 
 
-def test_what_is_hidden_is_not_followed(one):
-    tracker, steps, _ = one
+def test_what_is_hidden_is_not_followed(followed):
+    tracker, steps, _ = followed
     lost = lost_for_a_while(steps, tracker)
     hidden = [replace(step, window=replace(step.window, events=step.window.events[:0])) if 10 <= at < 15 else step for at, step in enumerate(lost)]
     with torch.inference_mode():
@@ -167,8 +167,8 @@ def test_nothing_changes_for_its_neighbour(two, number):
         assert torch.equal(ours.result.contours.pixels[other][: len(mask)][mask], theirs.result.contours.pixels[other][mask])
 
 
-def test_every_step_comes_once_and_in_order_and_the_lost_ones_with_better_poses(one):
-    tracker, steps, trajectory = one
+def test_every_step_comes_once_and_in_order_and_the_lost_ones_with_better_poses(followed):
+    tracker, steps, trajectory = followed
     retracer, lost = retracer_of(tracker, RETRACED), lost_for_a_while(steps, tracker)
     given = [(at, due) for at, step in enumerate(lost) for due in retracer.add(step)]
     waited_us = [lost[at].window.t_end_us - due.window.t_end_us for at, due in given]
@@ -181,16 +181,16 @@ def test_every_step_comes_once_and_in_order_and_the_lost_ones_with_better_poses(
     assert all(step.state.last_event_us.numel() == 0 for step in after)
 
 
-def test_an_object_that_is_never_lost_stays_as_it_was(one):
-    tracker, steps, _ = one
-    found = steps[6:]
+def test_an_object_that_is_never_lost_stays_as_it_was(followed):
+    tracker, steps, _ = followed
+    steady = steps[6:]
     retracer = retracer_of(tracker, RETRACED)
-    after = [due for step in found for due in retracer.add(step)] + retracer.rest()
-    assert all(torch.equal(ours.result.T_cam_obj, theirs.result.T_cam_obj) for ours, theirs in zip(after, found, strict=True))
+    after = [due for step in steady for due in retracer.add(step)] + retracer.rest()
+    assert all(torch.equal(ours.result.T_cam_obj, theirs.result.T_cam_obj) for ours, theirs in zip(after, steady, strict=True))
 
 
-def test_one_that_is_not_seen_well_again_stays_lost(one):
-    tracker, steps, _ = one
+def test_one_that_is_not_seen_well_again_stays_lost(followed):
+    tracker, steps, _ = followed
     lost = [astray(step, 0, tracker) if at >= FIRST else step for at, step in enumerate(steps)][6:]
     retracer = retracer_of(tracker, RETRACED)
     after = [due for step in lost for due in retracer.add(step)] + retracer.rest()
@@ -198,8 +198,8 @@ def test_one_that_is_not_seen_well_again_stays_lost(one):
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
-def test_short_runs_come_whole(one, count):
-    tracker, steps, _ = one
+def test_short_runs_come_whole(followed, count):
+    tracker, steps, _ = followed
     config = TrackerConfig(smoothing=SmoothingConfig(lag_s=0.05, retrace_s=0.5))
     objects = SmoothedObjects(tracker.centre_obj.double(), tracker.diameter_m.double(), tracker.intrinsics.double())
     assert len(list(refined_steps(iter(steps[:count]), Refinement(objects, config, tracker.alone)))) == count
@@ -221,11 +221,11 @@ def test_a_weigher_of_ones_own_judges_what_is_followed_back_too():
 
 def test_track_follows_objects_back_where_the_tracker_is_set_so():
     _, events = moving_box(pose(), 12)
-    found = {}
+    by_setting = {}
     for retrace_s in (0.0, 0.5):
         tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(smoothing=SmoothingConfig(retrace_s=retrace_s)))
-        found[retrace_s] = list(track([events], tracker, tracker.init(pose()[None], 0)))
-    times = [[int(result.t_us[0]) for result in results] for results in found.values()]
+        by_setting[retrace_s] = list(track([events], tracker, tracker.init(pose()[None], 0)))
+    times = [[int(result.t_us[0]) for result in results] for results in by_setting.values()]
     assert times[0] == times[1]
 
 

@@ -109,12 +109,12 @@ def test_a_sink_that_fails_ends_the_run_and_what_was_tracked_stays(sequence_path
     with pytest.raises(type(error)) as raised:
         run(quick(sequence_path, tmp_path / "out", preset=preset), [sink])
     assert raised.value is error and sink.closed
-    trajectory, told = read_tum(tmp_path / "out" / "trajectory_box.tum"), summary_in(tmp_path / "out")
+    trajectory, summary = read_tum(tmp_path / "out" / "trajectory_box.tum"), summary_in(tmp_path / "out")
     # What was held back to be smoothed is written too.
-    assert len(trajectory) == told["windows"] == (8 if preset == "default" else 4)
-    assert (told["ended"], told["interrupted"]) == ("failed", False)
-    assert str(error.args[-1]) in told["message"]
-    assert told["objects"]["box"]["errors"]["mean_rotation_deg"] < 1.5
+    assert len(trajectory) == summary["windows"] == (8 if preset == "default" else 4)
+    assert (summary["ended"], summary["interrupted"]) == ("failed", False)
+    assert str(error.args[-1]) in summary["message"]
+    assert summary["objects"]["box"]["errors"]["mean_rotation_deg"] < 1.5
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.yaml", "poses.csv", "summary.json", "trajectory_box.tum"]
 
@@ -137,8 +137,8 @@ def test_a_source_that_fails_leaves_what_was_tracked(sequence_path, tmp_path, mo
     with pytest.raises(type(error)) as raised:
         run(quick(sequence_path, tmp_path / "out"))
     assert raised.value is error
-    told = summary_in(tmp_path / "out")
-    assert told["ended"] == "failed" and told["windows"] == len(read_tum(tmp_path / "out" / "trajectory_box.tum")) >= 3
+    summary = summary_in(tmp_path / "out")
+    assert summary["ended"] == "failed" and summary["windows"] == len(read_tum(tmp_path / "out" / "trajectory_box.tum")) >= 3
 
 
 def test_one_of_many_that_fails_leaves_what_was_tracked_and_the_others_go_on(folder, tmp_path, monkeypatch):
@@ -351,8 +351,8 @@ def test_interrupt_ends_the_run_with_complete_outputs(sequence_path, tmp_path, n
     assert summary.interrupted
     assert signal.getsignal(number) is handler
     assert len(read_tum(tmp_path / "out" / "trajectory_box.tum")) == summary.windows == 3
-    told = summary_in(tmp_path / "out")
-    assert (told["ended"], told["interrupted"], told["message"]) == ("interrupted", True, f"ended by {number.name}")
+    summary = summary_in(tmp_path / "out")
+    assert (summary["ended"], summary["interrupted"], summary["message"]) == ("interrupted", True, f"ended by {number.name}")
 
 
 def test_a_signal_that_is_ignored_stays_ignored(sequence_path, tmp_path):

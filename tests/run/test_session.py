@@ -71,5 +71,5 @@ def test_a_clock_that_jumps_back_is_tracked_on_and_told(sequence_path, tmp_path)
         summary = run(quick(changed, tmp_path / "out"))
     assert summary.windows == expected.windows
     assert summary.problems == {"jumps back of the clock, taken out": 1}
-    told = json.loads((tmp_path / "out" / "summary.json").read_text())["clock_changes"]
-    assert told == [{"kind": "reset", "at_us": 20_001, "from_us": 20_000, "to_us": -999_979_500}]
+    changes = json.loads((tmp_path / "out" / "summary.json").read_text())["clock_changes"]
+    assert changes == [{"kind": "reset", "at_us": 20_001, "from_us": 20_000, "to_us": -999_979_500}]

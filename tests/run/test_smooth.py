@@ -104,7 +104,7 @@ def test_states_are_given_on_without_maps_which_would_fill_the_memory(both):
 def test_steps_are_held_back_for_the_lag_and_no_longer_than_twice_that(both, path):
     plain, _ = both
     session = open_session(RunConfig(source=path))
-    smoother = Smoother(SmoothedObjects.of(session.models, session.camera), TrackerConfig(smoothing=SmoothingConfig(lag_s=LAG_S)))
+    smoother = Smoother(SmoothedObjects.from_models(session.models, session.camera), TrackerConfig(smoothing=SmoothingConfig(lag_s=LAG_S)))
     waited_us = [step.window.t_end_us - due.window.t_end_us for step in plain for due in smoother.add(step)]
     assert 1e6 * LAG_S <= min(waited_us) < max(waited_us) <= 2e6 * LAG_S
     assert len(waited_us) + len(smoother.rest()) == len(plain)
@@ -117,8 +117,8 @@ def test_smoothed_poses_are_nearer_to_the_truth(both, path):
     def errors(steps):
         known = [step for step in steps if step.window.t_end_us <= int(truth.t_us[-1])]
         true = torch.stack([truth.at(torch.tensor([step.window.t_end_us]))[0] for step in known])
-        found = torch.stack([step.result.T_cam_obj[0] for step in known])
-        return [rotation_angle_deg(found[:, :3, :3], true[:, :3, :3]).mean(), (found - true)[:, :3, 3].norm(dim=-1).mean()]
+        T_estimated = torch.stack([step.result.T_cam_obj[0] for step in known])
+        return [rotation_angle_deg(T_estimated[:, :3, :3], true[:, :3, :3]).mean(), (T_estimated - true)[:, :3, 3].norm(dim=-1).mean()]
 
     (plain_deg, plain_m), (smooth_deg, smooth_m) = (errors(steps) for steps in both)
     assert smooth_deg < 0.9 * plain_deg
@@ -168,13 +168,16 @@ def test_a_run_writes_smoothed_poses(path, tmp_path):
 
 def test_track_gives_smoothed_results_where_the_tracker_is_set_so():
     _, events = moving_box(pose(), 12)
-    found = {}
+    results_by_preset = {}
     for name in ("causal", "default"):
         tracker = Tracker([box_model()], SMALL_CAMERA, preset(name))
-        found[name] = list(track([events], tracker, tracker.init(pose()[None], 0)))
-    times = [[int(result.t_us[0]) for result in results] for results in found.values()]
+        results_by_preset[name] = list(track([events], tracker, tracker.init(pose()[None], 0)))
+    times = [[int(result.t_us[0]) for result in results] for results in results_by_preset.values()]
     assert times[0] == times[1] == [5000 * number for number in range(1, 13)]
-    moved = [float((ours.T_cam_obj - theirs.T_cam_obj).abs().max()) for ours, theirs in zip(found["causal"], found["default"], strict=True)]
+    moved = [
+        float((ours.T_cam_obj - theirs.T_cam_obj).abs().max())
+        for ours, theirs in zip(results_by_preset["causal"], results_by_preset["default"], strict=True)
+    ]
     assert max(moved[:-1]) > 1e-5
     assert moved[-1] < 1e-9
 
@@ -192,11 +195,11 @@ class Camera(LiveSource):
 
 def test_a_live_source_is_never_held_back():
     _, events = moving_box(pose(), 12)
-    found = []
+    poses_of_each = []
     for name in ("causal", "default"):
         tracker = Tracker([box_model()], SMALL_CAMERA, preset(name))
-        found.append(torch.stack([result.T_cam_obj for result in track(Camera(events), tracker, tracker.init(pose()[None], 0))]))
-    assert torch.equal(*found)
+        poses_of_each.append(torch.stack([result.T_cam_obj for result in track(Camera(events), tracker, tracker.init(pose()[None], 0))]))
+    assert torch.equal(*poses_of_each)
 
 
 def test_the_followers_of_a_live_source_get_its_steps_as_they_come(path):

@@ -114,7 +114,7 @@ class Counting:
 @pytest.mark.parametrize(("fault", "message"), [({"broken_after": 2}, "time goes back"), ({"full_after": 2}, "disk of the test is full")])
 def test_a_stream_that_fails_on_its_way_leaves_and_the_others_go_on(paths, fault, message):
     followers = [Counting(paths[0], **fault), Counting(paths[2])]
-    failed, windows = follow([partial(lambda one: one, follower) for follower in followers], RunConfig(source=paths[0], preset="causal"))
+    failed, windows = follow([partial(lambda opened: opened, follower) for follower in followers], RunConfig(source=paths[0], preset="causal"))
     assert message in str(failed)
     assert (len(followers[0].steps), windows) == (2, 8)
     assert all(follower.closed for follower in followers)
@@ -125,7 +125,7 @@ def test_a_stream_that_fails_on_its_way_leaves_and_the_others_go_on(paths, fault
 
 def test_a_step_holds_its_own_stream_alone(paths):
     followers = [Counting(path) for path in paths]
-    follow([partial(lambda one: one, follower) for follower in followers], RunConfig(source=paths[0]))
+    follow([partial(lambda opened: opened, follower) for follower in followers], RunConfig(source=paths[0]))
     for follower in followers:
         step = follower.steps[0]
         objects = len(follower.session.models)
@@ -138,7 +138,7 @@ def test_a_step_holds_its_own_stream_alone(paths):
 
 def test_whoever_is_stopped_finishes_with_what_there_is(paths):
     followers = [Counting(path) for path in paths]
-    opening = [partial(lambda one: one, follower) for follower in followers]
+    opening = [partial(lambda opened: opened, follower) for follower in followers]
     assert follow(opening, RunConfig(source=paths[0], preset="causal"), lambda: len(followers[2].steps) == 2) == [2, 2, 2]
 
 
@@ -166,10 +166,10 @@ def test_runs_that_do_not_go_together_are_errors(sources, options, message, tmp_
 
 
 def test_shared_sequences_are_tracked_as_each_alone(data_dir, tmp_path):
-    found = [data_dir / "sequences" / f"{name}.npz" for name in ("ape_normal", "lbracket_normal")]
+    sources = [data_dir / "sequences" / f"{name}.npz" for name in ("ape_normal", "lbracket_normal")]
     ends_us = (40_000, 30_000)
-    configs = [quick(path, tmp_path / "together", end_us=end_us) for path, end_us in zip(found, ends_us, strict=True)]
+    configs = [quick(path, tmp_path / "together", end_us=end_us) for path, end_us in zip(sources, ends_us, strict=True)]
     assert len(dict(run_many(configs, streams=2))) == 2
-    for path, end_us in zip(found, ends_us, strict=True):
+    for path, end_us in zip(sources, ends_us, strict=True):
         run(quick(path, tmp_path / "alone", end_us=end_us))
         assert_same_runs(tmp_path / "together" / path.stem, tmp_path / "alone" / path.stem)

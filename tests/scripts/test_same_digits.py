@@ -42,18 +42,18 @@ def test_what_is_the_same_has_no_difference():
 
 
 def test_what_is_not_a_number_is_equal_to_what_is_not_a_number():
-    one = torch.tensor([1.0, torch.nan])
-    assert difference([{"quality": one}], [{"quality": one.clone()}]) is None
-    assert difference([{"quality": one}], [{"quality": torch.tensor([torch.nan, 1.0])}]) is not None
+    values = torch.tensor([1.0, torch.nan])
+    assert difference([{"quality": values}], [{"quality": values.clone()}]) is None
+    assert difference([{"quality": values}], [{"quality": torch.tensor([torch.nan, 1.0])}]) is not None
 
 
 def test_the_last_bit_of_one_number_is_a_difference():
     poses = windows()[1]["poses"].clone()
     poses[2] = torch.nextafter(poses[2], torch.tensor(torch.inf))
-    found = difference(windows(), changed(1, poses=poses))
-    assert (found.window, found.field) == (1, "poses")
-    assert "1 of 4 numbers differ, by up to 2.38e-07" in found.what
-    assert "at [2]" in found.what
+    first = difference(windows(), changed(1, poses=poses))
+    assert (first.window, first.field) == (1, "poses")
+    assert "1 of 4 numbers differ, by up to 2.38e-07" in first.what
+    assert "at [2]" in first.what
 
 
 def test_the_first_window_that_differs_is_told():

@@ -67,17 +67,17 @@ def test_suites_that_make_no_sense_are_errors(suite):
 
 def test_a_suite_runs_in_processes_tells_its_progress_and_is_taken_up_again(suite, tmp_path):
     needs_numba()
-    scenes, told = scenes_of(suite), []
+    scenes, progress = scenes_of(suite), []
     out = tmp_path / "out"
     simulate_to_file(scenes[0], out / "a.npz")
     kept = (out / "a.npz").stat().st_mtime_ns
     broken = scenes[1].model_copy(update={"name": "broken", "peak_speed": 20_000.0, "speed": 1.0})
-    failures = run_suite([*scenes, broken], out, 2, lambda name, share: told.append((name, share)))
+    failures = run_suite([*scenes, broken], out, 2, lambda name, share: progress.append((name, share)))
     assert [failure.name for failure in failures] == ["broken"]
     assert "peak_speed" in failures[0].reason
     assert sorted(path.name for path in out.glob("*.npz")) == ["a.npz", "b_calm.npz", "b_noisy.npz"]
     assert (out / "a.npz").stat().st_mtime_ns == kept
-    assert {name for name, share in told if share == 1.0} == {"a", "b_calm", "b_noisy", "broken"}
+    assert {name for name, share in progress if share == 1.0} == {"a", "b_calm", "b_noisy", "broken"}
     assert all(is_done(scene, out / f"{scene.name}.npz") for scene in scenes)
     # Other settings make another sequence; a damaged one is made again.
     assert not is_done(scenes[0].model_copy(update={"seed": 9}), out / "a.npz")

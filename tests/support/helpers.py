@@ -127,8 +127,8 @@ def edge_events(
     facing = ((normals @ T[:, None, :3, :3].transpose(-1, -2)) * ends_cam[:, :, :1]).sum(-1) < 0
     visible = facing.any(-1)
     pixels = project(ends_cam.flatten(1, 2), camera.intrinsics(torch.float64).expand(len(T), 4)).unflatten(1, (-1, 2))
-    found = [_crossings(pixels[:, edge], visible[:, edge], trajectory.t_us, camera) for edge in range(len(ends))]
-    u, v, t_us = torch.cat(found, 1)
+    crossings_of_edges = [_crossings(pixels[:, edge], visible[:, edge], trajectory.t_us, camera) for edge in range(len(ends))]
+    u, v, t_us = torch.cat(crossings_of_edges, 1)
     t_us, order = t_us.sort(stable=True)
     polarity = torch.randint(2, (len(t_us),), generator=generator(seed))
     return EventBatch.from_numpy(u[order].numpy(), v[order].numpy(), t_us.numpy(), polarity.numpy(), stream)
@@ -137,7 +137,7 @@ def edge_events(
 def _crossings(ends: Tensor, visible: Tensor, t_us: Tensor, camera: Camera) -> Tensor:
     """u, v and time ``[3, e]`` of the pixels that one projected edge, ``ends [t, 2, 2]``, passes."""
     span = (ends[:, 1] - ends[:, 0]).abs()
-    found = []
+    crossings = []
     for across, size in ((0, camera.height), (1, camera.width)):
         steep = visible & (span[:, 1 - across] > span[:, across])
         lines = torch.arange(size, dtype=torch.float64)
@@ -151,8 +151,8 @@ def _crossings(ends: Tensor, visible: Tensor, t_us: Tensor, camera: Camera) -> T
         at = torch.maximum(before, after).floor()
         time = t_us[step] + (t_us[step + 1] - t_us[step]) * (at - before) / (after - before)
         pixel = [at.long(), line] if across == 0 else [line, at.long()]
-        found.append(torch.stack([*pixel, time.ceil().long()]))
-    u, v, _ = every = torch.cat(found, 1)
+        crossings.append(torch.stack([*pixel, time.ceil().long()]))
+    u, v, _ = every = torch.cat(crossings, 1)
     return every[:, (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)]
 
 

@@ -20,16 +20,16 @@ _CHECKED = ("_linalg_check_errors", "linalg_cholesky", "linalg_solve", "linalg_i
 class _Watch(TorchDispatchMode):
     """Notes the line of the package that asked for each operation that waits."""
 
-    def __init__(self, found: list[str]) -> None:
+    def __init__(self, places: list[str]) -> None:
         super().__init__()
-        self.found = found
+        self.places = places
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = func._schema.name.removeprefix("aten::")
         made_here = name == "lift_fresh" and args[0].dim() > 0
         counted = name == "repeat_interleave" and func._overloadname in ("Tensor", "self_Tensor")
         if name in _READS + _CHECKED or made_here or counted or (name.startswith("index") and _by_mask(args)):
-            _note(self.found, name)
+            _note(self.places, name)
         return func(*args, **(kwargs or {}))
 
 
@@ -38,11 +38,11 @@ def _by_mask(args) -> bool:
     return any(torch.is_tensor(index) and index.dtype == torch.bool for index in indices)
 
 
-def _note(found: list[str], name: str) -> None:
+def _note(places: list[str], name: str) -> None:
     """Note an operation, unless it looks at what was asked for early."""
     place = _place(name)
     if not place.startswith("core/host_sync.py"):
-        found.append(place)
+        places.append(place)
 
 
 def _place(name: str) -> str:
@@ -57,16 +57,16 @@ def _place(name: str) -> str:
 @contextmanager
 def host_reads() -> Iterator[list[str]]:
     """The places that would wait, while it is open."""
-    found: list[str] = []
+    places: list[str] = []
     to_list = torch.Tensor.tolist
 
     def noted(tensor: torch.Tensor):
-        _note(found, "tolist")
+        _note(places, "tolist")
         return to_list(tensor)
 
     torch.Tensor.tolist = noted
     try:
-        with _Watch(found):
-            yield found
+        with _Watch(places):
+            yield places
     finally:
         torch.Tensor.tolist = to_list

@@ -90,8 +90,10 @@ def in_motion(config=None, displaced=None, dtype=torch.float32):
     tight = gate_widening(torch.zeros(1, dtype=dtype), tracker.config)
     index = index_for(contours, tracker.image_size, tracker.config, tight)
     observations = select_events(seen, index, prediction.moving(compensated=True), 1000)
-    found = judge_fit(prediction, align(prediction, contours, index, tight, observations, tracker.config), tracker.config, torch.ones(1, dtype=dtype))
-    return tracker, prediction, seen, found, trajectory.at(torch.tensor([end_us]))
+    scored = judge_fit(
+        prediction, align(prediction, contours, index, tight, observations, tracker.config), tracker.config, torch.ones(1, dtype=dtype)
+    )
+    return tracker, prediction, seen, scored, trajectory.at(torch.tensor([end_us]))
 
 
 def tracker_of(count=1, **kwargs):

@@ -36,9 +36,11 @@ def measure(setup: Setup) -> Report:
                 return estimate_flow(corners, newest_us, t_us, stream, ideal, FlowConfig())
 
         results.append(time_result(name, setup.clock.seconds(estimate, setup.repeats)))
-        found = estimate()
-        error = (found.flow - true_flow).norm(dim=-1)[found.has_flow] / _SPEED_PX_S
-        notes.append(f"{name}: {float(found.has_flow.float().mean()):.0%} have a flow, median error {float(error.median()):.1%} of the speed")
+        estimate_of_flow = estimate()
+        error = (estimate_of_flow.flow - true_flow).norm(dim=-1)[estimate_of_flow.has_flow] / _SPEED_PX_S
+        notes.append(
+            f"{name}: {float(estimate_of_flow.has_flow.float().mean()):.0%} have a flow, median error {float(error.median()):.1%} of the speed"
+        )
     return Report("flow", f"Flow of corners; {setup.clock.meaning}", tuple(results), tuple(notes))
 
 

@@ -159,11 +159,11 @@ def older_medians(path: Path, part: str) -> dict[str, float]:
         raise MissingFileError(f"there is no '{file}' to compare with. Give a bench_{part}.json that `torchtrack bench {part}` wrote, or its folder.")
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        found, medians = content["part"], {entry["name"]: float(entry["quartiles"][1]) for entry in content["results"]}
+        part_in_file, medians = content["part"], {entry["name"]: float(entry["quartiles"][1]) for entry in content["results"]}
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise ConfigError(f"'{file}' is not a file that `torchtrack bench {part}` wrote ({error!r}). Give its bench_{part}.json.") from error
-    if found != part:
-        raise ConfigError(f"'{file}' holds figures of the part '{found}', and '{part}' is measured. Give a bench_{part}.json.")
+    if part_in_file != part:
+        raise ConfigError(f"'{file}' holds figures of the part '{part_in_file}', and '{part}' is measured. Give a bench_{part}.json.")
     return medians
 
 

@@ -24,11 +24,11 @@ def measure(setup: Setup) -> Report:
     Raises:
         MissingExtraError: if the simulator's libraries are not installed.
     """
-    many, one = simulated(shapes_of(OBJECTS[-1]), COLUMNS, HD), simulated(STREAM_SHAPES)
+    many, single = simulated(shapes_of(OBJECTS[-1]), COLUMNS, HD), simulated(STREAM_SHAPES)
     objects = [_of_run(setup, f"{count} objects in one stream", many.first(count), 1) for count in OBJECTS]
-    streams = [_of_run(setup, f"{count} streams of one object", one, count) for count in STREAMS]
+    streams = [_of_run(setup, f"{count} streams of one object", single, count) for count in STREAMS]
     results = [result for result, _ in (*objects, *streams)]
-    growth = [_growth(name, counts, found) for name, counts, found in (("objects", OBJECTS, objects), ("streams", STREAMS, streams))]
+    growth = [_growth(name, counts, runs) for name, counts, runs in (("objects", OBJECTS, objects), ("streams", STREAMS, streams))]
     title = f"Growth of a step with objects ({HD[0]}x{HD[1]}) and with streams (640x480), preset default; {setup.clock.meaning}"
     return Report("scaling", title, (*results, *growth), tuple(note for _, note in (*objects, *streams)), tuple(_plots(objects, streams)))
 
@@ -43,10 +43,10 @@ def _of_run(setup: Setup, name: str, scene: Scene, streams: int) -> tuple[Result
     return time_result(name, medians), f"{name}: {quality}"
 
 
-def _growth(name: str, counts: tuple[int, ...], found: list[tuple[Result, str]]) -> Result:
+def _growth(name: str, counts: tuple[int, ...], runs: list[tuple[Result, str]]) -> Result:
     """What the last doubling costs over what one object costs alone, each: at most 1 where the cost is linear at most."""
-    one, half, all_of_them = (np.array(found[place][0].figures) for place in (0, -2, -1))
-    ratios = (all_of_them - half) / (counts[-1] - counts[-2]) / (one / counts[0])
+    first, half, all_of_them = (np.array(runs[place][0].figures) for place in (0, -2, -1))
+    ratios = (all_of_them - half) / (counts[-1] - counts[-2]) / (first / counts[0])
     return Result(f"a further one of {counts[-1]} {name} over the first", "times", tuple(ratios.tolist()), 1.0, lower_is_better=True)
 
 

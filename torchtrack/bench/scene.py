@@ -207,15 +207,15 @@ class Run:
 
     def latencies(self, clock: Clock, on_step: Callable[[StepResult], None] | None = None) -> list[float]:
         """Time of each step (s)."""
-        state, found = self.state, []
+        state, seconds = self.state, []
         with torch.inference_mode():
             for events, end_us in self.windows:
                 begun = clock.now()
                 state, result = self.tracker.step(state, events, end_us)
-                found.append(clock.now() - begun)
+                seconds.append(clock.now() - begun)
                 if on_step is not None:
                     on_step(result)
-        return found
+        return seconds
 
     def quality(self, clock: Clock) -> str:
         """How well it tracked, in words."""
@@ -235,8 +235,8 @@ class Run:
         true = [truth.at(result.t_us[:1].cpu())[0] for truth in self.truth if truth is not None]
         if not known:
             return torch.zeros(0, 2)
-        found, expected = result.T_cam_obj[known].cpu(), torch.stack(true)
-        return torch.stack([rotation_angle_deg(found[:, :3, :3], expected[:, :3, :3]), 1e3 * (found - expected)[:, :3, 3].norm(dim=-1)], -1)
+        estimated, expected = result.T_cam_obj[known].cpu(), torch.stack(true)
+        return torch.stack([rotation_angle_deg(estimated[:, :3, :3], expected[:, :3, :3]), 1e3 * (estimated - expected)[:, :3, 3].norm(dim=-1)], -1)
 
 
 def started(

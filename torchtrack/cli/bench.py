@@ -79,9 +79,9 @@ def _check(compare: Path | None, part: str, setup: Setup) -> None:
 def _measured(part: str, setup: Setup) -> Report:
     """The report of a part."""
     with Console(stderr=True).status(f"measuring {part}") as status:
-        told = replace(setup, show=lambda name: status.update(f"measuring {part}: {name}"))
+        setup_of_part = replace(setup, show=lambda name: status.update(f"measuring {part}: {name}"))
         # Only what is measured is loaded.
-        report: Report = import_module(f"torchtrack.bench.{part}").measure(told)
+        report: Report = import_module(f"torchtrack.bench.{part}").measure(setup_of_part)
     return report
 
 

@@ -54,8 +54,13 @@ def show_latency(paths: Sequence[str]) -> int:
     """Show how late the events of sequences are against their ground truth; returns the exit code."""
     table = Table("sequence", "latency (µs)", "± (µs)", "lag (px)", "distance before → after (px)", header_style="bold")
     for path in find_sequences([Path(text) for text in paths]):
-        found = estimate_latency(open_session(RunConfig(source=path)))
-        row = (f"{found.latency_us:.0f}", f"{found.deviation_us:.0f}", f"{found.lag_px:.2f}", f"{found.before_px:.2f} → {found.after_px:.2f}")
+        latency = estimate_latency(open_session(RunConfig(source=path)))
+        row = (
+            f"{latency.latency_us:.0f}",
+            f"{latency.deviation_us:.0f}",
+            f"{latency.lag_px:.2f}",
+            f"{latency.before_px:.2f} → {latency.after_px:.2f}",
+        )
         table.add_row(path.stem, *row)
     console = output_console()
     console.print(table)

@@ -32,7 +32,7 @@ def _type_name(annotation: Any) -> str:
     if origin is Literal:
         return " | ".join(inner)
     if origin in (Union, UnionType):
-        return " | ".join(_type_name(one) for one in inner)
+        return " | ".join(_type_name(member) for member in inner)
     if origin is tuple:
         return "list"
     return _PLAIN_NAMES.get(annotation, getattr(annotation, "__name__", str(annotation)))

@@ -15,10 +15,10 @@ _MOST_TOLD, _LONGEST_TOLD = 50, 200
 def explained(error: ValidationError, settings: type[BaseModel], file: str | None, from_command_line: Collection[str] = ()) -> str:
     """All mistakes, one a line: dotted key, what is wrong, what was got, and what was perhaps meant."""
     mistakes = error.errors()
-    told = [_line(details, settings, from_command_line) for details in mistakes[:_MOST_TOLD]]
+    shown = [_line(details, settings, from_command_line) for details in mistakes[:_MOST_TOLD]]
     count = "1 setting is wrong" if len(mistakes) == 1 else f"{len(mistakes)} settings are wrong"
-    more = [f"and {len(mistakes) - len(told)} more"] if len(mistakes) > len(told) else []
-    return f"{file or 'command line'}: {count}\n" + "\n".join(f"  {line}" for line in (*told, *more))
+    more = [f"and {len(mistakes) - len(shown)} more"] if len(mistakes) > len(shown) else []
+    return f"{file or 'command line'}: {count}\n" + "\n".join(f"  {line}" for line in (*shown, *more))
 
 
 def _line(details: ErrorDetails, settings: type[BaseModel], from_command_line: Collection[str]) -> str:

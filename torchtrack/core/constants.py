@@ -47,7 +47,7 @@ def _cells(radius: float | int) -> Numbers:
     return tuple((column, row) for row in steps for column in steps if row**2 + column**2 <= radius**2)
 
 
-def one(like: Tensor) -> Tensor:
+def scalar_one(like: Tensor) -> Tensor:
     """A single 1 of the type and on the device of ``like``: what is added to a tensor takes a third of what a Python number does."""
     return constant((1.0,), like.dtype, like.device)
 

@@ -29,10 +29,10 @@ def check_is_file(path: Path, what: str) -> None:
     if is_file(path):
         return
     try:
-        found = path.exists()
+        exists = path.exists()
     except OSError as error:
         raise MissingFileError(f"{what} '{path}' cannot be opened: {error.strerror}. Check the path.") from error
-    if found:
+    if exists:
         raise MissingFileError(f"{what} '{path}' is {'a folder' if path.is_dir() else 'a pipe or a device'}, and not a file. Check the path.")
     raise MissingFileError(f"{what} '{path}' does not exist. Check the path.")
 

@@ -1,14 +1,14 @@
-"""Values that are read back from a GPU, which make the CPU wait for it, and how the tracker goes without.
+"""Values that the CPU reads back from a GPU, and how the tracker avoids to wait for them.
 
 On the CPU a value is there once it is computed: sizes are exact, and a decision is taken where it comes up. A GPU works off
-a queue, and to read a value from it is to wait until the queue is empty, with nothing new in it. There, sizes are bounds
-that the settings and the image give, and what must be decided is asked for early (:class:`Answer`): its copy is begun in
-the middle of a window's work, and looked at once much more has been queued behind it. One is not: whether to search hangs
-on what the window's own alignment explains, and there the queue runs dry once.
+a queue. To read a value, the CPU waits until the queue is empty, and queues nothing meanwhile. So on a GPU, sizes are bounds
+that the settings and the image give, and a value that a decision needs is requested early (:class:`AsyncValue`): its copy
+begins in the middle of a window's work, and the CPU looks at it after it has queued much more. One value comes late: whether
+to search depends on what the window's own alignment explains. There the queue runs empty once a window.
 
 So the CPU is never a whole window ahead, and every decision is the one that the CPU takes. The flag of the window before
-would be there already, but objects would be searched for a window late. To ``torch.cuda.set_sync_debug_mode`` an answer is
-no synchronisation: it reports what waits for all that is queued.
+would be there already, but objects would be searched for a window late. ``torch.cuda.set_sync_debug_mode`` does not report
+an :class:`AsyncValue`: it reports what waits for all that is queued.
 """
 
 from dataclasses import dataclass
@@ -37,8 +37,8 @@ def none_of(values: Tensor) -> bool:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """Values that the CPU has, or that are on their way to it, where decisions are taken.
+class AsyncValue:
+    """Values that the CPU has, or that are on their way to it.
 
     Args:
         on_device: the values.
@@ -51,7 +51,7 @@ class Answer:
     arrived: torch.cuda.Event | None = None
 
     @classmethod
-    def to(cls, values: Tensor) -> "Answer":
+    def to(cls, values: Tensor) -> "AsyncValue":
         """Begin to copy values; from the CPU they need not be."""
         values = values.detach()
         if values.device.type != "cuda":
@@ -62,7 +62,7 @@ class Answer:
         return cls(values, copy, arrived)
 
     @classmethod
-    def of(cls, number: int, like: Tensor) -> "Answer":
+    def known(cls, number: int, like: Tensor) -> "AsyncValue":
         """One number for each of some values, known without a look at them."""
         return cls(torch.full_like(like, number), [number] * like.numel())
 
@@ -77,28 +77,28 @@ class Answer:
         return self.copy.tolist() if torch.is_tensor(self.copy) else self.copy
 
 
-class Questions:
-    """How a step asks for what it has to decide."""
+class HostReads:
+    """How a step requests the values that its decisions need."""
 
-    def ask(self, values: Tensor, usual: int) -> Answer:
-        """Begin to ask for values, which in a steady window are all ``usual``."""
-        return Answer.to(values)
+    def ask(self, values: Tensor, usual: int) -> AsyncValue:
+        """Begin to copy values, which in a steady window are all ``usual``."""
+        return AsyncValue.to(values)
 
     def none_of(self, values: Tensor) -> bool:
-        """Whether it is certain that no value is true, as in a steady window; on a GPU it never is, as it would take a wait."""
+        """Whether it is certain that no value is true, as in a steady window. On a GPU it is never certain: the CPU would have to wait."""
         return none_of(values)
 
 
-class Assumptions(Questions):
-    """All is taken to be as usual, where nothing can be asked for: within a CUDA graph."""
+class SteadyState(HostReads):
+    """Takes every value to be the usual one. A CUDA graph needs this: within it, nothing can be read."""
 
     def __init__(self) -> None:
         self._wrong: list[Tensor] = []
 
-    def ask(self, values: Tensor, usual: int) -> Answer:
-        """The usual answer; whether it is the right one is noted."""
+    def ask(self, values: Tensor, usual: int) -> AsyncValue:
+        """The usual value; whether it is the true one is noted."""
         self._wrong.append((values.detach() != usual).any())
-        return Answer.of(usual, values)
+        return AsyncValue.known(usual, values)
 
     def none_of(self, values: Tensor) -> bool:
         """As usual: none."""
@@ -106,5 +106,5 @@ class Assumptions(Questions):
         return True
 
     def wrong(self) -> Tensor:
-        """Whether any answer so far was not the right one."""
+        """Whether any value so far was not the usual one."""
         return torch.stack(self._wrong).any()

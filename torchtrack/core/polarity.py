@@ -45,6 +45,6 @@ def brighter(values: np.ndarray, source: str = "events", advice: Callable[[np.nd
 
 def shown_values(values: np.ndarray) -> str:
     """The values that there are, for a message."""
-    found = np.unique(values)
-    text = [f"{value:g}" for value in found[:_MOST_SHOWN].tolist()]
-    return ", ".join(text) + ", …" if len(found) > _MOST_SHOWN else " and ".join([", ".join(text[:-1]), text[-1]] if len(text) > 1 else text)
+    distinct = np.unique(values)
+    text = [f"{value:g}" for value in distinct[:_MOST_SHOWN].tolist()]
+    return ", ".join(text) + ", …" if len(distinct) > _MOST_SHOWN else " and ".join([", ".join(text[:-1]), text[-1]] if len(text) > 1 else text)

@@ -39,8 +39,8 @@ class LimitedLoader(yaml.SafeLoader):
         self._count(1, event)
         self._depth += 1
         if self._depth > self._limits.text_depth:
-            told = f"nested more than {self._limits.text_depth} levels deep; the setting limits.text_depth raises this"
-            raise yaml.composer.ComposerError(None, None, told, event.start_mark)
+            message = f"nested more than {self._limits.text_depth} levels deep; the setting limits.text_depth raises this"
+            raise yaml.composer.ComposerError(None, None, message, event.start_mark)
         node = super().compose_node(parent, index)
         self._depth -= 1
         if node is not None:
@@ -50,8 +50,8 @@ class LimitedLoader(yaml.SafeLoader):
     def _count(self, values: int, event: Any) -> None:
         self._values += values
         if self._values > self._limits.text_nodes:
-            told = f"more than {self._limits.text_nodes} values, with aliases written out; the setting limits.text_nodes raises this"
-            raise yaml.composer.ComposerError(None, None, told, event.start_mark)
+            message = f"more than {self._limits.text_nodes} values, with aliases written out; the setting limits.text_nodes raises this"
+            raise yaml.composer.ComposerError(None, None, message, event.start_mark)
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """What a node stands for.
@@ -65,8 +65,8 @@ class LimitedLoader(yaml.SafeLoader):
             kind = node.tag.rpartition(":")[2]
             # What cannot be encoded could not be shown either.
             shown = str(node.value)[:60].encode("utf-8", "replace").decode()
-            told = f"'{shown}' is no {kind} ({error}); put text in quotes"
-            raise yaml.constructor.ConstructorError(None, None, told, node.start_mark) from error
+            message = f"'{shown}' is no {kind} ({error}); put text in quotes"
+            raise yaml.constructor.ConstructorError(None, None, message, node.start_mark) from error
 
     # The library hands on what is no mapping too, and says so itself.
     def construct_mapping(self, node: yaml.MappingNode | Any, deep: bool = False) -> dict[Hashable, Any]:

@@ -54,10 +54,10 @@ def _overall(results: Sequence[ObjectResult]) -> _Overall | None:
         return None
     metrics = [result.metrics for result in results]
     return _Overall(
-        fmean(one.mean_rotation_deg for one in metrics),
-        10 * fmean(one.mean_translation_cm for one in metrics),
-        fmean(one.lost_fraction for one in metrics),
-        max(max(one.peak_rotation, one.peak_translation) for one in metrics),
+        fmean(entry.mean_rotation_deg for entry in metrics),
+        10 * fmean(entry.mean_translation_cm for entry in metrics),
+        fmean(entry.lost_fraction for entry in metrics),
+        max(max(entry.peak_rotation, entry.peak_translation) for entry in metrics),
         fmean(result.median_step_ms for result in results),
     )
 

@@ -64,10 +64,10 @@ def plan(config: EvaluateConfig, simulating: Told = lambda name, share: None) ->
     """
     check_cells(config.cells)
     check_writable(config.output / "metrics.json")
-    found = find_sequences(config.paths) if config.paths or not config.cells else []
+    searched = find_sequences(config.paths) if config.paths or not config.cells else []
     cells, failures = cell_sequences(config.cells, config.cache, config.jobs, simulating, config.executor)
     failed = {failure.sequence for failure in failures}
-    paths = dict.fromkeys([*found, *(path for path in cells.values() if path.stem not in failed)])
+    paths = dict.fromkeys([*searched, *(path for path in cells.values() if path.stem not in failed)])
     jobs = [Job(path, label, _run_config(path, method, config)) for path in paths for label, method in config.methods.items()]
     return Plan(tuple(jobs), cells, failures)
 
@@ -183,7 +183,7 @@ class _Measurement:
     def finish(self) -> list[ObjectResult | NotApplicable]:
         """What was measured of each object."""
         by_label = zip(self.session.labels, self._record.objects, strict=True)
-        return [*(self._result(label, of, of.errors) for label, of in by_label if of.errors is not None), *self._left_out]
+        return [*(self._result(label, record, record.errors) for label, record in by_label if record.errors is not None), *self._left_out]
 
     def close(self, error: BaseException | None = None) -> None:
         """Nothing is open."""

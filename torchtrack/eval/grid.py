@@ -124,7 +124,7 @@ def _rules(row: Sequence[Cell]) -> str:
 
 
 def _escaped(text: str) -> str:
-    return re.sub("|".join(map(re.escape, _LATEX)), lambda found: _LATEX[found.group()], text)
+    return re.sub("|".join(map(re.escape, _LATEX)), lambda match: _LATEX[match.group()], text)
 
 
 def _csv(records: Sequence[Mapping[str, Any]]) -> str:

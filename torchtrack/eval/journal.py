@@ -28,8 +28,8 @@ def identity(path: Path, method: str, config: RunConfig) -> str:
     """
     there = path.stat() if path.exists() else None
     file = (str(path.resolve()), there and there.st_size, there and there.st_mtime_ns)
-    told = json.dumps([file, method, config.model_dump(mode="json"), torchtrack.__version__], sort_keys=True)
-    return hashlib.sha256(told.encode()).hexdigest()
+    text = json.dumps([file, method, config.model_dump(mode="json"), torchtrack.__version__], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 class Journal:
@@ -77,8 +77,8 @@ class Journal:
 
     def _measurement(self, number: int, line: bytes) -> tuple[str, Measured]:
         try:
-            told = json.loads(line)
-            return told["identity"], [self._entry(values) for values in told["measured"]]
+            content = json.loads(line)
+            return content["identity"], [self._entry(values) for values in content["measured"]]
         except (ValueError, KeyError, TypeError) as error:
             raise UnknownFormatError(
                 f"line {number} of '{self._path}' is not a measurement that this version of torchtrack writes: "

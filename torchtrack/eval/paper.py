@@ -122,11 +122,11 @@ def paper_report(evaluation: Evaluation, cells: Mapping[str, CellConfig], paths:
 
 def _measured(evaluation: Evaluation, method: str, sequence: str, label: str | None) -> _Entry:
     """Our figure for a cell: that of the object named, else of the first."""
-    found: list[ObjectResult] = [result for result in evaluation.results if (result.method, result.sequence) == (method, sequence)]
-    found = [result for result in found if label in (None, result.object)]
+    results: list[ObjectResult] = [result for result in evaluation.results if (result.method, result.sequence) == (method, sequence)]
+    results = [result for result in results if label in (None, result.object)]
     unfit = [entry for entry in evaluation.not_applicable if (entry.method, entry.sequence) == (method, sequence) and label in (None, entry.object)]
-    if found:
-        metrics = found[0].metrics
+    if results:
+        metrics = results[0].metrics
         return _Entry(metrics.mean_rotation_deg, metrics.mean_translation_cm, metrics.lost_fraction)
     return _Entry(text="-" if unfit else "failed")
 

@@ -24,7 +24,7 @@ def find_sequences(paths: Sequence[Path]) -> list[Path]:
     """
     if not paths:
         raise ConfigError("paths: nothing to evaluate. Name sequences (.npz or .h5), or folders of them.")
-    found: dict[Path, None] = {}
+    sequences: dict[Path, None] = {}
     for path in paths:
         if not path.exists():
             raise MissingFileError(f"no sequence or folder at {path}. Check the path.")
@@ -33,8 +33,8 @@ def find_sequences(paths: Sequence[Path]) -> list[Path]:
             inside = [file for file in sorted(path.iterdir()) if file.suffix == ".npz" or (file.suffix == ".h5" and is_sequence(file))]
         if not inside:
             raise MissingFileError(f"the folder {path} holds no sequence (.npz or .h5). Check the path.")
-        found.update(dict.fromkeys(inside))
-    return list(found)
+        sequences.update(dict.fromkeys(inside))
+    return list(sequences)
 
 
 def cell_sequences(

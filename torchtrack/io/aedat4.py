@@ -93,7 +93,7 @@ class Aedat4File(EventFile):
                     table = root_table(content, prefixed=True)
                     start, count = vector(content, field_offset(content, table, 0), _EVENT.itemsize)
                 except EventDataError as error:
-                    self.problems.found(Problem.DAMAGED, 1, f"a packet of events is damaged ({error}). Copy it again.")
+                    self.problems.record(Problem.DAMAGED, 1, f"a packet of events is damaged ({error}). Copy it again.")
                     continue
                 waiting.append(content[start : start + count * _EVENT.itemsize])
                 if sum(map(len, waiting)) >= _FEWEST_BYTES:
@@ -109,7 +109,7 @@ class Aedat4File(EventFile):
             head = stream.read(8)
             stream_id, size = int.from_bytes(head[:4], "little", signed=True), int.from_bytes(head[4:], "little", signed=True)
             if len(head) < 8 or not 0 <= size <= _LARGEST_PACKET or stream.tell() + size > size_now:
-                self.problems.found(Problem.DAMAGED, 1, f"it ends within a packet at byte {stream.tell()}, or is damaged there. Copy it again.")
+                self.problems.record(Problem.DAMAGED, 1, f"it ends within a packet at byte {stream.tell()}, or is damaged there. Copy it again.")
                 return
             if stream_id == self.stream_id:
                 yield stream.read(size)
@@ -124,7 +124,7 @@ def _events(parts: list[bytes]) -> Columns:
 
 def _event_streams(description: str) -> dict[str, tuple[int, int | None, int | None]]:
     """Number, width and height of each stream of events, by the camera it is from; by its number where that does not tell them apart."""
-    found: list[tuple[str, tuple[int, int | None, int | None]]] = []
+    named_streams: list[tuple[str, tuple[int, int | None, int | None]]] = []
     starts = list(_NODE.finditer(description))
     ends = [match.start() for match in starts[1:]] + [len(description)]
     # Of no node there is still an end.
@@ -134,9 +134,9 @@ def _event_streams(description: str) -> dict[str, tuple[int, int | None, int | N
             sizes = [re.search(rf'key="size{axis}" type="int">(\d{{1,5}})<', content) for axis in "XY"]
             width, height = (int(size[1]) if size else None for size in sizes)
             camera = re.search(r'key="source" type="string">([^<]+)<', content)
-            found.append((camera[1] if camera else number, (int(number), width, height)))
-    distinct = len({name for name, _ in found}) == len(found)
-    return {name if distinct else str(stream[0]): stream for name, stream in found}
+            named_streams.append((camera[1] if camera else number, (int(number), width, height)))
+    distinct = len({name for name, _ in named_streams}) == len(named_streams)
+    return {name if distinct else str(stream[0]): stream for name, stream in named_streams}
 
 
 def _whole(content: bytes) -> bytes:

@@ -21,8 +21,8 @@ def cameras_of(content: Mapping[str, Any]) -> dict[str, Camera]:
     if isinstance(basalt, Mapping) and isinstance(basalt.get("intrinsics"), list):
         return _of_basalt(basalt)
     named = content.get("intrinsics")
-    if isinstance(named, Mapping) and (found := _mappings(named)):
-        return found
+    if isinstance(named, Mapping) and (cameras_in_it := _mappings(named)):
+        return cameras_in_it
     if chain := {name: camera for name, camera in _mappings(content).items() if "intrinsics" in camera}:
         return chain
     stereo = [number for number in ("1", "2") if f"M{number}" in content]
@@ -58,11 +58,11 @@ def chosen(cameras: dict[str, Camera], given: Given) -> tuple[str, Camera]:
     """
     listed = ", ".join(f"'{name}'{_shown(camera)}" for name, camera in cameras.items())
     if given.name is not None:
-        found = [name for name, camera in cameras.items() if given.name in (name, *_topics(camera))]
-        if len(found) != 1:
-            told = "several have it" if found else f"there are {listed}" if any(cameras) else "the file holds one, which has no such name"
-            raise CalibrationError(f"camera.name: '{given.name}' is no camera of this file; {told}.")
-        return found[0], cameras[found[0]]
+        matches = [name for name, camera in cameras.items() if given.name in (name, *_topics(camera))]
+        if len(matches) != 1:
+            explanation = "several have it" if matches else f"there are {listed}" if any(cameras) else "the file holds one, which has no such name"
+            raise CalibrationError(f"camera.name: '{given.name}' is no camera of this file; {explanation}.")
+        return matches[0], cameras[matches[0]]
     if len(cameras) == 1:
         return next(iter(cameras.items()))
     fitting = [name for name in sorted(cameras) if _has_size(cameras[name], given)]

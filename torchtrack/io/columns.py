@@ -37,7 +37,7 @@ class Columns:
         return cls(np.zeros(0, np.int64), pixels, pixels, np.zeros(0, bool))
 
     @classmethod
-    def of(cls, events: EventBatch) -> "Columns":
+    def from_batch(cls, events: EventBatch) -> "Columns":
         """The events of a batch of one stream."""
         return cls(events.t_us.numpy(), events.x.numpy(), events.y.numpy(), events.polarity.numpy())
 

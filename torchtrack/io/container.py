@@ -87,16 +87,16 @@ def _check_arrays(file: h5py.File, path: Path) -> None:
     """Refuse arrays beside the events that are in other files, or too large to be read whole."""
     for part in _PARTS & set(file):
         check_link(file, part, path)
-        found = [file[part]]
-        while found:
-            place = found.pop()
+        unvisited = [file[part]]
+        while unvisited:
+            place = unvisited.pop()
             if isinstance(place, h5py.Dataset):
                 check_whole(place, path)
                 continue
             for name in place:
                 check_link(place, name, path)
                 if not isinstance(place.get(name, getlink=True), h5py.SoftLink):
-                    found.append(place[name])
+                    unvisited.append(place[name])
 
 
 def _extra(array: h5py.Dataset) -> np.ndarray:

@@ -94,7 +94,7 @@ class CsvFile(TextFile):
                 rows.append(self._row(words))
             except ValueError as error:
                 if not is_names(line):
-                    self.problems.found(Problem.MALFORMED, 1, f"line {number}: expected t, x, y and polarity, got '{line[:80]}': {error}.")
+                    self.problems.record(Problem.MALFORMED, 1, f"line {number}: expected t, x, y and polarity, got '{line[:80]}': {error}.")
         return Columns(*np.array(rows, dtype=np.int64).reshape(-1, 4).T)
 
     def _row(self, words: list[str]) -> tuple[int, int, int, int]:

@@ -66,7 +66,7 @@ class DavisTextEvents(TextFile):
 
     def _read(self, max_events: int) -> Iterator[Columns]:
         line_number = 1
-        words = _Words.of(self.choices, self.unit)
+        words = _Words.from_choices(self.choices, self.unit)
         with self._stream() as stream:
             for block in _blocks(stream, self.path):
                 # One batch a block, however small the pieces were: those who cut windows pay for every batch.
@@ -82,7 +82,7 @@ class _Words:
     any_polarity: bool = False
 
     @classmethod
-    def of(cls, choices: ReadingConfig, unit: TimeUnit) -> "_Words":
+    def from_choices(cls, choices: ReadingConfig, unit: TimeUnit) -> "_Words":
         """As the user chooses."""
         return cls(unit, isinstance(choices.polarity, int))
 
@@ -105,7 +105,7 @@ def _unit(head: bytes, choices: ReadingConfig, problems: Problems) -> TimeUnit:
         words = line.partition(b"#")[0].split()
         if words:
             if not times:
-                _parse_line_of(line, number, _Words.of(choices, choices.time_unit or "s"), problems)
+                _parse_line_of(line, number, _Words.from_choices(choices, choices.time_unit or "s"), problems)
             times.append(words[0].decode("ascii", errors="replace"))
     whole = sorted(set(times), key=times.index)
     if choices.time_unit is None and len(whole) > 1 and all(time.isdigit() for time in whole):
@@ -206,7 +206,7 @@ def _parse_line_of(line: bytes, number: int, meant: _Words, problems: Problems) 
         return _parse_line(line, meant)
     except ValueError as error:
         shown = line[:80].decode("utf-8", errors="replace").strip()
-        problems.found(Problem.MALFORMED, 1, f"line {number}: {_EXPECTED}, got '{shown}': {error}.")
+        problems.record(Problem.MALFORMED, 1, f"line {number}: {_EXPECTED}, got '{shown}': {error}.")
         return None
 
 

@@ -58,7 +58,7 @@ class EsFile(EventFile):
                 events, reached_us, used = self._decode(np.frombuffer(data, np.uint8), reached_us)
                 rest = data[used:]
                 yield events
-        self.problems.found(Problem.DAMAGED, bool(rest), f"it ends within an event: {len(rest)} bytes are left over. Copy it again.")
+        self.problems.record(Problem.DAMAGED, bool(rest), f"it ends within an event: {len(rest)} bytes are left over. Copy it again.")
 
     def _decode(self, data: np.ndarray, reached_us: int) -> tuple[Columns, int, int]:
         """Events of some bytes that begin with an event; the time reached; and how many bytes were used."""

@@ -19,17 +19,17 @@ class EventArrays:
 
 def event_sets(names: Iterable[str]) -> dict[str, EventArrays]:
     """The complete sets among named arrays, by what stands before their names: "" for ``t x y p``, "left" for ``left_t left_x …``."""
-    found: dict[str, dict[Column, str]] = {}
+    columns_by_prefix: dict[str, dict[Column, str]] = {}
     units: dict[str, TimeUnit | None] = {}
     # Of several names for one thing, the shortest is the plain one.
     for name in sorted(names, key=lambda name: (len(name), name)):
         parsed = _parsed(name)
-        if parsed is None or parsed[1] in found.setdefault(parsed[0], {}):
+        if parsed is None or parsed[1] in columns_by_prefix.setdefault(parsed[0], {}):
             continue
         prefix, column, unit = parsed
-        found[prefix][column] = name
+        columns_by_prefix[prefix][column] = name
         units[prefix] = unit if column == "t" else units.get(prefix)
-    complete = {prefix: columns for prefix, columns in found.items() if len(columns) == 4}
+    complete = {prefix: columns for prefix, columns in columns_by_prefix.items() if len(columns) == 4}
     return {
         prefix: EventArrays((columns["t"], columns["x"], columns["y"], columns["p"]), units[prefix]) for prefix, columns in sorted(complete.items())
     }

@@ -111,7 +111,7 @@ class EventFile(EventStream):
         except EventDataError as error:
             if self.strict:
                 raise
-            self.problems.found(Problem.DAMAGED, 1, str(error))
+            self.problems.record(Problem.DAMAGED, 1, str(error))
 
     def _with_polarity(self, parts: Iterator[Columns]) -> Iterator[Columns]:
         """The same events, with booleans for the codes of polarity that the file has."""

@@ -64,7 +64,7 @@ def reached_us(clock: HighClock) -> int | None:
 def headless(before: np.ndarray, count: int, problems: Problems) -> int:
     """How many of ``count`` events come before the first time high word; they are counted as such."""
     first = int(before[0]) if len(before) else count
-    problems.found(Problem.HEADLESS, first, f"{first} events come before the first time.")
+    problems.record(Problem.HEADLESS, first, f"{first} events come before the first time.")
     return first
 
 
@@ -73,4 +73,4 @@ def count_unknown(kinds: np.ndarray, known: np.ndarray, problems: Problems) -> N
     unknown = int((~known[kinds]).sum()) if len(kinds) else 0
     if unknown:
         kind = int(kinds[np.argmax(~known[kinds])])
-        problems.found(Problem.UNKNOWN, unknown, f"{unknown} words are of no kind of this encoding (first: {kind}). Copy it again.")
+        problems.record(Problem.UNKNOWN, unknown, f"{unknown} words are of no kind of this encoding (first: {kind}). Copy it again.")

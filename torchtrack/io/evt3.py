@@ -103,7 +103,7 @@ class Evt3Decoder:
         """Only events whose time, row and column are known."""
         known = (events.t_us >= 0) & (events.y >= 0) & (events.x >= 0)
         count = int((~known).sum())
-        self._problems.found(Problem.HEADLESS, count, f"{count} events come before the first time, row or base.")
+        self._problems.record(Problem.HEADLESS, count, f"{count} events come before the first time, row or base.")
         return events[known]
 
     def _rows(self, words: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

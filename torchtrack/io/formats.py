@@ -92,10 +92,10 @@ def reader_of(path: Path) -> Callable[..., EventFile]:
         raise UnknownFormatError(f"'{path}' is not a file. Supported: {_SUPPORTED}.")
     with path.open("rb") as stream:
         head = stream.read(HEAD_BYTES)
-    found = _by_head(head, path)
-    if found is None:
+    event_format = _by_head(head, path)
+    if event_format is None:
         raise UnknownFormatError(f"'{path}' is in no known event format (it starts with {head[:16]!r}). Supported: {_SUPPORTED}.")
-    return found
+    return event_format
 
 
 def _by_head(head: bytes, path: Path) -> type[EventFile] | None:

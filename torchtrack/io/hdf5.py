@@ -118,8 +118,8 @@ class Hdf5Events(EventFile):
         said = next((unit_of(str(times.attrs[name])) for name in ("unit", "units") if name in times.attrs), None)
         # Whole µs, by the custom of data sets that have these tables.
         is_dsec = times.dtype.kind in "iu" and any(_beside(file, stream.group, name) is not None for name in ("ms_to_idx", "t_offset"))
-        told = self.choices.time_unit or said or stream.unit or ("us" if is_dsec else None)
-        return settled_unit(times[:ENOUGH_TIMES], "us" if times.dtype.kind in "iu" else "s", told, f"'{self.path}'")
+        stated = self.choices.time_unit or said or stream.unit or ("us" if is_dsec else None)
+        return settled_unit(times[:ENOUGH_TIMES], "us" if times.dtype.kind in "iu" else "s", stated, f"'{self.path}'")
 
     def _read(self, max_events: int) -> Iterator[Columns]:
         with open_hdf5(self.path) as file:
@@ -154,8 +154,8 @@ def _arrays(file: h5py.File, stream: Hdf5Stream) -> list[h5py.Dataset]:
 
 def _beside(file: h5py.File, group: str, name: str) -> h5py.Dataset | None:
     """An array in the group of the events, or in the file itself."""
-    found = (file.get(f"{group}/{name}"), file.get(name))
-    return next((array for array in found if isinstance(array, h5py.Dataset)), None)
+    candidates = (file.get(f"{group}/{name}"), file.get(name))
+    return next((array for array in candidates if isinstance(array, h5py.Dataset)), None)
 
 
 def _check_numbers(array: h5py.Dataset, path: Path) -> None:
@@ -184,8 +184,8 @@ def _check_filters(array: h5py.Dataset, path: Path) -> None:
 
 
 def _time_offset(file: h5py.File, group: str) -> int:
-    found = _beside(file, group, "t_offset")
-    return int(found[()].item()) if found is not None and found.size == 1 and found.dtype.kind in "iu" else 0
+    offset = _beside(file, group, "t_offset")
+    return int(offset[()].item()) if offset is not None and offset.size == 1 and offset.dtype.kind in "iu" else 0
 
 
 def _sensor_size(file: h5py.File, group: str) -> tuple[int | None, int | None]:

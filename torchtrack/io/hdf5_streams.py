@@ -46,7 +46,7 @@ def streams_of(file: h5py.File, path: Path) -> dict[str, Hdf5Stream]:
     records = file.get(_RECORDS)
     if isinstance(records, h5py.Dataset):
         return {_RECORDS: Hdf5Stream(_RECORDS)} if records.dtype.names and {"x", "y", "p", "t"} <= set(records.dtype.names) else {}
-    found: dict[str, Hdf5Stream] = {}
+    streams: dict[str, Hdf5Stream] = {}
     for group in _groups(file):
         members = file[group]
         if len(members) > _MOST_LOOKED_AT:
@@ -56,18 +56,18 @@ def streams_of(file: h5py.File, path: Path) -> dict[str, Hdf5Stream]:
                 check_link(members, name, path)
         arrays = [name for name in members if isinstance(members.get(name), h5py.Dataset)]
         for prefix, arrays_of in event_sets(arrays).items():
-            found["/".join(part for part in (group.strip("/"), prefix) if part) or "/"] = Hdf5Stream(group, arrays_of.names, arrays_of.unit)
-    return dict(sorted(found.items(), key=lambda item: _FIRST.index(item[0]) if item[0] in _FIRST else len(_FIRST)))
+            streams["/".join(part for part in (group.strip("/"), prefix) if part) or "/"] = Hdf5Stream(group, arrays_of.names, arrays_of.unit)
+    return dict(sorted(streams.items(), key=lambda item: _FIRST.index(item[0]) if item[0] in _FIRST else len(_FIRST)))
 
 
 def _groups(file: h5py.File) -> list[str]:
     """Names of the groups of a file, itself included."""
     groups, seen = ["/"], 0
 
-    def look(name: str, found: object) -> bool | None:
+    def look(name: str, member: object) -> bool | None:
         nonlocal seen
         seen += 1
-        if isinstance(found, h5py.Group):
+        if isinstance(member, h5py.Group):
             groups.append(name)
         # Anything but None ends the visit.
         return True if seen > _MOST_LOOKED_AT else None

@@ -43,8 +43,8 @@ def lens(content: Mapping[str, Any], coefficients: list[float], given: Given) ->
     denied = next((key for key, name in said.items() if name == _NO_FISHEYE), None)
     models = {name for name in said.values() if name != _NO_FISHEYE}
     if len(models) > 1 or (denied is not None and "fisheye" in models):
-        told = ", ".join(f"{key} says {name}" for key, name in said.items())
-        raise CalibrationError(f"the lens model is not clear: {told}. Correct the file, or leave out what is wrong.")
+        statements = ", ".join(f"{key} says {name}" for key, name in said.items())
+        raise CalibrationError(f"the lens model is not clear: {statements}. Correct the file, or leave out what is wrong.")
     if not models and denied is None and len(coefficients) == 4 and any(coefficients):
         warnings.warn(
             "no key says the lens model, and a fisheye model has four coefficients too: they are taken as k1 k2 p1 p2 of plumb_bob. "

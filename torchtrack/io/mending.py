@@ -136,7 +136,7 @@ class Mender:
         late = events.t_us < np.maximum.accumulate(events.t_us) - REORDER_US
         early = events.t_us > np.minimum.accumulate(np.where(usable, events.t_us, events.t_us.max())[::-1])[::-1] + REORDER_US
         kept = usable & ~(early if early.sum() <= late.sum() else late)
-        self._problems.found(Problem.BACK, int((~kept).sum()), f"times are in no order from event {self._at} on. Sort the events by time.")
+        self._problems.record(Problem.BACK, int((~kept).sum()), f"times are in no order from event {self._at} on. Sort the events by time.")
         return events[kept]
 
     def _sort_in(self, events: Columns) -> None:
@@ -149,9 +149,9 @@ class Mender:
         detail = f"time goes back from {before} to {after} µs at event {self._at + arrivals.first_late}. Sort the events by time."
         whole, overlapping = _parted(self._held, int(events.t_us.min()))
         events, repeated, too_late, late = merged(overlapping, events, arrivals, self._recent)
-        self._problems.found(Problem.REPEATED, repeated, f"{detail} These were there already: a packet was sent twice.")
-        self._problems.found(Problem.BACK, too_late, detail)
-        self._problems.found(Problem.SORTED, late, detail)
+        self._problems.record(Problem.REPEATED, repeated, f"{detail} These were there already: a packet was sent twice.")
+        self._problems.record(Problem.BACK, too_late, detail)
+        self._problems.record(Problem.SORTED, late, detail)
         if too_late:
             self._hold_us = min(max(self._hold_us, 2 * arrivals.latest_by), REORDER_US)
         self._held = whole
@@ -166,7 +166,7 @@ class Mender:
         wild = self._wild(back_us)
         if wild and (len(events) > wild or at_end):
             self._drop_newest(wild)
-            self._problems.found(Problem.WILD, wild, f"{detail}; what came just before is wild. Leave it out.")
+            self._problems.record(Problem.WILD, wild, f"{detail}; what came just before is wild. Leave it out.")
             return events
         if wild:
             return None
@@ -174,11 +174,11 @@ class Mender:
         past = events[:end]
         known = self._recent.knows(past[:256], self._held)
         if len(known) and known.mean() > 0.9:
-            self._problems.found(Problem.REPEATED, end, f"{detail}: what comes then was there already. Send each packet once.")
+            self._problems.record(Problem.REPEATED, end, f"{detail}: what comes then was there already. Send each packet once.")
         elif self._wrap(back_us) and (end > _FEW or at_end):
             return self._with_new_clock(events, back_us, detail)
         elif leaps or (at_end and not self._lasts(past, REORDER_US)):
-            self._problems.found(Problem.BACK, end, f"{detail} for {end} events. Sort the events by time.")
+            self._problems.record(Problem.BACK, end, f"{detail} for {end} events. Sort the events by time.")
         elif end < len(events) or at_end or self._lasts(past, _LASTING_US):
             return self._with_new_clock(events, back_us, detail)
         else:
@@ -204,12 +204,12 @@ class Mender:
         if wrap and wrap != self._counter:
             bits = wrap.bit_length() - 1
             advice = f"a counter of {bits} bits began again. Add 2^{bits} to the times from there on, or read it without strict, which does so."
-            self._problems.found(Problem.WRAPPED, 1, f"{detail}: {advice}")
+            self._problems.record(Problem.WRAPPED, 1, f"{detail}: {advice}")
         elif not wrap:
             advice = (
                 "the clock was set back, or another recording begins. Split the stream there, or read it without strict, which goes on from there."
             )
-            self._problems.found(Problem.RESET, 1, f"{detail} and stays there: {advice}")
+            self._problems.record(Problem.RESET, 1, f"{detail} and stays there: {advice}")
         if wrap != self._counter:
             shown = newest_us - self._shift_us, back_us - self._shift_us
             self._problems.clock_changed(ClockChange("wrap" if wrap else "reset", back_us + more, *shown))
@@ -312,7 +312,7 @@ def mended_batches(batches: Iterable[EventBatch], width: int, height: int, probl
     """Batches from anywhere, mended as those of a live source; what was wrong is told at the end."""
     mender, count = Mender(problems, waits=False), 0
     for batch in batches:
-        events = inside(Columns.of(batch.to("cpu")), width, height, problems, count)
+        events = inside(Columns.from_batch(batch.to("cpu")), width, height, problems, count)
         count += len(batch)
         yield from (piece.batch() for piece in mender.add(events))
     yield from (piece.batch() for piece in mender.rest())

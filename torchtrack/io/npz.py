@@ -158,14 +158,14 @@ class NpzEvents(EventFile):
             for name in ("width", "height"):
                 object.__setattr__(self, name, _sensor_length(archive, name, getattr(self, name), self.path))
             chosen = self._chosen(keys_of(archive))
-            told = self.choices.time_unit or chosen.unit or ("us" if _OF_SEQUENCE in keys_of(archive) else None)
+            stated = self.choices.time_unit or chosen.unit or ("us" if _OF_SEQUENCE in keys_of(archive) else None)
             members = [_open_member(archive, key, self.path) for key in chosen.names]
             for member in members:
                 stack.callback(member.stream.close)
             for member, key, name in zip(members, chosen.names, _EVENT_KEYS, strict=True):
-                _check_event_member(member, key, members[0].shape, name, told is not None)
+                _check_event_member(member, key, members[0].shape, name, stated is not None)
             count = members[0].shape[0]
-            unit = settled_unit(members[0].read(min(count, ENOUGH_TIMES)), "us", told, f"'{self.path}'")
+            unit = settled_unit(members[0].read(min(count, ENOUGH_TIMES)), "us", stated, f"'{self.path}'")
         for field_name, value in (("count", count), ("keys", chosen.names), ("unit", unit)):
             object.__setattr__(self, field_name, value)
 

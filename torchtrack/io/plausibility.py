@@ -67,7 +67,7 @@ class TimeNumbers:
     whole: bool
 
     @classmethod
-    def of(cls, numbers: np.ndarray, fewest: int) -> "TimeNumbers | None":
+    def from_values(cls, numbers: np.ndarray, fewest: int) -> "TimeNumbers | None":
         """Look at numbers in the order of the file; None where there are none that are finite."""
         values = numbers[np.isfinite(numbers)].astype(np.float64)
         if len(values) == 0:
@@ -90,26 +90,26 @@ def _rate(values: np.ndarray, fewest: int) -> float | None:
     return (len(values) - 1) / span if span > 0 else None
 
 
-def settled_unit(numbers: np.ndarray, custom: TimeUnit, told: TimeUnit | None, source: str, timed: Timed = EVENTS) -> TimeUnit:
+def settled_unit(numbers: np.ndarray, custom: TimeUnit, stated: TimeUnit | None, source: str, timed: Timed = EVENTS) -> TimeUnit:
     """The unit of times: as told, else by the format's custom, where that is plausible.
 
     Args:
         numbers: the first times as they are in the file, in its order: some tens of thousands are enough.
         custom: the unit that the format has where nobody says another.
-        told: the unit that the user or the file says.
+        stated: the unit that the user or the file says.
         source: name of the source, for messages.
         timed: what has these times.
 
     Raises:
         EventDataError: if nobody says the unit, and the custom cannot be right.
     """
-    if told is not None:
-        return told
-    found = TimeNumbers.of(numbers[:ENOUGH_TIMES], timed.fewest)
-    if found is None or (fault := _fault(found, custom, timed)) is None:
+    if stated is not None:
+        return stated
+    times = TimeNumbers.from_values(numbers[:ENOUGH_TIMES], timed.fewest)
+    if times is None or (fault := _fault(times, custom, timed)) is None:
         return custom
-    shown = ", ".join(f"{number:.10g}" for number in found.shown)
-    likely = [unit for unit in US_PER_UNIT if unit != custom and _is_usual(found, unit, timed) and _fault(found, unit, timed) is None]
+    shown = ", ".join(f"{number:.10g}" for number in times.shown)
+    likely = [unit for unit in US_PER_UNIT if unit != custom and _is_usual(times, unit, timed) and _fault(times, unit, timed) is None]
     fits = f" {' or '.join(UNIT_NAMES[unit] for unit in likely)} would fit." if likely else ""
     setting = f"Set {timed.setting} to {' or '.join(likely) if likely else 's, ms, us or ns'}"
     if fault.possible:
@@ -133,27 +133,27 @@ class _Fault:
     possible: bool
 
 
-def _fault(found: TimeNumbers, unit: TimeUnit, timed: Timed) -> _Fault | None:
-    latest_s = found.distance * US_PER_UNIT[unit] * 1e-6
+def _fault(times: TimeNumbers, unit: TimeUnit, timed: Timed) -> _Fault | None:
+    latest_s = times.distance * US_PER_UNIT[unit] * 1e-6
     if latest_s > _LATEST_S:
         return _Fault(f"that would be {latest_s / 31_556_952:,.0f} years", possible=False)
-    if unit == "s" and found.whole:
+    if unit == "s" and times.whole:
         return _Fault("they are whole numbers", possible=False)
-    if found.rate is None:
+    if times.rate is None:
         return None
-    rate = _per_second(found, unit)
+    rate = _per_second(times, unit)
     reason = f"that would be {rate:,.3g} {timed.name} a second"
     if not timed.possible[0] <= rate <= timed.possible[1]:
         return _Fault(reason, possible=False)
-    return _Fault(reason, possible=True) if found.count >= 2 * timed.fewest and not _is_usual(found, unit, timed) else None
+    return _Fault(reason, possible=True) if times.count >= 2 * timed.fewest and not _is_usual(times, unit, timed) else None
 
 
-def _is_usual(found: TimeNumbers, unit: TimeUnit, timed: Timed) -> bool:
-    return found.rate is None or timed.usual[0] <= _per_second(found, unit) <= timed.usual[1]
+def _is_usual(times: TimeNumbers, unit: TimeUnit, timed: Timed) -> bool:
+    return times.rate is None or timed.usual[0] <= _per_second(times, unit) <= timed.usual[1]
 
 
-def _per_second(found: TimeNumbers, unit: TimeUnit) -> float:
-    return 1e6 * (found.rate or 0.0) / US_PER_UNIT[unit]
+def _per_second(times: TimeNumbers, unit: TimeUnit) -> float:
+    return 1e6 * (times.rate or 0.0) / US_PER_UNIT[unit]
 
 
 def whole_microseconds(numbers: np.ndarray, unit: TimeUnit, source: str) -> np.ndarray:

@@ -54,7 +54,7 @@ class PolarityCode:
         wrong = 0 if known is None else int((~known).sum())
         if known is None or wrong > max(_MOST_DAMAGED * len(events), 1):
             return events
-        self.problems.found(Problem.MALFORMED, wrong, f"polarity holds {shown_values(events.polarity[~known])} in {wrong} events; expected 0 or 1.")
+        self.problems.record(Problem.MALFORMED, wrong, f"polarity holds {shown_values(events.polarity[~known])} in {wrong} events; expected 0 or 1.")
         return events[known]
 
 
@@ -82,7 +82,7 @@ def _tell_alike(count: int, are_brighter: bool, source: str) -> None:
 
 def _advice(values: np.ndarray) -> str:
     """How to say what a code means, and what one that tools are known to write by mistake is likely to mean."""
-    found = set(np.unique(values).tolist())
-    if found == {1, 255}:
+    distinct = set(np.unique(values).tolist())
+    if distinct == {1, 255}:
         return f" {_CHOOSE} 255 is -1 stored without a sign, so that is probably 1."
-    return f" {_CHOOSE}{' Here that is probably 2.' if found == {1, 2} else ''}"
+    return f" {_CHOOSE}{' Here that is probably 2.' if distinct == {1, 2} else ''}"

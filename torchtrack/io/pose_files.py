@@ -155,12 +155,12 @@ def _read_bop(text: str, wanted: _Wanted) -> Trajectory:
         of_images = sorted(((int(image), entries) for image, entries in scene.items()), key=lambda item: item[0])
         ids = list(dict.fromkeys(str(entry["obj_id"]) for _, entries in of_images for entry in entries))
         chosen = _one_of(ids, wanted.name, "obj_id")
-        found = [(image * wanted.frame_us, entry) for image, entries in of_images for entry in entries if str(entry["obj_id"]) == chosen]
-        T = np.tile(np.eye(4), (len(found), 1, 1))
-        for pose, (_, entry) in zip(T, found, strict=True):
+        timed_entries = [(image * wanted.frame_us, entry) for image, entries in of_images for entry in entries if str(entry["obj_id"]) == chosen]
+        T = np.tile(np.eye(4), (len(timed_entries), 1, 1))
+        for pose, (_, entry) in zip(T, timed_entries, strict=True):
             pose[:3, :3] = np.reshape(entry["cam_R_m2c"], (3, 3))
             pose[:3, 3] = 1e-3 * np.asarray(entry["cam_t_m2c"], np.float64)
-        t_us = np.array([time for time, _ in found], np.int64)
+        t_us = np.array([time for time, _ in timed_entries], np.int64)
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         if isinstance(error, PoseError):
             raise
@@ -224,7 +224,7 @@ def _body_columns(header: list[list[str]], axes: list[str], name: str | None) ->
         for kind, of_kind in (("Rotation", "XYZW"), ("Position", "XYZ"))
         for axis in of_kind
     ]
-    found = [column for column in columns if column is not None]
-    if len(found) != len(columns):
+    known = [column for column in columns if column is not None]
+    if len(known) != len(columns):
         raise PoseError(f"there is no rigid body '{chosen}' with rotation and position. Those there are: {', '.join(bodies)}.")
-    return found
+    return known

@@ -27,9 +27,9 @@ def pose_times_us(texts: Sequence[str], unit: TimeUnit | None) -> list[int]:
     """
     try:
         numbers = np.array([float(text) for text in texts[:_LOOKED_AT]])
-        told = "s" if unit is None and _are_keyframes(numbers) else unit
-        settled = settled_unit(numbers, "s", told, "the times of the poses", _POSES)
-        if told != unit and not any("." in text for text in texts[:_LOOKED_AT]):
+        stated = "s" if unit is None and _are_keyframes(numbers) else unit
+        settled = settled_unit(numbers, "s", stated, "the times of the poses", _POSES)
+        if stated != unit and not any("." in text for text in texts[:_LOOKED_AT]):
             message = "the times of the poses are whole numbers, and taken for seconds: are they numbers of images? If not, set time_unit to s."
             warnings.warn(message, TorchtrackWarning, stacklevel=2)
         # Exactly, by their digits.

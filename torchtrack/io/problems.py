@@ -69,7 +69,7 @@ class Problems:
     first: dict[Problem, str] = field(default_factory=dict)
     clock_changes: list[ClockChange] = field(default_factory=list)
 
-    def found(self, problem: Problem, count: int, detail: str) -> None:
+    def record(self, problem: Problem, count: int, detail: str) -> None:
         """Take note of ``count`` faults, of which ``detail`` describes the first.
 
         Raises:

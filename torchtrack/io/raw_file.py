@@ -100,7 +100,7 @@ def words_of(stream: BinaryIO, dtype: np.dtype, problems: Problems) -> Iterator[
         rest = data[whole:]
         if whole:
             yield np.frombuffer(data, dtype, count=whole // dtype.itemsize)
-    problems.found(Problem.DAMAGED, bool(rest), f"it ends within a word: {len(rest)} bytes are left over. Copy it again.")
+    problems.record(Problem.DAMAGED, bool(rest), f"it ends within a word: {len(rest)} bytes are left over. Copy it again.")
 
 
 def _skip_to(stream: BinaryIO, decoder: WordDecoder, start_us: int, problems: Problems) -> WordDecoder:

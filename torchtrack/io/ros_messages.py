@@ -113,7 +113,7 @@ class MessageDecoder:
             cursor.take(8)
             return self._packet(cursor) if self.kind == PACKETS else self._array(cursor)
         except EventDataError as error:
-            self.problems.found(Problem.DAMAGED, 1, f"a message cannot be read ({error}). Record it again.")
+            self.problems.record(Problem.DAMAGED, 1, f"a message cannot be read ({error}). Record it again.")
             return Columns.empty()
 
     def _packet(self, cursor: _Cursor) -> Columns | np.ndarray:

@@ -24,7 +24,7 @@ def inside(events: Columns, width: int, height: int, problems: Problems, first_i
     on_sensor = (events.x >= 0) & (events.x < width) & (events.y >= 0) & (events.y < height)
     at = int(np.argmin(on_sensor))
     wrong = int((~on_sensor).sum())
-    problems.found(
+    problems.record(
         Problem.OUTSIDE,
         wrong,
         f"event {first_index + at} is at ({events.x[at]}, {events.y[at]}), outside the sensor of {width}x{height} pixels "

@@ -75,7 +75,7 @@ def find_layout(head: str, source: str) -> TextLayout | None:
     before = lines[:first]
     separator = (_separator(lines[first]) if first is not None else None) or ","
     rows = [words for line in lines[len(before) : len(before) + _MOST_ROWS] if (words := split(_COMMENT.split(line, maxsplit=1)[0], separator))]
-    names = next((found for line in reversed(before) if (found := _names(line, separator)) is not None), None)
+    names = next((parsed for line in reversed(before) if (parsed := _names(line, separator)) is not None), None)
     width = len(rows[0]) if rows else len(names or ())
     size, skip = _size(before), len(before)
     if names is not None:
@@ -155,33 +155,33 @@ def _names(line: str, separator: str) -> list[str] | None:
 
 
 def _named_columns(names: list[str], source: str) -> tuple[tuple[int, int, int, int], TimeUnit | None]:
-    found: dict[Column, int] = {}
+    places: dict[Column, int] = {}
     unit = None
     for place, name in enumerate(names):
         column = column_of(name)
-        if column is not None and column[0] not in found:
-            found[column[0]] = place
+        if column is not None and column[0] not in places:
+            places[column[0]] = place
             unit = column[1] or unit
-    if len(found) < 4:
-        missing = ", ".join(sorted(set("txyp") - set(found)))
+    if len(places) < 4:
+        missing = ", ".join(sorted(set("txyp") - set(places)))
         raise EventDataError(f"{source}: its columns are named {', '.join(names)}; which of them is {missing} is not said. Name them t, x, y and p.")
-    return (found["t"], found["x"], found["y"], found["p"]), unit
+    return (places["t"], places["x"], places["y"], places["p"]), unit
 
 
 def _unnamed_columns(rows: list[list[str]], source: str) -> tuple[int, int, int, int]:
     rows = [row for row in rows if len(row) == 4]
     third, last = ({row[place].lower() for row in rows} for place in (2, 3))
     custom = _XYPT if third <= _POLARITIES and not last <= _POLARITIES else _TXYP
-    found = _by_numbers(rows)
-    if found is None or found == custom or len(rows) < _FEWEST_LINES:
+    likely = _by_numbers(rows)
+    if likely is None or likely == custom or len(rows) < _FEWEST_LINES:
         return custom
-    order = ", ".join(name for _, name in sorted(zip(found, "txyp", strict=True)))
+    order = ", ".join(name for _, name in sorted(zip(likely, "txyp", strict=True)))
     warnings.warn(
         f"{source}: columns are taken as {order}: only one never decreases, and one holds polarities. Name them in a first line to be sure.",
         TorchtrackWarning,
         stacklevel=2,
     )
-    return found
+    return likely
 
 
 def _by_numbers(rows: list[list[str]]) -> tuple[int, int, int, int] | None:
@@ -203,8 +203,8 @@ def _by_numbers(rows: list[list[str]]) -> tuple[int, int, int, int] | None:
 def _size(lines: list[str]) -> tuple[int, int] | None:
     """Width and height, as a comment says them, or a line of two numbers."""
     for line in lines:
-        if found := _SIZE.search(line):
-            return int(found[1]), int(found[2])
+        if match := _SIZE.search(line):
+            return int(match[1]), int(match[2])
         words = line.split()
         if len(words) == 2 and all(word.isdigit() and 0 < int(word) <= 1 << 16 for word in words):
             return int(words[0]), int(words[1])

@@ -27,7 +27,7 @@ class HighClock:
     def advance(self, shown: np.ndarray) -> np.ndarray:
         """Unwrapped high parts of the next words, with the one before them in front (-1 for none)."""
         sound, wild = self._without_wild(shown.astype(np.int64))
-        self._problems.found(Problem.TIME_WORD, wild, f"{wild} time words contradict those before and after them. Copy it again.")
+        self._problems.record(Problem.TIME_WORD, wild, f"{wild} time words contradict those before and after them. Copy it again.")
         high = np.full(len(sound) + 1, -1 if self.last is None else self.last, np.int64)
         if len(sound):
             high[1:] = unwrap(sound, self._bits, int(sound[0]) if self.last is None else self.last)

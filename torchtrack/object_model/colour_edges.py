@@ -29,9 +29,9 @@ def _steps(surface: Surface, table: EdgeTable, contrast: float, spacing_m: float
     normals = surface.normals[faces].sum(1)
     length = np.linalg.norm(normals, axis=1)
     # The two sides of a folded sheet have no mean normal; its fold is a crease anyway.
-    found = (np.abs(brighter_by) >= contrast) & (length > 1e-6)
+    strong = (np.abs(brighter_by) >= contrast) & (length > 1e-6)
     to_brighter = np.diff(surface.corners.mean(1)[faces], axis=1)[:, 0] * brighter_by[:, None]
-    return points_along(surface.vertices[vertices[found]], normals[found] / length[found, None], to_brighter[found], spacing_m)
+    return points_along(surface.vertices[vertices[strong]], normals[strong] / length[strong, None], to_brighter[strong], spacing_m)
 
 
 def _spread(surface: Surface, contrast: float, spacing_m: float) -> SurfacePoints:
@@ -39,9 +39,9 @@ def _spread(surface: Surface, contrast: float, spacing_m: float) -> SurfacePoint
     corners, luminance = surface.corners, surface.corner_luminance
     change = np.abs(luminance - np.roll(luminance, -1, 1))
     sides = np.linalg.norm(corners - np.roll(corners, -1, 1), axis=2)
-    found = ((change >= contrast).sum(1) >= 2) & (sides.max(1) <= _WIDEST_FRACTION * surface.diameter)
-    corners, luminance, change = corners[found], luminance[found], change[found]
+    crossed = ((change >= contrast).sum(1) >= 2) & (sides.max(1) <= _WIDEST_FRACTION * surface.diameter)
+    corners, luminance, change = corners[crossed], luminance[crossed], change[crossed]
     middles = (corners + np.roll(corners, -1, 1)) / 2
     strongest = np.argsort(-change, axis=1, kind="stable")[:, :2, None]
     darkest, brightest = (np.take_along_axis(corners, pick[:, None, None], 1)[:, 0] for pick in (luminance.argmin(1), luminance.argmax(1)))
-    return points_along(np.take_along_axis(middles, strongest, 1), surface.normals[found], brightest - darkest, spacing_m)
+    return points_along(np.take_along_axis(middles, strongest, 1), surface.normals[crossed], brightest - darkest, spacing_m)

@@ -102,7 +102,7 @@ def _checked_tree(path: Path, text: bytes) -> Tree:
 
 def _buffers(path: Path, tree: Tree, binary: bytes | None) -> list[bytes]:
     """The bytes of every buffer."""
-    found = []
+    data_of_each = []
     for number, buffer in enumerate(tree.get("buffers", [])):
         data = binary if number == 0 and "uri" not in buffer else _uri_bytes(path, buffer.get("uri"))
         if data is None:
@@ -110,8 +110,8 @@ def _buffers(path: Path, tree: Tree, binary: bytes | None) -> list[bytes]:
             data = b""
         elif len(data) < buffer["byteLength"]:
             raise ValueError(f"its buffer {number} should have {buffer['byteLength']} bytes, and has {len(data)}: it was cut short")
-        found.append(data)
-    return found
+        data_of_each.append(data)
+    return data_of_each
 
 
 def _uri_bytes(path: Path, uri: str | None) -> bytes | None:
@@ -230,8 +230,8 @@ def _name_materials(tree: Tree) -> dict[str, str]:
 def colour_texture(material: Tree) -> Tree | None:
     """The texture of a material's colour."""
     glossy: Tree = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-    found: Tree | None = material.get("pbrMetallicRoughness", {}).get("baseColorTexture") or glossy.get("diffuseTexture")
-    return found
+    texture: Tree | None = material.get("pbrMetallicRoughness", {}).get("baseColorTexture") or glossy.get("diffuseTexture")
+    return texture
 
 
 def _image_name(tree: Tree, texture: Tree) -> str:

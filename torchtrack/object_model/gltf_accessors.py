@@ -24,8 +24,8 @@ class GltfContent:
         Raises:
             IndexError: if there is none.
         """
-        found: Tree = at(self.tree["accessors"], index)
-        return found
+        accessor: Tree = at(self.tree["accessors"], index)
+        return accessor
 
     def values(self, index: int) -> np.ndarray:
         """The values ``[n, k]`` of an accessor; normalised integers as float64 in 0..1 or -1..1."""
@@ -66,9 +66,9 @@ class GltfContent:
 
     def _with_sparse(self, values: np.ndarray, sparse: Tree, width: int, dtype: np.dtype) -> np.ndarray:
         """The values with those replaced that ``sparse`` lists."""
-        of = self._dense(sparse["indices"], sparse["count"], 1, np.dtype(_DTYPES[sparse["indices"]["componentType"]])).reshape(-1)
+        replaced = self._dense(sparse["indices"], sparse["count"], 1, np.dtype(_DTYPES[sparse["indices"]["componentType"]])).reshape(-1)
         values = values.copy()
-        values[of] = self._dense(sparse["values"], sparse["count"], width, dtype)
+        values[replaced] = self._dense(sparse["values"], sparse["count"], width, dtype)
         return values
 
 

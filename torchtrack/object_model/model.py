@@ -199,9 +199,9 @@ def _print_edges(surface: Surface, table: EdgeTable, settings: ModelSettings, na
     if settings.max_texture_points == 0:
         return NO_POINTS
     printed = texture_edges(surface, table, settings.texture_contrast)
-    for number, found in enumerate(printed):
+    for number, printed_edges in enumerate(printed):
         # A texture of few pixels is a colour: trimesh gives one to every part without a material.
-        if len(found.points) == 0 and surface.textures[number].size > _COLOUR_PIXELS:
+        if len(printed_edges.points) == 0 and surface.textures[number].size > _COLOUR_PIXELS:
             which = f"texture {number + 1} of {len(printed)}" if len(printed) > 1 else "the texture"
             tell(
                 f"{which} of '{name}' gives no edges, so that only the geometry is used: {why_no_edges(surface, number, settings.texture_contrast)}."

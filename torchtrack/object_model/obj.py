@@ -158,8 +158,8 @@ def _materials(path: Path, text: str) -> tuple[ObjMaterials, str]:
     if len(names) > _MOST_LIBRARIES:
         raise ModelError(f"'{path}' names {len(names)} material libraries, expected at most {_MOST_LIBRARIES}: it is damaged. Export it again.")
     for name in names:
-        found = find_beside(path, name)
-        if found is None:
+        material_path = find_beside(path, name)
+        if material_path is None:
             missing.append(name)
             continue
         for line in _decoded(SideFiles(path).get(name)).splitlines():
@@ -171,7 +171,7 @@ def _materials(path: Path, text: str) -> tuple[ObjMaterials, str]:
             elif kind.lower() == "map_kd" and materials:
                 images[materials[-1]] = rest = image_name(rest)
                 # An image's name is meant from the library's folder, and often written from the model's.
-                image = find_beside(found, rest) or find_beside(path, rest)
+                image = find_beside(material_path, rest) or find_beside(path, rest)
                 missing += [] if image else [rest]
                 rest = str(image or rest)
             lines.append(f"{kind} {rest}")

@@ -33,11 +33,11 @@ class SideFiles(Resolver):
         name = str(key)
         if name in self.given:
             return self.given[name]
-        found = find_beside(self.path, name)
-        if found is None:
+        side_file = find_beside(self.path, name)
+        if side_file is None:
             raise FileNotFoundError(f"there is no file '{name}' in '{self.path.parent}'")
-        check_limit("mesh_bytes", found.stat().st_size, found)
-        return found.read_bytes()
+        check_limit("mesh_bytes", side_file.stat().st_size, side_file)
+        return side_file.read_bytes()
 
     def write(self, name: str, data: Any) -> None:
         """Not for a model that is read."""

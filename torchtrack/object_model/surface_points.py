@@ -60,9 +60,11 @@ def points_along(segments: np.ndarray, normals: np.ndarray, to_brighter: np.ndar
     length = np.linalg.norm(along, axis=1)
     count = np.ceil(length / spacing_m).astype(np.int64).clip(min=1)
     check_point_count(int(count.sum()), MOST_POINTS)
-    of = np.repeat(np.arange(len(segments)), count)
-    fraction = (np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[of]
-    return oriented_points(start[of] + fraction[:, None] * along[of], along[of], normals[of], to_brighter[of], float(length.sum()))
+    segment = np.repeat(np.arange(len(segments)), count)
+    fraction = (np.arange(len(segment)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[segment]
+    return oriented_points(
+        start[segment] + fraction[:, None] * along[segment], along[segment], normals[segment], to_brighter[segment], float(length.sum())
+    )
 
 
 def join_points(sets: Sequence[SurfacePoints]) -> SurfacePoints:

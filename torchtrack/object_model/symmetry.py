@@ -147,8 +147,8 @@ def stacked(axes: Sequence[RevolutionAxis | None]) -> tuple[Float[Tensor, "b 3"]
 
 def of_each(models: Sequence[ObjectModel], look: Callable[[ObjectModel], T]) -> list[T]:
     """What is found of each model; one that several objects have is looked at once."""
-    found = {number: look(model) for number, model in {id(model): model for model in models}.items()}
-    return [found[id(model)] for model in models]
+    by_model = {number: look(model) for number, model in {id(model): model for model in models}.items()}
+    return [by_model[id(model)] for model in models]
 
 
 def _quartered(triangles: Float[Tensor, "f 3 3"]) -> Float[Tensor, "q 3 3"]:

@@ -145,14 +145,14 @@ class RunOutputs:
 
     def _fail(self, error: BaseException) -> None:
         """Close the files, and write the summary; that they cannot be written is not told above what ended the run."""
-        told = str(error) if isinstance(error, TorchtrackError) else f"{type(error).__name__}: {error}".removesuffix(": ")
+        message = str(error) if isinstance(error, TorchtrackError) else f"{type(error).__name__}: {error}".removesuffix(": ")
         try:
             with suppress(OutputError):
                 self._writing.close()
         finally:
             with suppress(OutputError):
                 ended: Ended = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-                write_summary(self._folder.path / SUMMARY, self._summary(ended, told))
+                write_summary(self._folder.path / SUMMARY, self._summary(ended, message))
 
     def _summary(self, ended: Ended, message: str) -> RunSummary:
         wall_s = time.perf_counter() - self._begun_s
@@ -169,7 +169,7 @@ class RunOutputs:
         facts = {label: dict(self._known) for label in self.session.labels}
         for sink in self._sinks:
             if isinstance(sink, AlignmentRecord):
-                facts = {label: {**found, **sink.facts()[label]} for label, found in facts.items()}
+                facts = {label: {**facts_of_object, **sink.facts()[label]} for label, facts_of_object in facts.items()}
         return facts
 
 

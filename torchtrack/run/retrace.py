@@ -78,9 +78,9 @@ class Retracer:
         newest, begun = self._held[self._looked_at - 1 :], time.perf_counter()
         if len(newest) > 1:
             objects, states = self._objects, [step.state for step in newest]
-            found = goes_on(filtered_of(states), objects.centre_obj, objects.diameter_m, self._config.motion)
+            is_continuous = goes_on(filtered_of(states), objects.centre_obj, objects.diameter_m, self._config.motion)
             status = torch.stack([step.result.status for step in newest[1:]]).cpu()
-            lost = ~found | (status >= int(Status.LOST))
+            lost = ~is_continuous | (status >= int(Status.LOST))
             seen = torch.stack([state.unseen_s == 0 for state in states[1:]]).cpu() & ~lost
             for at, (lost_now, seen_now) in enumerate(zip(lost.tolist(), seen.tolist(), strict=True), self._looked_at):
                 self._note(at, lost_now, seen_now)

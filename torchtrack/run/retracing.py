@@ -125,7 +125,7 @@ def _apart_px(step: Step, number: int, result: StepResult, alone: Tracker) -> fl
 
 def _with_object(step: Step, number: int, state: TrackerState, result: StepResult) -> Step:
     """The step with another state and result of one object, for which time runs backwards."""
-    before, told = step.state, step.result
+    before, forward = step.state, step.result
     state = replace(
         before,
         T_cam_obj=_row(before.T_cam_obj, number, state.T_cam_obj),
@@ -134,21 +134,21 @@ def _with_object(step: Step, number: int, state: TrackerState, result: StepResul
         score=_row(before.score, number, state.score),
     )
     result = replace(
-        told,
-        T_cam_obj=_row(told.T_cam_obj, number, result.T_cam_obj),
-        covariance=_row(told.covariance, number, result.covariance),
-        status=_row(told.status, number, result.status),
-        quality=_row(told.quality, number, result.quality),
-        contours=_contours(told, number, result),
-        observation_count=_row(told.observation_count, number, result.observation_count),
+        forward,
+        T_cam_obj=_row(forward.T_cam_obj, number, result.T_cam_obj),
+        covariance=_row(forward.covariance, number, result.covariance),
+        status=_row(forward.status, number, result.status),
+        quality=_row(forward.quality, number, result.quality),
+        contours=_contours(forward, number, result),
+        observation_count=_row(forward.observation_count, number, result.observation_count),
     )
     return replace(step, state=state, result=result)
 
 
-def _contours(told: StepResult, number: int, result: StepResult) -> Contours:
+def _contours(forward: StepResult, number: int, result: StepResult) -> Contours:
     """The contours of a result, with those of one object from another."""
-    count = max(told.contours.mask.shape[1], result.contours.mask.shape[1])
-    own, other = told.contours.widened(count), result.contours.widened(count)
+    count = max(forward.contours.mask.shape[1], result.contours.mask.shape[1])
+    own, other = forward.contours.widened(count), result.contours.widened(count)
     return Contours(*(_row(value, number, getattr(other, name)) for name, value in vars(own).items()))
 
 

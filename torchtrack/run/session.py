@@ -144,7 +144,7 @@ def _opened(config: RunConfig) -> Session:
         events=events,
         camera=camera,
         labels=tuple(obj.label for obj in chosen),
-        models=tuple(_load_model(obj, found, config) for obj, found in zip(chosen, known, strict=True)),
+        models=tuple(_load_model(obj, in_sequence, config) for obj, in_sequence in zip(chosen, known, strict=True)),
         ground_truth=truth,
         T_cam_obj=torch.stack(poses),
         start_us=start_us,
@@ -220,21 +220,21 @@ def _sequence_camera(config: CameraConfig, events: EventSource, source: Path) ->
 
 def _matching(obj: ObjectConfig, of_sequence: dict[str, SequenceObject], source: Path | str) -> SequenceObject | None:
     """The object of the sequence that a configured one names, or None where it brings its own model."""
-    found = of_sequence.get(obj.label)
-    if found is None and obj.mesh is None and obj.polylines is None:
+    in_sequence = of_sequence.get(obj.label)
+    if in_sequence is None and obj.mesh is None and obj.polylines is None:
         known = f"its objects are {', '.join(of_sequence)}" if of_sequence else "it brings none of its own"
         raise ConfigError(f"objects: '{obj.label}' has no model, and '{source}' knows no such object ({known}). Give mesh or polylines.")
-    return found
+    return in_sequence
 
 
-def _load_model(obj: ObjectConfig, found: SequenceObject | None, config: RunConfig) -> ObjectModel:
+def _load_model(obj: ObjectConfig, in_sequence: SequenceObject | None, config: RunConfig) -> ObjectModel:
     if obj.polylines is not None:
         return ObjectModel.from_polylines(obj.polylines, name=obj.label, unit=obj.unit)
     if obj.mesh is not None:
         return ObjectModel.from_file(obj.mesh, name=obj.label, unit=obj.unit)
-    if found is None:
+    if in_sequence is None:
         raise ConfigError(f"objects: '{obj.label}' has no model.")
-    return ObjectModel.from_file(found.model_path(config.models), name=obj.label)
+    return ObjectModel.from_file(in_sequence.model_path(config.models), name=obj.label)
 
 
 def _start(config: RunConfig, events: EventSource, truth: tuple[Trajectory | None, ...]) -> int:
@@ -261,8 +261,8 @@ def _no_events(config: RunConfig, events: EventSource) -> str:
 def _check_start(config: RunConfig, first_us: int) -> None:
     """Refuse initial poses from long before the first event, which are likely on another clock; tell of those from some time before."""
     before_s = 1e-6 * (first_us - (config.start_us or 0))
-    told = f"start_us: the initial pose is of {config.start_us} µs, but the first event of '{config.source}' after that is at {first_us} µs, "
+    message = f"start_us: the initial pose is of {config.start_us} µs, but the first event of '{config.source}' after that is at {first_us} µs, "
     if before_s > _FARTHEST_START_S:
-        raise ConfigError(f"{told}{before_s:.0f} s later: they are on different clocks. Leave start_us out, or give it in the time of the events.")
+        raise ConfigError(f"{message}{before_s:.0f} s later: they are on different clocks. Leave start_us out, or give it in the time of the events.")
     if before_s > _DOUBTFUL_START_S:
-        warnings.warn(f"{told}{before_s:.1f} s later. It is taken to have stayed there. Check start_us.", TorchtrackWarning, stacklevel=2)
+        warnings.warn(f"{message}{before_s:.1f} s later. It is taken to have stayed there. Check start_us.", TorchtrackWarning, stacklevel=2)

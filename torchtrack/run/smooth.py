@@ -28,7 +28,7 @@ class SmoothedObjects:
     intrinsics: Float[Tensor, "b 4"]
 
     @classmethod
-    def of(cls, models: Sequence[ObjectModel], camera: Camera) -> "SmoothedObjects":
+    def from_models(cls, models: Sequence[ObjectModel], camera: Camera) -> "SmoothedObjects":
         """Objects that are seen by one camera."""
         centre_obj = torch.stack([model.centre for model in models]).double()
         diameter_m = torch.tensor([model.diameter_m for model in models], dtype=torch.float64)

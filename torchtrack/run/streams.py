@@ -136,7 +136,7 @@ def _refined(follower: Follower[R], config: TrackingConfig) -> Follower[R]:
         # Compiling would take longer than it saves.
         return build_tracker([session.with_objects([number])], config.model_copy(update={"compiled": False}))
 
-    return _Refined(follower, Refinement(SmoothedObjects.of(session.models, session.camera), config.tracker, alone))
+    return _Refined(follower, Refinement(SmoothedObjects.from_models(session.models, session.camera), config.tracker, alone))
 
 
 def _take(number: int, step: "Step | Ended", follower: Follower[R], outcomes: dict[int, R | TorchtrackError | OSError]) -> None:

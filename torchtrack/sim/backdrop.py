@@ -107,4 +107,4 @@ def _between_grid(values: Float[ndarray, "gh gw"], height: int, width: int) -> F
 def _line_weights(size: int, points: int) -> Float[ndarray, "n p"]:
     """Weights of the grid's points for every pixel of a line."""
     at = np.append(np.arange(0, size - 1, _GRID_PX), size - 1.0)
-    return np.stack([np.interp(np.arange(size), at, one) for one in np.eye(points)], 1).astype(np.float32)
+    return np.stack([np.interp(np.arange(size), at, unit_values) for unit_values in np.eye(points)], 1).astype(np.float32)

@@ -105,8 +105,8 @@ def _closed_grid(rings: Float[ndarray, "n m 3"], *, closed_lengthwise: bool) -> 
     """Rings of points joined to a surface; the last to the first where asked, else both ends are capped by their narrow rings."""
     count, around, _ = rings.shape
     ring, step = np.meshgrid(np.arange(count if closed_lengthwise else count - 1), np.arange(around), indexing="ij")
-    after, beside = (ring + 1) % count, (step + 1) % around
-    a, b, c, d = (i * around + j for i, j in ((ring, step), (after, step), (after, beside), (ring, beside)))
+    after, next_step = (ring + 1) % count, (step + 1) % around
+    a, b, c, d = (i * around + j for i, j in ((ring, step), (after, step), (after, next_step), (ring, next_step)))
     faces = [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)]
     if not closed_lengthwise:
         fan = np.stack([np.zeros(around - 2, int), np.arange(1, around - 1), np.arange(2, around)], 1)

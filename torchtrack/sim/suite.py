@@ -92,12 +92,12 @@ def _expanded(path: Path, overrides: Mapping[str, Any], within: tuple[Path, ...]
 def _matching(folder: Path, pattern: str) -> list[Path]:
     """Files that a pattern names, relative to a folder."""
     try:
-        found = sorted(folder.glob(pattern)) if not Path(pattern).is_absolute() else [Path(pattern)]
+        paths = sorted(folder.glob(pattern)) if not Path(pattern).is_absolute() else [Path(pattern)]
     except (ValueError, OSError) as error:
         raise ConfigError(f"{folder}: scenes: '{pattern}' is no pattern of file names ({error}). Correct it.") from error
-    if not found:
+    if not paths:
         raise MissingFileError(f"scenes: nothing at {folder / pattern}. Check the path.")
-    return found
+    return paths
 
 
 def is_done(scene: SceneConfig, path: Path) -> bool:
@@ -132,7 +132,7 @@ def run_suite(
     scenes: Sequence[SceneConfig],
     folder: Path,
     jobs: int,
-    told: Told = lambda name, share: None,
+    on_progress: Told = lambda name, share: None,
     *,
     preview: bool = False,
     executor: ExecutorName = "local",
@@ -143,24 +143,24 @@ def run_suite(
         scenes: each with another name.
         folder: where sequences go; a sequence of the same settings is kept as it is.
         jobs: processes, of one thread each.
-        told: for a progress bar.
+        on_progress: for a progress bar.
         preview: whether to write a video of each.
         executor: where they are simulated.
     """
     pending = []
     for scene in scenes:
         if is_done(scene, folder / f"{scene.name}.npz"):
-            told(scene.name, 1.0)
+            on_progress(scene.name, 1.0)
         else:
             pending.append(scene)
     failures = []
     targets = [(scene, folder / f"{scene.name}.npz") for scene in pending]
     for number, outcome in run_tasks(
-        partial(_simulate_one, preview=preview), targets, executor, jobs, lambda number, share: told(pending[number].name, share)
+        partial(_simulate_one, preview=preview), targets, executor, jobs, lambda number, share: on_progress(pending[number].name, share)
     ):
         if isinstance(outcome, TaskFailure):
             failures.append(Failure(pending[number].name, outcome.reason))
-        told(pending[number].name, 1.0)
+        on_progress(pending[number].name, 1.0)
     return failures
 
 

@@ -79,4 +79,4 @@ def learns_next(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, conf
     if state.learned is None or on_surfaces is None:
         return False
     wanted = state.learned.wanted(on_surfaces, config.learning)
-    return wanted is not None and host_sync.Answer.to(wanted).any()
+    return wanted is not None and host_sync.AsyncValue.to(wanted).any()

@@ -112,7 +112,7 @@ class CompiledStep:
             if len(nearby.events) < 2:
                 return None
             next_state, result, wrong = self._taken(self._tracker.opened(plain, events), nearby, t_us, learns)
-            is_wrong = host_sync.Answer.to(wrong[None])
+            is_wrong = host_sync.AsyncValue.to(wrong[None])
         return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
     def __getstate__(self) -> dict[str, Any]:

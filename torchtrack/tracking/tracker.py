@@ -58,7 +58,7 @@ from torchtrack.tracking.validation.measures import asked_apart
 from torchtrack.tracking.validation.scored_fit import explained_at_rest, judge_fit
 from torchtrack.tracking.validation.status import Status
 
-_QUESTIONS = host_sync.Questions()
+_QUESTIONS = host_sync.HostReads()
 
 
 class Tracker(TrackedObjects):
@@ -149,7 +149,7 @@ class Tracker(TrackedObjects):
             if steady is not None:
                 return _counted(steady)
             in_parts = to_be_parted(state, events, t_us, self.objects, self.config)
-            parted = host_sync.Answer.to(in_parts)
+            parted = host_sync.AsyncValue.to(in_parts)
             if host_sync.read_at_once(in_parts) and bool(in_parts.all()):
                 return _counted(self._advance_in_parts(state, events, t_us, in_parts))
             done = self._advance(state, events, t_us)
@@ -166,7 +166,7 @@ class Tracker(TrackedObjects):
         Returns:
             State, result, and whether any of this was called for: then they do not hold, and :meth:`step` is to take the window.
         """
-        t_us, assumptions = self._window_end(state, events, t_end_us), host_sync.Assumptions()
+        t_us, assumptions = self._window_end(state, events, t_end_us), host_sync.SteadyState()
         with torch.autocast(t_us.device.type, enabled=False):
             assumptions.ask(to_be_parted(state, events, t_us, self.objects, self.config), False)
             done = _counted(self.advance(self.opened(state, events), NearbyEvents(events), t_us, questions=assumptions))
@@ -209,7 +209,7 @@ class Tracker(TrackedObjects):
         self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"], *, learns: bool = False
     ) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
         """:meth:`advance` with nothing to decide; and whether anything was, or windows in parts may be called for."""
-        assumptions = host_sync.Assumptions()
+        assumptions = host_sync.SteadyState()
         assumptions.ask(of_unknown_motion(state, t_us, self.objects, self.config), False)
         return *self.advance(state, events, t_us, questions=assumptions, learns=learns), assumptions.wrong()
 
@@ -236,7 +236,7 @@ class Tracker(TrackedObjects):
         events: NearbyEvents,
         t_us: Int[Tensor, "s"],
         starting: Tensor | None = None,
-        questions: host_sync.Questions = _QUESTIONS,
+        questions: host_sync.HostReads = _QUESTIONS,
         *,
         learns: bool = True,
     ) -> tuple[TrackerState, StepResult]:
@@ -328,7 +328,7 @@ class Tracker(TrackedObjects):
         turned = may_have_turned(self.has_turning_axis, state.unseen_s, config) if self.turns else self.has_turning_axis
         return Doubt(*told, self.has_symmetry, state.unseen_s, strayed, turned, *anew)
 
-    def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: host_sync.Questions) -> TrackerState:
+    def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: host_sync.HostReads) -> TrackerState:
         """The state that a window is predicted from: of what is lost for long, where it was last seen well."""
         lost = is_lost(state, self.diameter_m, self.config)
         # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.

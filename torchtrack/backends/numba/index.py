@@ -95,7 +95,7 @@ def _write_point(
 
 @accelerates(index_contours)
 def index_contours_numba(
-    contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"] | host_sync.Answer, cell_px: int
+    contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"] | host_sync.AsyncValue, cell_px: int
 ) -> ContourIndex:
     """Point by point."""
     answer = radii(radius_px, contours)

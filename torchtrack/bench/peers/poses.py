@@ -91,12 +91,12 @@ def _of_peer(
         work = comparison.prepare(name, package, partial(make, our.given))
         if work is None:
             return
-        found = comparison.time(f"B={count}: {name}", work)
-        each_s = 1e-3 * found.median / count
+        timing = comparison.time(f"B={count}: {name}", work)
+        each_s = 1e-3 * timing.median / count
         must_lead = name != "OpenCV" or count >= _LEAD_OPENCV_FROM
-        comparison.ahead(found, our.result, 1.0 if name in _TO_LEAD and must_lead else None)
-        _compare_poses(comparison, found.name, our.T_found, np.asarray(work()))
-        yield float(count), found.median
+        comparison.ahead(timing, our.result, 1.0 if name in _TO_LEAD and must_lead else None)
+        _compare_poses(comparison, timing.name, our.T_found, np.asarray(work()))
+        yield float(count), timing.median
 
 
 def _compare_poses(comparison: Comparison, name: str, ours: Float[ndarray, "b 4 4"], theirs: Float[ndarray, "b 4 4"]) -> None:
@@ -136,7 +136,7 @@ def _scipy(given: PointPoses) -> Work:
         T[:3, :3], T[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix() @ T_start[:3, :3], start + step[3:]
         return T
 
-    return lambda: np.stack([solve_one(*one) for one in zip(given.points, given.pixels, given.T_start, strict=True)])
+    return lambda: np.stack([solve_one(*problem) for problem in zip(given.points, given.pixels, given.T_start, strict=True)])
 
 
 def _opencv(given: PointPoses) -> Work:
@@ -152,7 +152,7 @@ def _opencv(given: PointPoses) -> Work:
         T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
         return T
 
-    return lambda: np.stack([solve_one(*one) for one in zip(given.points, given.pixels, given.T_start, strict=True)])
+    return lambda: np.stack([solve_one(*problem) for problem in zip(given.points, given.pixels, given.T_start, strict=True)])
 
 
 def _pypose(given: PointPoses) -> Work:
@@ -178,7 +178,7 @@ def _pypose(given: PointPoses) -> Work:
         return model.pose.matrix().detach().numpy()
 
     tensors = [torch.from_numpy(value) for value in (given.points, given.pixels, given.T_start)]
-    return lambda: np.stack([solve_one(*one) for one in zip(*tensors, strict=True)])
+    return lambda: np.stack([solve_one(*problem) for problem in zip(*tensors, strict=True)])
 
 
 def _theseus(given: PointPoses) -> Work:
@@ -204,9 +204,9 @@ def _theseus(given: PointPoses) -> Work:
 
     def solve() -> ndarray:
         with torch.no_grad():
-            found, _ = layer.forward({"pose": T_start[:, :3]}, optimizer_kwargs={"damping": 1e-6})
+            solved, _ = layer.forward({"pose": T_start[:, :3]}, optimizer_kwargs={"damping": 1e-6})
         last = torch.tensor([[[0.0, 0.0, 0.0, 1.0]]], dtype=torch.float64).expand(len(T_start), 1, 4)
-        return torch.cat([found["pose"], last], 1).numpy()
+        return torch.cat([solved["pose"], last], 1).numpy()
 
     return solve
 

@@ -62,12 +62,12 @@ def _rapid(shape: str) -> Work:
 
     def track() -> ndarray:
         rotation, translation = cv2.Rodrigues(T_start[:3, :3])[0].astype(np.float32), T_start[:3, 3:].astype(np.float32)
-        found = []
+        poses = []
         for image in images:
             for _ in range(_ROUNDS):
                 _, rotation, translation, _ = refine(image, _LINES, _REACH_PX, vertices, faces, K, rotation, translation)
-            found.append(np.concatenate([cv2.Rodrigues(rotation)[0], translation], 1))
-        return np.stack(found)
+            poses.append(np.concatenate([cv2.Rodrigues(rotation)[0], translation], 1))
+        return np.stack(poses)
 
     return track
 
@@ -84,12 +84,12 @@ def _images(scene: Scene) -> Iterator[UInt8[ndarray, "h w"]]:
         yield (255 * surface[0]).byte().numpy()
 
 
-def _quality(scene: Scene, found: ndarray) -> str:
+def _quality(scene: Scene, T_estimated: ndarray) -> str:
     """Median error over all windows, in words."""
     truth = scene.truth[0]
     if truth is None:
         return "its truth is not known"
     true = truth.at(torch.tensor([end_us for _, end_us in scene.windows(_WINDOW_US)])).numpy()
-    angle_deg = np.degrees(Rotation.from_matrix(true[:, :3, :3].swapaxes(1, 2) @ found[:, :, :3]).magnitude())
-    way_mm = 1e3 * np.linalg.norm(true[:, :3, 3] - found[:, :, 3], axis=-1)
+    angle_deg = np.degrees(Rotation.from_matrix(true[:, :3, :3].swapaxes(1, 2) @ T_estimated[:, :, :3]).magnitude())
+    way_mm = 1e3 * np.linalg.norm(true[:, :3, 3] - T_estimated[:, :, 3], axis=-1)
     return f"median error {np.median(angle_deg):.2f}° and {np.median(way_mm):.2f} mm (images are made beforehand)"

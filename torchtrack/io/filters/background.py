@@ -72,8 +72,8 @@ def _support(x: np.ndarray, y: np.ndarray, t_us: np.ndarray, width: int, max_age
     support = np.zeros(len(keys), np.int8)
     for dx, dy in _NEIGHBOURS:
         wanted = keys + (dy * columns + dx) * span
-        found = np.searchsorted(keys, wanted, side="right") - 1
-        support += (found >= 0) & (keys[found] >= wanted - max_age_us)
+        newest = np.searchsorted(keys, wanted, side="right") - 1
+        support += (newest >= 0) & (keys[newest] >= wanted - max_age_us)
     unsorted = np.empty_like(support)
     unsorted[order] = support
     return unsorted

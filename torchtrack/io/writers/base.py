@@ -36,7 +36,7 @@ class EventWriter(ABC):
         """
         if len(events) == 0:
             return
-        columns = inside(Columns.of(events), self.width, self.height, Problems("events to write", strict=True), self._count)
+        columns = inside(Columns.from_batch(events), self.width, self.height, Problems("events to write", strict=True), self._count)
         check_order(columns.t_us, "events to write", self._last_us, self._count)
         self._append(columns)
         self._last_us = int(columns.t_us[-1])

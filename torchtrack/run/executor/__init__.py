@@ -28,7 +28,7 @@ def run_tasks(
     tasks: Sequence[T],
     executor: ExecutorName = "local",
     jobs: int = 1,
-    told: Callable[[int, float], None] = lambda number, share: None,
+    on_progress: Callable[[int, float], None] = lambda number, share: None,
 ) -> Iterator[tuple[int, R | TaskFailure]]:
     """The number of each task and what became of it, as it comes.
 
@@ -41,7 +41,7 @@ def run_tasks(
         executor: ``local`` for processes of this machine, or for this process itself where there is nothing to share
             out; ``ray`` for the cluster at ``$RAY_ADDRESS``, or for one that is started on this machine.
         jobs: how many processes; the cluster at ``$RAY_ADDRESS`` has its own number.
-        told: called with the number of a task and how far it is.
+        on_progress: called with the number of a task and how far it is.
 
     Raises:
         MissingExtraError: if Ray is wanted and not installed.
@@ -54,5 +54,5 @@ def run_tasks(
         # Each process imports this file anew: what it does not need would only make it slower to start.
         from torchtrack.run.executor.on_ray import run_on_ray
 
-        return run_on_ray(function, tasks, jobs, told)
-    return run_in_processes(function, tasks, processes, told) if processes > 1 else run_here(function, tasks, told)
+        return run_on_ray(function, tasks, jobs, on_progress)
+    return run_in_processes(function, tasks, processes, on_progress) if processes > 1 else run_here(function, tasks, on_progress)

@@ -34,7 +34,7 @@ def run_in_groups(
 
 def grouped(alike: Sequence[Hashable], size: int) -> list[list[int]]:
     """Numbers of items that are alike, ``size`` at most together, in the order of the first of each group."""
-    found: dict[Hashable, list[int]] = {}
+    numbers_by_key: dict[Hashable, list[int]] = {}
     for number, key in enumerate(alike):
-        found.setdefault(key, []).append(number)
-    return sorted(numbers[first : first + size] for numbers in found.values() for first in range(0, len(numbers), size))
+        numbers_by_key.setdefault(key, []).append(number)
+    return sorted(numbers[first : first + size] for numbers in numbers_by_key.values() for first in range(0, len(numbers), size))

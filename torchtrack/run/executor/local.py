@@ -25,14 +25,16 @@ _GRACE_S = 10.0
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
-def run_here(function: Callable[[T, Tell], R], tasks: Sequence[T], told: Callable[[int, float], None]) -> Iterator[tuple[int, R | TaskFailure]]:
+def run_here(
+    function: Callable[[T, Tell], R], tasks: Sequence[T], on_progress: Callable[[int, float], None]
+) -> Iterator[tuple[int, R | TaskFailure]]:
     """One task after the other in this process."""
     for number, task in enumerate(tasks):
-        yield number, attempt(function, task, lambda share, number=number: told(number, share))  # type: ignore[misc]
+        yield number, attempt(function, task, lambda share, number=number: on_progress(number, share))  # type: ignore[misc]
 
 
 def run_in_processes(
-    function: Callable[[T, Tell], R], tasks: Sequence[T], processes: int, told: Callable[[int, float], None]
+    function: Callable[[T, Tell], R], tasks: Sequence[T], processes: int, on_progress: Callable[[int, float], None]
 ) -> Iterator[tuple[int, R | TaskFailure]]:
     """All tasks in so many processes."""
     waiting, ended = deque(range(len(tasks))), Counter[int]()
@@ -49,7 +51,7 @@ def run_in_processes(
                 worker = at_work[pipe]  # type: ignore[index]
                 number, (kind, value) = worker.number, worker.receive()
                 if kind == "share":
-                    told(number, value)
+                    on_progress(number, value)
                 elif kind == "outcome":
                     yield number, value
                 else:

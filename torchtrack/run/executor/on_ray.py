@@ -22,14 +22,14 @@ _GRACE_S = 10.0
 
 
 def run_on_ray(
-    function: Callable[[T, Tell], R], tasks: Sequence[T], jobs: int, told: Callable[[int, float], None]
+    function: Callable[[T, Tell], R], tasks: Sequence[T], jobs: int, on_progress: Callable[[int, float], None]
 ) -> Iterator[tuple[int, R | TaskFailure]]:
     """All tasks on the cluster, or in so many processes of one that is started on this machine."""
     ray = optional("ray", "ray", "cluster", "The executor 'ray'")
-    return _run(ray, function, tasks, jobs, told)
+    return _run(ray, function, tasks, jobs, on_progress)
 
 
-def _run(ray: Any, function: Callable[[Any, Tell], Any], tasks: Sequence[Any], jobs: int, told: Callable[[int, float], None]) -> Iterator[Any]:
+def _run(ray: Any, function: Callable[[Any, Tell], Any], tasks: Sequence[Any], jobs: int, on_progress: Callable[[int, float], None]) -> Iterator[Any]:
     with _cluster(ray, jobs):
         board = ray.remote(num_cpus=0)(_Board).remote()
         # Ray tries again where the process is gone; an error of the task itself is its outcome.
@@ -39,7 +39,7 @@ def _run(ray: Any, function: Callable[[Any, Tell], Any], tasks: Sequence[Any], j
             while running:
                 done, _ = ray.wait(list(running), timeout=_POLL_S)
                 for number, share in ray.get(board.take.remote()):
-                    told(number, share)
+                    on_progress(number, share)
                 for reference in done:
                     number = running.pop(reference)
                     yield number, _outcome(ray, reference)

@@ -37,9 +37,9 @@ class AlignmentRecord:
         for name, contours in (("tracked", tracked), ("initial", initial)):
             for index in range(len(self._labels)):
                 seen = tracked.mask[index].cpu()
-                found = alignment(pixels, contours.pixels[index].cpu()[seen].double().numpy(), contours.normals[index].cpu()[seen].double().numpy())
-                self._median_px[name][index].append(found.median_px)
-                self._share[name][index].append(found.share_near)
+                aligned = alignment(pixels, contours.pixels[index].cpu()[seen].double().numpy(), contours.normals[index].cpu()[seen].double().numpy())
+                self._median_px[name][index].append(aligned.median_px)
+                self._share[name][index].append(aligned.share_near)
 
     def close(self) -> None:
         """Nothing is open."""

@@ -87,9 +87,9 @@ def ended(folder: Path, suffix: str = "") -> str | None:
     ``running`` is the summary of a run that is going on, or was killed.
     """
     try:
-        told = json.loads((folder / f"{SUMMARY}{suffix}").read_text(encoding="utf-8"))
+        summary = json.loads((folder / f"{SUMMARY}{suffix}").read_text(encoding="utf-8"))
         # Earlier versions wrote the summary of complete and of interrupted runs alone.
-        return str(told.get("ended") or ("interrupted" if told.get("interrupted") else "completed"))
+        return str(summary.get("ended") or ("interrupted" if summary.get("interrupted") else "completed"))
     except (OSError, ValueError, AttributeError):
         return None
 

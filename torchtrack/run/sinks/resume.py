@@ -46,7 +46,7 @@ def check_resumable(config: RunConfig) -> None:
         raise ConfigError(f"resume: the run in '{folder}' is complete, nothing is left to do. Track without --resume to do all anew.")
     if isinstance(config.source, str):
         raise ConfigError(f"resume: '{config.source}' is live, what it sent is gone. Track without --resume, from where the objects are now.")
-    before, now = (flat(one.model_dump(mode="json", exclude=_MAY_DIFFER)) for one in (load(RunConfig, folder / CONFIG), config))
+    before, now = (flat(run.model_dump(mode="json", exclude=_MAY_DIFFER)) for run in (load(RunConfig, folder / CONFIG), config))
     if other := sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key)):
         named = ", ".join(f"{key} was {before.get(key)!r}, is {now.get(key)!r}" for key in other[:3])
         raise ConfigError(f"resume: the run in '{folder}' had other settings: {named}. Give the same, or track without --resume.")
@@ -54,10 +54,10 @@ def check_resumable(config: RunConfig) -> None:
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings by dotted key."""
-    found: dict[str, Any] = {}
+    by_key: dict[str, Any] = {}
     for key, value in values.items():
-        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return found
+        by_key |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return by_key
 
 
 def take_up(folder: Path, labels: Sequence[str]) -> Earlier:

@@ -150,7 +150,9 @@ def summarise_run(source: str, labels: Sequence[str], record: Record, facts: Fac
         tracking_real_time_factor=_ratio(duration_s, 1e-3 * float(step_ms.sum())),
         step_median_ms=float(np.median(step_ms)) if len(step_ms) else math.nan,
         step_p95_ms=float(np.percentile(step_ms, 95)) if len(step_ms) else math.nan,
-        objects={label: _summarise_object(of, record.duration_s, dict(facts.more.get(label, {}))) for label, of in by_label},
+        objects={
+            label: _summarise_object(record_of_object, record.duration_s, dict(facts.more.get(label, {}))) for label, record_of_object in by_label
+        },
         resumed_us=facts.resumed_us,
     )
 

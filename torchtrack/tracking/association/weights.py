@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.linalg import vecdot
 
 from torchtrack.config.tracker import MatchingConfig
-from torchtrack.core.constants import constant, one
+from torchtrack.core.constants import constant, scalar_one
 from torchtrack.core.padded import take_points
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
@@ -38,7 +38,7 @@ def told_by_each(beside: Float[Tensor, "b n"], common_px2: Float[Tensor, "b n"],
         common_px2: variance of what they have in common (px²).
         observation_px: standard deviation of what each has alone.
     """
-    return torch.addcmul(one(beside), beside, common_px2, value=observation_px**-2).reciprocal()
+    return torch.addcmul(scalar_one(beside), beside, common_px2, value=observation_px**-2).reciprocal()
 
 
 def mistaken_px2(
@@ -121,7 +121,7 @@ def concentration(on_count: Float[Tensor, "b n"], near_count: Float[Tensor, "b n
     of the observations near a contour that are on it. No patch counts for nothing: one that is off the contour as a whole
     must still pull a pose back that has begun to slip.
     """
-    share, gain = (on_count + one(on_count)) / (near_count + two_of(near_count)), 1 / (config.gathered_share - config.smeared_share)
+    share, gain = (on_count + scalar_one(on_count)) / (near_count + two_of(near_count)), 1 / (config.gathered_share - config.smeared_share)
     smeared = constant((-config.smeared_share * gain,), share.dtype, share.device)
     return torch.add(smeared, share, alpha=gain).clamp_(config.least_trust, 1)
 
@@ -143,7 +143,7 @@ def polarity_agreement(
 
 def agreeing(agreement: Tensor, config: MatchingConfig) -> Tensor:
     """Trust in events whose polarity is what it should be, 1, or the opposite, -1, as far as that is known."""
-    return torch.add(one(agreement), agreement, alpha=config.polarity_gain).clamp_(config.least_agreement, 1)
+    return torch.add(scalar_one(agreement), agreement, alpha=config.polarity_gain).clamp_(config.least_agreement, 1)
 
 
 def two_of(like: Tensor) -> Tensor:

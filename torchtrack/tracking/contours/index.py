@@ -49,7 +49,7 @@ class ContourIndex:
     cell_px: int
     nearest: Int[Tensor, "b p"]
     pixels: Float[Tensor, "b m 2"]
-    radius_px: host_sync.Answer
+    radius_px: host_sync.AsyncValue
 
     def look_up(self, pixels: Float[Tensor, "b n 2"], finely: Bool[Tensor, "b"] | None = None) -> Int[Tensor, "b n"]:
         """The contour point nearest to the centre of each pixel's cell, -1 where none is near.
@@ -99,7 +99,7 @@ class ContourIndex:
 
 @accelerable
 def index_contours(
-    contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"] | host_sync.Answer, cell_px: int
+    contours: Contours, image_size: tuple[int, int], radius_px: int | Int[Tensor, "b"] | host_sync.AsyncValue, cell_px: int
 ) -> ContourIndex:
     """Index the visible contour points; those far outside the image (height, width) are left out.
 
@@ -140,11 +140,11 @@ def index_contours(
     return ContourIndex(low, (rows, columns), cell_px, nearest, contours.pixels, answer)
 
 
-def radii(radius_px: int | Tensor | host_sync.Answer, contours: Contours) -> host_sync.Answer:
+def radii(radius_px: int | Tensor | host_sync.AsyncValue, contours: Contours) -> host_sync.AsyncValue:
     """The radius of each object."""
     if isinstance(radius_px, int):
-        return host_sync.Answer.of(radius_px, contours.mask[:, 0].long())
-    return radius_px if isinstance(radius_px, host_sync.Answer) else host_sync.Answer.to(radius_px)
+        return host_sync.AsyncValue.known(radius_px, contours.mask[:, 0].long())
+    return radius_px if isinstance(radius_px, host_sync.AsyncValue) else host_sync.AsyncValue.to(radius_px)
 
 
 def _first_cells(centre: Float[Tensor, "b m 2"], inside: Bool[Tensor, "b m"], margin: int) -> Float[Tensor, "b 2"]:

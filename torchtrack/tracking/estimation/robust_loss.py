@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.core.constants import one
+from torchtrack.core.constants import scalar_one
 
 # By these numbers, kernels know them.
 LOSSES = ("none", "huber", "tukey")
@@ -41,4 +41,4 @@ def robust_weight(residuals: Float[Tensor, "b n"], scale: Float[Tensor, "b"], lo
 def _inside(residuals: Tensor, c: Tensor) -> Tensor:
     """``1 - (r/c)²``, not below zero."""
     relative = residuals / c
-    return torch.addcmul(one(c), relative, relative, value=-1).clamp(min=0)
+    return torch.addcmul(scalar_one(c), relative, relative, value=-1).clamp(min=0)

@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerable
-from torchtrack.core.host_sync import Answer
+from torchtrack.core.host_sync import AsyncValue
 from torchtrack.tracking.association.along_flow import match_along_flow
 from torchtrack.tracking.association.matches import Matches, both_coordinates
 from torchtrack.tracking.association.nearest import ContourTable, contour_table, match_nearest
@@ -70,14 +70,14 @@ def usual_index_radius(config: TrackerConfig) -> int:
 
 
 def index_for(
-    contours: Contours, image_size: tuple[int, int], config: TrackerConfig, widening: Float[Tensor, "b"], radius_px: Answer | None = None
+    contours: Contours, image_size: tuple[int, int], config: TrackerConfig, widening: Float[Tensor, "b"], radius_px: AsyncValue | None = None
 ) -> ContourIndex:
     """The index of contours, wide enough for each object's first gate.
 
     Args:
         radius_px: :func:`index_radius`, where it was asked for ahead.
     """
-    return index_contours(contours, image_size, radius_px or Answer.to(index_radius(widening, config)), config.matching.index_cell_px)
+    return index_contours(contours, image_size, radius_px or AsyncValue.to(index_radius(widening, config)), config.matching.index_cell_px)
 
 
 def align(

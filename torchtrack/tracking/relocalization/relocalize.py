@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core.host_sync import Answer
+from torchtrack.core.host_sync import AsyncValue
 from torchtrack.tracking.estimation.rounds import gate_widening
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
@@ -54,7 +54,7 @@ def search_wanted(
     doubt = replace(doubt, adrift=doubt.adrift & ~stands)
     uncertain = drifted(prediction, doubt, config.search)
     sigma_px = torch.where(doubt.adrift, uncertain.sigma_px(found.fit.contours), doubt.sigma_px)
-    answers = (Answer.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px, doubt.sigma_px))
+    answers = (AsyncValue.to(values).numbers() for values in (*(enough & reason for reason in reasons), sigma_px, doubt.sigma_px))
     for number, told in enumerate(zip(*answers, strict=True)):
         it_stands, is_tried, may_have_slipped, is_mirrored, is_turned, has_run_off, own_sigma_px, predicted_px = told
         if it_stands:
@@ -89,7 +89,7 @@ def _search_anew(
     """:func:`search_wanted` for objects that are far off in depth, or explain little: around where they were last seen well."""
     found, prediction, widening = so_far
     anywhere = gate_widening(torch.full_like(widening, torch.inf), config)
-    for number, is_sought in enumerate(Answer.to(doubt.anew()).numbers()):
+    for number, is_sought in enumerate(AsyncValue.to(doubt.anew()).numbers()):
         if is_sought:
             # A look from there is a wide one, however far this one goes.
             other, wide_px, before = last_seen.prediction(number, prediction), 2 * config.search.wide_sigma_px, found
