@@ -37,7 +37,7 @@ PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted((REPOSIT
 # All but what is generated.
 README = "\n\n".join([FRONT, *(text for name, text in PAGES.items() if name != "settings.md")])
 SETTINGS = {"track": RunConfig, "evaluate": EvaluateConfig, "demo": DemoConfig, "simulate": SceneConfig}
-COMMANDS = ("track", "evaluate", "simulate", "demo", "outline", "info", "convert", "bench", "settings")
+COMMANDS = ("track", "evaluate", "simulate", "demo", "outline", "model", "info", "convert", "bench", "settings")
 BLOCKS = ("ACCURACY", "ABLATION", "PAPER TABLES", "SPEED")
 FILE_SUFFIXES = ("py", "yaml", "txt", "npz", "json", "csv", "tum", "mp4", "png", "obj", "glb", "md")
 
@@ -130,7 +130,7 @@ def test_dotted_names_exist():
 
 def test_settings_named_alone_exist():
     every = {part for key in dotted_keys(RunConfig) for part in key.split(".")}
-    named = {"initial_pose", "start_us", "translation_m", "quaternion_xyzw", "matrix", "trajectory", "polylines", "mesh", "unit"}
+    named = {"initial_pose", "start_us", "translation_m", "quaternion_xyzw", "matrix", "trajectory", "polylines", "mesh", "unit", "scale", "centre"}
     assert named | {"source", "sensor_latency_us"} <= every & set(spans())
 
 

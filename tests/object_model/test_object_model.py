@@ -13,7 +13,7 @@ from PIL import Image
 
 from torchtrack.errors import MissingFileError, ModelError, TorchtrackWarning, UnknownFormatError
 from torchtrack.object_model import ModelSettings, ObjectModel
-from torchtrack.object_model.loading import checked_scale
+from torchtrack.object_model.placement import Placement
 
 SIDE = 0.1
 
@@ -192,13 +192,13 @@ def test_wrong_unit_says_which_would_fit():
         ObjectModel.from_mesh(cube(100), name="box")
     with pytest.raises(ModelError, match=r"0\.000173 m across with unit='mm'.*unit='m' \(0\.173 m\)"):
         ObjectModel.from_mesh(cube(0.1), name="box", unit="mm")
-    with pytest.raises(ModelError, match="scale the model in a mesh editor"):
+    with pytest.raises(ModelError, match="No known unit makes it plausible: set scale"):
         ObjectModel.from_mesh(cube(1e9), name="box")
 
 
 def test_unknown_unit():
     with pytest.raises(ModelError, match=r"unknown unit 'furlong'.*m, cm, mm, inch"):
-        checked_scale(np.eye(3), "furlong", "box")
+        Placement("furlong").metres(np.eye(3), "box")
 
 
 def test_degenerate_and_repeated_faces_are_dropped_quietly():
@@ -376,7 +376,7 @@ def test_many_parts_are_turned_in_one_search():
 def test_model_far_from_its_origin_is_refused(shift: list[float]):
     far = cube().apply_translation(shift)
     away = rf"\({0 - shift[0]:.10g}, {0 - shift[1]:.10g}, .*\)"
-    with pytest.raises(ModelError, match=rf"'far' lies .* times its diameter from its own origin.*Move it by {away} m in a mesh editor"):
+    with pytest.raises(ModelError, match=rf"'far' lies .* times its diameter from its own origin.*centre to true, or move it by {away} m in a mesh"):
         ObjectModel.from_mesh(far, name="far")
     with pytest.raises(ModelError, match="from its own origin"):
         ObjectModel.from_polylines(np.asarray(far.vertices)[far.edges])

@@ -11,6 +11,7 @@ import torch
 from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import LimitError, MissingFileError, ModelError, UnknownFormatError
 from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.polylines import as_polylines
 
 SQUARE = [[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0], [0, 0, 0]]
 LINE = [[0.02, 0.02, 0], [0.08, 0.08, 0]]
@@ -136,4 +137,4 @@ def test_lines_that_go_on_and_end_in_comments(tmp_path: Path):
 
 def test_lists_of_wrong_types():
     with pytest.raises(ModelError, match="not made of points of three numbers"):
-        ObjectModel.from_polylines([[[0, 0, 0], ["a", 0, 0]]])
+        as_polylines([[[0, 0, 0], ["a", 0, 0]]])

@@ -6,11 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from tiny_sequence import write_tiny_sequence
 
 from torchtrack.config.run import RunConfig
 from torchtrack.errors import ConfigError, EventDataError, TorchtrackWarning
+from torchtrack.io import read_sequence
+from torchtrack.object_model import ObjectModel
 from torchtrack.run.runner import run
+from torchtrack.run.session import open_session
 
 
 @pytest.fixture(scope="module")
@@ -73,3 +77,17 @@ def test_a_clock_that_jumps_back_is_tracked_on_and_told(sequence_path, tmp_path)
     assert summary.problems == {"jumps back of the clock, taken out": 1}
     changes = json.loads((tmp_path / "out" / "summary.json").read_text())["clock_changes"]
     assert changes == [{"kind": "reset", "at_us": 20_001, "from_us": 20_000, "to_us": -999_979_500}]
+
+
+def test_a_model_is_placed_by_its_settings_and_a_sequences_own_is_not(sequence_path):
+    mesh = next(sequence_path.parent.glob("*.ply"))
+    label = read_sequence(sequence_path).objects[0].label
+    pose = {"translation_m": (0, 0, 0.5)}
+    placed = {"label": "other", "mesh": mesh, "unit": "cm", "scale": 200.0, "centre": True, "initial_pose": pose}
+    session = open_session(RunConfig(source=sequence_path, objects=[placed]))
+    assert session.models[0].diameter_m == pytest.approx(2 * ObjectModel.from_file(mesh).diameter_m)
+    assert session.models[0].centre.abs().max() < 1e-6
+    with pytest.raises(ConfigError, match=r"centre: '.*' knows poses of .* Leave centre out"):
+        open_session(RunConfig(source=sequence_path, objects=[{**placed, "label": label}]))
+    with pytest.raises(ValidationError, match="unit, scale and centre are of a mesh or polylines given here"):
+        RunConfig(source=sequence_path, objects=[{"label": label, "centre": True}])

@@ -11,6 +11,7 @@ from torchtrack.core.camera import project
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import ConfigError, EventDataError, MissingFileError, ModelError, UnknownFormatError
 from torchtrack.io.sequence import read_sequence
+from torchtrack.object_model import ObjectModel
 from torchtrack.sim import BackgroundConfig, CameraConfig, MotionConfig, ObjectConfig, SceneConfig, simulate, write
 from torchtrack.sim.meshes import make_mesh
 from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
@@ -244,6 +245,18 @@ def test_meshes_that_cannot_be_drawn_are_errors(tmp_path):
         ObjectConfig(label="a", mesh=tmp_path / "cube.ply", unit="mm").build()
     (part,) = ObjectConfig(label="a", mesh=tmp_path / "cube.ply", scale=2.0).build()
     assert part.extents == pytest.approx([0.24] * 3)
+
+
+def test_unit_scale_and_centre_place_a_mesh_as_they_do_for_a_tracker(tmp_path):
+    make_mesh("cube").apply_translation((1.0, 2.0, 3.0)).export(tmp_path / "cube.ply")
+    placed = {"unit": "inch", "scale": 30.0, "centre": True}
+    (part,) = ObjectConfig(label="a", mesh=tmp_path / "cube.ply", **placed).build()
+    assert part.extents == pytest.approx([0.12 * 30 * 0.0254] * 3)
+    assert part.bounds.mean(0) == pytest.approx([0, 0, 0], abs=1e-9)
+    model = ObjectModel.from_file(tmp_path / "cube.ply", **placed)
+    assert (2 * model.half_extent).tolist() == pytest.approx(part.extents, rel=1e-5)
+    with pytest.raises(ValidationError, match="built-in object is enlarged by"):
+        ObjectConfig(label="a", shape="cube", scale=30.0)
 
 
 def test_event_camera_parameters_can_replace_the_profile():

@@ -13,7 +13,7 @@ from tyro.conf import subcommand
 
 from torchtrack.cli.console import flushed, report, take_any_text
 from torchtrack.cli.exit_codes import ExitCode
-from torchtrack.cli.options import Demo, Evaluate, Outline, Settings, Simulate, Track
+from torchtrack.cli.options import Demo, Evaluate, Model, Outline, Settings, Simulate, Track
 from torchtrack.cli.options_files import Bench, Convert, Info
 from torchtrack.config.load import load, typed
 from torchtrack.core.limits import Limits, limits
@@ -29,6 +29,7 @@ _Command = (
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Demo, subcommand("demo")]
     | Annotated[Outline, subcommand("outline")]
+    | Annotated[Model, subcommand("model")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Convert, subcommand("convert")]
     | Annotated[Bench, subcommand("bench")]

@@ -1,6 +1,7 @@
 """The options of each command. What a command does is imported when it runs: ``torchtrack --help`` is not to wait for PyTorch."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
@@ -217,6 +218,29 @@ class Outline:
 
         refuse_settings(overrides)
         return outline(self.image, self.calibration, self.output, self.distance_m, self.width, self.height)
+
+
+@dataclass(frozen=True)
+class Model:
+    """Say what a model is: size, unit, origin, surface, edges, texture, symmetries; and draw the contours that the tracker would use."""
+
+    file: Positional[Annotated[str, arg(metavar="FILE")]]
+    """A mesh (PLY, OBJ, STL, GLB, glTF, OFF), or polylines (JSON, or OBJ with lines)."""
+    output: Annotated[str | None, _option("FILE", "-o")] = None
+    """The picture of six views to write (.png)."""
+    unit: Annotated[Literal["m", "cm", "mm", "inch"] | None, _option("UNIT")] = None
+    """Unit of the file's numbers; the likeliest when not given."""
+    scale: float = 1.0
+    """Enlargement."""
+    centre: bool = False
+    """Have the middle of the model as its origin."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        from torchtrack.cli.model import show_model
+
+        refuse_settings(overrides)
+        return show_model(Path(self.file), self.unit, self.scale, None if self.output is None else Path(self.output), centre=self.centre)
 
 
 @dataclass(frozen=True)

@@ -52,12 +52,16 @@ class ObjectConfig(Settings):
     mesh: ConfigPath | None = Field(None, description="PLY, OBJ, STL, GLB or OFF file; by default the sequence's own.")
     polylines: ConfigPath | None = Field(None, description="File of 3D polylines, instead of a mesh.")
     unit: Literal["m", "cm", "mm", "inch"] = Field("m", description="Unit of the model's coordinates.")
+    scale: float = Field(1.0, gt=0, le=1e6, description="Enlargement of the model.")
+    centre: bool = Field(False, description="The middle of the model's bounding box is the origin that its poses are of.")
     initial_pose: PoseConfig | None = Field(None, description="Pose at the start; by default the sequence's ground truth.")
 
     @model_validator(mode="after")
     def _one_model(self) -> "ObjectConfig":
         if self.mesh is not None and self.polylines is not None:
             raise ValueError("give mesh or polylines, not both")
+        if self.mesh is None and self.polylines is None and (self.unit, self.scale, self.centre) != ("m", 1.0, False):
+            raise ValueError("unit, scale and centre are of a mesh or polylines given here: a sequence's own model is as its poses are")
         return self
 
 

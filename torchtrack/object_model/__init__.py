@@ -4,7 +4,8 @@ A model is read once, checked, and turned into plain tensors in metres in the ob
 
 ==================  ===========================================================================
 ``surface.py``      meshes welded by position, with texture coordinates and colours per corner
-``loading.py``      PLY, OBJ, STL, GLB and OFF through trimesh; units; files and origins that cannot be used
+``loading.py``      PLY, OBJ, STL, GLB and OFF through trimesh; files that cannot be used
+``placement.py``    units, scale and origin
 ``gltf.py``         checks before trimesh reads a glTF file, and what it would misread made plain (``gltf_accessors.py``)
 ``obj.py``          the same for OBJ and its material libraries
 ``ply.py``          the same for PLY
@@ -18,6 +19,7 @@ A model is read once, checked, and turned into plain tensors in metres in the ob
 ``sampling.py``     even samples of a surface
 ``polylines.py``    models that are 3D line segments and nothing else
 ``model.py``        :class:`ObjectModel`, which puts them together
+``report.py``       what can be said of a model before it is tracked
 ==================  ===========================================================================
 """
 

@@ -18,15 +18,11 @@ from torchtrack.object_model.gltf import read_gltf
 from torchtrack.object_model.notices import tell
 from torchtrack.object_model.obj import check_indices, read_obj
 from torchtrack.object_model.ply import read_ply
-from torchtrack.object_model.settings import METRES_PER_UNIT
 from torchtrack.object_model.side_files import MeshText, find_beside
 from torchtrack.object_model.stl_off import read_off, read_stl
 from torchtrack.object_model.textures import check_textures, tell_lost_textures
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
-_SMALLEST_M, _LARGEST_M = 0.005, 5.0
-# Poses are float32: with the origin so many diameters away, their rounding moves the model by 1e-4 and 1e-5 of its diameter.
-_FARTHEST, _FAR = 1000.0, 100.0
 # What trimesh's readers raise, depending on what their parsing trips over.
 _READER_ERRORS: tuple[type[Exception], ...] = (
     *(ValueError, TypeError, LookupError, AttributeError, NameError, AssertionError, ArithmeticError, OSError, EOFError, SyntaxError),
@@ -154,50 +150,11 @@ def _check_corners(part: trimesh.Trimesh, name: str) -> None:
         )
 
 
-def checked_scale(points: np.ndarray, unit: str, name: str) -> float:
-    """Metres per ``unit``, once points ``[n, 3]`` in that unit have passed the checks that every model must pass.
-
-    Raises:
-        ModelError: if a coordinate is not finite, the unit is unknown, the diameter is outside 5 mm to 5 m, or the origin is
-            too far away.
-    """
-    if unit not in METRES_PER_UNIT:
-        raise ModelError(f"unknown unit '{unit}' for '{name}': use one of {', '.join(METRES_PER_UNIT)}.")
-    bad = ~np.isfinite(points).all(1)
-    if bad.any():
-        raise ModelError(f"{bad.sum()} of {len(points)} vertices of '{name}' are not finite (NaN or infinite). Repair the model and export it again.")
-    with np.errstate(over="ignore", invalid="ignore"):
-        diameter = float(np.linalg.norm(np.ptp(points, axis=0)))
-        middle = points.min(0) / 2 + points.max(0) / 2
-    _check_diameter(diameter, unit, name)
-    _check_origin(middle, diameter, unit, name)
-    return METRES_PER_UNIT[unit]
-
-
-def _check_origin(middle: np.ndarray, diameter: float, unit: str, name: str) -> None:
-    """Refuse a model so far from its own origin that float32 poses of that origin cannot say where the model is."""
-    ratio = float(np.linalg.norm(middle)) / diameter
-    if ratio <= _FAR:
-        return
-    shift = ", ".join(f"{0 - value:.10g}" for value in middle)
-    problem = f"'{name}' lies {ratio:,.0f} times its diameter from its own origin, as models in map coordinates do"
-    advice = f"Move it by ({shift}) {unit} in a mesh editor, so that its middle is at the origin, and give initial poses of the moved model."
-    if ratio > _FARTHEST:
-        raise ModelError(
-            f"{problem}: poses, which are of that origin, would be rounded to more than 1e-4 of its size; "
-            f"expected less than {_FARTHEST:.0f} times. {advice}"
-        )
-    tell(f"{problem}: poses are of that origin, so a small error of rotation is a large one of translation. {advice}")
-
-
-def _check_diameter(diameter: float, unit: str, name: str) -> None:
-    """Refuse a size that no tracked object has, and say which unit would make it plausible."""
-    metres = diameter * METRES_PER_UNIT[unit]
-    if _SMALLEST_M <= metres <= _LARGEST_M:
-        return
-    plausible = [f"unit='{u}' ({diameter * scale:.3g} m)" for u, scale in METRES_PER_UNIT.items() if _SMALLEST_M <= diameter * scale <= _LARGEST_M]
-    advice = f"Plausible would be {' or '.join(plausible)}." if plausible else "No known unit makes it plausible: scale the model in a mesh editor."
-    raise ModelError(f"'{name}' is {metres:.3g} m across with unit='{unit}'; expected 5 mm to 5 m. {advice}")
+def place_part(part: trimesh.Trimesh, factor: float, origin: np.ndarray) -> None:
+    """Have a part in metres, with another point (m) as its origin; it is changed."""
+    part.apply_scale(factor)
+    if origin.any():
+        part.apply_translation(-origin)
 
 
 def join_parts(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:

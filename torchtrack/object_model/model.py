@@ -12,9 +12,10 @@ from torch import Tensor
 
 from torchtrack.errors import ModelError
 from torchtrack.object_model.colour_edges import colour_edges
-from torchtrack.object_model.loading import MESH_SUFFIXES, check_file, checked_scale, join_parts, load_parts, mesh_parts
+from torchtrack.object_model.loading import MESH_SUFFIXES, check_file, join_parts, load_parts, mesh_parts, place_part
 from torchtrack.object_model.mesh_edges import NO_EDGES, EdgeTable, MeshEdges, contour_edges
 from torchtrack.object_model.notices import tell
+from torchtrack.object_model.placement import Placement
 from torchtrack.object_model.polylines import POLYLINE_SUFFIXES, as_polylines, has_obj_lines, read_polylines, segments_of
 from torchtrack.object_model.sampling import NO_SAMPLES, sample_surface
 from torchtrack.object_model.settings import ModelSettings, Unit
@@ -67,13 +68,24 @@ class ObjectModel:
     mesh: trimesh.Trimesh | None
 
     @classmethod
-    def from_file(cls, path: str | Path, *, name: str | None = None, unit: Unit = "m", settings: ModelSettings | None = None) -> "ObjectModel":
+    def from_file(
+        cls,
+        path: str | Path,
+        *,
+        name: str | None = None,
+        unit: Unit = "m",
+        scale: float = 1.0,
+        centre: bool = False,
+        settings: ModelSettings | None = None,
+    ) -> "ObjectModel":
         """A model from a PLY, OBJ, STL, GLB, glTF or OFF mesh, or from polylines (JSON, or OBJ with lines and no faces).
 
         Args:
             path: the file.
             name: the object's name; the file's, when not given.
             unit: the unit of the file's numbers (glTF is always in metres).
+            scale: the model is enlarged by this.
+            centre: the middle of its bounding box becomes the origin of the object's frame.
             settings: how edges and samples are taken.
 
         Raises:
@@ -83,8 +95,8 @@ class ObjectModel:
         path = check_file(path, tuple(dict.fromkeys(MESH_SUFFIXES + POLYLINE_SUFFIXES)))
         try:
             if path.suffix.lower() == ".json" or (path.suffix.lower() == ".obj" and has_obj_lines(path)):
-                return cls.from_polylines(path, name=name, unit=unit)
-            return cls.from_mesh(load_parts(path), name=name or path.stem, unit=unit, settings=settings)
+                return cls.from_polylines(path, name=name, unit=unit, scale=scale, centre=centre)
+            return cls.from_mesh(load_parts(path), name=name or path.stem, unit=unit, scale=scale, centre=centre, settings=settings)
         except ModelError as error:
             if str(path) in str(error):
                 raise
@@ -97,9 +109,11 @@ class ObjectModel:
         *,
         name: str = "object",
         unit: Unit = "m",
+        scale: float = 1.0,
+        centre: bool = False,
         settings: ModelSettings | None = None,
     ) -> "ObjectModel":
-        """A model from a mesh, a scene, or meshes that make up one object; they are not changed.
+        """A model from a mesh, a scene, or meshes that make up one object; they are not changed. Arguments are those of :meth:`from_file`.
 
         Warns (:class:`~torchtrack.errors.TorchtrackWarning`) when faces point inwards and are flipped.
 
@@ -110,9 +124,9 @@ class ObjectModel:
         parts = mesh_parts(mesh, name)
         if not parts:
             raise ModelError(f"'{name}' has no triangles: the tracker needs a surface. Give a triangle mesh, or lines with from_polylines.")
-        scale = checked_scale(np.concatenate([part.vertices for part in parts]), unit, name)
+        factor, origin = Placement(unit, scale, centre).metres(np.concatenate([part.vertices for part in parts]), name)
         for part in parts:
-            part.apply_scale(scale)
+            place_part(part, factor, origin)
         surface, table, outwards = turn_outwards(surface_from_parts(parts), name)
         return cls._assemble(
             name,
@@ -131,6 +145,8 @@ class ObjectModel:
         *,
         name: str | None = None,
         unit: Unit = "m",
+        scale: float = 1.0,
+        centre: bool = False,
     ) -> "ObjectModel":
         """A model of line segments alone: a printed pattern, a book's page.
 
@@ -138,6 +154,7 @@ class ObjectModel:
             source: a file (see :mod:`torchtrack.object_model.polylines`), or a list of polylines ``[n, 3]``.
             name: the object's name; the file's, when not given.
             unit: the unit of the numbers, unless the file states its own.
+            scale, centre: as in :meth:`from_file`.
 
         Raises:
             MissingFileError, UnknownFormatError, ModelError: as :meth:`from_file`.
@@ -152,7 +169,8 @@ class ObjectModel:
         segments = segments_of(polylines)
         if len(segments) == 0:
             raise ModelError(f"'{name}' has no line segments. Give at least one polyline of two different points.")
-        points = segments.reshape(-1, 3) * checked_scale(segments.reshape(-1, 3), stated or unit, name)
+        factor, origin = Placement(stated or unit, scale, centre).metres(segments.reshape(-1, 3), name)
+        points = segments.reshape(-1, 3) * factor - origin
         return cls._assemble(name, points, segments=points.reshape(-1, 2, 3))
 
     @classmethod

@@ -120,12 +120,20 @@ def symmetry_planes(model: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tenso
     points = model.surface_points.double()
     if len(points) == 0:
         return no_planes(model)
-    middle = points.mean(0)
-    arms = points - middle
-    axes, surface = torch.linalg.eigh(arms.mT @ arms).eigenvectors.mT, cKDTree(arms.numpy())
+    arms = points - points.mean(0)
+    return points.mean(0), mirrored_across(model, torch.linalg.eigh(arms.mT @ arms).eigenvectors.mT)
+
+
+def mirrored_across(model: ObjectModel, axes: Float[Tensor, "k 3"]) -> Float[Tensor, "m 3"]:
+    """Those of some unit normals (float64) whose planes through the middle of the surface mirror it onto itself, or nearly so."""
+    points = model.surface_points.double()
+    if len(points) == 0:
+        return axes[:0]
+    arms = points - points.mean(0)
+    surface = cKDTree(arms.numpy())
     images = (arms - 2 * (arms @ axis)[:, None] * axis for axis in axes)
     apart_m = torch.tensor([surface.query(image.numpy())[0].mean() for image in images])
-    return middle, axes[apart_m < _MIRRORED * model.diameter_m]
+    return axes[apart_m < _MIRRORED * model.diameter_m]
 
 
 def no_planes(_: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tensor, "0 3"]]:

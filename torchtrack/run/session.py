@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -228,10 +229,14 @@ def _matching(obj: ObjectConfig, of_sequence: dict[str, SequenceObject], source:
 
 
 def _load_model(obj: ObjectConfig, in_sequence: SequenceObject | None, config: RunConfig) -> ObjectModel:
+    if obj.centre and in_sequence is not None and in_sequence.ground_truth is not None:
+        known = f"'{config.source}' knows poses of '{obj.label}', which are of the origin of its own model"
+        raise ConfigError(f"objects: centre: {known}. Leave centre out, or give the object another label.")
+    placed: dict[str, Any] = {"name": obj.label, "unit": obj.unit, "scale": obj.scale, "centre": obj.centre}
     if obj.polylines is not None:
-        return ObjectModel.from_polylines(obj.polylines, name=obj.label, unit=obj.unit)
+        return ObjectModel.from_polylines(obj.polylines, **placed)
     if obj.mesh is not None:
-        return ObjectModel.from_file(obj.mesh, name=obj.label, unit=obj.unit)
+        return ObjectModel.from_file(obj.mesh, **placed)
     if in_sequence is None:
         raise ConfigError(f"objects: '{obj.label}' has no model.")
     return ObjectModel.from_file(in_sequence.model_path(config.models), name=obj.label)

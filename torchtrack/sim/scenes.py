@@ -11,7 +11,8 @@ from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.core.camera import Camera, DistortionModel
 from torchtrack.core.limits import Limits, current_limits
 from torchtrack.io.calibration import read_calibration
-from torchtrack.object_model.loading import checked_scale, load_parts
+from torchtrack.object_model.loading import load_parts, place_part
+from torchtrack.object_model.placement import Placement
 from torchtrack.sim.background import BackgroundConfig
 from torchtrack.sim.meshes import make_mesh
 from torchtrack.sim.render import RenderConfig
@@ -62,7 +63,8 @@ class ObjectConfig(Settings):
     ) = Field(None, description="A built-in object; or give mesh.")
     mesh: ConfigPath | None = Field(None, description="PLY, OBJ, STL, GLB, glTF or OFF file, with its texture or colours.")
     unit: Literal["m", "cm", "mm", "inch"] = Field("m", description="Unit of the mesh file's coordinates.")
-    scale: float = Field(1.0, gt=0.05, le=20, description="Enlargement; at 1 the built-in objects measure 10 to 25 cm.")
+    scale: float = Field(1.0, gt=0, le=1e6, description="Enlargement; at 1 the built-in objects measure 10 to 25 cm.")
+    centre: bool = Field(False, description="The middle of the mesh's bounding box is the origin that its poses are of.")
     reflectance: float = Field(0.6, gt=0, le=1, description="Share of light that an object without texture gives back.")
     gloss: float = Field(0.08, ge=0, le=2, description="Strength of the highlight.")
     motion: MotionConfig = Field(default_factory=MotionConfig, description="Mean pose and swing.")
@@ -71,6 +73,8 @@ class ObjectConfig(Settings):
     def _one_model(self) -> "ObjectConfig":
         if (self.shape is None) == (self.mesh is None):
             raise ValueError("give either shape or mesh, exactly one of them")
+        if self.shape is not None and not 0.05 < self.scale <= 20:
+            raise ValueError(f"scale: a built-in object is enlarged by 0.05 to 20; got {self.scale:g}")
         return self
 
     def build(self) -> Model:
@@ -82,8 +86,11 @@ class ObjectConfig(Settings):
         if self.mesh is None:
             return (make_mesh(str(self.shape), self.scale),)
         parts = load_parts(self.mesh)
-        scale = checked_scale(np.concatenate([part.vertices for part in parts]), self.unit, self.label) * self.scale
-        return tuple(part.apply_scale(scale) for part in parts)
+        points = np.concatenate([part.vertices for part in parts])
+        factor, origin = Placement(self.unit, self.scale, self.centre).metres(points, self.label)
+        for part in parts:
+            place_part(part, factor, origin)
+        return tuple(parts)
 
 
 class LightConfig(Settings):
