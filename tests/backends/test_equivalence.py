@@ -140,7 +140,7 @@ def told(name, value, args):
     if operation == "peaks":
         # Which of several equal cells is named is chance.
         return [value[0]]
-    if operation == "found":
+    if operation == "strongest_along_normals":
         # So it is which of several places with as many events.
         return [value[1]]
     if operation == "limb_features":

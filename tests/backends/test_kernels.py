@@ -30,7 +30,7 @@ from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
 from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.hypotheses import mark
+from torchtrack.tracking.relocalization.sampling import score_outlines
 from torchtrack.tracking.validation.measures import shares
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
@@ -267,7 +267,7 @@ def test_what_is_not_a_number_stays_with_its_object(what):
     assert torch.equal(index.look_up(contours.pixels)[[0, 2]], other.look_up(contours.pixels)[[0, 2]])
 
 
-# ---- marks of poses
+# ---- scores of poses
 
 
 @pytest.mark.parametrize("each", [True, False])
@@ -283,7 +283,7 @@ def test_marks_of_poses(each, dtype):
     offsets = torch.nn.functional.pad(random_twist(40, rotation_rad=0.01, translation_m=3.0).to(dtype), (0, 7))
     offsets[3, :6] = torch.nan
     image = uniform(IMAGE_SIZE[0] + 4, IMAGE_SIZE[1] + 4, high=3, seed=7, dtype=dtype)
-    by_kernels, plain = both_ways(lambda: mark(outlines, prediction.poses_at(offsets[:, :6]), camera, image))
+    by_kernels, plain = both_ways(lambda: score_outlines(outlines, prediction.poses_at(offsets[:, :6]), camera, image))
     known = torch.arange(40) != 3
     torch.testing.assert_close(by_kernels[known], plain[known], rtol=1e-4, atol=1e-9 if dtype == torch.float64 else 0.03)
 

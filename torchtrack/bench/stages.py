@@ -35,7 +35,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "reprojection": ("tracking.estimation.rounds:reproject", "tracking.update:reproject"),
     "alignment, rest": ("tracking.tracker:align",),
     "quality": ("tracking.tracker:judge_fit",),
-    "search": ("tracking.tracker:is_wanted", "tracking.tracker:search_wanted"),
+    "search": ("tracking.tracker:triggers", "tracking.tracker:relocalize"),
     "conclusion": ("tracking.tracker:conclude",),
     "learning": ("tracking.tracker:learned_after",),
     "rest": ("tracking.tracker:Tracker.step",),

@@ -17,9 +17,8 @@ from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
 from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.motion.prediction import far_pose
-from torchtrack.tracking.relocalization.axis_rotation import TurningAxes
-from torchtrack.tracking.relocalization.symmetric import SymmetryPlanes
-from torchtrack.tracking.relocalization.triggers import mirrors, turns
+from torchtrack.tracking.relocalization.symmetric import Ambiguities, RotationAxes, SymmetryPlanes
+from torchtrack.tracking.relocalization.triggers import tries_mirrored, tries_rotated
 
 
 class TrackedObjects(nn.Module):
@@ -73,12 +72,12 @@ class TrackedObjects(nn.Module):
         self.register_buffer("revolution_axes", revolution_axes(objects))
         self.revolves = bool(self.revolution_axes.any())
         # Looking for planes takes as long as some windows.
-        points, normals = zip(*of_each(objects, symmetry_planes if mirrors(self.config) else no_planes), strict=True)
+        points, normals = zip(*of_each(objects, symmetry_planes if tries_mirrored(self.config) else no_planes), strict=True)
         self.symmetry_counts = tuple(len(each) for each in normals)
         self.register_buffer("symmetry_points", torch.stack(points))
         self.register_buffer("symmetry_normals", torch.stack([pad(each, (0, 0, 0, 3 - len(each))) for each in normals]))
         self.register_buffer("has_symmetry", torch.tensor(self.symmetry_counts) > 0)
-        on_axes, directions = stacked(of_each(objects, turning_axis) if turns(self.config) else [None] * len(objects))
+        on_axes, directions = stacked(of_each(objects, turning_axis) if tries_rotated(self.config) else [None] * len(objects))
         self.register_buffer("turning_points", on_axes)
         self.register_buffer("turning_directions", directions)
         self.register_buffer("has_turning_axis", directions.any(1))
@@ -106,14 +105,10 @@ class TrackedObjects(nn.Module):
         return ObjectBatch(self.models, *own, shape, self._shared)
 
     @property
-    def planes(self) -> SymmetryPlanes:
-        """The planes of symmetry of the objects."""
-        return SymmetryPlanes(self.symmetry_points, self.symmetry_normals, self.symmetry_counts)
-
-    @property
-    def axes(self) -> TurningAxes:
-        """The axes that most of an object can be turned about unseen."""
-        return TurningAxes(self.turning_points, self.turning_directions)
+    def ambiguities(self) -> Ambiguities:
+        """In which other poses each object looks about the same."""
+        planes = SymmetryPlanes(self.symmetry_points, self.symmetry_normals, self.symmetry_counts)
+        return Ambiguities(planes, RotationAxes(self.turning_points, self.turning_directions), self.has_symmetry, self.has_turning_axis)
 
     @property
     def sensors(self) -> Sensors:

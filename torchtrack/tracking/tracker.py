@@ -34,21 +34,23 @@ from torchtrack.tracking.initialization import check_poses, first_state, held_ba
 from torchtrack.tracking.motion.predict import forecast
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.objects import TrackedObjects
-from torchtrack.tracking.relocalization.axis_rotation import may_have_turned
 from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere
-from torchtrack.tracking.relocalization.refine import rehearse
-from torchtrack.tracking.relocalization.relocalize import search_wanted
+from torchtrack.tracking.relocalization.lost_object import OtherPoses, Relocalized
+from torchtrack.tracking.relocalization.relocalize import relocalize
+from torchtrack.tracking.relocalization.sampling import rehearse
 from torchtrack.tracking.relocalization.tentative import after_probation
 from torchtrack.tracking.relocalization.triggers import (
-    Doubt,
-    gathered_when_known,
-    has_strayed,
-    is_adrift,
-    is_due,
-    is_lost,
-    is_wanted,
-    looked_for_anew,
+    AROUND_LAST_SEEN,
+    SEARCHED,
+    Trigger,
+    gather_evidence,
+    has,
+    is_time,
+    may_have_rotated,
+    reference_where_known,
+    schedule,
     searches,
+    triggers,
 )
 from torchtrack.tracking.start_check import check_in_view
 from torchtrack.tracking.state import StepResult, TrackerState, choose_rows
@@ -253,15 +255,15 @@ class Tracker(TrackedObjects):
         config, sensors, last_event_us = self.config, self.sensors, state.last_event_us
         window_s = self._window_s(state, t_us)
         dt_s = window_s[self.stream_index]
-        recorded = self._predict(self._expected(state, events.events, t_us, dt_s, questions), dt_s)
+        planned = schedule(state, self.objects, t_us, config)
+        lost = has(planned.triggers, Trigger.LOST)
+        recorded = self._predict(self._expected(state, lost, events.events, t_us, dt_s, questions), dt_s)
         prediction = recorded.detached()
-        off_in_depth, little = looked_for_anew(state, self.objects, t_us, config)
-        nearby = self._near(events, prediction, off_in_depth | little, dt_s)
+        nearby = self._near(events, prediction, has(planned.triggers, AROUND_LAST_SEEN), dt_s)
         seen, burst_age_us = sensors.window_events(nearby, state.burst_age_us, t_us, t_us - state.t_us, config.matching.burst_us)
         contours = prediction.contours(dt_s, config.contours)
         sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(self.diameter_m)
         starting = torch.zeros_like(self.stream_index, dtype=torch.bool) if starting is None else starting
-        doubt = self._doubt(state, t_us, sigma_px, starting, (off_in_depth, little))
         widening = gate_widening(sigma_px, config)
         # Asked for here: a GPU answers while corners are looked for.
         radius_px = questions.ask(index_radius(widening, config), usual_index_radius(config))
@@ -270,22 +272,25 @@ class Tracker(TrackedObjects):
         observations = self._observed(corners, seen, prediction, contours, index, sensors.history(last_event_us, t_us))
         as_late = dated(observations, state.late_share, state.unseen_s, config.matching)
         fit = align(recorded, contours, index, widening, as_late, config)
-        full_gathered = gathered_when_known(doubt, state.full_gathered, config.search)
+        full_gathered = reference_where_known(sigma_px, state.full_gathered, config.search)
         apart = asked_apart(state.full_apart, state.unseen_s, config.quality)
         found = judge_fit(prediction, fit, config, explained_at_rest(widening), full_gathered, apart)
         if self.turns:
-            found = replace(found, turn_unclear=doubt.may_have_turned)
+            found = replace(found, turn_unclear=may_have_rotated(self.has_turning_axis, state.unseen_s, config.search))
+        evidence = gather_evidence(state, planned, found, sigma_px, starting, self.ambiguities)
+        flags = triggers(evidence, config)
         # A GPU is waited for: a pose that begins to slip is farther off a window later.
-        wanted = questions.ask(is_wanted(doubt, found.score, config), False)
+        wanted = questions.ask(has(flags, SEARCHED), False)
         if wanted.any():
-            last_seen = LastSeen.of(state, self.objects, t_us, config)
-            found, recorded, widening = search_wanted(recorded, doubt, seen, found, widening, config, last_seen, self.planes, self.axes)
+            others = OtherPoses(LastSeen.of(state, self.objects, t_us, config), self.ambiguities)
+            relocalized = relocalize(Relocalized(found, recorded, widening), flags, evidence, seen, others, config)
+            found, recorded, widening = relocalized.scored, relocalized.prediction, relocalized.gate_scale
             prediction = recorded.detached()
         next_state, result = conclude(state, recorded, widening, found, corners, dt_s, config)
         if config.search.probation:
             next_state, result = after_probation(state, next_state, result, prediction, widening, config)
         next_state = learned_after(next_state, result, prediction, found, Lesson(seen, dt_s, sigma_px, self.on_surfaces, learns), config)
-        if config.matching.adaptive_bursts and not host_sync.none_of(due := is_due(state.t_us, t_us, LOOK_US)):
+        if config.matching.adaptive_bursts and not host_sync.none_of(due := is_time(state.t_us, t_us, LOOK_US)):
             sure = due[0, self.stream_index] & (result.status == int(Status.TRACKING)) & ~found.elsewhere
             late_share = late_share_after(state.late_share, observations, contours, fit.matches, prediction, sure, config.matching)
             next_state = replace(next_state, late_share=late_share)
@@ -317,20 +322,10 @@ class Tracker(TrackedObjects):
             state.motion, dt_s, objects, self.revolution_axes if self.revolves and self.config.motion.spin_fades else None, self.far_pose, self.config
         )
 
-    def _doubt(self, state: TrackerState, t_us: Tensor, sigma_px: Tensor, starting: Tensor, anew: tuple[Tensor, Tensor]) -> Doubt:
-        """What speaks for trying other poses in the window that ends at ``t_us``; with why objects are looked for ``anew``."""
-        config = self.config.search
-        due, far_due = is_due(state.t_us, t_us, config.interval_us, config.doubt_us)[:, self.stream_index]
-        adrift = is_adrift(state.doubted_s, far_due, config)
-        strayed = ~(adrift | starting) & has_strayed(state.score, state.full_share, state.unseen_s, sigma_px, far_due, config)
-        since_s = torch.where(strayed, state.unseen_s, state.doubted_s)
-        told = sigma_px, state.score, state.usual_score, starting, due, adrift | strayed, since_s, state.full_share, far_due
-        turned = may_have_turned(self.has_turning_axis, state.unseen_s, config) if self.turns else self.has_turning_axis
-        return Doubt(*told, self.has_symmetry, state.unseen_s, strayed, turned, *anew)
-
-    def _expected(self, state: TrackerState, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: host_sync.HostReads) -> TrackerState:
+    def _expected(
+        self, state: TrackerState, lost: Tensor, events: EventBatch, t_us: Tensor, dt_s: Tensor, questions: host_sync.HostReads
+    ) -> TrackerState:
         """The state that a window is predicted from: of what is lost for long, where it was last seen well."""
-        lost = is_lost(state, self.diameter_m, self.config)
         # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.
         unfound = ~(state.usual_score > 0)
         if self.config.motion.speed_from_events and not questions.none_of(unfound):

@@ -17,7 +17,7 @@ from torchtrack.tracking.estimation.rounds import Fit, may_be_anywhere
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import fade, found_acceleration, left_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.triggers import in_doubt
+from torchtrack.tracking.relocalization.triggers import is_smeared
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.measures import visible_share
 from torchtrack.tracking.validation.scored_fit import Found
@@ -91,7 +91,7 @@ def judged_objects(
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
     trusted = torch.where(failed, 0, torch.maximum(hidden, trust(share, config.quality, state.full_share, widening)))
-    doubted = ~failed & in_doubt(found.score, state.full_share, found.gathered, found.full_gathered, config.search)
+    doubted = ~failed & is_smeared(found.score, state.full_share, found.gathered, found.full_gathered, config.search)
     unsure = doubted | (~failed & found.turn_unclear)
     status = torch.where(unsure, status.clamp(min=int(Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)

@@ -16,7 +16,9 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg, so3_exp, transform_points
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.axis_rotation import TurningAxes, _peaks, may_have_turned
+from torchtrack.tracking.relocalization.axis_rotation import _peaks
+from torchtrack.tracking.relocalization.symmetric import RotationAxes
+from torchtrack.tracking.relocalization.triggers import may_have_rotated
 from torchtrack.tracking.validation.status import Status
 
 CAMERA = Camera(fx=400.0, fy=400.0, cx=159.5, cy=119.5, width=320, height=240)
@@ -116,7 +118,7 @@ def test_while_the_handle_is_hidden_nothing_is_told():
 
 
 def test_what_was_seen_all_the_time_is_not_looked_at(monkeypatch):
-    monkeypatch.setattr("torchtrack.tracking.relocalization.relocalize.turns_compared", lambda *args: pytest.fail("looked at"))
+    monkeypatch.setattr("torchtrack.tracking.relocalization.axis_rotation._peaks", lambda *args: pytest.fail("looked at"))
     state, _, _ = after_a_while(unseen_s=0.0)
     assert float(state.unseen_s) == 0
 
@@ -124,7 +126,7 @@ def test_what_was_seen_all_the_time_is_not_looked_at(monkeypatch):
 def test_a_neighbour_in_another_stream_is_not_disturbed():
     trajectory, events = scene()
     other = replace(events, stream_index=torch.ones_like(events.stream_index))
-    both = [(concatenate([one, two]), end) for (one, end), (two, _) in zip(windows(events, COUNT), windows(other, COUNT), strict=True)]
+    both = [(concatenate([first, second]), end) for (first, end), (second, _) in zip(windows(events, COUNT), windows(other, COUNT), strict=True)]
     states = []
     for wrong in (0.0, 2.2):
         tracker = Tracker([can(), can()], [CAMERA, CAMERA], stream_index=[0, 1], dtype=torch.float64)
@@ -154,18 +156,19 @@ def velocity_at(prediction: Prediction, point_obj):
 
 
 def test_what_is_turned_keeps_its_axis_where_it_is_and_goes(dtype):
-    tracker, one = predicted(dtype)
+    tracker, alone = predicted(dtype)
+    axes = tracker.ambiguities.axes
     assert tracker.turns and tracker.has_turning_axis.tolist() == [True]
     angles = torch.tensor([0.0, 0.5, 3.0, -1.0], dtype=dtype)
-    rows = tracker.axes.turned(0, one, angles)
-    for point in (tracker.axes.points_obj[0], tracker.axes.points_obj[0] + 0.03 * tracker.axes.directions_obj[0]):
+    rows = axes.rotated(0, alone, angles)
+    for point in (axes.points_obj[0], axes.points_obj[0] + 0.03 * axes.directions_obj[0]):
         places = transform_points(rows.T_cam_obj, point.expand(4, 1, 3))
         torch.testing.assert_close(places, places[:1].expand(4, 1, 3), rtol=0, atol=1e-6)
         torch.testing.assert_close(velocity_at(rows, point), velocity_at(rows, point)[:1].expand(4, 3), rtol=0, atol=1e-6)
-    degrees = rotation_angle_deg(rows.T_cam_obj[:, :3, :3].double(), one.T_cam_obj[:, :3, :3].double().expand(4, 3, 3))
+    degrees = rotation_angle_deg(rows.T_cam_obj[:, :3, :3].double(), alone.T_cam_obj[:, :3, :3].double().expand(4, 3, 3))
     torch.testing.assert_close(degrees, angles.double().abs() * 180 / math.pi, rtol=0, atol=0.1)
-    along = (one.T_cam_obj[0, :3, :3] @ tracker.axes.directions_obj[0]).double()
-    gained = (rows.covariance - one.covariance)[1]
+    along = (alone.T_cam_obj[0, :3, :3] @ axes.directions_obj[0]).double()
+    gained = (rows.covariance - alone.covariance)[1]
     assert float(along @ gained[:3, :3] @ along) == pytest.approx(0.01, rel=1e-4)
     assert float(along @ gained[6:9, 6:9] @ along) == pytest.approx(16, rel=1e-4)
     assert float(gained.trace()) == pytest.approx(16.01, rel=1e-4)
@@ -187,13 +190,13 @@ def test_turns_out_of_reach_are_left_out():
     assert chosen[0] == 0 and {30} <= set(chosen[exists].tolist()) and not {60, 90} & set(chosen[exists].tolist())
 
 
-def test_what_was_not_seen_for_a_while_may_have_turned():
+def test_what_was_not_seen_for_a_while_may_have_rotated():
     has_axis, unseen_s = torch.tensor([True, True, False]), torch.tensor([0.06, 0.04, 0.06])
-    assert may_have_turned(has_axis, unseen_s, SearchConfig(doubt_us=50_000)).tolist() == [True, False, False]
+    assert may_have_rotated(has_axis, unseen_s, SearchConfig(doubt_us=50_000)).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("search", [{"turned": False}, {"hypotheses": 0}, {"doubt_us": 0}])
 def test_where_nothing_is_compared_no_axis_is_looked_for(search):
     tracker = Tracker([can()], CAMERA, TrackerConfig(search=SearchConfig(**search)))
     assert not tracker.turns
-    assert not any(value.any() for value in tensors_of(TurningAxes(tracker.turning_points, tracker.turning_directions)))
+    assert not any(value.any() for value in tensors_of(RotationAxes(tracker.turning_points, tracker.turning_directions)))

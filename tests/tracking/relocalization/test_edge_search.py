@@ -8,7 +8,7 @@ from torch.nn.functional import avg_pool2d
 from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.tracking.relocalization.edge_search import FAR_PX, NEAR_PX, found, pulled
+from torchtrack.tracking.relocalization.edge_search import FAR_PX, NEAR_PX, pulled, strongest_along_normals
 from torchtrack.tracking.relocalization.event_image import event_density
 from torchtrack.tracking.relocalization.view_sphere import outlines_at
 
@@ -66,7 +66,7 @@ def test_contour_points_find_events_the_same_by_a_kernel(dtype):
     poses = displaced(prediction, [0.1, 0.0, 0.0, 0.01, 0.0, 0.0], [0.0, 0.1, 0.2, 0.0, 0.01, 0.0])
     outlines = outlines_at(prediction, poses, TrackerConfig())
     outlines.pixels[0, 3], outlines.pixels[1, 5], outlines.mask[1, 7] = torch.nan, 1e12, False
-    (targets, weights), (expected, counts) = both_ways(lambda: found(outlines, image, FAR_PX[0]))
+    (targets, weights), (expected, counts) = both_ways(lambda: strongest_along_normals(outlines, image, FAR_PX[0]))
     torch.testing.assert_close(weights, counts, rtol=1e-5, atol=1e-5)
     assert not weights[1, 7] and float(weights.max()) > 1
     # Of places with as much, one way may take the one and the other the other.

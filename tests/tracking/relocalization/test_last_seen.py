@@ -11,10 +11,8 @@ from torchtrack import Tracker
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.lie import retract_about
-from torchtrack.tracking.relocalization.acceptance import scored_by_events
-from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere
-from torchtrack.tracking.relocalization.relocalize import _least
-from torchtrack.tracking.relocalization.triggers import is_lost, looked_for_anew
+from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere, less_certain, with_drift
+from torchtrack.tracking.relocalization.triggers import Trigger, has, schedule
 from torchtrack.tracking.state import joined
 from torchtrack.tracking.validation.status import Status
 
@@ -43,40 +41,48 @@ def moved_away(tracker, state, metres):
 # ---- when
 
 
+def is_lost(tracker, state, config=CONFIG):
+    return has(schedule(state, tracker.objects, state.t_us, config).triggers, Trigger.LOST).tolist() == [True]
+
+
+def is_looked_for(trigger, tracker, state, t_us, config=CONFIG):
+    return has(schedule(state, tracker.objects, t_us, config).triggers, trigger).tolist() == [True]
+
+
 def test_an_object_is_lost_once_nothing_is_known_of_it_and_it_was_not_seen_for_long():
     tracker, state, *_ = started()
     gone = unseen(state, covariance=uncertain(state))
-    assert is_lost(gone, tracker.diameter_m, CONFIG).tolist() == [True]
-    assert not is_lost(unseen(gone, 0.05), tracker.diameter_m, CONFIG)
-    assert not is_lost(unseen(state), tracker.diameter_m, CONFIG)
-    assert not is_lost(replace(gone, usual_score=torch.zeros(1)), tracker.diameter_m, CONFIG)
-    assert not is_lost(gone, tracker.diameter_m, TrackerConfig(search=SearchConfig(anew_us=0)))
+    assert is_lost(tracker, gone)
+    assert not is_lost(tracker, unseen(gone, 0.05))
+    assert not is_lost(tracker, unseen(state))
+    assert not is_lost(tracker, replace(gone, usual_score=torch.zeros(1)))
+    assert not is_lost(tracker, gone, TrackerConfig(search=SearchConfig(anew_us=0)))
     # Without searches nothing would find it there.
-    assert not is_lost(gone, tracker.diameter_m, TrackerConfig(search=SearchConfig(hypotheses=0)))
+    assert not is_lost(tracker, gone, TrackerConfig(search=SearchConfig(hypotheses=0)))
 
 
 @pytest.mark.parametrize(("metres", "off"), [(0.0, False), (0.05, False), (0.3, True), (-0.2, True)])
 def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(metres, off):
     tracker, state, *_ = started()
     away, due = unseen(state, T_cam_obj=moved_away(tracker, state, metres)), state.t_us + 1_000_000
-    assert looked_for_anew(away, tracker.objects, due, CONFIG)[0].tolist() == [off]
-    assert not looked_for_anew(away, tracker.objects, state.t_us, CONFIG)[0]
-    assert not looked_for_anew(unseen(away, 0.05), tracker.objects, due, CONFIG)[0]
+    assert is_looked_for(Trigger.DEPTH_CHANGED, tracker, away, due) == off
+    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, away, state.t_us)
+    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, unseen(away, 0.05), due)
     # What is lost is expected there as it is.
-    assert not looked_for_anew(replace(away, covariance=uncertain(away)), tracker.objects, due, CONFIG)[0]
+    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, replace(away, covariance=uncertain(away)), due)
 
 
-@pytest.mark.parametrize(("score", "little"), [(0.6, True), (0.7, False)])
-def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_for_there(score, little):
+@pytest.mark.parametrize(("score", "is_below"), [(0.6, True), (0.7, False)])
+def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_for_there(score, is_below):
     tracker, state, *_ = started()
     low = unseen(state, score=torch.full((1,), score), full_share=torch.full((1,), 0.9))
     due = state.t_us + 1_000_000
-    assert looked_for_anew(low, tracker.objects, due, CONFIG)[1].tolist() == [little]
-    assert not looked_for_anew(low, tracker.objects, state.t_us, CONFIG)[1]
-    assert not looked_for_anew(unseen(low, 0.05), tracker.objects, due, CONFIG)[1]
-    assert not looked_for_anew(replace(low, covariance=uncertain(low)), tracker.objects, due, CONFIG)[1]
+    assert is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due) == is_below
+    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, state.t_us)
+    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, unseen(low, 0.05), due)
+    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, replace(low, covariance=uncertain(low)), due)
     for never in ({"anew_below": 0}, {"anew_us": 0}, {"hypotheses": 0}):
-        assert not looked_for_anew(low, tracker.objects, due, TrackerConfig(search=SearchConfig(**never)))[1]
+        assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due, TrackerConfig(search=SearchConfig(**never)))
 
 
 # ---- where
@@ -114,37 +120,58 @@ def test_an_object_that_may_be_anywhere_has_a_covariance_without_bounds_of_its_o
     assert torch.equal(anywhere(state.covariance, torch.tensor([True]))[0], torch.eye(12, dtype=torch.float64))
 
 
-# ---- what is asked of a find
+# ---- how far what drifts may be
 
 
-def test_small_poses_that_few_events_explain_are_worth_less():
-    score, count = torch.tensor([0.9, 0.8, 0.0]), torch.tensor([100, 900, 2000])
-    assert scored_by_events(score, count).tolist() == pytest.approx([0.3, 0.8, 0.0])
-    assert scored_by_events(torch.zeros(3), count).tolist() == [0.0, 0.0, 0.0]
+def drifting(prediction, drift_s, config):
+    return with_drift(prediction, torch.tensor([True]), torch.tensor([drift_s]), config)
 
 
-def asked_anew(off_in_depth, little):
-    """What is asked of a find around where the object was last seen well, what it explained then, and by how many events it does now."""
-    tracker, state, *_ = started()
-    why = torch.tensor([off_in_depth]), torch.tensor([little])
-    tracked = tracker._doubt(state, state.t_us + 50_000, torch.ones(1), torch.tensor([False]), why)
-    found = in_motion()[3]
-    return _least(tracked, found, tracker.config)[2, :, 0].tolist(), float(state.full_share), int(found.count)
+def test_who_drifts_off_is_the_less_certain_the_longer_it_lasts():
+    _, prediction, _, scored, _ = in_motion()
+    contours, config = scored.fit.contours, SearchConfig(drift_px_s=200, drift_diameters_s=100)
+    grown = [drifting(prediction, t, config) for t in (0.05, 0.1, 0.4, 1.0, 5.0)]
+    sigma_px = [float(grown_for.sigma_px(contours)) for grown_for in grown]
+    # Turning and moving together carry contours farther than either.
+    assert all(20 * n < px < 40 * n for px, n in zip(sigma_px[:3], (0.5, 1, 4), strict=True))
+    # In the end it may be rotated anyhow, but it is not looked for in another place.
+    rotated_rad, moved_m = (torch.stack([grown_for.covariance[0, k, k].sqrt() for grown_for in grown[2:]]) for k in (0, 3))
+    torch.testing.assert_close(rotated_rad[1:] / rotated_rad[0], torch.full((2,), 2.5, dtype=torch.float64), atol=0.01, rtol=0)
+    torch.testing.assert_close(moved_m, moved_m[:1].expand(3))
 
 
-@pytest.mark.parametrize("little", [False, True])
-def test_what_is_off_in_depth_gives_way_to_far_more_events(little):
-    (margin, needed, gathered, count), full, matched = asked_anew(True, little)
-    assert margin == -torch.inf and gathered == 0
-    assert needed == pytest.approx(0.75 * full)
-    assert count == 2 * matched
+def test_what_is_small_in_the_image_drifts_no_faster_for_its_size():
+    _, prediction, _, scored, _ = in_motion()
+    sigma_px = [
+        float(drifting(prediction, 0.2, config).sigma_px(scored.fit.contours))
+        for config in (SearchConfig(drift_px_s=1e6, drift_diameters_s=1.0), SearchConfig(drift_px_s=1e6, drift_diameters_s=2.0))
+    ]
+    size_px = float(prediction.objects.size_px(prediction.T_cam_obj))
+    assert 0.2 * size_px < sigma_px[0] < 0.4 * size_px
+    assert sigma_px[1] == pytest.approx(2 * sigma_px[0], rel=0.1)
 
 
-def test_what_explains_little_gives_way_to_nearly_all_by_no_fewer_events():
-    (margin, needed, gathered, count), full, matched = asked_anew(False, True)
-    assert margin == pytest.approx(0.15) and gathered == 0
-    assert needed == pytest.approx(0.9 * full)
-    assert count == matched
+def test_a_drift_is_one_velocity_that_explains_where_the_pose_is():
+    _, prediction, _, _, _ = in_motion()
+    lasted_s = 0.25
+    added = drifting(prediction, lasted_s, SearchConfig()).covariance - prediction.covariance
+    pose_part, both, rate = added[0, :6, :6], added[0, :6, 6:], added[0, 6:, 6:]
+    torch.testing.assert_close(pose_part, lasted_s**2 * rate)
+    torch.testing.assert_close(both, lasted_s * rate)
+
+
+def test_others_are_as_certain_as_before():
+    _, prediction, _, _, _ = in_motion()
+    assert torch.equal(with_drift(prediction, torch.tensor([False]), torch.tensor([0.2]), SearchConfig()).covariance, prediction.covariance)
+
+
+def test_of_what_slipped_all_is_less_certain_alike():
+    _, prediction, *_ = in_motion()
+    wider = less_certain(prediction.copies(0, 1), 0.5, 2.5).covariance
+    torch.testing.assert_close(wider, 25 * prediction.covariance)
+
+
+# ---- what is remembered
 
 
 def test_an_object_seen_by_few_events_is_not_remembered_as_seen_well(way):

@@ -15,7 +15,7 @@ from torchtrack.core.lie import difference_about, retract_about, rotation_angle_
 from torchtrack.object_model.symmetry import symmetry_planes
 from torchtrack.tracking.motion.model import Acceleration
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.last_seen import as_last_seen
+from torchtrack.tracking.relocalization.last_seen import where_last_seen
 from torchtrack.tracking.relocalization.symmetric import SymmetryPlanes, mirrored
 from torchtrack.tracking.validation.status import Status
 
@@ -88,7 +88,7 @@ def test_the_mirrored_pose_turns_so_that_it_stays_mirrored():
 
 def test_as_last_seen_it_is_turned_and_as_far_away_as_then_in_the_place_of_now():
     prediction, then = predicted(seed=1), random_pose(seed=2)
-    other = as_last_seen(prediction, then)
+    other = where_last_seen(prediction, then)
     torch.testing.assert_close(other.T_cam_obj[0, :3, :3], then[:3, :3])
     centre_then = then[:3, :3] @ prediction.objects.centre_obj[0] + then[:3, 3]
     assert float(other.centre_cam[0, 2]) == pytest.approx(float(centre_then[2]))
@@ -97,22 +97,26 @@ def test_as_last_seen_it_is_turned_and_as_far_away_as_then_in_the_place_of_now()
 
 
 def test_one_prediction_takes_the_place_of_another_where_it_is_taken():
-    one, other = predicted(seed=1), mirrored(predicted(seed=1), MIDDLE, ACROSS)
-    three = one.copies(0, 3)
+    own, other = predicted(seed=1), mirrored(predicted(seed=1), MIDDLE, ACROSS)
+    three = own.copies(0, 3)
     for taken in (True, False):
         now = three.exchanged(1, other, torch.tensor(taken))
-        expected = [one, other if taken else one, one]
+        expected = [own, other if taken else own, own]
         for name in ("T_cam_obj", "velocity", "covariance"):
             assert torch.equal(getattr(now, name), torch.cat([getattr(p, name) for p in expected])), name
         assert torch.equal(now.acceleration.expected, torch.cat([p.acceleration.expected for p in expected]))
         assert torch.equal(now.acceleration.variance, three.acceleration.variance)
 
 
-def test_planes_are_handed_out_object_by_object():
-    points, normals = torch.rand(2, 3), torch.rand(2, 3, 3)
-    planes = SymmetryPlanes(points, normals, (2, 0))
-    assert [(point.tolist(), normal.tolist()) for point, normal in planes.of(0)] == [(points[0].tolist(), normals[0, k].tolist()) for k in range(2)]
-    assert list(planes.of(1)) == []
+def test_an_object_is_mirrored_in_its_own_planes_alone():
+    prediction = predicted()
+    normals = torch.nn.functional.normalize(torch.rand((2, 3, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64), dim=-1)
+    planes = SymmetryPlanes(MIDDLE.expand(2, 3), normals, (2, 0))
+    for plane in range(2):
+        expected = mirrored(prediction, MIDDLE, normals[0, plane]).T_cam_obj
+        assert torch.equal(planes.mirrored(0, plane, prediction).T_cam_obj, expected)
+    assert planes.mirrored(0, 2, prediction) is None
+    assert planes.mirrored(1, 0, prediction) is None
 
 
 # ---- in the tracker
@@ -121,7 +125,7 @@ def test_planes_are_handed_out_object_by_object():
 @pytest.mark.parametrize(("changes", "count"), [({}, 3), ({"search": {"mirrored_to": 0}}, 0), ({"search": {"hypotheses": 0}}, 0)])
 def test_planes_are_looked_for_only_where_mirrored_poses_are_tried(changes, count):
     tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig.model_validate(changes))
-    assert len(list(tracker.planes.of(0))) == count
+    assert tracker.ambiguities.planes.counts == (count,)
     assert bool(tracker.has_symmetry) == (count > 0)
 
 

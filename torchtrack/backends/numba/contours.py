@@ -17,7 +17,7 @@ from torchtrack.core.dispatch import accelerates
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.tracking.contours import points
 from torchtrack.tracking.contours.points import MAX_ACTIVE_EDGES, MIN_PX_PER_M, MIN_TEXTURE_COSINE, Contours
-from torchtrack.tracking.relocalization import hypotheses
+from torchtrack.tracking.relocalization import sampling
 from torchtrack.tracking.relocalization.event_image import BORDER_PX
 
 # Rows of a model's table of edges, and of the points sampled on them.
@@ -255,7 +255,7 @@ def normal_of(across_x: float, across_y: float, inverse: float, of_lens: Numbers
 
 
 @kernel(fastmath=FAST)
-def mark(
+def score_outlines(
     points_obj: Array,
     tangents_obj: Array,
     mask: Array,
@@ -265,19 +265,19 @@ def mark(
     image: Array,
     border_px: int,
     beside_px: float,
-    marks: Array,
+    scores: Array,
 ) -> None:
-    """How much denser events are on contours at some poses than beside them: :func:`torchtrack.tracking.relocalization.hypotheses.mark`.
+    """How much denser events are on contours at some poses than beside them: :func:`torchtrack.tracking.relocalization.sampling.score_outlines`.
 
     Args:
         points_obj, tangents_obj, mask: ``[n, 3, m]`` and ``[n, m]`` of each pose; or one row for all.
         T_cam_obj: ``[n, 4, 4]``.
         intrinsics: ``[4]``.
         image: ``[h, w]``, with a border.
-        marks: ``[n]``, filled.
+        scores: ``[n]``, filled.
     """
     of_lens, flat, height, width = lens(intrinsics), image.ravel(), float(image.shape[0]), float(image.shape[1])
-    for n in range(len(marks)):
+    for n in range(len(scores)):
         row, pose, total, count = n if len(mask) > 1 else 0, entries(T_cam_obj[n]), 0.0, 0
         for i in range(mask.shape[1]):
             x, y, z = placed(pose, points_obj[row, 0, i], points_obj[row, 1, i], points_obj[row, 2, i])
@@ -290,7 +290,7 @@ def mark(
                 inner = at(flat, width, height, u - beside_px * nu, v - beside_px * nv, border_px)
                 total += at(flat, width, height, u, v, border_px) - 0.5 * (outer + inner)
                 count += 1
-        marks[n] = total / max(count, 1)
+        scores[n] = total / max(count, 1)
 
 
 @kernel(fastmath=FAST)
@@ -381,13 +381,13 @@ def assemble_numba(
     return Contours(points_obj, tangents_obj, kind, is_shown, *(value.transpose(1, 2) for value in (points_cam, pixels, normals)))
 
 
-@accelerates(hypotheses.mark)
-def mark_numba(
+@accelerates(sampling.score_outlines)
+def score_outlines_numba(
     outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"], image: Float[Tensor, "h w"]
 ) -> Float[Tensor, "n"]:
     """Point by point."""
-    marks = image.new_empty(len(T_cam_obj))
+    scores = image.new_empty(len(T_cam_obj))
     given = as_arrays(outlines.points_obj.transpose(1, 2), outlines.tangents_obj.transpose(1, 2), outlines.mask)
     seen = as_arrays(T_cam_obj, intrinsics[0])
-    mark(*given, *seen, sampling_settings(), *as_arrays(image), BORDER_PX, hypotheses.BESIDE_PX, marks.numpy())
-    return marks
+    score_outlines(*given, *seen, sampling_settings(), *as_arrays(image), BORDER_PX, sampling.BESIDE_PX, scores.numpy())
+    return scores

@@ -1,4 +1,4 @@
-"""Where contour points find events along their normals: :func:`torchtrack.tracking.relocalization.edge_search.found`, point by point."""
+"""Where contour points have most events along their normals: :func:`torchtrack.tracking.relocalization.edge_search.strongest_along_normals`, point by point."""
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torchtrack.tracking.relocalization.event_image import BORDER_PX
 
 
 @kernel(fastmath=FAST)
-def find(
+def look_along_normals(
     pixels: Array, normals: Array, mask: Array, image: Array, border_px: int, reach_px: float, looks: int, targets: Array, weights: Array
 ) -> None:
     """The place with most events along the normal of each contour point, rather near by, and how much that counts.
@@ -83,10 +83,12 @@ def peaks_numba(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tu
     return best, place
 
 
-@accelerates(edge_search.found)
-def found_numba(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
+@accelerates(edge_search.strongest_along_normals)
+def strongest_along_normals_numba(
+    outlines: Contours, image: Float[Tensor, "h w"], reach_px: float
+) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
     """Point by point."""
     targets, weights = image.new_empty(*outlines.mask.shape, 2), image.new_empty(outlines.mask.shape)
     points = as_arrays(outlines.pixels.transpose(1, 2), outlines.normals.transpose(1, 2), outlines.mask)
-    find(*points, *as_arrays(image), BORDER_PX, reach_px, edge_search.LOOKS, *as_arrays(targets, weights))
+    look_along_normals(*points, *as_arrays(image), BORDER_PX, reach_px, edge_search.LOOKS, *as_arrays(targets, weights))
     return targets, weights

@@ -1,25 +1,156 @@
-"""Whether another pose is taken in the place of an object's own."""
+"""What is asked of a hypothesis to be taken in the place of an object's own pose: a test for each reason to try others."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.line_ends import running_on
+from torchtrack.tracking.relocalization.lost_object import LostObject
+from torchtrack.tracking.relocalization.triggers import DRIFTS, Trigger, TriggerEvidence, has
 from torchtrack.tracking.validation.scored_fit import Found
 
-# Shares that differ by less are the same: which of them is larger is chance.
+# Ratios that differ by less are the same: which of them is larger is chance.
 AS_MUCH = 0.02
-
-
 # The 99th percentile of the squared distance of a pose, of six dimensions, in standard deviations (chi-square).
 _LIKELY = 16.8
+# What explains so many times as many events as a pose far off in depth is no smaller thing that chance explains.
+_FAR_MORE = 2.0
 
 
-def is_taken(number: int, other: Found, found: Found) -> Bool[Tensor, ""]:
-    """Whether a search found the object ``number`` in another pose; a GPU is not waited for to know."""
-    return (other.fit.solution.T_cam_obj[number] != found.fit.solution.T_cam_obj[number]).any()
+@dataclass(frozen=True)
+class Choice:
+    """Which of some hypotheses is the best.
+
+    Args:
+        row: of the best.
+        is_accepted: whether it takes the place of the object's own pose.
+        axis_is_clear: whether that tells how the object is rotated about its axis; none where that is not asked.
+    """
+
+    row: Int[Tensor, "1"]
+    is_accepted: Bool[Tensor, "1"]
+    axis_is_clear: Bool[Tensor, "1"] | None = None
+
+
+@runtime_checkable
+class Acceptance(Protocol):
+    """Chooses between hypotheses."""
+
+    def row(self, number: int) -> "Acceptance":
+        """What is asked of a single object."""
+
+    def choose(self, tried: Found, hypotheses: Hypotheses, lost: LostObject) -> Choice:
+        """The best of the hypotheses, and whether it is accepted."""
+
+
+@dataclass(frozen=True)
+class AcceptanceTest:
+    """What a hypothesis has to be to be accepted.
+
+    Args:
+        margin: by how much its score has to be larger than that of the object's own pose.
+        min_score: how large it has to be at least.
+        min_inlier_ratio: how much of the events around its contours has to be on them; what cannot be told passes.
+        min_matches: how many observations it has to match.
+    """
+
+    margin: Float[Tensor, "*b"]
+    min_score: Float[Tensor, "*b"]
+    min_inlier_ratio: Float[Tensor, "*b"]
+    min_matches: Float[Tensor, "*b"]
+
+    def row(self, number: int) -> "AcceptanceTest":
+        """What is asked of a single object."""
+        return AcceptanceTest(self.margin[number], self.min_score[number], self.min_inlier_ratio[number], self.min_matches[number])
+
+    def choose(self, tried: Found, hypotheses: Hypotheses, lost: LostObject) -> Choice:
+        """The hypothesis with the best score, and of those about as good the one that the prediction expects most."""
+        config, prediction, offsets = lost.config, hypotheses.prediction, tried.fit.solution.from_prior
+        eligible = self.is_passed(tried, config) & is_likely(offsets, hypotheses.covariance)
+        score, asked = torch.where(eligible, tried.score, 0), self.asked_score(lost.window.scored, lost.number, config)
+        if config.search.line_ends and hypotheses.is_wide:
+            score = less_where_lines_run_on(score, score > asked, tried.fit.contours, hypotheses.places, prediction.objects.image_size)
+        by_events = config.search.by_events and hypotheses.is_wide
+        best = likeliest(less_by_few_events(score, tried.count) if by_events else score, offsets, prediction.covariance[0])
+        return Choice(best, score.index_select(0, best) > asked)
+
+    def is_passed(self, tried: Found, config: TrackerConfig) -> Bool[Tensor, "n"]:
+        """Which hypotheses match enough observations that gather enough."""
+        # Written so that what does not tell how far it gathers passes.
+        gathers = ~(tried.gathered < self.min_inlier_ratio)
+        return (tried.count >= self.min_matches.clamp(min=config.quality.min_observations)) & gathers
+
+    def asked_score(self, scored: Found, number: int, config: TrackerConfig) -> Float[Tensor, ""]:
+        """The score that has to be surpassed."""
+        own = torch.where(scored.count[number] >= config.quality.min_observations, scored.score[number], 0.0)
+        return torch.maximum(own + self.margin, self.min_score)
+
+
+# ---- the tests
+
+
+def near_prediction(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found, config: TrackerConfig) -> AcceptanceTest:
+    """Of poses around the prediction.
+
+    While a motion is not known nothing says how far events gather when all is well, and dense print explains as much of many poses:
+    a pose that smears the events more than the prediction's own is not better.
+    """
+    search, starting, reference = config.search, evidence.is_starting, evidence.reference_explained_ratio
+    margin = torch.where(starting, search.start_margin, search.margin)
+    # What is far away has to explain about as much as usual; so has what is reached step by step, while a motion is lost, ever farther away.
+    min_score = torch.where(has(flags, DRIFTS) | starting, search.adrift_share * reference, 0)
+    # What is partly hidden explains less, too: nothing but the whole object, seen elsewhere by no fewer events, speaks against that.
+    # A part of its edges does not.
+    slow = has(flags, Trigger.SLOW_DRIFT)
+    margin = torch.where(slow, search.slip_margin, margin)
+    min_score = torch.where(slow, search.slip_share * reference, min_score)
+    # Of a new object, only what explains nearly all is surely better: edges of what hides it explain half.
+    new = has(flags, Trigger.NEW)
+    min_score = torch.where(new, search.new_share, min_score)
+    min_inlier_ratio = torch.where(starting | new, scored.gathered.nan_to_num(0.0) - AS_MUCH, 0)
+    return AcceptanceTest(margin, min_score, min_inlier_ratio, torch.where(slow, _matches(scored), 0))
+
+
+def elsewhere(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found, config: TrackerConfig) -> AcceptanceTest:
+    """Of poses that are not around the prediction, or farther away than it allows."""
+    reference = evidence.reference_explained_ratio
+    nothing = torch.zeros_like(reference)
+    return AcceptanceTest(nothing + config.search.slip_margin, config.search.slip_share * reference, nothing, nothing)
+
+
+def as_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found, config: TrackerConfig) -> AcceptanceTest:
+    """Of poses as the object was last validated: what is explained enough where it is gives way to far more events alone."""
+    test = elsewhere(evidence, flags, scored, config)
+    matches = _matches(scored)
+    at_least = torch.where(has(flags, Trigger.SLOW_DRIFT), matches, 0)
+    min_matches = torch.where(has(flags, Trigger.HELD), _FAR_MORE * matches, at_least)
+    return AcceptanceTest(test.margin, test.min_score, test.min_inlier_ratio, min_matches)
+
+
+def around_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found, config: TrackerConfig) -> AcceptanceTest:
+    """Of poses all around where the object was last validated.
+
+    A small thing that is all explained says nothing against a pose of which far more events are explained. What is partly hidden does.
+    """
+    changed, search = has(flags, Trigger.DEPTH_CHANGED), config.search
+    margin = torch.where(changed, -torch.inf, search.slip_margin)
+    min_score = torch.where(changed, config.quality.certain_at, search.slip_share) * evidence.reference_explained_ratio
+    min_matches = torch.where(changed, _FAR_MORE, 1) * _matches(scored)
+    return AcceptanceTest(margin, min_score, torch.zeros_like(min_score), min_matches)
+
+
+def _matches(scored: Found) -> Float[Tensor, "b"]:
+    return scored.count.to(scored.score.dtype)
+
+
+# ---- what they compare
 
 
 def is_likely(from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Bool[Tensor, "n"]:
@@ -47,13 +178,13 @@ def less_where_lines_run_on(
     return score.index_copy(0, rows, score[rows] * (1 - running_on(contours.rows(rows), places, image_size)))
 
 
-def scored_by_events(score: Float[Tensor, "n"], count: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+def less_by_few_events(score: Float[Tensor, "n"], count: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
     """Scores of poses, less where fewer events are explained than by others: of small ones, far away, chance explains all."""
     matched = torch.where(score > 0, count, 0).to(score.dtype)
     return score * (matched / matched.max().clamp(min=1)).sqrt()
 
 
 def likeliest(score: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Int[Tensor, "1"]:
-    """Of the poses that explain as much as the best does, the one that the prediction expects most: a turn of a vase explains nothing."""
+    """Of the poses that explain as much as the best does, the one that the prediction expects most: a rotation of a vase explains nothing."""
     away = _squared_deviations(from_prior[:, :12], covariance)
     return torch.where(score >= score.max() - AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]

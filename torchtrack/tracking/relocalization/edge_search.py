@@ -23,7 +23,7 @@ from torchtrack.tracking.relocalization.event_image import look_up
 FAR_PX, NEAR_PX = (12.0, 8.4, 5.9), (7.2, 5.0, 3.5)
 # Places that each looks at, on both sides.
 LOOKS = 17
-# Standard deviation of what a contour point with one event finds (px), with its share of what all have in common.
+# Standard deviation of where a contour point with a single event is drawn to (px), with its share of what all have in common.
 _FIND_PX = 10.0
 _SOLVER = SolverConfig(iterations=1, loss="huber")
 
@@ -36,7 +36,7 @@ def pulled(
     covariance: Float[Tensor, "6 6"],
     reaches_px: tuple[float, ...],
 ) -> Float[Tensor, "k 4 4"]:
-    """Poses of one object, each moved to where its contours lie on events.
+    """Poses of an object, each moved to where its contours lie on events.
 
     Args:
         prediction: of the object, with the ``covariance`` of its pose.
@@ -48,7 +48,7 @@ def pulled(
     information = (_FIND_PX**2 * inverse(covariance[None])).to(T_cam_obj.dtype)
     for reach_px in reaches_px:
         outlines = reproject(outlines, T_cam_obj, prediction.objects.intrinsics.expand(len(T_cam_obj), 4))
-        targets, weights = found(outlines, image, reach_px)
+        targets, weights = strongest_along_normals(outlines, image, reach_px)
         problem = _problem(prediction, outlines, targets, weights, reach_px, information)
         offset = difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
         T_cam_obj = solve_pose(problem, T_cam_obj, _SOLVER, offset).T_cam_obj
@@ -56,8 +56,8 @@ def pulled(
 
 
 @accelerable
-def found(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
-    """Where each contour point finds most events along its normal, rather near by, and how much that counts."""
+def strongest_along_normals(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
+    """Where each contour point has most events along its normal, rather near by, and how much that counts."""
     steps_px = torch.linspace(-reach_px, reach_px, LOOKS, dtype=image.dtype, device=image.device)
     looked_at = outlines.pixels[:, :, None] + steps_px[:, None] * outlines.normals[:, :, None]
     there = look_up(image, looked_at) * (1 - steps_px.abs() / (reach_px + 1))
@@ -68,7 +68,7 @@ def found(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> t
 def _problem(
     prediction: Prediction, outlines: Contours, targets: Tensor, weights: Tensor, reach_px: float, information: Float[Tensor, "1 6 6"]
 ) -> PoseProblem:
-    """The least squares problem of contour points and what they found."""
+    """The least squares problem of contour points and where most events are."""
     objects, count = prediction.objects, len(targets)
     return PoseProblem(
         points_obj=outlines.points_obj,

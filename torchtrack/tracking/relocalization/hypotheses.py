@@ -1,122 +1,112 @@
-"""Poses worth trying where one prediction is too uncertain: drawn from its covariance, and marked by the events on their contours.
+"""Where the poses that are tried come from: sources of hypotheses, all of the same signature.
 
-Thousands are marked in the time that a few dozen take to be aligned. Where the prediction is so uncertain that even these hardly
-come near the right one, turns alone are drawn, tried in all places of the image (:mod:`torchtrack.tracking.relocalization.correlation`), and the
-best pulled onto the events (:mod:`torchtrack.tracking.relocalization.edge_search`).
+A source looks at an object (:class:`torchtrack.tracking.relocalization.lost_object.LostObject`) and gives poses that are worth
+aligning, with what changes where one of them is accepted; or none. A further source of hypotheses is a function like these, and a
+line in :mod:`torchtrack.tracking.relocalization.sources`.
 """
 
-from functools import lru_cache
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
 
-from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core.dispatch import accelerable
-from torchtrack.core.lie import difference_about
-from torchtrack.tracking.contours.points import Contours, assemble
+from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.estimation.rounds import gate_widening
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.correlation import shifted
-from torchtrack.tracking.relocalization.edge_search import FAR_PX, NEAR_PX, pulled
-from torchtrack.tracking.relocalization.event_image import event_density, look_up
-from torchtrack.tracking.relocalization.view_sphere import outlines_at, thinned
-
-# Events beside a contour are counted this far from it (px), and more than this many of them in one place say no more.
-BESIDE_PX, ENOUGH_EVENTS = 4.0, 3.0
+from torchtrack.tracking.relocalization.last_seen import less_certain, where_last_seen
+from torchtrack.tracking.relocalization.lost_object import LostObject
+from torchtrack.tracking.relocalization.sampling import sample
 
 
-def promising(
-    prediction: Prediction,
-    outline: Contours,
-    covariance: Float[Tensor, "12 12"],
-    sigma_px: float,
-    places: tuple[Float[Tensor, "1 e 2"], Bool[Tensor, "1 e"]],
-    config: TrackerConfig,
-) -> Float[Tensor, "n 13"]:
-    """Offsets of pose and velocity that are worth aligning, ``search.hypotheses`` of them; the first, the prediction itself, is none.
+@dataclass(frozen=True)
+class Hypotheses:
+    """Poses of an object that are worth aligning.
 
     Args:
-        prediction: of the one object.
-        outline: its contours where it was looked for.
-        covariance: to draw from.
-        sigma_px: what it comes to in the image.
-        places: pixels of the events at the window's end, and which of them exist.
+        prediction: of the object alone, which they are taken around.
+        offsets: of pose and velocity from there.
+        covariance: of pose and velocity, that they were sampled from.
+        places: pixels of the object's events at the window's end, and which of them exist.
+        is_wide: whether hardly anything was known of where the object is.
+        replaces_prediction: whether the prediction takes the place of the object's own where one of them is accepted.
+        released: information that then no longer holds the pose; none for nothing.
+        gate_scale: the scale of the first gate then; none for as it is.
     """
-    settings = config.search
-    enough = event_density(*places, prediction.objects.image_size).clamp(max=ENOUGH_EVENTS)
-    if sigma_px > settings.wide_sigma_px:
-        poses, outlines = _near_events(prediction, covariance, places, enough, config)
-        offsets = difference_about(prediction.T_cam_obj.expand(len(poses), 4, 4), poses, prediction.objects.centre_obj.expand(len(poses), 3))
-        offsets = _with_velocity(offsets, covariance)
-    else:
-        offsets, outlines = draw_offsets(covariance, settings.drawn).to(prediction.velocity.dtype), thinned(outline)
-        poses = prediction.poses_at(offsets[:, :6])
-    marks = mark(outlines, poses, prediction.objects.intrinsics, enough)
-    chosen = marks.topk(min(settings.hypotheses - 1, len(marks))).indices
-    return torch.cat([torch.zeros_like(offsets[:1]), offsets[chosen]])
+
+    prediction: Prediction
+    offsets: Float[Tensor, "n 13"]
+    covariance: Float[Tensor, "12 12"]
+    places: tuple[Float[Tensor, "1 e 2"], Bool[Tensor, "1 e"]]
+    is_wide: bool
+    replaces_prediction: bool = False
+    released: Float[Tensor, "12 12"] | None = None
+    gate_scale: Float[Tensor, "1"] | None = None
+
+    def rows(self, count: int) -> Prediction:
+        """The prediction that each of ``count`` of them is an offset from."""
+        return self.prediction.copies(0, count)
+
+    def prediction_at(self, row: Int[Tensor, "1"]) -> Prediction:
+        """The prediction of the object alone that the hypothesis in a row is weighed against."""
+        return self.prediction
 
 
-def _near_events(
-    prediction: Prediction, covariance: Tensor, places: tuple[Tensor, Tensor], enough: Float[Tensor, "h w"], config: TrackerConfig
-) -> tuple[Float[Tensor, "k 4 4"], Contours]:
-    """Poses of a very uncertain object whose contours lie on events, and these: turned as drawn, shifted to where most are, and pulled onto them."""
-    steps = draw_offsets(covariance, config.search.turns)[:, :6].to(prediction.velocity.dtype)
-    sigma_m = covariance.diagonal()[3:5].mean().sqrt().to(steps.dtype)
-    steps, outlines = shifted(prediction, steps, sigma_m, places, config)
-    around = avg_pool2d(enough[None], 3, 1, 1)[0]
-    onto = (around, covariance[:6, :6])
-    poses = pulled(prediction, prediction.poses_at(steps), outlines, *onto, FAR_PX)
-    best = mark(outlines, poses, prediction.objects.intrinsics, enough).topk(min(config.search.pulled, len(poses))).indices
-    poses = poses[best]
-    # What was seen from near there does not do any more.
-    poses = pulled(prediction, poses, outlines_at(prediction, poses, config), *onto, NEAR_PX)
-    return poses, outlines_at(prediction, poses, config)
+def around_prediction(lost: LostObject) -> Hypotheses:
+    """Sampled from its prediction: near it, or, where hardly anything is known, in all places of the image."""
+    return sampled_around(lost, lost.predicted(), lost.sigma_px, lost.contours())
 
 
-def draw_offsets(covariance: Float[Tensor, "12 12"], count: int) -> Float[Tensor, "n 13"]:
-    """Offsets of pose and velocity, drawn evenly from a covariance; the first is none. The swelling, last, is not drawn.
+def around_prediction_released(lost: LostObject) -> Hypotheses:
+    """Sampled near the prediction of an object that is sure of where it is, and may be farther off than that.
 
-    The sequence is the same every time: a search can be repeated.
+    Held by its prediction, no pose some pixels away is reached, however much it explains. What is accepted goes on as certain as
+    if it had been predicted: an object that is not held at all wanders off from a hypothesis to the next.
     """
-    return _with_velocity(_normal(count, covariance.dtype, covariance.device) @ _root(covariance).T, covariance)
+    config, sigma_px, slip_px = lost.config, lost.sigma_px, lost.config.search.slip_sigma_px
+    hypotheses = sampled_around(lost, less_certain(lost.predicted(), sigma_px, slip_px), slip_px, lost.contours())
+    released = config.solver.observation_px**2 * (1 - (sigma_px / slip_px) ** 2) * lost.widened.information[lost.number]
+    return replace(hypotheses, released=released)
 
 
-def _root(covariance: Tensor) -> Tensor:
-    return torch.linalg.cholesky_ex(covariance[:6, :6]).L
+def as_last_seen(lost: LostObject) -> Hypotheses:
+    """Rotated and as far away as when it was last validated, in the place of the image where it is predicted."""
+    T_last_seen = lost.others.last_seen.T_cam_obj[lost.number]
+    return _sampled_elsewhere(lost, where_last_seen(lost.predicted(), T_last_seen), lost.sigma_px)
 
 
-def _with_velocity(pose: Float[Tensor, "n 6"], covariance: Float[Tensor, "12 12"]) -> Float[Tensor, "n 13"]:
-    """Offsets of poses with those of the velocity: a pose that is off implies a velocity that was."""
-    gain = torch.linalg.solve_ex(covariance[:6, :6], covariance[:6, 6:]).result
-    return pad(torch.cat([pose, pose @ gain.to(pose.dtype)], -1), (0, 1))
+def mirrored(lost: LostObject, plane: int) -> Hypotheses | None:
+    """Mirrored in depth by a plane of symmetry; none where the object has no plane of that number."""
+    other = lost.others.ambiguities.planes.mirrored(lost.number, plane, lost.as_scored())
+    if other is None:
+        return None
+    slip_px = lost.config.search.slip_sigma_px
+    return _sampled_elsewhere(lost, less_certain(other, lost.predicted_sigma_px, slip_px), slip_px)
 
 
-@lru_cache(maxsize=8)
-def _normal(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "n 6"]:
-    """Normally distributed numbers, spread evenly; the first are none."""
-    with torch.inference_mode(mode=False):
-        even = torch.quasirandom.SobolEngine(6, scramble=False).draw(count + 1)[1:].to(device, dtype)
-        normal = torch.erfinv(2 * even - 1) * 2**0.5
-        normal[0] = 0
-        return normal
+def around_last_seen(lost: LostObject) -> Hypotheses:
+    """All around where it was last validated, at rest there."""
+    other = lost.others.last_seen.prediction(lost.number, lost.window.prediction)
+    # A look from there is a wide one, however far this one goes.
+    hypotheses = _sampled_elsewhere(lost, other, 2 * lost.config.search.wide_sigma_px)
+    return replace(hypotheses, gate_scale=gate_widening(torch.full_like(lost.window.gate_scale[:1], torch.inf), lost.config))
 
 
-@accelerable
-def mark(outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"], image: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
-    """How much denser events are on the contours of one object at each of some poses than beside them.
+def sampled_around(lost: LostObject, prediction: Prediction, sigma_px: float, outline: Contours) -> Hypotheses:
+    """Sampled from a ``prediction`` of the object alone, with its contours there; the first of them is the prediction itself.
 
     Args:
-        outlines: its contours at each pose; or one for all, which are moved: over a few degrees they stay contours, even on a smooth surface.
-        T_cam_obj: the poses.
-        image: how many events there are at every pixel, as :mod:`torchtrack.tracking.relocalization.event_image` has it.
+        sigma_px: standard deviation of the prediction in the image.
     """
-    count = len(T_cam_obj)
-    points, tangents, kind, mask = (
-        values.expand(count, *values.shape[1:]) for values in (outlines.points_obj, outlines.tangents_obj, outlines.kind, outlines.mask)
-    )
-    moved = assemble(points, tangents, kind, mask, T_cam_obj, intrinsics.expand(count, 4))
-    total = image.new_zeros(count)
-    for side_px, weight in ((0.0, 1.0), (BESIDE_PX, -0.5), (-BESIDE_PX, -0.5)):
-        total = total + weight * (look_up(image, moved.pixels + side_px * moved.normals) * moved.mask).sum(-1)
-    return total / moved.mask.sum(-1).clamp(min=1)
+    search = lost.config.search
+    widened_px = max(sigma_px, search.least_sigma_px)
+    covariance = less_certain(prediction, sigma_px, widened_px).covariance[0]
+    places = prediction.carried(lost.events.pixels, lost.events.age_s), lost.events.mask
+    offsets = sample(prediction, outline, covariance, widened_px, places, lost.config)
+    return Hypotheses(prediction, offsets, covariance, places, is_wide=sigma_px > search.wide_sigma_px)
+
+
+def _sampled_elsewhere(lost: LostObject, prediction: Prediction, sigma_px: float) -> Hypotheses:
+    """Sampled around a prediction of the object that is not its own."""
+    outline = prediction.objects.contours(prediction.T_cam_obj, lost.config.contours)
+    return replace(sampled_around(lost, prediction, sigma_px, outline), replaces_prediction=True)

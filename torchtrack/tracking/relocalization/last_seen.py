@@ -11,37 +11,34 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import rim_and_centre
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.triggers import Doubt
 from torchtrack.tracking.state import TrackerState
 
-# An object is not looked for farther away than it can have drifted in this time (s), nor turned farther than in this.
-_LONGEST_S, _LONGEST_TURN_S = 0.4, 1.0
+# An object is not looked for farther away than it can have drifted in this time (s), nor rotated farther than in this.
+_LONGEST_S, _LONGEST_ROTATION_S = 0.4, 1.0
 
 
-def drifted(prediction: Prediction, doubt: Doubt, config: SearchConfig) -> Prediction:
-    """The prediction, of objects that are adrift so uncertain as if they had moved otherwise, at some constant velocity, since the doubt began."""
+def with_drift(prediction: Prediction, is_adrift: Bool[Tensor, "b"], drift_s: Float[Tensor, "b"], config: SearchConfig) -> Prediction:
+    """The prediction, of objects that drift so uncertain as if they had moved otherwise, at some constant velocity, for that long."""
     objects = prediction.objects
     speed_m_s = torch.minimum(config.drift_px_s / objects.px_per_m(prediction.T_cam_obj), config.drift_diameters_s * objects.diameter_m).double()
     velocity = rim_and_centre(speed_m_s[:, None], objects.diameter_m.double()[:, None])
-    turned_s, moved_s = (doubt.doubted_s.clamp(max=longest_s).double()[:, None].expand(-1, 3) for longest_s in (_LONGEST_TURN_S, _LONGEST_S))
-    # Pose and velocity are off together: one such velocity explains both.
-    pose, rate = (torch.diag_embed(part) for part in (velocity * torch.cat([turned_s, moved_s], 1), velocity))
+    rotated_s, moved_s = (drift_s.clamp(max=longest_s).double()[:, None].expand(-1, 3) for longest_s in (_LONGEST_ROTATION_S, _LONGEST_S))
+    # Pose and velocity are off together: such a velocity explains both.
+    pose, rate = (torch.diag_embed(part) for part in (velocity * torch.cat([rotated_s, moved_s], 1), velocity))
     root = torch.cat([pose, rate], 1)
-    return replace(prediction, covariance=prediction.covariance + doubt.adrift[:, None, None] * (root @ root.mT))
+    return replace(prediction, covariance=prediction.covariance + is_adrift[:, None, None] * (root @ root.mT))
 
 
-def less_certain(prediction: Prediction, number: int, sigma_px: float, wider_px: float) -> Prediction:
-    """The prediction, of the object ``number`` as if its standard deviation in the image, ``sigma_px``, were ``wider_px``.
+def less_certain(prediction: Prediction, sigma_px: float, wider_px: float) -> Prediction:
+    """The prediction, of an object alone, as if its standard deviation in the image, ``sigma_px``, were ``wider_px``.
 
     A pose that slipped was sure of itself all the while: its covariance tells the directions it can be off in, but not how far.
     """
-    covariance = prediction.covariance.clone()
-    covariance[number] *= (wider_px / max(sigma_px, 1e-6)) ** 2
-    return replace(prediction, covariance=covariance)
+    return replace(prediction, covariance=prediction.covariance * (wider_px / max(sigma_px, 1e-6)) ** 2)
 
 
-# Standard deviations: turn (rad), and depth (as a share of it).
-_TURN_RAD, _DEPTH_SHARE = 1.0, 0.1
+# Standard deviations: rotation (rad), and depth (as a share of it).
+_ROTATION_RAD, _DEPTH_SHARE = 1.0, 0.1
 
 
 # And way across the image (px/s, and as a share of its diagonal), the longer the object was not seen well.
@@ -77,8 +74,8 @@ class LastSeen:
         height, width = objects.image_size
         across_px = (_SPEED_PX_S * state.unseen_s.double()).clamp(max=_DIAGONALS * (height**2 + width**2) ** 0.5)
         across_m, depth_m = across_px / objects.px_per_m(T_cam_obj).double(), _DEPTH_SHARE * objects.depth_m(T_cam_obj).double()
-        turn_rad = torch.full_like(depth_m, _TURN_RAD)
-        pose = share[:, None] * torch.stack([turn_rad, turn_rad, turn_rad, across_m, across_m, depth_m], 1)
+        rotation_rad = torch.full_like(depth_m, _ROTATION_RAD)
+        pose = share[:, None] * torch.stack([rotation_rad, rotation_rad, rotation_rad, across_m, across_m, depth_m], 1)
         diameter_m = objects.diameter_m.double()[:, None]
         rate = rim_and_centre(torch.full_like(diameter_m, config.motion.initial_speed_m_s), diameter_m)
         return cls(state.T_last_seen, torch.diag_embed(torch.cat([pose, rate], 1).square()))
@@ -95,11 +92,11 @@ class LastSeen:
         )
 
     def prediction(self, number: int, prediction: Prediction) -> Prediction:
-        """The prediction of one object alone, at rest there."""
-        one, own = prediction.copies(number, 1), slice(number, number + 1)
-        acceleration = one.acceleration and replace(one.acceleration, expected=torch.zeros_like(one.acceleration.expected))
-        T_cam_obj, velocity = self.T_cam_obj[own].to(one.T_cam_obj.dtype), torch.zeros_like(one.velocity)
-        return Prediction(one.objects, T_cam_obj, torch.ones_like(one.usable), velocity, self.covariance[own], acceleration)
+        """The prediction of an object alone, at rest there."""
+        alone, own = prediction.copies(number, 1), slice(number, number + 1)
+        acceleration = alone.acceleration and replace(alone.acceleration, expected=torch.zeros_like(alone.acceleration.expected))
+        T_cam_obj, velocity = self.T_cam_obj[own].to(alone.T_cam_obj.dtype), torch.zeros_like(alone.velocity)
+        return Prediction(alone.objects, T_cam_obj, torch.ones_like(alone.usable), velocity, self.covariance[own], acceleration)
 
 
 def anywhere(covariance: Float[Tensor, "b 12 12"], chosen: Bool[Tensor, "b"]) -> Float[Tensor, "b 12 12"]:
@@ -108,10 +105,10 @@ def anywhere(covariance: Float[Tensor, "b 12 12"], chosen: Bool[Tensor, "b"]) ->
     return torch.where(chosen[:, None, None], unknown, covariance)
 
 
-def as_last_seen(prediction: Prediction, T_last_seen: Float[Tensor, "4 4"]) -> Prediction:
-    """The prediction, of one object, turned and as far away as when it was last seen well, in the place of the image where it is predicted.
+def where_last_seen(prediction: Prediction, T_last_seen: Float[Tensor, "4 4"]) -> Prediction:
+    """The prediction, of an object alone, rotated and as far away as when it was last seen well, in the place of the image where it is predicted.
 
-    What slips runs off in depth and turns on; in the image it is held by what it slipped onto.
+    What slips runs off in depth and rotates on; in the image it is held by what it slipped onto.
     """
     centre_obj, then = prediction.objects.centre_obj[0], T_last_seen.to(prediction.T_cam_obj.dtype)
     now_cam, then_cam = prediction.centre_cam[0], then[:3, :3] @ centre_obj + then[:3, 3]

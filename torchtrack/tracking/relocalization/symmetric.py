@@ -1,19 +1,24 @@
-"""Where an object may be, if not where it is predicted: mirrored in depth, or turned as when it was last seen well.
+"""Poses in which an object looks about the same: mirrored in depth, or rotated about an axis.
 
 Seen from afar, all points of a body may be mirrored in the plane through its middle that faces the camera, and none moves in the
-image. Mirrored in its own plane of symmetry as well, the body is as it was, but turned: both poses have the same outline, and
-where they meet, as the body turns, a tracker may follow either. Perspective, and what is seen within the outline, tell them apart.
+image. Mirrored in its own plane of symmetry as well, the body is as it was, but rotated: both poses have the same outline, and
+where they meet, as the body rotates, a tracker may follow either. Perspective, and what is seen within the outline, tell them apart.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
+from torchtrack.core.lie import retract_about
 from torchtrack.tracking.motion.prediction import Prediction
+
+# Planes of symmetry of an object, at most.
+MOST_PLANES = 3
+# How certain a rotation about the axis is (rad), and its rate (rad/s), that was not seen.
+_ROTATION_RAD, _RATE_RAD_S = 0.1, 4.0
 
 
 @dataclass(frozen=True)
@@ -30,16 +35,63 @@ class SymmetryPlanes:
     normals_obj: Float[Tensor, "b k 3"]
     counts: tuple[int, ...]
 
-    def of(self, number: int) -> Iterator[tuple[Float[Tensor, "3"], Float[Tensor, "3"]]]:
-        """Point and normal of each plane of one object."""
-        return ((self.points_obj[number], self.normals_obj[number, plane]) for plane in range(self.counts[number]))
+    def mirrored(self, number: int, plane: int, prediction: Prediction) -> Prediction | None:
+        """The ``prediction`` of the object ``number`` alone, mirrored in one of its planes; none where it has fewer."""
+        if plane >= self.counts[number]:
+            return None
+        return mirrored(prediction, self.points_obj[number], self.normals_obj[number, plane])
+
+
+@dataclass(frozen=True)
+class RotationAxes:
+    """The axis of each object that most of it can be rotated about unseen.
+
+    Args:
+        points_obj: a point on it (m).
+        directions_obj: its unit direction; zero of objects without an axis.
+    """
+
+    points_obj: Float[Tensor, "b 3"]
+    directions_obj: Float[Tensor, "b 3"]
+
+    def rotated(self, number: int, prediction: Prediction, angles: Float[Tensor, "n"]) -> Prediction:
+        """The ``prediction`` of the object ``number`` alone, rotated by some angles about its axis, of which hardly anything is known then.
+
+        What is on the axis goes on as it did.
+        """
+        count, point, direction = len(angles), self.points_obj[number], self.directions_obj[number]
+        copies, along = prediction.copies(0, count), prediction.T_cam_obj[0, :3, :3] @ direction
+        rotations = pad(angles[:, None] * along, (0, 3))
+        moved = replace(copies, T_cam_obj=retract_about(copies.T_cam_obj, rotations, point.expand(count, 3)))
+        gained = torch.linalg.cross(copies.velocity[:, :3], moved.centre_cam - copies.centre_cam, dim=-1)
+        unknown, spread = torch.zeros_like(prediction.covariance), torch.outer(along, along).to(prediction.covariance.dtype)
+        for first, sigma in ((0, _ROTATION_RAD), (6, _RATE_RAD_S)):
+            unknown[:, first : first + 3, first : first + 3] = sigma**2 * spread
+        velocity = torch.cat([copies.velocity[:, :3], copies.velocity[:, 3:] + gained], 1)
+        return replace(moved, velocity=velocity, covariance=copies.covariance + unknown)
+
+
+@dataclass(frozen=True)
+class Ambiguities:
+    """In which other poses each object looks about the same.
+
+    Args:
+        planes: of symmetry.
+        axes: that most of an object can be rotated about unseen.
+        has_symmetry: objects with a plane; ``has_axis``, with an axis.
+    """
+
+    planes: SymmetryPlanes
+    axes: RotationAxes
+    has_symmetry: Bool[Tensor, "b"]
+    has_axis: Bool[Tensor, "b"]
 
 
 def mirrored(prediction: Prediction, point_obj: Float[Tensor, "3"], normal_obj: Float[Tensor, "3"]) -> Prediction:
-    """The prediction, of one object, in the pose of the same outline; it turns as it has to for that to stay so.
+    """The prediction, of a single object, in the pose of the same outline; it rotates as it has to for that to stay so.
 
     With the reflections ``D``, in the plane that faces the camera, and ``S``, in that of symmetry, it is ``R' = D R S``: a
-    rotation. Turns, which are axial vectors, become ``-D ω``, and the middle goes on as it did.
+    rotation. Rates, which are axial vectors, become ``-D ω``, and the middle goes on as it did.
 
     Args:
         point_obj, normal_obj: of the plane of symmetry.

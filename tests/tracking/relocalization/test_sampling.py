@@ -1,4 +1,4 @@
-"""Poses worth trying: how they are drawn, how events mark them, and that the true one is among them."""
+"""Poses worth aligning: how they are drawn, how events score them, and that the true pose is among them."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from tracked_boxes import in_motion
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization.event_image import event_density
-from torchtrack.tracking.relocalization.hypotheses import draw_offsets, mark, promising
+from torchtrack.tracking.relocalization.sampling import draw_offsets, sample, score_outlines
 from torchtrack.tracking.relocalization.view_sphere import outlines_at, thinned
 
 IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
@@ -28,9 +28,9 @@ def test_offsets_are_drawn_with_the_covariance():
     assert offsets.shape == (8000, 13)
     assert (offsets[0] == 0).all()
     assert (offsets[:, 12] == 0).all()
-    found = offsets[:, :6].T @ offsets[:, :6] / len(offsets)
+    sampled = offsets[:, :6].T @ offsets[:, :6] / len(offsets)
     scale = covariance[:6, :6].diagonal().sqrt()
-    assert float(((found - covariance[:6, :6]) / (scale[:, None] * scale)).abs().max()) < 0.03
+    assert float(((sampled - covariance[:6, :6]) / (scale[:, None] * scale)).abs().max()) < 0.03
     assert float((offsets[:, :6].mean(0) / scale).abs().max()) < 0.01
     assert torch.isfinite(offsets).all()
 
@@ -41,9 +41,9 @@ def test_the_velocity_of_an_offset_is_what_its_pose_implies():
     offsets = draw_offsets(covariance, 100)
     gain = covariance[6:, :6] @ torch.linalg.inv(covariance[:6, :6])
     torch.testing.assert_close(offsets[:, 6:12], offsets[:, :6] @ gain.T)
-    apart = covariance.clone()
-    apart[6:, :6] = apart[:6, 6:] = 0
-    assert float(draw_offsets(apart, 100)[:, 6:].abs().max()) == 0
+    unrelated = covariance.clone()
+    unrelated[6:, :6] = unrelated[:6, 6:] = 0
+    assert float(draw_offsets(unrelated, 100)[:, 6:].abs().max()) == 0
 
 
 def test_the_draw_is_the_same_every_time_and_more_of_it_begins_as_less():
@@ -52,7 +52,7 @@ def test_the_draw_is_the_same_every_time_and_more_of_it_begins_as_less():
     assert torch.equal(draw_offsets(covariance, 600)[:300], draw_offsets(covariance, 300))
 
 
-# ---- how poses are marked
+# ---- how poses are scored
 
 
 def test_density_counts_the_events_around_every_pixel():
@@ -72,33 +72,33 @@ def test_events_outside_the_image_or_nowhere_are_not_counted():
     assert int(density[151, 201]) == 1
 
 
-def marks_at(prediction, outlines, offsets, image):
-    return mark(outlines, prediction.poses_at(offsets[:, :6]), prediction.objects.intrinsics, image)
+def scores_at(prediction, outlines, offsets, image):
+    return score_outlines(outlines, prediction.poses_at(offsets[:, :6]), prediction.objects.intrinsics, image)
 
 
-def test_the_true_pose_is_marked_best(dtype):
-    _, prediction, seen, found, _ = in_motion(dtype=dtype)
+def test_the_true_pose_is_scored_best(dtype):
+    _, prediction, seen, scored, _ = in_motion(dtype=dtype)
     density = event_density(seen.pixels + prediction.plane_velocity(seen.pixels) * seen.age_s[..., None], seen.mask, IMAGE_SIZE)
     away = torch.zeros(13, 13, dtype=dtype)
     for axis in range(6):
         away[2 * axis + 1, axis], away[2 * axis + 2, axis] = (0.15, -0.15) if axis < 3 else (0.015, -0.015)
     # Depth moves contours least.
     away[11:] *= 4
-    marks = marks_at(prediction, thinned(found.fit.contours), away, density.clamp(max=3))
-    assert int(marks.argmax()) == 0
-    assert float(marks[0]) > 1.5 * float(marks[1:].max())
+    scores = scores_at(prediction, thinned(scored.fit.contours), away, density.clamp(max=3))
+    assert int(scores.argmax()) == 0
+    assert float(scores[0]) > 1.5 * float(scores[1:].max())
 
 
-def test_marks_of_poses_behind_the_camera_are_numbers():
-    _, prediction, seen, found, _ = in_motion()
+def test_scores_of_poses_behind_the_camera_are_numbers():
+    _, prediction, seen, scored, _ = in_motion()
     offsets = torch.zeros(2, 13)
     offsets[1, 5] = -2.0
     density = event_density(seen.pixels, seen.mask, IMAGE_SIZE)
-    for outlines in (thinned(found.fit.contours), outlines_at(prediction, prediction.poses_at(offsets[:, :6]), TrackerConfig())):
-        assert torch.isfinite(marks_at(prediction, outlines, offsets, density)).all()
+    for outlines in (thinned(scored.fit.contours), outlines_at(prediction, prediction.poses_at(offsets[:, :6]), TrackerConfig())):
+        assert torch.isfinite(scores_at(prediction, outlines, offsets, density)).all()
 
 
-# ---- what is promising
+# ---- what is sampled
 
 
 def nearest(offsets, prediction, T_true):
@@ -112,21 +112,21 @@ def places_of(prediction, seen):
 
 
 @pytest.mark.parametrize("rotation_rad", [0.15, 0.3, 0.45])
-def test_a_pose_near_the_true_one_is_among_the_promising(rotation_rad, dtype):
+def test_a_pose_near_the_true_one_is_among_the_sample(rotation_rad, dtype):
     displaced = torch.tensor([[rotation_rad, -rotation_rad, rotation_rad, 0.02, -0.02, 0.01]], dtype=torch.float64)
-    tracker, prediction, seen, found, T_true = in_motion(displaced=displaced, dtype=dtype)
+    tracker, prediction, seen, scored, T_true = in_motion(displaced=displaced, dtype=dtype)
     sigma = torch.tensor([rotation_rad] * 3 + [0.03] * 3 + [1.0] * 3 + [0.1] * 3, dtype=torch.float64)
     once = TrackerConfig(search=SearchConfig(wide_sigma_px=100.0))
     places, covariance = places_of(prediction, seen), torch.diag(sigma.square())
-    shifted, drawn = (promising(prediction, found.fit.contours, covariance, 30.0, places, config) for config in (tracker.config, once))
+    shifted, drawn = (sample(prediction, scored.fit.contours, covariance, 30.0, places, config) for config in (tracker.config, once))
     assert shifted.shape == drawn.shape == (24, 13)
     assert shifted.dtype == dtype
     assert not shifted[0].any()
     assert nearest(shifted, prediction, T_true) < min(10, 0.7 * nearest(drawn, prediction, T_true))
 
 
-def test_as_many_are_promising_as_are_to_be_tried_or_kept():
-    _, prediction, seen, found, _ = in_motion()
+def test_as_many_are_sampled_as_are_to_be_tried_or_kept():
+    _, prediction, seen, scored, _ = in_motion()
     covariance = 1e-2 * torch.eye(12, dtype=torch.float64)
     for few, count in (
         (SearchConfig(hypotheses=5, turns=40), 5),
@@ -135,20 +135,20 @@ def test_as_many_are_promising_as_are_to_be_tried_or_kept():
         (SearchConfig(hypotheses=1), 1),
     ):
         config = TrackerConfig(search=few)
-        assert len(promising(prediction, found.fit.contours, covariance, 30.0, places_of(prediction, seen), config)) == count
+        assert len(sample(prediction, scored.fit.contours, covariance, 30.0, places_of(prediction, seen), config)) == count
 
 
-def test_without_events_what_is_promising_is_still_finite():
-    _, prediction, seen, found, _ = in_motion()
+def test_without_events_what_is_sampled_is_still_finite():
+    _, prediction, seen, scored, _ = in_motion()
     covariance = 1e-2 * torch.eye(12, dtype=torch.float64)
     nothing = seen.pixels, torch.zeros_like(seen.mask)
-    assert torch.isfinite(promising(prediction, found.fit.contours, covariance, 30.0, nothing, TrackerConfig())).all()
+    assert torch.isfinite(sample(prediction, scored.fit.contours, covariance, 30.0, nothing, TrackerConfig())).all()
 
 
-def test_where_the_prediction_is_good_only_what_it_allows_is_promising():
-    tracker, prediction, seen, found, _ = in_motion()
+def test_where_the_prediction_is_good_only_what_it_allows_is_sample():
+    tracker, prediction, seen, scored, _ = in_motion()
     covariance = 1e-6 * torch.eye(12, dtype=torch.float64)
-    offsets = promising(prediction, found.fit.contours, covariance, 3.0, (seen.pixels, seen.mask), tracker.config)
+    offsets = sample(prediction, scored.fit.contours, covariance, 3.0, (seen.pixels, seen.mask), tracker.config)
     drawn = draw_offsets(covariance, SearchConfig().drawn).float()
     assert ((offsets[:, None] == drawn).all(-1).any(-1)).all()
     assert float(offsets[:, :6].abs().max()) < 5e-3

@@ -1,0 +1,63 @@
+"""What relocalization works on, for its tests: evidence for triggers, and objects that other poses are tried for."""
+
+import torch
+
+from torchtrack.tracking.relocalization import hypotheses
+from torchtrack.tracking.relocalization.acceptance import AcceptanceTest
+from torchtrack.tracking.relocalization.last_seen import LastSeen
+from torchtrack.tracking.relocalization.lost_object import LostObject, OtherPoses, Relocalized
+from torchtrack.tracking.relocalization.refine import exchanged, refined
+from torchtrack.tracking.relocalization.triggers import NONE, TriggerEvidence
+
+# Of an object that is seen well, in a window in which it is time for nothing.
+SEEN_WELL = {
+    "sigma_px": 1.0,
+    "score": 0.9,
+    "last_score": 0.9,
+    "mean_score": 0.9,
+    "matches": 200,
+    "reference_explained_ratio": 0.9,
+    "drift_s": 0.0,
+    "time_since_validated_s": 0.0,
+    "is_starting": False,
+    "is_due": False,
+    "is_drift_due": False,
+    "has_symmetry": False,
+    "has_axis": False,
+    "earlier": int(NONE),
+}
+
+
+def evidence(count=1, **changes):
+    """Evidence of objects that are seen well, but for what is changed: by a value for all of them, or a list of one for each."""
+    values = {name: torch.as_tensor(value).expand(count) for name, value in (SEEN_WELL | changes).items()}
+    return TriggerEvidence(**values)
+
+
+def acceptance_test(margin=0.1, min_score=0.0, min_inlier_ratio=0.0, min_matches=0.0):
+    """A test for a single object."""
+    return AcceptanceTest(*(torch.tensor([value]) for value in (margin, min_score, min_inlier_ratio, min_matches)))
+
+
+def lost_object(tracker, prediction, seen, scored, sigma_px, config=None):
+    """The first object of a tracker, to try other poses for."""
+    others = OtherPoses(LastSeen(prediction.T_cam_obj.double(), prediction.covariance), tracker.ambiguities)
+    return LostObject(
+        number=0,
+        window=Relocalized(scored, prediction, torch.ones_like(scored.score)),
+        widened=prediction,
+        sigma_px=sigma_px,
+        predicted_sigma_px=sigma_px,
+        time_since_validated_s=torch.zeros(()),
+        events=seen.of(0),
+        others=others,
+        config=config or tracker.config,
+    )
+
+
+def searched(lost, test=None, propose=hypotheses.around_prediction):
+    """What the window gives with other poses tried for the object."""
+    proposed = propose(lost)
+    tried = refined(proposed, lost)
+    choice = (test or acceptance_test()).row(0).choose(tried, proposed, lost)
+    return exchanged(lost, proposed, tried, choice)

@@ -1,0 +1,52 @@
+"""Which hypotheses answer which triggers, in the order in which they are tried, and the test that each has to pass."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from jaxtyping import Int
+from torch import Tensor
+
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.tracking.relocalization import acceptance, hypotheses
+from torchtrack.tracking.relocalization.acceptance import Acceptance
+from torchtrack.tracking.relocalization.axis_rotation import rotated, rotation_test
+from torchtrack.tracking.relocalization.hypotheses import Hypotheses
+from torchtrack.tracking.relocalization.lost_object import LostObject
+from torchtrack.tracking.relocalization.symmetric import MOST_PLANES
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger, TriggerEvidence
+from torchtrack.tracking.validation.scored_fit import Found
+
+
+@dataclass(frozen=True)
+class Source:
+    """Hypotheses that some triggers call for.
+
+    Args:
+        triggers: any of which calls for them.
+        propose: the hypotheses of an object, or none.
+        test: what is asked of them, of each object, before any are tried.
+        unless: a trigger that calls for others in their place.
+        comes_last: whether they are tried once all others were, and what these gave is settled.
+    """
+
+    triggers: Trigger
+    propose: Callable[[LostObject], Hypotheses | None]
+    test: Callable[[TriggerEvidence, Int[Tensor, "b"], Found, TrackerConfig], Acceptance]
+    unless: Trigger = NONE
+    comes_last: bool = False
+
+    def is_called_for(self, flags: int) -> bool:
+        """Whether an object with these triggers is to be tried there."""
+        return bool(flags & self.triggers) and not flags & self.unless
+
+
+SOURCES = (
+    Source(Trigger.HELD, hypotheses.around_prediction_released, acceptance.near_prediction),
+    Source(AROUND_PREDICTION, hypotheses.around_prediction, acceptance.near_prediction, unless=Trigger.HELD),
+    Source(Trigger.SCORE_DROP, hypotheses.around_prediction_released, acceptance.elsewhere),
+    Source(Trigger.NOT_VALIDATED, hypotheses.as_last_seen, acceptance.as_last_seen),
+    *(Source(Trigger.MIRROR_AMBIGUOUS, partial(hypotheses.mirrored, plane=plane), acceptance.elsewhere) for plane in range(MOST_PLANES)),
+    Source(Trigger.AXIS_AMBIGUOUS, rotated, rotation_test),
+    Source(AROUND_LAST_SEEN, hypotheses.around_last_seen, acceptance.around_last_seen, comes_last=True),
+)
