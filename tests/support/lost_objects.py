@@ -4,10 +4,11 @@ import torch
 
 from torchtrack.tracking.relocalization import hypotheses
 from torchtrack.tracking.relocalization.acceptance import AcceptanceTest
+from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_object import LostObject, OtherPoses, Relocalized
 from torchtrack.tracking.relocalization.refine import exchanged, refined
-from torchtrack.tracking.relocalization.triggers import NONE, TriggerEvidence
+from torchtrack.tracking.relocalization.triggers import NONE
 
 # Of an object that is seen well, in a window in which it is time for nothing.
 SEEN_WELL = {
@@ -56,8 +57,8 @@ def lost_object(tracker, prediction, seen, scored, sigma_px, config=None):
 
 
 def searched(lost, test=None, propose=hypotheses.around_prediction):
-    """What the window gives with other poses tried for the object."""
+    """The fits of a window with other poses tried for the object."""
     proposed = propose(lost)
     tried = refined(proposed, lost)
     choice = (test or acceptance_test()).row(0).choose(tried, proposed, lost)
-    return exchanged(lost, proposed, tried, choice)
+    return exchanged(lost, proposed, tried, choice).scored

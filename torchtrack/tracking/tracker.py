@@ -34,21 +34,20 @@ from torchtrack.tracking.initialization import check_poses, first_state, held_ba
 from torchtrack.tracking.motion.predict import forecast
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.objects import TrackedObjects
+from torchtrack.tracking.relocalization.evidence import gather_evidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere
 from torchtrack.tracking.relocalization.lost_object import OtherPoses, Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.sampling import rehearse
+from torchtrack.tracking.relocalization.schedule import is_time, schedule
 from torchtrack.tracking.relocalization.tentative import after_probation
 from torchtrack.tracking.relocalization.triggers import (
     AROUND_LAST_SEEN,
     SEARCHED,
     Trigger,
-    gather_evidence,
     has,
-    is_time,
     may_have_rotated,
     reference_where_known,
-    schedule,
     searches,
     triggers,
 )

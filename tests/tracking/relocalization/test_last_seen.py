@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose
+from lost_states import moved_away, uncertain, unseen
 from tracked_boxes import follow, in_motion, moving_box, started, windows
 
 from torchtrack import Tracker
@@ -12,77 +13,12 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere, less_certain, with_drift
-from torchtrack.tracking.relocalization.triggers import Trigger, has, schedule
 from torchtrack.tracking.state import joined
 from torchtrack.tracking.validation.status import Status
 
 CONFIG = TrackerConfig()
 # A fifth of the image's diagonal.
 _WIDEST_PX = 0.2 * (SMALL_CAMERA.width**2 + SMALL_CAMERA.height**2) ** 0.5
-
-
-def unseen(state, unseen_s=0.2, **changes):
-    """The state of an object that was seen well once, but not for a while."""
-    return replace(state, unseen_s=torch.full_like(state.unseen_s, unseen_s), **changes)
-
-
-def uncertain(state, turn_rad=0.45):
-    """Covariance of an object of which hardly anything is known."""
-    return torch.eye(12, dtype=torch.float64).expand(len(state.covariance), 12, 12) * turn_rad**2
-
-
-def moved_away(tracker, state, metres):
-    """Pose so much farther from the camera."""
-    step = torch.zeros(len(state.T_cam_obj), 6, dtype=torch.float64)
-    step[:, 5] = metres
-    return retract_about(state.T_cam_obj, step, tracker.centre_obj.double())
-
-
-# ---- when
-
-
-def is_lost(tracker, state, config=CONFIG):
-    return has(schedule(state, tracker.objects, state.t_us, config).triggers, Trigger.LOST).tolist() == [True]
-
-
-def is_looked_for(trigger, tracker, state, t_us, config=CONFIG):
-    return has(schedule(state, tracker.objects, t_us, config).triggers, trigger).tolist() == [True]
-
-
-def test_an_object_is_lost_once_nothing_is_known_of_it_and_it_was_not_seen_for_long():
-    tracker, state, *_ = started()
-    gone = unseen(state, covariance=uncertain(state))
-    assert is_lost(tracker, gone)
-    assert not is_lost(tracker, unseen(gone, 0.05))
-    assert not is_lost(tracker, unseen(state))
-    assert not is_lost(tracker, replace(gone, usual_score=torch.zeros(1)))
-    assert not is_lost(tracker, gone, TrackerConfig(search=SearchConfig(anew_us=0)))
-    # Without searches nothing would find it there.
-    assert not is_lost(tracker, gone, TrackerConfig(search=SearchConfig(hypotheses=0)))
-
-
-@pytest.mark.parametrize(("metres", "off"), [(0.0, False), (0.05, False), (0.3, True), (-0.2, True)])
-def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(metres, off):
-    tracker, state, *_ = started()
-    away, due = unseen(state, T_cam_obj=moved_away(tracker, state, metres)), state.t_us + 1_000_000
-    assert is_looked_for(Trigger.DEPTH_CHANGED, tracker, away, due) == off
-    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, away, state.t_us)
-    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, unseen(away, 0.05), due)
-    # What is lost is expected there as it is.
-    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, replace(away, covariance=uncertain(away)), due)
-
-
-@pytest.mark.parametrize(("score", "is_below"), [(0.6, True), (0.7, False)])
-def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_for_there(score, is_below):
-    tracker, state, *_ = started()
-    low = unseen(state, score=torch.full((1,), score), full_share=torch.full((1,), 0.9))
-    due = state.t_us + 1_000_000
-    assert is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due) == is_below
-    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, state.t_us)
-    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, unseen(low, 0.05), due)
-    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, replace(low, covariance=uncertain(low)), due)
-    for never in ({"anew_below": 0}, {"anew_us": 0}, {"hypotheses": 0}):
-        assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due, TrackerConfig(search=SearchConfig(**never)))
 
 
 # ---- where

@@ -2,13 +2,15 @@
 
 import pytest
 import torch
-from helpers import SMALL_CAMERA, generator, pose_errors
+from helpers import SMALL_CAMERA, box_model, generator, pose, pose_errors
 from tracked_boxes import in_motion
 
+from torchtrack import Tracker
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.dispatch import backend_is_installed
 from torchtrack.tracking.relocalization.event_image import event_density
-from torchtrack.tracking.relocalization.sampling import draw_offsets, sample, score_outlines
+from torchtrack.tracking.relocalization.sampling import draw_offsets, rehearse, sample, score_outlines
 from torchtrack.tracking.relocalization.view_sphere import outlines_at, thinned
 
 IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
@@ -152,3 +154,17 @@ def test_where_the_prediction_is_good_only_what_it_allows_is_sample():
     drawn = draw_offsets(covariance, SearchConfig().drawn).float()
     assert ((offsets[:, None] == drawn).all(-1).any(-1)).all()
     assert float(offsets[:, :6].abs().max()) < 5e-3
+
+
+# ---- before the first window
+
+
+@pytest.mark.parametrize(("hypotheses", "times"), [(24, 1), (0, 0)])
+def test_a_search_is_rehearsed_before_the_first_window(hypotheses, times, monkeypatch):
+    rehearsed = []
+    monkeypatch.setattr(
+        "torchtrack.tracking.tracker.rehearse", lambda prediction, config: (rehearsed.append(prediction), rehearse(prediction, config))
+    )
+    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(hypotheses=hypotheses)))
+    tracker.prepare(tracker.init(pose()[None], 0))
+    assert len(rehearsed) == times * backend_is_installed()

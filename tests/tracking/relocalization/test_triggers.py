@@ -13,7 +13,7 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
-from torchtrack.tracking.relocalization.triggers import NONE, SEARCHED, Trigger, is_smeared, is_time, reference_where_known, triggers
+from torchtrack.tracking.relocalization.triggers import NONE, SEARCHED, Trigger, is_smeared, reference_where_known, triggers
 from torchtrack.tracking.validation.status import Status
 
 # The box fires few events: with corners beside them, enough is observed of one that slipped to say more than that it is too little.
@@ -180,16 +180,6 @@ def test_what_drifts_or_is_very_uncertain_is_looked_for_as_it_was_last_seen_when
     assert having(Trigger.NOT_VALIDATED, later) == [True, False, False, False]
     for never in ({"unseen_us": 0}, {"doubt_us": 0}):
         assert not any(having(Trigger.NOT_VALIDATED, given, **never))
-
-
-def test_it_is_time_once_in_every_interval_whatever_the_windows():
-    ends_us = torch.arange(0, 100_001, 5000)
-    due = is_time(ends_us[:-1], ends_us[1:], 20_000)[0]
-    assert due.nonzero().flatten().tolist() == [3, 7, 11, 15, 19]
-    assert is_time(ends_us[:-1], ends_us[1:], 0).all()
-    assert is_time(torch.tensor([1000]), torch.tensor([61_000]), 20_000).all()
-    of_each = is_time(ends_us[:-1], ends_us[1:], 20_000, 0)
-    assert torch.equal(of_each[0], due) and of_each[1].all()
 
 
 @pytest.mark.parametrize(("doubt_us", "expected"), [(50_000, [False, True, False]), (20_000, [True, True, False]), (0, [False] * 3)])

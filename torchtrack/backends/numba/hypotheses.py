@@ -1,4 +1,7 @@
-"""Where contour points have most events along their normals: :func:`torchtrack.tracking.relocalization.edge_search.strongest_along_normals`, point by point."""
+"""Where contour points have most events along their normals, and peaks of correlations, point by point and cell by cell.
+
+References are :mod:`torchtrack.tracking.relocalization.edge_search` and :mod:`torchtrack.tracking.relocalization.correlation`.
+"""
 
 import numpy as np
 import torch

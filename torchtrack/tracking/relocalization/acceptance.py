@@ -10,10 +10,11 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.line_ends import running_on
 from torchtrack.tracking.relocalization.lost_object import LostObject
-from torchtrack.tracking.relocalization.triggers import DRIFTS, Trigger, TriggerEvidence, has
+from torchtrack.tracking.relocalization.triggers import DRIFTS, Trigger, has
 from torchtrack.tracking.validation.scored_fit import Found
 
 # Ratios that differ by less are the same: which of them is larger is chance.

@@ -19,11 +19,11 @@ from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import Choice
 from torchtrack.tracking.relocalization.event_image import event_density
+from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.sampling import ENOUGH_EVENTS, score_outlines
 from torchtrack.tracking.relocalization.symmetric import RotationAxes
-from torchtrack.tracking.relocalization.triggers import TriggerEvidence
 from torchtrack.tracking.relocalization.view_sphere import thinned
 from torchtrack.tracking.validation.scored_fit import Found
 

@@ -13,11 +13,12 @@ from torchtrack.tracking.estimation.rounds import gate_widening
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import Acceptance
+from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.last_seen import with_drift
 from torchtrack.tracking.relocalization.lost_object import LostObject, OtherPoses, Relocalized
 from torchtrack.tracking.relocalization.refine import exchanged, refined
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
-from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, DRIFTS, Trigger, TriggerEvidence, has
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, DRIFTS, Trigger, has
 
 
 def relocalize(

@@ -11,10 +11,11 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization import acceptance, hypotheses
 from torchtrack.tracking.relocalization.acceptance import Acceptance
 from torchtrack.tracking.relocalization.axis_rotation import rotated, rotation_test
+from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.symmetric import MOST_PLANES
-from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger, TriggerEvidence
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger
 from torchtrack.tracking.validation.scored_fit import Found
 
 

@@ -7,7 +7,7 @@ instead, so that a pose elsewhere has to explain nearly all, and no fewer events
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntFlag, auto
 
 import torch
@@ -18,21 +18,13 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import none_of
-from torchtrack.tracking.contours.objects import ObjectBatch
-from torchtrack.tracking.motion.model import MOST_UNCERTAIN
-from torchtrack.tracking.relocalization.symmetric import Ambiguities
-from torchtrack.tracking.state import TrackerState
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.validation.status import are_many
 
 # An object is new while what it explains when seen well, which rises with every window, is below this share of what it explains.
 _NEW = 0.9
 # Events that gather less than this share of how far they do when an object is seen well are smeared.
 SMEARED = 0.8
-# A prediction that is so uncertain, as a share of the most that predictions become, tells nothing any more.
-_NOTHING_KNOWN = 0.8
-# Farther away, or nearer, than when it was last seen well by this factor, an object may have been mistaken for others' edges.
-_DEPTH_FACTOR = 1.25
 
 
 class Trigger(IntFlag):
@@ -64,93 +56,6 @@ AROUND_PREDICTION = Trigger.STARTING | Trigger.UNCERTAIN | Trigger.NEW | Trigger
 # What calls for a search. An object that is lost is expected where it was last validated, and uncertain there; an object that was not
 # validated for long is uncertain or drifts.
 SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP | Trigger.MIRROR_AMBIGUOUS | Trigger.AXIS_AMBIGUOUS
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """What is known of a window before it is looked at.
-
-    Args:
-        triggers: those of :class:`Trigger` that hang on the state alone.
-        is_due: objects that it is time for, should they be very uncertain: what is hidden is not found by looking more often.
-        is_drift_due: objects that it is time to look for farther away, should there be reason to.
-    """
-
-    triggers: Int[Tensor, "b"]
-    is_due: Bool[Tensor, "b"]
-    is_drift_due: Bool[Tensor, "b"]
-
-
-@dataclass(frozen=True)
-class TriggerEvidence:
-    """What the triggers are set by, once a window is aligned.
-
-    Args:
-        sigma_px: standard deviation of each object's prediction in the image (px).
-        score: of the fit; ``last_score`` is that of the window before: a single window that is a little worse is no reason.
-        mean_score: as a rule.
-        matches: matched observations of the fit.
-        reference_explained_ratio: what the object explains when it is seen well.
-        drift_s: for how long it has explained too little by smeared events (s).
-        time_since_validated_s: how long ago it was last seen well (s).
-        is_starting: objects whose motion is not known yet.
-        is_due, is_drift_due: as :class:`Schedule` has them.
-        has_symmetry: objects with a plane of symmetry; ``has_axis``, with an axis that most of it can be rotated about unseen.
-        earlier: triggers that are set already.
-    """
-
-    sigma_px: Float[Tensor, "b"]
-    score: Float[Tensor, "b"]
-    last_score: Float[Tensor, "b"]
-    mean_score: Float[Tensor, "b"]
-    matches: Int[Tensor, "b"]
-    reference_explained_ratio: Float[Tensor, "b"]
-    drift_s: Float[Tensor, "b"]
-    time_since_validated_s: Float[Tensor, "b"]
-    is_starting: Bool[Tensor, "b"]
-    is_due: Bool[Tensor, "b"]
-    is_drift_due: Bool[Tensor, "b"]
-    has_symmetry: Bool[Tensor, "b"]
-    has_axis: Bool[Tensor, "b"]
-    earlier: Int[Tensor, "b"]
-
-    def stays_below(self, level: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
-        """Whose score was below ``level`` in two windows in a row."""
-        return torch.maximum(self.score, self.last_score) < level
-
-
-def schedule(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> Schedule:
-    """What the state alone says of the window that ends at ``t_us``: which objects are lost, and which are looked for all around."""
-    search = config.search
-    is_due, is_drift_due = is_time(state.t_us, t_us, search.interval_us, search.doubt_us)[:, objects.stream_index]
-    return Schedule(_not_validated_for_long(state, objects, is_drift_due, config), is_due, is_drift_due)
-
-
-def gather_evidence(
-    state: TrackerState,
-    window: Schedule,
-    scored: Found,
-    sigma_px: Float[Tensor, "b"],
-    is_starting: Bool[Tensor, "b"],
-    ambiguities: Ambiguities,
-) -> TriggerEvidence:
-    """The evidence of a window that was aligned."""
-    return TriggerEvidence(
-        sigma_px=sigma_px,
-        score=scored.score,
-        last_score=state.score,
-        mean_score=state.usual_score,
-        matches=scored.count,
-        reference_explained_ratio=state.full_share,
-        drift_s=state.doubted_s,
-        time_since_validated_s=state.unseen_s,
-        is_starting=is_starting,
-        is_due=window.is_due,
-        is_drift_due=window.is_drift_due,
-        has_symmetry=ambiguities.has_symmetry,
-        has_axis=ambiguities.has_axis,
-        earlier=window.triggers,
-    )
 
 
 def triggers(evidence: TriggerEvidence, config: TrackerConfig) -> Int[Tensor, "b"]:
@@ -304,47 +209,7 @@ def _looks_far(evidence: TriggerEvidence, config: SearchConfig) -> Bool[Tensor, 
     return evidence.is_drift_due & (config.doubt_us > 0)
 
 
-# ---- those that hang on the state alone
-
-
-def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_due: Bool[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:
-    """LOST, DEPTH_CHANGED and FAR_BELOW_REFERENCE, of objects that were found once, and then not seen well for long.
-
-    LOST: nothing is known of them any more but where they were last seen well, and they are expected there. Others are looked for all
-    around that place. Those that explain little are partly hidden, as a rule; but a pose may also have gone along with what hid the
-    object, and hold on to other edges.
-    """
-    unseen = _is_unseen_for_long(state, config)
-    if none_of(unseen):
-        return unseen.long()
-    lost = unseen & _is_unknown(state, objects.diameter_m)
-    due = unseen & is_drift_due & ~lost
-    now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.T_last_seen))
-    changed = due & (torch.maximum(now_m / then_m, then_m / now_m) > _DEPTH_FACTOR)
-    below = due & (state.score < config.search.anew_below * state.full_share)
-    bits = Trigger.LOST, Trigger.DEPTH_CHANGED, Trigger.FAR_BELOW_REFERENCE
-    return (torch.stack([lost, changed, below]) * constant(tuple((int(bit),) for bit in bits), torch.int64, lost.device)).sum(0)
-
-
-def _is_unseen_for_long(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    if not (config.search.anew_us and searches(config)):
-        return torch.zeros_like(state.unseen_s, dtype=torch.bool)
-    return (state.unseen_s >= 1e-6 * config.search.anew_us) & (state.usual_score > 0)
-
-
-def _is_unknown(state: TrackerState, diameter_m: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
-    sigma = state.covariance.diagonal(dim1=-2, dim2=-1)[:, :6].sqrt()
-    rotation_rad, move_m = sigma.unflatten(1, (2, 3)).amax(-1).unbind(1)
-    return (rotation_rad > _NOTHING_KNOWN * MOST_UNCERTAIN) | (move_m > _NOTHING_KNOWN * MOST_UNCERTAIN * diameter_m)
-
-
 # ---- what else hangs on the same settings
-
-
-def is_time(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], *intervals_us: int) -> Bool[Tensor, "k s"]:
-    """Streams in which it is time for what is done once in each of some intervals: by the clock, whatever the windows."""
-    each_us = constant(tuple((max(interval_us, 1),) for interval_us in intervals_us), t_us.dtype, t_us.device)
-    return t_us // each_us > since_us // each_us
 
 
 def searches(config: TrackerConfig) -> bool:

@@ -1,0 +1,175 @@
+"""What is asked of another pose to take the place of an object's own: in general, and by each test."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from lost_objects import acceptance_test, evidence, lost_object, searched
+from tracked_boxes import in_motion
+
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.tracking.relocalization import acceptance
+from torchtrack.tracking.relocalization.acceptance import AcceptanceTest, is_likely, less_by_few_events, likeliest
+from torchtrack.tracking.relocalization.triggers import NONE, Trigger, triggers
+
+CONFIG = TrackerConfig()
+# Ten degrees and some millimetres: edges are several pixels off, farther than the tight gate reaches.
+DISPLACED = torch.tensor([[0.09, -0.06, 0.12, 0.008, -0.006, 0.0]], dtype=torch.float64)
+
+
+# ---- a test
+
+
+def scored_as(score, inlier_ratio, count):
+    """Fits of some poses, so good."""
+    scored = in_motion()[3]
+    rows = len(score)
+    values = {"measured": torch.tensor(score), "gathered": torch.tensor(inlier_ratio), "count": torch.tensor(count)}
+    return replace(scored, **values, at_rest=torch.zeros(rows), full_gathered=torch.zeros(rows))
+
+
+def test_a_pose_passes_that_matches_enough_events_which_gather_enough():
+    tried = scored_as([0.9] * 5, [0.6, 0.4, torch.nan, 0.6, 0.6], [100, 100, 100, 99, 29])
+    passed = acceptance_test(min_inlier_ratio=0.5, min_matches=100.0).row(0).is_passed(tried, CONFIG)
+    assert passed.tolist() == [True, False, True, False, False]
+    # Never by fewer than any fit needs.
+    assert acceptance_test().row(0).is_passed(tried, CONFIG).tolist() == [True, True, True, True, False]
+
+
+def test_the_score_to_surpass_is_better_than_ones_own_by_the_margin_and_no_less_than_the_least():
+    own = scored_as([0.5, 0.7, 0.5], [torch.nan] * 3, [100, 100, 10])
+    test = AcceptanceTest(torch.full((3,), 0.1), torch.full((3,), 0.65), torch.zeros(3), torch.zeros(3))
+    # Of a fit by too few events nothing counts.
+    assert [float(test.row(number).asked_score(own, number, CONFIG)) for number in range(3)] == pytest.approx([0.65, 0.8, 0.65])
+
+
+def test_a_row_is_the_test_of_a_single_object():
+    test = AcceptanceTest(*torch.arange(12.0).view(4, 3).unbind(0)).row(1)
+    assert [float(value) for value in vars(test).values()] == [1.0, 4.0, 7.0, 10.0]
+
+
+def test_of_poses_that_explain_as_much_the_most_expected_is_taken():
+    """Turns of a vase about its axis all explain the same: the best of them by a hair is chance."""
+    from_prior = torch.zeros(4, 13)
+    from_prior[:, 1] = torch.tensor([0.5, 0.01, 0.0, 0.3])
+    share, covariance = torch.tensor([0.9, 0.89, 0.6, 0.885]), 1e-2 * torch.eye(12, dtype=torch.float64)
+    assert likeliest(share, from_prior, covariance).tolist() == [1]
+    assert likeliest(share, from_prior.index_fill(0, torch.tensor([1]), torch.nan), covariance).tolist() == [3]
+    assert likeliest(torch.tensor([0.9, 0.8, 0.6, 0.0]), from_prior, covariance).tolist() == [0]
+
+
+def test_what_a_prediction_does_not_allow_is_not_likely():
+    """In standard deviations; what is not a number is none."""
+    offsets = torch.zeros(5, 13)
+    offsets[1, 0], offsets[2, 0], offsets[3, :6], offsets[4, 2] = 0.4, 0.42, 0.18, torch.nan
+    assert is_likely(offsets, 1e-2 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True, False, False, False]
+    wide = torch.full((1, 13), 5.0)
+    assert is_likely(torch.cat([offsets[:1], wide]), 25.0 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True]
+
+
+def test_small_poses_that_few_events_explain_are_worth_less():
+    score, count = torch.tensor([0.9, 0.8, 0.0]), torch.tensor([100, 900, 2000])
+    assert less_by_few_events(score, count).tolist() == pytest.approx([0.3, 0.8, 0.0])
+    assert less_by_few_events(torch.zeros(3), count).tolist() == [0.0, 0.0, 0.0]
+
+
+# ---- what it leaves
+
+
+def test_what_is_no_better_by_the_margin_is_left():
+    tracker, prediction, seen, scored, _ = in_motion()
+    assert float(scored.share) > 0.7
+    assert searched(lost_object(tracker, prediction, seen, scored, 1.0)) is scored
+
+
+def test_what_explains_too_little_for_being_far_away_is_left():
+    tracker, prediction, seen, scored, _ = in_motion(displaced=DISPLACED)
+    prediction = replace(prediction, covariance=1e2 * prediction.covariance)
+    assert searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_score=1.1)) is scored
+    better = searched(lost_object(tracker, prediction, seen, scored, 8.0))
+    assert better.elsewhere.tolist() == [True] and scored.elsewhere.tolist() == [False]
+
+
+@pytest.mark.parametrize("gathered", [0.3, torch.nan])
+def test_what_smears_events_more_than_it_may_is_left(gathered):
+    """Where it cannot be told how far events gather, nothing speaks against a pose."""
+    tracker, prediction, seen, scored, _ = in_motion(displaced=DISPLACED)
+    prediction = replace(prediction, covariance=1e2 * prediction.covariance)
+    assert searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_inlier_ratio=1.01)) is scored
+    better = searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_inlier_ratio=gathered))
+    assert better.elsewhere.tolist() == [True]
+    assert float(better.gathered) > 0.3
+
+
+def test_what_explains_too_few_events_is_left():
+    tracker, prediction, seen, scored, _ = in_motion(displaced=DISPLACED)
+    prediction = replace(prediction, covariance=1e2 * prediction.covariance)
+    better = searched(lost_object(tracker, prediction, seen, scored, 8.0))
+    many = float(better.count)
+    assert searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_matches=many)).elsewhere.tolist() == [True]
+    assert searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_matches=2 * many)) is scored
+
+
+# ---- the test of each source
+
+
+def asked_by(test, given, scored=None):
+    """What a test asks for of a single object."""
+    flags, scored = triggers(given, CONFIG), scored or in_motion()[3]
+    return torch.stack(list(vars(test(given, flags, scored, CONFIG)).values()))[:, 0], scored
+
+
+SLOWLY = {"is_drift_due": True, "time_since_validated_s": 0.2, "last_score": 0.5, "score": 0.5, "reference_explained_ratio": 0.8}
+
+
+def test_what_drifts_slowly_has_to_explain_nearly_all_elsewhere_and_by_no_fewer_events():
+    given = evidence(**SLOWLY)
+    for test in (acceptance.near_prediction, acceptance.as_last_seen):
+        asked, scored = asked_by(test, given)
+        torch.testing.assert_close(asked, torch.tensor([0.15, 0.72, 0.0, float(scored.count)]))
+    torch.testing.assert_close(asked_by(acceptance.elsewhere, given)[0], torch.tensor([0.15, 0.72, 0.0, 0.0]))
+
+
+def test_what_is_where_it_is_predicted_gives_way_to_what_is_better_by_the_margin():
+    torch.testing.assert_close(asked_by(acceptance.near_prediction, evidence(sigma_px=5.0))[0], torch.tensor([0.1, 0.0, 0.0, 0.0]))
+
+
+def test_what_drifts_has_to_explain_about_as_much_as_usual_far_away():
+    given = evidence(is_drift_due=True, drift_s=0.2, matches=10)
+    torch.testing.assert_close(asked_by(acceptance.near_prediction, given)[0], torch.tensor([0.1, 0.65 * 0.9, 0.0, 0.0]))
+
+
+def test_what_is_held_gives_way_to_far_more_events_as_last_seen():
+    asked, scored = asked_by(acceptance.as_last_seen, evidence(is_drift_due=True, drift_s=0.2, reference_explained_ratio=0.8))
+    torch.testing.assert_close(asked, torch.tensor([0.15, 0.72, 0.0, 2.0 * float(scored.count)]))
+
+
+def test_a_new_object_has_to_be_explained_nearly_all_with_events_that_gather_no_less():
+    given = evidence(is_due=True, reference_explained_ratio=0.5, score=0.8, last_score=0.8, mean_score=0.8)
+    assert triggers(given, CONFIG).tolist() == [Trigger.NEW]
+    asked, scored = asked_by(acceptance.near_prediction, given)
+    torch.testing.assert_close(asked, torch.tensor([0.1, 0.9, float(scored.gathered) - 0.02, 0.0]))
+
+
+def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
+    """Of any two poses, dense print explains about as much."""
+    starting = evidence(is_starting=True)
+    asked, scored = asked_by(acceptance.near_prediction, starting)
+    assert 0.5 < float(asked[2]) < float(scored.gathered) < float(asked[2]) + 0.05
+    assert float(asked[0]) == pytest.approx(0.02)
+    assert float(asked_by(acceptance.near_prediction, evidence(sigma_px=5.0))[0][2]) == float(asked_by(acceptance.elsewhere, starting)[0][2]) == 0
+    unknown = replace(scored, gathered=torch.full((1,), torch.nan))
+    assert float(asked_by(acceptance.near_prediction, starting, unknown)[0][2]) <= 0
+
+
+@pytest.mark.parametrize("also", [NONE, Trigger.FAR_BELOW_REFERENCE])
+def test_what_changed_its_depth_gives_way_to_far_more_events(also):
+    asked, scored = asked_by(acceptance.around_last_seen, evidence(earlier=int(Trigger.DEPTH_CHANGED | also)))
+    assert float(asked[0]) == -torch.inf and float(asked[2]) == 0
+    assert float(asked[1]) == pytest.approx(0.75 * 0.9)
+    assert float(asked[3]) == 2 * float(scored.count)
+
+
+def test_what_is_far_below_its_reference_gives_way_to_nearly_all_by_no_fewer_events():
+    asked, scored = asked_by(acceptance.around_last_seen, evidence(earlier=int(Trigger.FAR_BELOW_REFERENCE)))
+    torch.testing.assert_close(asked, torch.tensor([0.15, 0.81, 0.0, float(scored.count)]))

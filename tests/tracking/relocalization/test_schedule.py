@@ -1,0 +1,69 @@
+"""When it is time to look for objects, and which of them the state alone says are lost, or are looked for all around."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from lost_states import moved_away, uncertain, unseen
+from tracked_boxes import started
+
+from torchtrack.config.search import SearchConfig
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.tracking.relocalization.schedule import is_time, schedule
+from torchtrack.tracking.relocalization.triggers import Trigger, has
+
+CONFIG = TrackerConfig()
+
+
+def test_it_is_time_once_in_every_interval_whatever_the_windows():
+    ends_us = torch.arange(0, 100_001, 5000)
+    due = is_time(ends_us[:-1], ends_us[1:], 20_000)[0]
+    assert due.nonzero().flatten().tolist() == [3, 7, 11, 15, 19]
+    assert is_time(ends_us[:-1], ends_us[1:], 0).all()
+    assert is_time(torch.tensor([1000]), torch.tensor([61_000]), 20_000).all()
+    of_each = is_time(ends_us[:-1], ends_us[1:], 20_000, 0)
+    assert torch.equal(of_each[0], due) and of_each[1].all()
+
+
+def is_lost(tracker, state, config=CONFIG):
+    return has(schedule(state, tracker.objects, state.t_us, config).triggers, Trigger.LOST).tolist() == [True]
+
+
+def is_looked_for(trigger, tracker, state, t_us, config=CONFIG):
+    return has(schedule(state, tracker.objects, t_us, config).triggers, trigger).tolist() == [True]
+
+
+def test_an_object_is_lost_once_nothing_is_known_of_it_and_it_was_not_seen_for_long():
+    tracker, state, *_ = started()
+    gone = unseen(state, covariance=uncertain(state))
+    assert is_lost(tracker, gone)
+    assert not is_lost(tracker, unseen(gone, 0.05))
+    assert not is_lost(tracker, unseen(state))
+    assert not is_lost(tracker, replace(gone, usual_score=torch.zeros(1)))
+    assert not is_lost(tracker, gone, TrackerConfig(search=SearchConfig(anew_us=0)))
+    # Without searches nothing would find it there.
+    assert not is_lost(tracker, gone, TrackerConfig(search=SearchConfig(hypotheses=0)))
+
+
+@pytest.mark.parametrize(("metres", "off"), [(0.0, False), (0.05, False), (0.3, True), (-0.2, True)])
+def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(metres, off):
+    tracker, state, *_ = started()
+    away, due = unseen(state, T_cam_obj=moved_away(tracker, state, metres)), state.t_us + 1_000_000
+    assert is_looked_for(Trigger.DEPTH_CHANGED, tracker, away, due) == off
+    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, away, state.t_us)
+    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, unseen(away, 0.05), due)
+    # What is lost is expected there as it is.
+    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, replace(away, covariance=uncertain(away)), due)
+
+
+@pytest.mark.parametrize(("score", "is_below"), [(0.6, True), (0.7, False)])
+def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_for_there(score, is_below):
+    tracker, state, *_ = started()
+    low = unseen(state, score=torch.full((1,), score), full_share=torch.full((1,), 0.9))
+    due = state.t_us + 1_000_000
+    assert is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due) == is_below
+    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, state.t_us)
+    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, unseen(low, 0.05), due)
+    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, replace(low, covariance=uncertain(low)), due)
+    for never in ({"anew_below": 0}, {"anew_us": 0}, {"hypotheses": 0}):
+        assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due, TrackerConfig(search=SearchConfig(**never)))

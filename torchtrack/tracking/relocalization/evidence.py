@@ -1,0 +1,91 @@
+"""What triggers are set by: what is known before a window is looked at, and what is measured once it is aligned."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack.tracking.relocalization.symmetric import Ambiguities
+from torchtrack.tracking.state import TrackerState
+from torchtrack.tracking.validation.scored_fit import Found
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """What is known of a window before it is looked at.
+
+    Args:
+        triggers: those of :class:`Trigger` that hang on the state alone.
+        is_due: objects that it is time for, should they be very uncertain: what is hidden is not found by looking more often.
+        is_drift_due: objects that it is time to look for farther away, should there be reason to.
+    """
+
+    triggers: Int[Tensor, "b"]
+    is_due: Bool[Tensor, "b"]
+    is_drift_due: Bool[Tensor, "b"]
+
+
+@dataclass(frozen=True)
+class TriggerEvidence:
+    """What the triggers are set by, once a window is aligned.
+
+    Args:
+        sigma_px: standard deviation of each object's prediction in the image (px).
+        score: of the fit; ``last_score`` is that of the window before: a single window that is a little worse is no reason.
+        mean_score: as a rule.
+        matches: matched observations of the fit.
+        reference_explained_ratio: what the object explains when it is seen well.
+        drift_s: for how long it has explained too little by smeared events (s).
+        time_since_validated_s: how long ago it was last seen well (s).
+        is_starting: objects whose motion is not known yet.
+        is_due, is_drift_due: as :class:`Schedule` has them.
+        has_symmetry: objects with a plane of symmetry; ``has_axis``, with an axis that most of it can be rotated about unseen.
+        earlier: triggers that are set already.
+    """
+
+    sigma_px: Float[Tensor, "b"]
+    score: Float[Tensor, "b"]
+    last_score: Float[Tensor, "b"]
+    mean_score: Float[Tensor, "b"]
+    matches: Int[Tensor, "b"]
+    reference_explained_ratio: Float[Tensor, "b"]
+    drift_s: Float[Tensor, "b"]
+    time_since_validated_s: Float[Tensor, "b"]
+    is_starting: Bool[Tensor, "b"]
+    is_due: Bool[Tensor, "b"]
+    is_drift_due: Bool[Tensor, "b"]
+    has_symmetry: Bool[Tensor, "b"]
+    has_axis: Bool[Tensor, "b"]
+    earlier: Int[Tensor, "b"]
+
+    def stays_below(self, level: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
+        """Whose score was below ``level`` in two windows in a row."""
+        return torch.maximum(self.score, self.last_score) < level
+
+
+def gather_evidence(
+    state: TrackerState,
+    window: Schedule,
+    scored: Found,
+    sigma_px: Float[Tensor, "b"],
+    is_starting: Bool[Tensor, "b"],
+    ambiguities: Ambiguities,
+) -> TriggerEvidence:
+    """The evidence of a window that was aligned."""
+    return TriggerEvidence(
+        sigma_px=sigma_px,
+        score=scored.score,
+        last_score=state.score,
+        mean_score=state.usual_score,
+        matches=scored.count,
+        reference_explained_ratio=state.full_share,
+        drift_s=state.doubted_s,
+        time_since_validated_s=state.unseen_s,
+        is_starting=is_starting,
+        is_due=window.is_due,
+        is_drift_due=window.is_drift_due,
+        has_symmetry=ambiguities.has_symmetry,
+        has_axis=ambiguities.has_axis,
+        earlier=window.triggers,
+    )

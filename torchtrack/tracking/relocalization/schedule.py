@@ -1,0 +1,63 @@
+"""What is due in a window, and which objects have triggers already: what the clock and the state alone say."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.constants import constant
+from torchtrack.core.host_sync import none_of
+from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.motion.model import MOST_UNCERTAIN
+from torchtrack.tracking.relocalization.evidence import Schedule
+from torchtrack.tracking.relocalization.triggers import Trigger, searches
+from torchtrack.tracking.state import TrackerState
+
+# A prediction that is so uncertain, as a share of the most that predictions become, tells nothing any more.
+_NOTHING_KNOWN = 0.8
+# Farther away, or nearer, than when it was last seen well by this factor, an object may have been mistaken for others' edges.
+_DEPTH_FACTOR = 1.25
+
+
+def schedule(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> Schedule:
+    """What the state alone says of the window that ends at ``t_us``: which objects are lost, and which are looked for all around."""
+    search = config.search
+    is_due, is_drift_due = is_time(state.t_us, t_us, search.interval_us, search.doubt_us)[:, objects.stream_index]
+    return Schedule(_not_validated_for_long(state, objects, is_drift_due, config), is_due, is_drift_due)
+
+
+def is_time(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], *intervals_us: int) -> Bool[Tensor, "k s"]:
+    """Streams in which it is time for what is done once in each of some intervals: by the clock, whatever the windows."""
+    each_us = constant(tuple((max(interval_us, 1),) for interval_us in intervals_us), t_us.dtype, t_us.device)
+    return t_us // each_us > since_us // each_us
+
+
+def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_due: Bool[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:
+    """LOST, DEPTH_CHANGED and FAR_BELOW_REFERENCE, of objects that were found once, and then not seen well for long.
+
+    LOST: nothing is known of them any more but where they were last seen well, and they are expected there. Others are looked for all
+    around that place. Those that explain little are partly hidden, as a rule; but a pose may also have gone along with what hid the
+    object, and hold on to other edges.
+    """
+    unseen = _is_unseen_for_long(state, config)
+    if none_of(unseen):
+        return unseen.long()
+    lost = unseen & _is_unknown(state, objects.diameter_m)
+    due = unseen & is_drift_due & ~lost
+    now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.T_last_seen))
+    changed = due & (torch.maximum(now_m / then_m, then_m / now_m) > _DEPTH_FACTOR)
+    below = due & (state.score < config.search.anew_below * state.full_share)
+    bits = Trigger.LOST, Trigger.DEPTH_CHANGED, Trigger.FAR_BELOW_REFERENCE
+    return (torch.stack([lost, changed, below]) * constant(tuple((int(bit),) for bit in bits), torch.int64, lost.device)).sum(0)
+
+
+def _is_unseen_for_long(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    if not (config.search.anew_us and searches(config)):
+        return torch.zeros_like(state.unseen_s, dtype=torch.bool)
+    return (state.unseen_s >= 1e-6 * config.search.anew_us) & (state.usual_score > 0)
+
+
+def _is_unknown(state: TrackerState, diameter_m: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
+    sigma = state.covariance.diagonal(dim1=-2, dim2=-1)[:, :6].sqrt()
+    rotation_rad, move_m = sigma.unflatten(1, (2, 3)).amax(-1).unbind(1)
+    return (rotation_rad > _NOTHING_KNOWN * MOST_UNCERTAIN) | (move_m > _NOTHING_KNOWN * MOST_UNCERTAIN * diameter_m)
