@@ -35,6 +35,8 @@ ORDER = (
     ("cli",),
     ("__main__",),
 )
+# A function that needs more is two, or its arguments are one thing without a name.
+MOST_ARGUMENTS = 8
 PLACES = {name: place for place, names in enumerate(ORDER) for name in names}
 
 
@@ -80,6 +82,20 @@ def test_nobody_imports_the_backend():
     """It registers itself where the seam loads it; the simulator's kernels are compiled as the backend's are."""
     users = {module for module in MODULES for imported, _ in imports(module) if room_of(imported) == "backends" and room_of(module) != "backends"}
     assert {user.split(".")[0] for user in users} <= {"sim", "bench"}
+
+
+def functions(module: str) -> Iterator[tuple[str, int]]:
+    """Functions and methods of a module by their names, and how many arguments they take beside their own object."""
+    for node in ast.walk(MODULES[module]):
+        if isinstance(node, ast.FunctionDef):
+            names = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+            yield f"{module}.{node.name}", len(names) - (names[:1] in (["self"], ["cls"]))
+
+
+def test_no_function_of_tracking_takes_too_many_arguments():
+    taken = {name: count for module in MODULES if module.startswith("tracking") for name, count in functions(module)}
+    assert len(taken) > 300
+    assert {name: count for name, count in taken.items() if count > MOST_ARGUMENTS} == {}
 
 
 def test_no_module_is_imported_in_a_circle():

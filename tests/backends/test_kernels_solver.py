@@ -6,7 +6,7 @@ import pytest
 import torch
 from both_ways import assert_as_close, both_ways
 from helpers import perturbed, random_pose, random_twist
-from pose_problems import LOSSES, cast, far_off, problem_at
+from pose_problems import LOSSES, cast, far_off, problem_at, tensors_of
 from window_problems import windowed
 
 from torchtrack.config.tracker import SolverConfig
@@ -81,5 +81,5 @@ def test_a_solution_shares_no_memory_with_what_was_given():
 
 def test_of_no_objects_nothing_is_found():
     problem = problem_at(random_pose(2), 30)
-    empty = replace(problem, **{name: value[:0] for name, value in vars(problem).items() if value is not None})
+    empty = replace(problem, **{name: value[:0] for name, value in tensors_of(problem).items()})
     assert solve_pose(empty, random_pose(2)[:0], SolverConfig(iterations=3)).T_cam_obj.shape == (0, 4, 4)

@@ -1,7 +1,5 @@
 """Shared by several tests: cost_of, problem_at, cast, far_off, perturbed, LOSSES."""
 
-from dataclasses import fields
-
 import torch
 from helpers import SMALL_CAMERA, generator, perturbed, random_pose
 
@@ -37,8 +35,8 @@ def problem_at(T_true, count=60, *, outliers=0, noise_px=0.0, prior=0.0, seed=0,
 
 
 def tensors_of(problem):
-    """The tensors of a problem without further unknowns, by name."""
-    return {field.name: getattr(problem, field.name) for field in fields(problem) if field.name != "window"}
+    """The tensors of a problem, by name; those of further unknowns and terms apart."""
+    return {name: value for name, value in vars(problem).items() if isinstance(value, torch.Tensor)}
 
 
 def cast(problem, dtype):

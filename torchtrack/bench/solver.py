@@ -1,6 +1,7 @@
 """How long Levenberg-Marquardt takes: many poses at once, of 200 observations each, ten iterations."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -77,8 +78,8 @@ def _poses(points: Tensor, directions: Tensor, random: torch.Generator, device: 
     off = torch.tensor([_OFF_RAD] * 3 + [_OFF_M] * 3, dtype=torch.float64)
     T_start = retract_about(T_true, off * normal(count, 6), centre)
     ones, scale, no_prior = torch.ones(count, RESIDUALS), torch.full((count,), _SCALE_PX), torch.zeros(count, 6, 6)
-    problem = PoseProblem(points, targets, directions, ones, intrinsics, centre, scale, T_start, no_prior)
-    problem = PoseProblem(**{name: value.to(device, dtype) for name, value in vars(problem).items() if value is not None})
+    given: tuple[Any, ...] = (points, targets, directions, ones, intrinsics, centre, scale, T_start, no_prior)
+    problem = PoseProblem(*(value.to(device, dtype) for value in given))
     return Poses(problem, T_start.to(device, dtype), T_true.to(device))
 
 

@@ -1,11 +1,11 @@
 """Gradients of poses by their inputs: against finite differences of the converged optimum, and where there is none."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
 from helpers import generator, perturbed, pose, random_pose
-from pose_problems import cost_of, problem_at
+from pose_problems import cost_of, problem_at, tensors_of
 from torch.autograd import gradcheck
 from window_problems import windowed
 
@@ -74,7 +74,7 @@ def changed(problem, name, amount):
 
 def leaves(problem):
     """The problem with every tensor of numbers to be differentiated by, and these."""
-    tensors = {field.name: getattr(problem, field.name).clone().requires_grad_() for field in fields(problem) if field.name != "window"}
+    tensors = {name: value.clone().requires_grad_() for name, value in tensors_of(problem).items()}
     return PoseProblem(**tensors, window=problem.window), tensors
 
 
@@ -132,7 +132,7 @@ def test_gradcheck_of_the_cost_and_of_the_step():
 
 def test_values_stay_to_the_last_bit(dtype):
     problem = noisy("tukey", window=True, batch=2)
-    tensors = {name: value.to(dtype) for name, value in vars(problem).items() if name != "window"}
+    tensors = {name: value.to(dtype) for name, value in tensors_of(problem).items()}
     window = type(problem.window)(*(value.to(dtype) for value in vars(problem.window).values()))
     problem = PoseProblem(**tensors, window=window)
     solution = solve_pose(problem, problem.T_prior, settings("tukey", 2))
@@ -176,8 +176,8 @@ def test_gradients_are_finite_at_identity_and_for_padding(loss, window):
 @pytest.mark.parametrize("fault", ["unseen", "infinite", "bent"])
 def test_a_failed_element_has_no_gradient_and_leaves_its_neighbours_alone(fault):
     problem = noisy("tukey", batch=3)
-    alone = PoseProblem(*(value[::2] for name, value in vars(problem).items() if name != "window"))
-    broken = {name: value.clone() for name, value in vars(problem).items() if name != "window"}
+    alone = PoseProblem(*(value[::2] for value in tensors_of(problem).values()))
+    broken = {name: value.clone() for name, value in tensors_of(problem).items()}
     broken["prior_information"][1] = 0
     if fault == "unseen":
         broken["weights"][1] = 0
@@ -201,7 +201,7 @@ def test_a_failed_element_has_no_gradient_and_leaves_its_neighbours_alone(fault)
 def test_the_step_can_be_mapped_over_a_further_axis():
     problems = [noisy("tukey", batch=2, seed=seed) for seed in range(3)]
     steps = torch.stack([newton_step(problem, problem.T_prior, problem.T_prior.new_zeros(2, 0), "tukey")[0] for problem in problems])
-    names = [field.name for field in fields(PoseProblem) if field.name != "window"]
+    names = list(tensors_of(problems[0]))
     stacked = tuple(torch.stack([getattr(problem, name) for problem in problems]) for name in names)
 
     def step(*tensors):

@@ -15,9 +15,9 @@ from torchtrack.core.image_velocity import pose_jacobian
 from torchtrack.core.lie import retract_about, se3_exp, small_difference_about, transform_points
 from torchtrack.core.linalg import solve_positive
 from torchtrack.tracking.estimation import levenberg_marquardt
-from torchtrack.tracking.estimation.levenberg_marquardt import _Place, robust_cost, solve_pose
+from torchtrack.tracking.estimation.levenberg_marquardt import robust_cost, solve_pose
 from torchtrack.tracking.estimation.robust_loss import robust_loss, robust_weight
-from torchtrack.tracking.estimation.terms import PoseProblem
+from torchtrack.tracking.estimation.terms import Place, PoseProblem
 
 pytestmark = pytest.mark.usefixtures("way")
 THOROUGH = SolverConfig(iterations=20)
@@ -221,14 +221,14 @@ def before_the_last_step(problem, start, config):
     """The pose that the solver's last step, which nothing judges, is taken from."""
     places = []
 
-    class Watched(_Place):
+    class Watched(Place):
         def moved(self, step):
             places.append(self)
             return Watched(**vars(super().moved(step)))
 
     # Kernels cannot be watched; tests/test_kernels_solver.py has that they go the same way.
     with pytest.MonkeyPatch.context() as patch, dispatch.backend(wanted=False):
-        patch.setattr(levenberg_marquardt, "_Place", Watched)
+        patch.setattr(levenberg_marquardt, "Place", Watched)
         solve_pose(problem, start, config)
     return places[-1].pose(problem)
 

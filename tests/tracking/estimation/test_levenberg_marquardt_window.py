@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import pose_errors, random_pose
+from pose_problems import tensors_of
 from window_problems import FASTER, WINDOW_S, windowed
 
 from torchtrack.config.tracker import SolverConfig
@@ -159,7 +160,7 @@ def test_a_batch_is_its_elements(dtype):
     for row in range(3):
         part = slice(row, row + 1)
         window = WindowTerms(*(value[part] for value in vars(problem.window).values()))
-        own = PoseProblem(**{name: value[part] for name, value in vars(problem).items() if name != "window"}, window=window)
+        own = PoseProblem(**{name: value[part] for name, value in tensors_of(problem).items()}, window=window)
         alone = solve_pose(own, T_true[part].to(dtype), THOROUGH)
         torch.testing.assert_close(together.T_cam_obj[part], alone.T_cam_obj, rtol=0, atol=5e-5 if dtype == torch.float32 else 1e-10)
 

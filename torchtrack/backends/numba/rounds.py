@@ -169,7 +169,7 @@ def knows(config: TrackerConfig) -> bool:
     return usual and not matching.along_flow and matching.residual == "normal"
 
 
-@accelerates(rounds.align_rounds, supports=lambda start, table, observations, gates, config: knows(config))
+@accelerates(rounds.align_rounds, supports=lambda start, table, observations, gates, config: knows(config) and not start.extra_terms)
 def align_rounds_numba(
     start: Start, table: ContourTable, observations: Observations, gates: Gates, config: TrackerConfig
 ) -> tuple[Linearisation, Matches, Contours]:

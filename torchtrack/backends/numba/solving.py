@@ -221,7 +221,7 @@ def damping_settings(config: SolverConfig, hessian: Float[Tensor, "b k k"]) -> D
     return DampingSettings(config.damping, lm.LEAST_DIAGONAL, lm.least_share(hessian))
 
 
-@accelerates(lm.solve_pose)
+@accelerates(lm.solve_pose, supports=lambda problem, T_start, config, from_prior=None: not problem.extra_terms)
 def solve_pose_numba(
     problem: PoseProblem, T_start: Float[Tensor, "b 4 4"], config: SolverConfig, from_prior: Float[Tensor, "b k"] | None = None
 ) -> Linearisation:

@@ -6,8 +6,9 @@ Newton's method of which ``g`` alone is recorded. The Hessian has to be the exac
 robust loss bends and the projection curves, which at residuals of 2 px makes the gradients wrong by a quarter.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, is_dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -51,7 +52,7 @@ def with_gradient(problem: PoseProblem, solution: Linearisation, config: SolverC
     """
     if not torch.is_grad_enabled() or not any(value.requires_grad for value in _tensors_of(problem)):
         return solution
-    exact = _in_double(problem)
+    exact: PoseProblem = _in_double(problem)
     counted = _counted(exact)
     found = _Place(solution.T_cam_obj.detach().double(), solution.from_prior.detach().double()[:, 6:])
     optimum = _optimum(counted, found, config)
@@ -114,32 +115,38 @@ def _optimum(problem: PoseProblem, place: _Place, config: SolverConfig) -> _Plac
     return place
 
 
-def _tensors_of(problem: PoseProblem) -> list[Tensor]:
-    """All tensors of a problem."""
-    values = [value for part in (problem, problem.window) if part is not None for value in vars(part).values()]
-    return [value for value in values if isinstance(value, Tensor)]
+def _tensors_of(part: object) -> Iterator[Tensor]:
+    """All tensors of a problem, and of its terms."""
+    if isinstance(part, Tensor):
+        yield part
+    elif is_dataclass(part):
+        for value in vars(part).values():
+            yield from _tensors_of(value)
+    elif isinstance(part, tuple):
+        for value in part:
+            yield from _tensors_of(value)
 
 
-def _in_double(problem: PoseProblem) -> PoseProblem:
-    """The problem in float64, with zero in the place of what is not finite: padding may hold anything."""
-
-    def double(part: PoseProblem | WindowTerms) -> dict[str, Tensor]:
-        values = {field.name: getattr(part, field.name) for field in fields(part)}
-        return {name: value.double().nan_to_num(0.0, 0.0, 0.0) for name, value in values.items() if isinstance(value, Tensor)}
-
-    window = None if problem.window is None else WindowTerms(**double(problem.window))
-    return PoseProblem(**double(problem), window=window)
+def _in_double(part: Any) -> Any:
+    """A problem in float64, its terms too, with zero in the place of what is not finite: padding may hold anything."""
+    if isinstance(part, Tensor):
+        return part.double().nan_to_num(0.0, 0.0, 0.0) if part.is_floating_point() else part
+    if isinstance(part, tuple):
+        return tuple(_in_double(value) for value in part)
+    if is_dataclass(part) and not isinstance(part, type):
+        return replace(part, **{name: _in_double(value) for name, value in vars(part).items()})
+    return part
 
 
 @torch.no_grad()
 def _counted(problem: PoseProblem) -> PoseProblem:
-    """The problem with those observations alone that have a weight, as a constant: the rest neither draws nor bends."""
+    """The problem with those observations of contours alone that have a weight, as a constant: the rest neither draws nor bends."""
     counted = problem.weights != 0
     # On a GPU, which would have to be waited for to know how many these are, all of them.
     most = int(counted.sum(-1).max()) if host_sync.read_at_once(counted) else counted.shape[1]
     rows = problem.weights.abs().topk(max(most, 1)).indices
 
-    def of_rows(part: PoseProblem | WindowTerms, names: tuple[str, ...]) -> dict[str, Tensor]:
+    def of_rows(part: PoseProblem | WindowTerms, names: tuple[str, ...]) -> dict[str, Any]:
         values = {name: getattr(part, name) for name in names}
         return {name: torch.take_along_dim(value, rows if value.dim() == 2 else rows[..., None], 1) for name, value in values.items()}
 

@@ -21,7 +21,7 @@ from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.implicit_gradient import with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
-from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, WindowTerms
+from torchtrack.tracking.estimation.terms import CostTerm, Linearisation, PoseProblem, WindowTerms
 from torchtrack.tracking.motion.prediction import Prediction
 
 # The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).
@@ -88,6 +88,7 @@ def align(
     observations: Observations,
     config: TrackerConfig,
     offset: Float[Tensor, "b 13"] | None = None,
+    extra_terms: tuple[CostTerm, ...] = (),
 ) -> Fit:
     """Match and solve, one round per gate.
 
@@ -98,6 +99,7 @@ def align(
         contours: visible contours where the rounds begin, and ``index`` of them.
         widening: of each object's first gate; it is taken back by the last.
         offset: of the beginning from the prediction: pose, velocity and swelling; none when not given.
+        extra_terms: of the cost, beside contour distances and prior.
     """
     objects, matching = prediction.objects, config.matching
     information = _information(prediction, config)
@@ -105,7 +107,7 @@ def align(
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
     table = _table(contours, index, objects, matching)
     gates = Gates(widening, _narrowing(widening, len(matching.gates_px)), _looked_up_finely(objects, begin, table, widening, matching))
-    start = Start(prediction, begin, offset, information, contours, index)
+    start = Start(prediction, begin, offset, information, contours, index, extra_terms)
     solution, matches, contours = align_rounds(start, table, observations, gates, config)
     return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
 
@@ -119,6 +121,7 @@ class Start:
         begin: where they begin, and ``offset`` of that from the prediction.
         information: of the prior.
         contours: visible there, and ``index`` of them.
+        extra_terms: of every round's cost.
     """
 
     prediction: Prediction
@@ -127,6 +130,7 @@ class Start:
     information: Float[Tensor, "b k k"]
     contours: Contours
     index: ContourIndex
+    extra_terms: tuple[CostTerm, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -169,7 +173,7 @@ def align_rounds(
         else:
             matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider, gates.finely)
         matches = _believed(matches, observations, config)
-        problem = _problem(prediction, start.information, matches, observations, offset, gate_px * wider, config)
+        problem = _problem(start, matches, offset, gate_px * wider, config)
         solution = solve_pose(problem, begin.T_cam_obj, config.solver, offset)
         begin, offset = prediction.at(solution.T_cam_obj, solution.from_prior), solution.from_prior
     return with_gradient(problem, solution, config.solver), matches, contours
@@ -229,16 +233,9 @@ def _believed(matches: Matches, observations: Observations, config: TrackerConfi
     return replace(matches, mask=matches.mask & enough, weights=weights * enough * told)
 
 
-def _problem(
-    prediction: Prediction,
-    information: Tensor,
-    matches: Matches,
-    observations: Observations,
-    offset: Float[Tensor, "b k"],
-    gate_px: Float[Tensor, "b"],
-    config: TrackerConfig,
-) -> PoseProblem:
+def _problem(start: Start, matches: Matches, offset: Float[Tensor, "b k"], gate_px: Float[Tensor, "b"], config: TrackerConfig) -> PoseProblem:
     """The least squares problem of one round; objects without a match stay where they are."""
+    prediction = start.prediction
     rows = both_coordinates(matches) if config.matching.residual == "point" else matches
     return PoseProblem(
         points_obj=rows.points_obj,
@@ -249,8 +246,9 @@ def _problem(
         centre_obj=prediction.objects.centre_obj,
         scale_px=gate_px,
         T_prior=prediction.T_cam_obj,
-        prior_information=information,
+        prior_information=start.information,
         window=_window_terms(prediction, rows, offset, config) if config.solver.prior else None,
+        extra_terms=start.extra_terms,
     )
 
 
