@@ -6,7 +6,7 @@ The pipeline, one file per stage, in data-flow order::
     time surface   decayed image of last event times          torchtrack.tracking.frontend.time_surface
     corners        guided filter, Harris, snapped to events   torchtrack.tracking.frontend.corners
     flow           robust event flow of each corner           torchtrack.tracking.frontend.flow
-    contours       visible 3D contours at the predicted pose  torchtrack.tracking.contours.points
+    contours       visible 3D contours at the predicted pose  torchtrack.tracking.contours.sampling
     observations   corners and recent events of each object   torchtrack.tracking.association.observations
     matching       observations to contours                   torchtrack.tracking.association.weights
     pose solver    Levenberg-Marquardt on SE(3)               torchtrack.tracking.estimation.levenberg_marquardt

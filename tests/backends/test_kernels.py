@@ -24,7 +24,8 @@ from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.association.polarity import remembered
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
-from torchtrack.tracking.contours.points import assemble, mesh_contours, reproject
+from torchtrack.tracking.contours.points import assemble, reproject
+from torchtrack.tracking.contours.sampling import mesh_contours
 from torchtrack.tracking.contours.visibility import Scene, remove_hidden
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
 from torchtrack.tracking.frontend.tiles import SensorTiles

@@ -22,7 +22,8 @@ from torchtrack.core.lie import transform_points
 from torchtrack.errors import EventDataError
 from torchtrack.object_model.contour_source import group_by_model
 from torchtrack.run.session import Session
-from torchtrack.tracking.contours.points import Contours, mesh_contours
+from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.contours.sampling import mesh_contours
 
 # Latencies that are tried first, µs.
 _GRID_US = np.arange(-10_000, 50_001, 1500)

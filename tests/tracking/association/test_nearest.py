@@ -18,7 +18,8 @@ from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.weights import concentration, on_and_around, patch, patch_sums
 from torchtrack.tracking.contours.index import index_contours
-from torchtrack.tracking.contours.points import Contours, mesh_contours, reproject
+from torchtrack.tracking.contours.points import Contours, reproject
+from torchtrack.tracking.contours.sampling import mesh_contours
 
 
 def brute_force(contours, places, number):

@@ -15,7 +15,8 @@ from torchtrack.core.lie import transform_points
 from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, ContourModel, group_by_model
-from torchtrack.tracking.contours.points import image_normals, mesh_contours, reproject
+from torchtrack.tracking.contours.points import image_normals, reproject
+from torchtrack.tracking.contours.sampling import mesh_contours
 
 CONFIG = ContourConfig(remove_hidden=False)
 INTRINSICS = SMALL_CAMERA.intrinsics(torch.float64)

@@ -11,7 +11,7 @@ from torchtrack.core.camera import Camera
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import group_by_model
 from torchtrack.tracking.contours import visibility
-from torchtrack.tracking.contours.points import mesh_contours
+from torchtrack.tracking.contours.sampling import mesh_contours
 from torchtrack.tracking.contours.visibility import DepthGrid, Scene, depth_buffer, hidden_by_faces, remove_hidden
 from torchtrack.tracking.validation.measures import visible_share
 

@@ -1,4 +1,4 @@
-"""Contour points of a mesh, and where they show: :func:`torchtrack.tracking.contours.points.mesh_contours` and ``assemble``, object by object."""
+"""Contour points of a mesh, and where they show: :func:`torchtrack.tracking.contours.sampling.mesh_contours` and ``assemble``, object by object."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,8 @@ from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.dispatch import accelerates
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.tracking.contours import points
-from torchtrack.tracking.contours.points import MAX_ACTIVE_EDGES, MIN_PX_PER_M, MIN_TEXTURE_COSINE, Contours
+from torchtrack.tracking.contours.points import MIN_PX_PER_M, Contours
+from torchtrack.tracking.contours.sampling import MAX_ACTIVE_EDGES, MIN_TEXTURE_COSINE, mesh_points
 from torchtrack.tracking.relocalization import sampling
 from torchtrack.tracking.relocalization.event_image import BORDER_PX
 
@@ -334,7 +335,7 @@ def sampling_settings(config: ContourConfig = _TO_SHOW) -> SamplingSettings:
     )
 
 
-@accelerates(points.mesh_points)
+@accelerates(mesh_points)
 def mesh_points_numba(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> tuple[Tensor, ...]:
     """Edge by edge."""
     settings, batch = sampling_settings(config), len(T_cam_obj)

@@ -149,7 +149,7 @@ class GridSettings(NamedTuple):
 
 
 class SamplingSettings(NamedTuple):
-    """What :mod:`torchtrack.backends.numba.contours` goes by: settings, and constants of :mod:`torchtrack.tracking.contours.points`.
+    """What :mod:`torchtrack.backends.numba.contours` goes by: settings, and constants of :mod:`torchtrack.tracking.contours.sampling`.
 
     Args:
         occluding: whether edges between a front and a back face are contours.

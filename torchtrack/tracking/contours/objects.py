@@ -12,7 +12,8 @@ from torch.linalg import vecdot
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
-from torchtrack.tracking.contours.points import Contours, assemble, joined, mesh_contours
+from torchtrack.tracking.contours.points import Contours, assemble, joined
+from torchtrack.tracking.contours.sampling import mesh_contours
 from torchtrack.tracking.contours.splat import splat_contours
 from torchtrack.tracking.contours.visibility import Scene, remove_hidden
 
