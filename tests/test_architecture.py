@@ -24,6 +24,8 @@ ORDER = (
     ("tracking.relocalization",),
     ("tracking.adapt", "tracking.update", "tracking.objects"),
     ("tracking.initialization", "tracking.start_check", "tracking.step_check"),
+    ("tracking.expectation",),
+    ("tracking.step",),
     ("tracking.cuda_graphs",),
     ("tracking.graphs",),
     ("tracking.tracker",),

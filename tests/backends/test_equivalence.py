@@ -1,12 +1,12 @@
 """Every operation that the backend accelerates, beside its reference, on what whole steps of the tracker ask of it."""
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from helpers import SMALL_CAMERA, bevelled_model, pose, random_events
+from states import changed
 from tracked_boxes import follow, moving_box, one_box_scene, scene_of_one_stream, scene_of_streams, tensors_of, tracker_of, windows
 
 from torchtrack import Tracker
@@ -33,8 +33,8 @@ def lost_box():
     _, events = moving_box(pose(), 6)
     tracker = tracker_of(dtype=torch.float64)
     state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 3))
-    unknown = torch.eye(12, dtype=torch.float64).expand_as(state.covariance)
-    follow(tracker, replace(state, covariance=unknown), windows(events, 6)[3:])
+    unknown = torch.eye(12, dtype=torch.float64).expand_as(state.motion.covariance)
+    follow(tracker, changed(state, covariance=unknown), windows(events, 6)[3:])
 
 
 def smooth_box():

@@ -12,6 +12,7 @@ from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.index import index_contours
+from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.window_events import SharedEvents, WindowEvents
@@ -29,10 +30,10 @@ def window_of(objects: int, count: int, window_us: int, camera: Camera = SMALL_C
     T_cam_obj = pose().repeat(objects, 1, 1)
     T_cam_obj[:, :3, 3] = torch.tensor(PLACES_M[:objects]).double()
     state = first_state(tracker, T_cam_obj, torch.zeros(1, dtype=torch.int64))
-    ages = torch.randint(LONG_AGO_US, state.burst_age_us.shape, generator=generator(1), dtype=torch.int16)
+    ages = torch.randint(LONG_AGO_US, state.maps.burst_age_us.shape, generator=generator(1), dtype=torch.int16)
     events = random_events(count, width=camera.width, height=camera.height, duration_us=window_us - 1) if count else EventBatch.empty()
     t_us, dt_s = torch.tensor([window_us]), torch.full((objects,), 1e-6 * window_us).double()
-    prediction, sensors = tracker._predict(state, dt_s), tracker.sensors
+    prediction, sensors = predicted_after(tracker, state, dt_s), tracker.sensors
 
     def seen():
         nearby = sensors.near_objects(NearbyEvents(events), prediction, dt_s, tracker.config)
@@ -93,7 +94,7 @@ def test_events_of_no_stream_are_not_seen():
     tracker, events, prediction, _ = window_of(2, 500, 5000)
     beyond = replace(events, stream_index=torch.full_like(events.stream_index, 3))
     dt_s, t_us = torch.full((2,), 5e-3).double(), torch.tensor([5000])
-    ages = tracker.init(pose().expand(2, 4, 4), 0).burst_age_us
+    ages = tracker.init(pose().expand(2, 4, 4), 0).maps.burst_age_us
     with torch.inference_mode():
         counts = []
         for batch in (events, concatenate([events, beyond])):

@@ -1,11 +1,10 @@
 """Kernels of the filter, from a window's forecast to its conclusion, give what PyTorch's operations give; objects do not see one another."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from both_ways import assert_as_close, both_ways
 from helpers import SMALL_CAMERA, box_model, generator, pose, random_twist
+from states import changed
 from tracked_boxes import tensors_of
 
 from torchtrack import Tracker
@@ -17,8 +16,8 @@ from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.motion.predict import forecast
-from torchtrack.tracking.state import Probation
 from torchtrack.tracking.update import conclude
+from torchtrack.tracking.validation.health import TentativeTrack
 from torchtrack.tracking.validation.scored_fit import Found
 from torchtrack.tracking.validation.status import Status
 
@@ -44,12 +43,15 @@ def boxes(config=None, dtype=torch.float64):
     state = tracker.init(pose().expand(OBJECTS, 4, 4), 0)
     T_cam_obj = retract_about(state.T_cam_obj, random_twist(OBJECTS, rotation_rad=1.0, translation_m=0.05), tracker.centre_obj.double())
     velocity, acceleration = (random_twist(OBJECTS, rotation_rad=3.0, translation_m=0.8, seed=seed).to(dtype) for seed in (1, 2))
-    shares = {name: uniform(OBJECTS, seed=number).to(dtype) for number, name in enumerate(("usual_score", "full_share", "full_gathered", "score"))}
-    shares["full_count"] = 80 * uniform(OBJECTS, seed=7).to(dtype)
-    times = {name: 0.2 * uniform(OBJECTS, seed=5 + number).to(dtype) for number, name in enumerate(("doubted_s", "unseen_s"))}
+    shares = {
+        name: uniform(OBJECTS, seed=number).to(dtype)
+        for number, name in enumerate(("mean_score", "reference_explained_ratio", "reference_inlier_ratio", "score"))
+    }
+    shares["reference_matches"] = 80 * uniform(OBJECTS, seed=7).to(dtype)
+    times = {name: 0.2 * uniform(OBJECTS, seed=5 + number).to(dtype) for number, name in enumerate(("drift_s", "time_since_validated_s"))}
     darker = uniform(OBJECTS, 8, low=-1, seed=9).to(dtype)
     motion = {"velocity": velocity, "acceleration": acceleration * 10, "covariance": 1e-4 * random_covariances(OBJECTS)}
-    return tracker, replace(state, T_cam_obj=T_cam_obj, darker_outside=darker, **motion, **shares, **times)
+    return tracker, changed(state, T_cam_obj=T_cam_obj, darker_outside=darker, **motion, **shares, **times)
 
 
 # ---- the forecast
@@ -87,10 +89,10 @@ def test_forecasts(settings, spins, dtype):
 
 def test_what_would_be_lost_is_no_less_certain_than_before():
     tracker, state = boxes()
-    state.covariance[2] *= 1e8
+    state.motion.covariance[2] *= 1e8
     by_kernel, plain = both_ways(forecasts(tracker, state))
-    assert torch.equal(by_kernel.covariance[2], state.covariance[2])
-    assert torch.equal(plain.covariance[2], state.covariance[2])
+    assert torch.equal(by_kernel.covariance[2], state.motion.covariance[2])
+    assert torch.equal(plain.covariance[2], state.motion.covariance[2])
 
 
 @pytest.mark.parametrize("spoilt", ["not a number", "behind the camera", "much too far away"])
@@ -204,11 +206,11 @@ def test_a_solution_that_is_not_a_number_stays_with_its_object(what):
     others = torch.arange(OBJECTS) != 4
     for ours, theirs in zip(tensors_of(result)[1:], tensors_of(plain)[1:], strict=True):
         assert_as_close(ours[others], theirs[others])
-    assert torch.isfinite(state.covariance).all()
-    assert torch.isfinite(state.acceleration).all()
+    assert torch.isfinite(state.motion.covariance).all()
+    assert torch.isfinite(state.motion.acceleration).all()
     if what == "from_prior":
         assert result.status[4] == int(Status.DIVERGED)
-    assert_as_close(state.full_share[others], plain_state.full_share[others])
+    assert_as_close(state.health.reference_explained_ratio[others], plain_state.health.reference_explained_ratio[others])
 
 
 def test_what_is_not_concluded_is_left_as_it_was():
@@ -221,5 +223,5 @@ def test_what_is_not_concluded_is_left_as_it_was():
         after, _ = conclude(state, prediction, torch.ones_like(dt_s), found, no_corners(found.fit.contours.pixels), dt_s, tracker.config)
     for ours, theirs in zip(tensors_of(state), before, strict=True):
         assert torch.equal(ours, theirs)
-    assert isinstance(after.probation, Probation)
-    assert after.probation is state.probation
+    assert isinstance(after.tentative, TentativeTrack)
+    assert after.tentative is state.tentative

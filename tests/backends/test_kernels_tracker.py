@@ -6,6 +6,7 @@ import pytest
 import torch
 from both_ways import ROUNDINGS
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
+from states import changed
 from tracked_boxes import SCENES, WIDE_CAMERA, assert_same, follow, merged, moving_box, poses_of, started, tensors_of, windows
 
 from torchtrack import Tracker
@@ -150,7 +151,7 @@ def test_a_neighbour_that_fails_changes_nothing():
     events = merged(*(moving_box(T, 4, WIDE_CAMERA, seed=seed)[1] for seed, T in enumerate(starts)))
     tracker = Tracker([box_model(), box_model()], WIDE_CAMERA, dtype=torch.float64)
     state = tracker.init(starts, 0)
-    spoilt = replace(state, T_cam_obj=state.T_cam_obj.clone(), velocity=state.velocity.clone())
+    spoilt = changed(state, T_cam_obj=state.T_cam_obj.clone(), velocity=state.velocity.clone())
     spoilt.T_cam_obj[1], spoilt.velocity[1] = torch.nan, torch.nan
     with torch.inference_mode():
         results = [follow(tracker, begin, windows(events, 4))[1] for begin in (state, spoilt)]
@@ -197,7 +198,7 @@ def test_events_outside_the_sensor_are_told_before_a_compiled_graph_is_given_the
     _, state, _, (events, end_us), _ = started(torch.float64)
     spoilt = replace(events, x=events.x.clone())
     spoilt.x[7] = SMALL_CAMERA.width
-    before = state.burst_age_us.clone()
+    before = state.maps.burst_age_us.clone()
     with torch.inference_mode(), pytest.raises(EventDataError, match="event 7 is at .*, outside the sensor of 200x150 pixels"):
         graphs._in_bursts(state, graphs._filled(NearbyEvents(spoilt), 1), torch.tensor([end_us]), 1000)
-    assert torch.equal(state.burst_age_us, before)
+    assert torch.equal(state.maps.burst_age_us, before)

@@ -1,11 +1,10 @@
 """The comparison methods: that they track what they are made for, and say what they are not made for."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 import trimesh
 from helpers import SMALL_CAMERA, box_model, contours_at, pose, pose_errors, random_events, upright_line
+from states import changed
 from tracked_boxes import WINDOW_US, assert_same, follow, moving_box, poses_of, windows
 
 from torchtrack import Tracker, preset
@@ -48,7 +47,7 @@ def test_objects_do_not_disturb_each_other(name):
     away = pose((0.1, 0.2, 0.3), (0.0, 5.0, 1.0))
     _, first = follow(alone, alone.init(pose()[None], 0), windows(events, 2))
     state = beside.init(pose().expand(2, 4, 4), 0)
-    state = replace(state, T_cam_obj=torch.stack([pose(), away]))
+    state = changed(state, T_cam_obj=torch.stack([pose(), away]))
     _, both = follow(beside, state, windows(events, 2))
     torch.testing.assert_close(poses_of(both), poses_of(first), rtol=0, atol=1e-5)
     assert int(both[-1].status[1]) == Status.OUT_OF_VIEW
@@ -108,16 +107,16 @@ def test_the_filter_starts_with_its_own_uncertainty_and_carries_it_on():
     _, events = moving_box(pose(), COUNT)
     tracker = tracker_for("line", [box_model()])
     first = tracker.init(pose()[None], 0)
-    assert first.covariance[0].diagonal().sqrt().tolist() == pytest.approx([0.01] * 3 + [0.005] * 3 + [3.0] * 3 + [0.5] * 3)
+    assert first.motion.covariance[0].diagonal().sqrt().tolist() == pytest.approx([0.01] * 3 + [0.005] * 3 + [3.0] * 3 + [0.5] * 3)
     state, results = follow(tracker, first, windows(events, COUNT))
-    sigma = state.covariance[0].diagonal().sqrt()
+    sigma = state.motion.covariance[0].diagonal().sqrt()
     # Of events that are nearly all in common, a turn is known to a degree and a half.
     assert 0.005 < float(sigma[:3].max()) < 0.03
-    assert (sigma[9:] < first.covariance[0].diagonal()[9:].sqrt()).all()
+    assert (sigma[9:] < first.motion.covariance[0].diagonal()[9:].sqrt()).all()
     # The same, of the left perturbation: what holds of the turn about the centre holds of that.
-    torch.testing.assert_close(results[-1].covariance[0, :3, :3], state.covariance[0, :3, :3])
+    torch.testing.assert_close(results[-1].covariance[0, :3, :3], state.motion.covariance[0, :3, :3])
     after, _ = tracker.step(state, random_events(0), (COUNT + 1) * WINDOW_US)
-    assert (torch.linalg.eigvalsh(after.covariance[0, :6, :6] - state.covariance[0, :6, :6]) > 0).all()
+    assert (torch.linalg.eigvalsh(after.motion.covariance[0, :6, :6] - state.motion.covariance[0, :6, :6]) > 0).all()
 
 
 # ---- events and lines

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import IMAGE_SIZE, box_model, contours_at, generator, random_events
+from states import changed
 from tracked_boxes import SCENES, assert_same, follow, started
 
 from torchtrack import Tracker
@@ -224,12 +225,12 @@ def test_a_steady_step_says_when_it_does_not_hold(nothing_is_read, monkeypatch, 
     assert not wrong
     if not reading:
         nothing_is_read()
-    uncertain = state.covariance.clone()
+    uncertain = state.motion.covariance.clone()
     if reason == "in parts":
         uncertain[:, 6:, 6:] += torch.eye(6) * 4.0
     elif reason in ("searched", "far away"):
         uncertain[:, :6, :6] += torch.eye(6) * (0.05 if reason == "searched" else 0.005) ** 2
     # No window explains twice as much as all there is.
-    usual_score = state.usual_score + (2 if reason == "lost" else 0)
-    *_, wrong = boxes.steady_step(replace(state, covariance=uncertain, usual_score=usual_score), *window)
+    usual_score = state.health.mean_score + (2 if reason == "lost" else 0)
+    *_, wrong = boxes.steady_step(changed(state, covariance=uncertain, mean_score=usual_score), *window)
     assert wrong

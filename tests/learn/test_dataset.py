@@ -20,6 +20,7 @@ from torchtrack.io.convert import convert
 from torchtrack.learn.augmentation import AugmentationConfig
 from torchtrack.learn.dataset import ClipConfig, SequenceBatches, WindowDataset, WindowStream, opened
 from torchtrack.learn.samples import collate, start_state
+from torchtrack.tracking.expectation import predicted_after
 
 # Workers are tested on small machines too, and forked: a fresh process would take seconds to import everything.
 pytestmark = [pytest.mark.filterwarnings("ignore:This DataLoader will create"), pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")]
@@ -181,9 +182,9 @@ def test_a_tracker_follows_a_batch_from_its_start(folder):
     model = ObjectModel.from_file(data.sequences[0].objects[0].model_path())
     tracker = Tracker([model] * 3, [CAMERA] * 3, TrackerConfig(motion=MotionConfig(turn_s=0)), range(3), torch.float64)
     state = start_state(tracker, batch, speed_sigma_m_s=0.05)
-    assert torch.equal(state.t_us, batch.t_us[:, 0]) and (state.last_event_us <= batch.t_us[:, 0, None, None]).all()
+    assert torch.equal(state.t_us, batch.t_us[:, 0]) and (state.maps.last_event_us <= batch.t_us[:, 0, None, None]).all()
     for number in range(batch.windows):
-        predicted = tracker._predict(state, (batch.t_us[:, number + 1] - state.t_us) * 1e-6).T_cam_obj
+        predicted = predicted_after(tracker, state, (batch.t_us[:, number + 1] - state.t_us) * 1e-6).T_cam_obj
         if number == 0:
             torch.testing.assert_close(predicted, batch.T_cam_obj[:, 1], atol=2e-5, rtol=0)
         state, _ = tracker(batch.window(number)[0], state, batch.window(number)[1])

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose
+from states import changed
 from tracked_boxes import WIDE_CAMERA, merged, moving_box, windows
 
 from torchtrack import Tracker, preset
@@ -40,9 +41,9 @@ def astray(step, number, tracker, *, lost=True, by=OFF):
         T_cam_obj = step.state.T_cam_obj.clone()
         rows = slice(number, number + 1)
         T_cam_obj[rows] = retract_about(T_cam_obj[rows], by[None], tracker.centre_obj[rows].double())
-        status, score, unseen_s = step.result.status.clone(), step.state.score.clone(), step.state.unseen_s.clone()
+        status, score, unseen_s = step.result.status.clone(), step.state.health.score.clone(), step.state.health.time_since_validated_s.clone()
         status[number], score[number], unseen_s[number] = int(Status.LOST) if lost else int(Status.UNCERTAIN), 0.2, 0.05
-        state = replace(step.state, T_cam_obj=T_cam_obj, score=score, unseen_s=unseen_s)
+        state = changed(step.state, T_cam_obj=T_cam_obj, score=score, time_since_validated_s=unseen_s)
         return replace(step, state=state, result=replace(step.result, T_cam_obj=T_cam_obj, status=status))
 
 
@@ -114,7 +115,7 @@ def test_velocities_and_covariances_are_of_time_running_forwards(followed):
     with torch.inference_mode():
         after = retraced(lost_for_a_while(steps, tracker), 0, Gap(FIRST, SEEN), tracker.alone(0))
     torch.testing.assert_close(after[12].state.velocity, steps[12].state.velocity, rtol=0.2, atol=0.05)
-    covariance, before = after[12].state.covariance[0], steps[12].state.covariance[0]
+    covariance, before = after[12].state.motion.covariance[0], steps[12].state.motion.covariance[0]
     assert torch.linalg.eigvalsh(covariance).min() > 0
     # What comes after a pose tells of it the other way than what came before: one that is found too far on is found too slow.
     along = [values[:6, 6:].diagonal().sign() for values in (covariance, before)]
@@ -178,7 +179,7 @@ def test_every_step_comes_once_and_in_order_and_the_lost_ones_with_better_poses(
     assert retracer.rest() == []
     # Twelve windows are held: those at the start of the gap are gone by the time the object is seen well.
     assert errors_m(after, trajectory)[SEEN - 10 : SEEN].max() < 1e-3
-    assert all(step.state.last_event_us.numel() == 0 for step in after)
+    assert all(step.state.maps.last_event_us.numel() == 0 for step in after)
 
 
 def test_an_object_that_is_never_lost_stays_as_it_was(followed):

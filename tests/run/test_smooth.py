@@ -97,8 +97,8 @@ def test_state_and_result_are_of_the_smoothed_pose(both):
 def test_states_are_given_on_without_maps_which_would_fill_the_memory(both):
     _, smooth = both
     for step in smooth:
-        assert step.state.last_event_us.numel() == step.state.burst_age_us.numel() == 0
-        assert step.state.last_event_us.untyped_storage().nbytes() == step.state.burst_age_us.untyped_storage().nbytes() == 0
+        assert step.state.maps.last_event_us.numel() == step.state.maps.burst_age_us.numel() == 0
+        assert step.state.maps.last_event_us.untyped_storage().nbytes() == step.state.maps.burst_age_us.untyped_storage().nbytes() == 0
 
 
 def test_steps_are_held_back_for_the_lag_and_no_longer_than_twice_that(both, path):

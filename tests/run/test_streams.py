@@ -131,7 +131,7 @@ def test_a_step_holds_its_own_stream_alone(paths):
         objects = len(follower.session.models)
         assert step.result.T_cam_obj.shape == (objects, 4, 4)
         assert step.result.contours.pixels.shape[0] == step.result.corners.flow.shape[0] == objects
-        assert step.state.last_event_us.shape[0] == len(step.state.t_us) == 1
+        assert step.state.maps.last_event_us.shape[0] == len(step.state.t_us) == 1
         assert int(step.result.t_us[0]) == step.window.t_end_us
         assert step.seconds > 0
 

@@ -1,20 +1,19 @@
 """States of objects that were seen well once, but not for a while."""
 
-from dataclasses import replace
-
 import torch
+from states import changed
 
 from torchtrack.core.lie import retract_about
 
 
 def unseen(state, unseen_s=0.2, **changes):
     """The state of an object that was seen well once, but not for a while."""
-    return replace(state, unseen_s=torch.full_like(state.unseen_s, unseen_s), **changes)
+    return changed(state, time_since_validated_s=torch.full_like(state.health.time_since_validated_s, unseen_s), **changes)
 
 
 def uncertain(state, turn_rad=0.45):
     """Covariance of an object of which hardly anything is known."""
-    return torch.eye(12, dtype=torch.float64).expand(len(state.covariance), 12, 12) * turn_rad**2
+    return torch.eye(12, dtype=torch.float64).expand(len(state.motion.covariance), 12, 12) * turn_rad**2
 
 
 def moved_away(tracker, state, metres):

@@ -5,6 +5,7 @@ from functools import cache
 
 import torch
 from helpers import SMALL_CAMERA, box_model, drifting, edge_events, pose
+from states import changed
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import (
@@ -17,6 +18,7 @@ from torchtrack.core.events import concatenate, pad_streams
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.estimation.rounds import align, gate_widening, index_for
+from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.validation.scored_fit import judge_fit
 
 WINDOW_US = 5_000
@@ -83,8 +85,8 @@ def in_motion(config=None, displaced=None, dtype=torch.float32):
         config = TrackerConfig(matching=MatchingConfig(fine_below_px=0))
     tracker, state, _, (events, end_us), trajectory = started(dtype, config)
     if displaced is not None:
-        state = replace(state, T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()))
-    prediction = tracker._predict(state, torch.tensor([5e-3], dtype=dtype))
+        state = changed(state, T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()))
+    prediction = predicted_after(tracker, state, torch.tensor([5e-3], dtype=dtype))
     seen = tracker.sensors.seen(pad_streams(events, 1, torch.tensor([end_us])))
     contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
     tight = gate_widening(torch.zeros(1, dtype=dtype), tracker.config)

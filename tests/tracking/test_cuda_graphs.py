@@ -122,7 +122,7 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
             def advance_as_there(*args, tracker=tracker, learns):
                 with pytest.MonkeyPatch.context() as patch:
                     patch.setattr(host_sync, "read_at_once", lambda values: False)
-                    return tracker.steady_advance(*args, learns=learns)
+                    return graphs.steady_advance(tracker, *args, learns=learns)
 
             tracker.graphs._compiles = True
             monkeypatch.setattr(
@@ -139,7 +139,7 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
 
 def test_trackers_that_are_copied_or_moved_begin_without_graphs():
     tracker = Tracker([box_model()], SMALL_CAMERA)
-    tracker.graphs._graphs[None, None] = tracker.steady_advance
+    tracker.graphs._graphs[None, None] = graphs.steady_advance
     copied = copy.deepcopy(tracker)
     assert copied.graphs._tracker is copied
     assert (len(tracker.graphs), len(copied.graphs)) == (1, 0)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
+from states import changed
 from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, tensors_of, windows
 
 from torchtrack import Tracker
@@ -38,7 +39,7 @@ class Graphs:
         monkeypatch.setattr(room, "_compiled", self._graph_of)
 
     def _graph_of(self, function, device):
-        if function.__name__ == "near_tiles":
+        if function.__name__ == "_tiles_near":
             return self._reading_nothing(function)
         number = len(self.calls)
         self.calls.append(0)
@@ -90,9 +91,9 @@ def test_poses_are_those_of_a_step(graphs, streams, mode):
     for one, other in zip(expected, found, strict=True):
         torch.testing.assert_close(other.T_cam_obj, one.T_cam_obj, rtol=0, atol=1e-6)
         assert torch.equal(other.status, one.status)
-    assert torch.equal(compiled_state.last_event_us, state.last_event_us)
-    assert torch.equal(compiled_state.burst_age_us, state.burst_age_us)
-    assert compiled_state.learned.windows == state.learned.windows == COUNT
+    assert torch.equal(compiled_state.maps.last_event_us, state.maps.last_event_us)
+    assert torch.equal(compiled_state.maps.burst_age_us, state.maps.burst_age_us)
+    assert compiled_state.appearance.learned.windows == state.appearance.learned.windows == COUNT
     assert found[-1].T_cam_obj.is_inference() == (mode is torch.inference_mode)
 
 
@@ -109,7 +110,7 @@ def test_poses_of_a_smooth_object_are_those_of_a_step(graphs):
     assert sum(graphs.calls) >= COUNT // 3
     # What lies halfway between two pixels is counted at one or the other.
     torch.testing.assert_close(compiled_state.T_cam_obj, state.T_cam_obj, rtol=0, atol=1e-4)
-    assert torch.equal(compiled_state.last_event_us, state.last_event_us)
+    assert torch.equal(compiled_state.maps.last_event_us, state.maps.last_event_us)
 
 
 def test_windows_that_are_learned_from_are_taken_without_a_graph(graphs):
@@ -125,7 +126,7 @@ def test_the_graph_of_one_stream_is_prepared(graphs):
     tracker = Tracker([box_model()], SMALL_CAMERA, compiled=True)
     state = tracker.init(pose()[None], 0)
     tracker.prepare(state)
-    tracker.prepare(replace(state, learned=replace(state.learned, windows=7)))
+    tracker.prepare(changed(state, learned=replace(state.appearance.learned, windows=7)))
     assert graphs.calls == [2]
 
 
@@ -143,10 +144,10 @@ def test_a_window_that_is_not_steady_is_taken_without_a_graph(graphs):
         tracker = Tracker([box_model()], SMALL_CAMERA, compiled=is_compiled)
         with torch.inference_mode():
             state, _ = follow(tracker, tracker.init(pose()[None], 0), cut[:-1])
-            uncertain = state.covariance.clone()
+            uncertain = state.motion.covariance.clone()
             uncertain[:, :6, :6] += torch.eye(6) * 0.05**2
             before = graphs.dropped
-            results.append(tracker.step(replace(state, covariance=uncertain), *cut[-1])[1])
+            results.append(tracker.step(changed(state, covariance=uncertain), *cut[-1])[1])
     assert graphs.dropped == before + 1
     torch.testing.assert_close(results[1].T_cam_obj, results[0].T_cam_obj, rtol=0, atol=1e-5)
 

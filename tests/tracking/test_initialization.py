@@ -56,4 +56,4 @@ def test_an_object_that_has_not_been_found_is_held_back(held_back):
     tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(motion=MotionConfig(speed_from_events=held_back)))
     few = events[torch.arange(len(events)) % 20 == 0]
     state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(few, 1))
-    assert (float(state.covariance[0, 9, 9].sqrt()) < 0.3) == held_back
+    assert (float(state.motion.covariance[0, 9, 9].sqrt()) < 0.3) == held_back

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors, random_events
+from states import changed
 from tracked_boxes import (
     HOLD,
     PREDICT,
@@ -98,8 +99,8 @@ def test_the_first_state_is_at_rest():
     assert torch.equal(state.T_cam_obj, pose().repeat(2, 1, 1))
     assert (state.velocity == 0).all()
     assert state.t_us.tolist() == [1234] * 3
-    assert state.last_event_us.shape == (3, 150, 200)
-    assert (state.last_event_us == NEVER_US).all()
+    assert state.maps.last_event_us.shape == (3, 150, 200)
+    assert (state.maps.last_event_us == NEVER_US).all()
     assert tracker.init(pose().repeat(2, 1, 1), torch.tensor([1, 2, 3])).t_us.tolist() == [1, 2, 3]
 
 
@@ -135,9 +136,9 @@ def test_results_have_their_shapes_and_types(dtype):
     assert result.T_cam_obj.shape == (1, 4, 4)
     assert result.covariance.shape == (1, 6, 6)
     assert result.contours.pixels.dtype == result.corners.pixels.dtype == result.quality.dtype == dtype
-    assert state.covariance.dtype == result.covariance.dtype == torch.float64
-    assert state.velocity.dtype == state.score.dtype == state.usual_score.dtype == dtype
-    assert state.covariance.shape == (1, 12, 12)
+    assert state.motion.covariance.dtype == result.covariance.dtype == torch.float64
+    assert state.velocity.dtype == state.health.score.dtype == state.health.mean_score.dtype == dtype
+    assert state.motion.covariance.shape == (1, 12, 12)
     assert Status(int(result.status)) == Status.TRACKING
     assert 0.5 < float(result.quality) <= 1
     assert result.t_us.tolist() == state.t_us.tolist() == [5 * WINDOW_US]
@@ -145,7 +146,7 @@ def test_results_have_their_shapes_and_types(dtype):
     assert int(result.observation_count) > 30
     assert not result.corners.mask.any()
     assert (torch.linalg.eigvalsh(result.covariance[0]) > 0).all()
-    assert (torch.linalg.eigvalsh(state.covariance[0]) > 0).all()
+    assert (torch.linalg.eigvalsh(state.motion.covariance[0]) > 0).all()
     assert float(result.covariance[0].diagonal()[:3].sqrt().max()) < 0.015
 
 
@@ -188,13 +189,13 @@ def test_the_newest_events_are_remembered_where_corners_are_looked_for():
     tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(corners=CornerConfig(max_corners=32)))
     after, _ = tracker.step(state, events, end_us)
     last = events[-1:]
-    assert int(after.last_event_us[0, last.y, last.x]) == int(last.t_us)
-    assert int((after.last_event_us != state.last_event_us).sum()) == len({*zip(events.x.tolist(), events.y.tolist(), strict=True)})
+    assert int(after.maps.last_event_us[0, last.y, last.x]) == int(last.t_us)
+    assert int((after.maps.last_event_us != state.maps.last_event_us).sum()) == len({*zip(events.x.tolist(), events.y.tolist(), strict=True)})
 
 
 def test_nothing_is_remembered_that_nobody_asks_for():
     tracker, state, _, window, _ = started()
-    assert (tracker.step(state, *window)[0].last_event_us == NEVER_US).all()
+    assert (tracker.step(state, *window)[0].maps.last_event_us == NEVER_US).all()
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode, torch.enable_grad])
@@ -227,9 +228,9 @@ def test_without_events_the_pose_is_held_and_the_status_says_so(dtype):
     assert after.t_us.tolist() == [35_000]
     assert int(result.observation_count) == 0
     # It is not known any more where it goes: less certain in every direction, and of its velocity by what was set aside.
-    assert (torch.linalg.eigvalsh(after.covariance[0, :6, :6] - state.covariance[0, :6, :6]) > 0).all()
+    assert (torch.linalg.eigvalsh(after.motion.covariance[0, :6, :6] - state.motion.covariance[0, :6, :6]) > 0).all()
     assert torch.isfinite(result.covariance).all()
-    speed_sigma = after.covariance[0].diagonal()[6:].sqrt()
+    speed_sigma = after.motion.covariance[0].diagonal()[6:].sqrt()
     assert (speed_sigma >= state.velocity[0].abs()).all()
 
 
@@ -306,7 +307,7 @@ def test_an_object_out_of_view_is_told():
 def test_an_object_that_others_explain_better_is_lost():
     """A tracker that believes in a motion that no events confirm."""
     tracker, state, _, (events, end_us), _ = started()
-    state = replace(state, velocity=torch.tensor([[0.0, 0.0, 0.0, 2.0, -1.5, 0.0]]))
+    state = changed(state, velocity=torch.tensor([[0.0, 0.0, 0.0, 2.0, -1.5, 0.0]]))
     half = events[events.x < 95]
     _, result = tracker.step(state, half, end_us)
     assert Status(int(result.status)) >= Status.UNCERTAIN

@@ -1,11 +1,11 @@
 """Many objects and streams at once: batches that equal loops, cameras of different sizes, and failed neighbours."""
 
-from dataclasses import replace
 from functools import cache
 
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors, random_events
+from states import changed
 from tracked_boxes import (
     SAME_POSE,
     WIDE_CAMERA,
@@ -103,17 +103,17 @@ def test_streams_may_end_their_windows_at_different_times():
 def disturbed(kind, starts, state):
     """Initial state of two objects of which the second fails in some way."""
     if kind == "out of view":
-        return replace(state, T_cam_obj=torch.stack([starts[0], pose(translation=(3.0, 0.0, 0.5))]))
+        return changed(state, T_cam_obj=torch.stack([starts[0], pose(translation=(3.0, 0.0, 0.5))]))
     if kind == "far away":
-        return replace(state, T_cam_obj=torch.stack([starts[0], pose(translation=(1e30, 0.0, 1e30))]))
+        return changed(state, T_cam_obj=torch.stack([starts[0], pose(translation=(1e30, 0.0, 1e30))]))
     if kind == "behind":
-        return replace(state, T_cam_obj=torch.stack([starts[0], pose(translation=(0.0, 0.0, -0.5))]))
+        return changed(state, T_cam_obj=torch.stack([starts[0], pose(translation=(0.0, 0.0, -0.5))]))
     if kind == "beyond float32":
-        return replace(state, T_cam_obj=torch.stack([starts[0], pose(translation=(0.0, 0.0, 1e300))]))
+        return changed(state, T_cam_obj=torch.stack([starts[0], pose(translation=(0.0, 0.0, 1e300))]))
     if kind == "nan":
-        return replace(state, T_cam_obj=torch.stack([starts[0], torch.full((4, 4), torch.nan, dtype=torch.float64)]))
+        return changed(state, T_cam_obj=torch.stack([starts[0], torch.full((4, 4), torch.nan, dtype=torch.float64)]))
     if kind == "wild velocity":
-        return replace(state, velocity=torch.tensor([[0.0] * 6, [1e30] * 6], dtype=state.velocity.dtype))
+        return changed(state, velocity=torch.tensor([[0.0] * 6, [1e30] * 6], dtype=state.velocity.dtype))
     return state
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 import trimesh
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors
+from states import changed
 from tracked_boxes import WINDOW_US, follow, moving_box, started, tracker_of, windows
 
 from torchtrack import Tracker
@@ -15,13 +16,14 @@ from torchtrack.config.tracker import MotionConfig, SolverConfig, TrackerConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import difference_about, retract_about, transform_points
 from torchtrack.object_model import ObjectModel
+from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.motion.model import initial_covariance, left_covariance
 from torchtrack.tracking.validation.status import Status
 
 
 def sigmas(state):
     """Deviations of pose and velocity of the first object."""
-    return state.covariance[0].diagonal().sqrt()
+    return state.motion.covariance[0].diagonal().sqrt()
 
 
 def silent(tracker, state, count):
@@ -39,8 +41,8 @@ def test_the_first_covariance_is_that_of_the_settings():
     config = TrackerConfig(motion=MotionConfig(initial_shift=0.02, initial_speed_m_s=0.7))
     tracker = tracker_of(2, config=config)
     state = tracker.init(pose().repeat(2, 1, 1), 0)
-    torch.testing.assert_close(state.covariance, initial_covariance(tracker.diameter_m, config.motion))
-    assert state.score.tolist() == state.usual_score.tolist() == [0, 0]
+    torch.testing.assert_close(state.motion.covariance, initial_covariance(tracker.diameter_m, config.motion))
+    assert state.health.score.tolist() == state.health.mean_score.tolist() == [0, 0]
 
 
 def test_events_make_pose_and_velocity_certain(dtype):
@@ -57,10 +59,10 @@ def test_without_events_nothing_gets_more_certain_and_with_them_it_does_again(dt
     tracker, state, _, (events, end_us), _ = started(dtype)
     states = silent(tracker, state, 4)
     for before, after in pairwise(states):
-        assert (torch.linalg.eigvalsh(after.covariance[0] - before.covariance[0])[-6:] > 0).all()
+        assert (torch.linalg.eigvalsh(after.motion.covariance[0] - before.motion.covariance[0])[-6:] > 0).all()
         assert (sigmas(after) >= sigmas(before)).all()
     later = replace(events, t_us=events.t_us + int(states[-1].t_us) - end_us + WINDOW_US)
-    still = replace(states[-1], T_cam_obj=state.T_cam_obj, velocity=state.velocity)
+    still = changed(states[-1], T_cam_obj=state.T_cam_obj, velocity=state.velocity)
     seen, _ = tracker.step(still, later, int(states[-1].t_us) + WINDOW_US)
     assert (sigmas(seen)[:6] < sigmas(states[-1])[:6]).all()
 
@@ -87,13 +89,13 @@ def test_errors_are_as_large_as_the_covariance_says():
 def test_the_covariance_told_is_of_the_left_perturbation(dtype):
     tracker, state, result, _, _ = started(dtype)
     centre = transform_points(state.T_cam_obj, tracker.centre_obj.double()[:, None])[:, 0]
-    torch.testing.assert_close(result.covariance, left_covariance(state.covariance[:, :6, :6], centre))
+    torch.testing.assert_close(result.covariance, left_covariance(state.motion.covariance[:, :6, :6], centre))
 
 
 def test_without_a_prior_there_is_no_velocity():
     _, state, _, _, _ = started(config=TrackerConfig(solver=SolverConfig(prior=False, iterations=2)))
     assert (state.velocity == 0).all()
-    assert torch.isfinite(state.covariance).all()
+    assert torch.isfinite(state.motion.covariance).all()
 
 
 @pytest.mark.parametrize("in_window", [True, False])
@@ -114,9 +116,9 @@ def test_the_usual_score_follows_the_share_slowly(dtype):
         state, result = tracker.step(state, batch, end_us)
         usual += 0.1 * (float(result.quality) - usual)
         full += (0.1 if float(result.quality) > full else 0.005) * (float(result.quality) - full)
-        assert float(state.score) == float(result.quality)
-        assert float(state.usual_score) == pytest.approx(usual, abs=1e-5)
-        assert float(state.full_share) == pytest.approx(full, abs=1e-5)
+        assert float(state.health.score) == float(result.quality)
+        assert float(state.health.mean_score) == pytest.approx(usual, abs=1e-5)
+        assert float(state.health.reference_explained_ratio) == pytest.approx(full, abs=1e-5)
     assert 0.5 < usual < float(result.quality)
 
 
@@ -124,9 +126,9 @@ def test_a_window_that_failed_does_not_change_what_is_usual():
     tracker, state, _, _, _ = started()
     after, result = tracker.step(state, EventBatch.empty(), 30_000)
     assert int(result.status) == Status.TOO_FEW_EVENTS
-    assert float(after.usual_score) == float(state.usual_score)
-    assert float(after.full_share) == float(state.full_share)
-    assert float(after.score) < float(state.score)
+    assert float(after.health.mean_score) == float(state.health.mean_score)
+    assert float(after.health.reference_explained_ratio) == float(state.health.reference_explained_ratio)
+    assert float(after.health.score) < float(state.health.score)
 
 
 # ---- back after an outage
@@ -156,11 +158,11 @@ def test_a_box_that_turned_away_during_an_outage_is_found_again(dtype):
 def test_a_share_that_is_too_small_for_so_wide_a_search_is_no_find():
     """Where an object is looked for all over, a few edges that fit are not it: the pose stays as predicted."""
     tracker, state, _, (events, end_us), _ = started()
-    uncertain = replace(state, covariance=1e3 * state.covariance)
+    uncertain = changed(state, covariance=1e3 * state.motion.covariance)
     away = retract_about(state.T_cam_obj, torch.tensor([[0.0, 0.0, 0.0, 0.06, 0.05, 0.0]]).double(), tracker.centre_obj.double())
-    _, result = tracker.step(replace(uncertain, T_cam_obj=away), events[torch.arange(0, len(events), 8)], end_us)
+    _, result = tracker.step(changed(uncertain, T_cam_obj=away), events[torch.arange(0, len(events), 8)], end_us)
     assert int(result.status) >= Status.LOST
-    prediction = tracker._predict(replace(uncertain, T_cam_obj=away), torch.tensor([5e-3]))
+    prediction = predicted_after(tracker, changed(uncertain, T_cam_obj=away), torch.tensor([5e-3]))
     torch.testing.assert_close(result.T_cam_obj, prediction.T_cam_obj.double(), rtol=0, atol=1e-6)
 
 
@@ -172,7 +174,7 @@ def test_a_spin_that_nothing_shows_fades_for_its_object_alone():
         tracker = Tracker([can, box_model()], SMALL_CAMERA, TrackerConfig(motion=MotionConfig(spin_fades=fades)))
         state = tracker.init(start, t_us=0)
         spinning = torch.cat([5.0 * start[:, :3, 2], torch.zeros(2, 3)], 1).float()
-        velocities.append(silent(tracker, replace(state, velocity=spinning), 4)[-1].velocity)
+        velocities.append(silent(tracker, changed(state, velocity=spinning), 4)[-1].velocity)
     slowed, free = velocities
     assert torch.equal(slowed[1], free[1])
     assert float(slowed[0].norm() / free[0].norm()) == pytest.approx(math.exp(-4 * WINDOW_US * 1e-6 / MotionConfig().coast_s), rel=1e-4)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, random_twist
+from states import changed
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 from tracked_boxes import assert_same, moving_box, started, windows
@@ -46,7 +47,7 @@ def weighing(weigher, config=None, dtype=torch.float64, count=5):
 
 
 def with_pose(state, T_cam_obj):
-    return replace(state, T_cam_obj=T_cam_obj)
+    return changed(state, T_cam_obj=T_cam_obj)
 
 
 def seen_from(T_cam_obj):
@@ -66,7 +67,7 @@ def test_full_trust_changes_nothing(dtype):
 
 def test_without_trust_there_is_nothing_to_go_by_and_no_gradient():
     tracker, state, window = weighing(ByAge(offset=-100.0))
-    state = replace(state, T_cam_obj=state.T_cam_obj.clone().requires_grad_())
+    state = changed(state, T_cam_obj=state.T_cam_obj.clone().requires_grad_())
     next_state, result = tracker.step(state, *window)
     assert result.status.tolist() == [int(Status.TOO_FEW_EVENTS)]
     by_offset, by_pose = torch.autograd.grad(seen_from(next_state.T_cam_obj), [tracker.weigher.offset, state.T_cam_obj], allow_unused=True)
@@ -131,7 +132,7 @@ def test_gradients_by_the_initial_pose_are_those_of_finite_differences():
     twist = random_twist(1, seed=5, rotation_rad=1.0, translation_m=0.3)
     amount = torch.zeros((), dtype=torch.float64, requires_grad=True)
     # A prior that counts, so that the pose it comes from does.
-    state = replace(state, covariance=1e-3 * state.covariance)
+    state = changed(state, covariance=1e-3 * state.motion.covariance)
 
     def after(amount):
         return seen_from(tracker.step(with_pose(state, se3_exp(amount * twist) @ state.T_cam_obj), *window)[0].T_cam_obj)
@@ -155,7 +156,7 @@ def test_gradients_flow_through_windows_to_everything():
     gradients = torch.autograd.grad(seen_from(result.T_cam_obj) + state.velocity.sum(), list(wanted.values()))
     for name, gradient in zip(wanted, gradients, strict=True):
         assert torch.isfinite(gradient).all() and (gradient != 0).any(), name
-    assert not state.covariance.requires_grad
+    assert not state.motion.covariance.requires_grad
 
 
 def test_recording_changes_no_value():

@@ -1,10 +1,9 @@
 """Windows that are taken in parts while an object's motion is not known."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors
+from states import changed
 from tracked_boxes import assert_same, follow, moving_box, poses_of, started, windows
 
 from torchtrack import Tracker
@@ -51,9 +50,9 @@ def test_an_object_whose_place_is_not_known_either_is_looked_for_by_all_events_o
     # Its motion alone is not known, and then its place too.
     wild, lost = (variance * torch.eye(12, dtype=torch.float64)[None] for variance in (1e-4, 0.3))
     wild[:, 6:, 6:] *= 1e6
-    for covariance, parted in ((state.covariance, False), (wild, True), (lost, False)):
+    for covariance, parted in ((state.motion.covariance, False), (wild, True), (lost, False)):
         unknown = initialization.of_unknown_motion(
-            replace(state, covariance=covariance), torch.full_like(state.t_us, end_us), tracker.objects, tracker.config
+            changed(state, covariance=covariance), torch.full_like(state.t_us, end_us), tracker.objects, tracker.config
         )
         assert unknown.tolist() == [parted]
 
@@ -66,8 +65,8 @@ def test_a_neighbour_in_parts_changes_nothing():
     for number, ((ours, end_us), (theirs, _)) in enumerate(zip(windows(left, 3), windows(right, 3), strict=True)):
         if number == 1:
             # From here on the first object's motion counts as known, and the second's does not.
-            state = replace(state, covariance=state.covariance * 1e-2)
-            pair = replace(pair, covariance=pair.covariance * torch.tensor([1e-2, 10.0])[:, None, None])
+            state = changed(state, covariance=state.motion.covariance * 1e-2)
+            pair = changed(pair, covariance=pair.motion.covariance * torch.tensor([1e-2, 10.0])[:, None, None])
         state, result = alone.step(state, ours, end_us)
         pair, results = both.step(pair, concatenate([ours, theirs]), end_us)
         torch.testing.assert_close(results.T_cam_obj[0], result.T_cam_obj[0], rtol=0, atol=1e-5)
@@ -80,7 +79,7 @@ def test_rows_are_chosen_object_by_object():
     first = tracker.step(state, events, 5_000)
     second = tracker.step(first[0], events[:0], 5_000)
     chosen_state, chosen = choose_rows(torch.tensor([True, False]), first, second)
-    assert torch.equal(chosen_state.covariance, torch.stack([first[0].covariance[0], second[0].covariance[1]]))
+    assert torch.equal(chosen_state.motion.covariance, torch.stack([first[0].motion.covariance[0], second[0].motion.covariance[1]]))
     assert torch.equal(chosen.contours.pixels, torch.stack([first[1].contours.pixels[0], second[1].contours.pixels[1]]))
     assert torch.equal(chosen.corners.mask, torch.stack([first[1].corners.mask[0], second[1].corners.mask[1]]))
     assert chosen.status.tolist() == [int(first[1].status[0]), int(second[1].status[1])]

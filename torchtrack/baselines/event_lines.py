@@ -130,7 +130,7 @@ class EventLineTracker(Tracker):
         T_start = lie.retract_about(T_last, velocity * duration_s[:, None], self.centre_obj)
         usable = torch.isfinite(T_start).flatten(1).all(-1) & (self._centre_cam(T_start)[:, 2] > MIN_DEPTH_M)
         T_start = torch.where(usable[:, None, None], T_start, T_last)
-        return Window(t_us, duration_s, update_last_event(state.last_event_us, events), T_start, torch.where(usable[:, None], velocity, 0))
+        return Window(t_us, duration_s, update_last_event(state.maps.last_event_us, events), T_start, torch.where(usable[:, None], velocity, 0))
 
     def _centre_cam(self, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 3"]:
         """Centre of each object in the camera's frame (m)."""
@@ -251,4 +251,5 @@ class EventLineTracker(Tracker):
             corners=no_corners(contours.pixels),
             observation_count=matches.mask.sum(-1),
         )
-        return replace(state, T_cam_obj=T_cam_obj, velocity=velocity, t_us=window.t_us, last_event_us=window.last_event_us), result
+        motion = replace(state.motion, T_cam_obj=T_cam_obj, velocity=velocity)
+        return replace(state, t_us=window.t_us, motion=motion, maps=replace(state.maps, last_event_us=window.last_event_us)), result

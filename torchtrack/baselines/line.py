@@ -40,12 +40,13 @@ class LineTracker(EventLineTracker):
         """The state before the first window; see :meth:`torchtrack.tracking.tracker.Tracker.init`."""
         state = super().init(T_cam_obj, t_us)
         deviations = torch.tensor(_FIRST_DEVIATIONS, dtype=torch.float64, device=state.T_cam_obj.device).repeat_interleave(3)
-        return replace(state, covariance=torch.diag(deviations.square()).repeat(len(state.T_cam_obj), 1, 1))
+        covariance = torch.diag(deviations.square()).repeat(len(state.T_cam_obj), 1, 1)
+        return replace(state, motion=replace(state.motion, covariance=covariance))
 
     def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """Advance every object by one window; see :meth:`torchtrack.tracking.tracker.Tracker.step`."""
         window = self._open(state, events, t_end_us, state.velocity)
-        predicted = predicted_covariance(state.covariance, window.duration_s.double())
+        predicted = predicted_covariance(state.motion.covariance, window.duration_s.double())
         eye = torch.eye(6, dtype=predicted.dtype, device=predicted.device).expand(len(predicted), 6, 6)
         information = solve_positive(predicted[:, :6, :6], eye)[0]
         found = self._solve_rounds(window, events, information.to(state.velocity.dtype), weight=_EVENT_PX**-2, apart_px=_APART_PX)
@@ -55,7 +56,7 @@ class LineTracker(EventLineTracker):
         velocity = window.velocity + torch.where(taken[:, None], correction, 0).to(window.velocity.dtype)
         kept = torch.where(taken[:, None, None], covariance, predicted)
         next_state, result = self._close(state, window, *found, judged, velocity, kept[:, :6, :6])
-        return replace(next_state, covariance=kept), result
+        return replace(next_state, motion=replace(next_state.motion, covariance=kept)), result
 
 
 def predicted_covariance(covariance: Float[Tensor, "b 12 12"], duration_s: Float[Tensor, "b"]) -> Float[Tensor, "b 12 12"]:

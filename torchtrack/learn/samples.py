@@ -103,12 +103,14 @@ def start_state(tracker: Tracker, batch: Batch, speed_sigma_m_s: float | None = 
     # Objects of samples may be anywhere before the camera.
     check_poses(batch.T_start, tracker.centre_obj, tracker.object_names)
     state = first_state(tracker, batch.T_start.double(), batch.t_us[:, 0])
-    state = replace(state, last_event_us=update_last_event(state.last_event_us, batch.past()))
+    maps = replace(state.maps, last_event_us=update_last_event(state.maps.last_event_us, batch.past()))
+    state = replace(state, maps=maps)
     if speed_sigma_m_s is None:
         return state
     motion = tracker.config.motion.model_copy(update={"initial_speed_m_s": speed_sigma_m_s})
     velocity = state_velocity(batch.velocity[:, 0], batch.T_cam_obj[:, 0], tracker.centre_obj.double())
-    return replace(state, velocity=velocity.to(state.velocity), covariance=initial_covariance(tracker.diameter_m, motion))
+    covariance = initial_covariance(tracker.diameter_m, motion)
+    return replace(state, motion=replace(state.motion, velocity=velocity.to(state.velocity), covariance=covariance))
 
 
 def state_velocity(twist: Float[Tensor, "b 6"], T_cam_obj: Float[Tensor, "b 4 4"], centre_obj: Float[Tensor, "b 3"]) -> Float[Tensor, "b 6"]:

@@ -81,7 +81,7 @@ class Retracer:
             is_continuous = goes_on(filtered_of(states), objects.centre_obj, objects.diameter_m, self._config.motion)
             status = torch.stack([step.result.status for step in newest[1:]]).cpu()
             lost = ~is_continuous | (status >= int(Status.LOST))
-            seen = torch.stack([state.unseen_s == 0 for state in states[1:]]).cpu() & ~lost
+            seen = torch.stack([state.health.time_since_validated_s == 0 for state in states[1:]]).cpu() & ~lost
             for at, (lost_now, seen_now) in enumerate(zip(lost.tolist(), seen.tolist(), strict=True), self._looked_at):
                 self._note(at, lost_now, seen_now)
             seconds = (time.perf_counter() - begun) / (len(newest) - 1)

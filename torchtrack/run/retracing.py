@@ -65,9 +65,9 @@ def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> li
                 break
             continue
         since_us = before.window.t_end_us
-        if at < gap.first and not float(before.state.unseen_s[number]) and _apart_px(before, number, result, alone) < _SAME_PX:
+        if at < gap.first and not float(before.state.health.time_since_validated_s[number]) and _apart_px(before, number, result, alone) < _SAME_PX:
             break
-        if at >= gap.first or float(state.score[0]) > float(before.state.score[number]) + _MARGIN:
+        if at >= gap.first or float(state.health.score[0]) > float(before.state.health.score[number]) + _MARGIN:
             changed[at] = _with_object(before, number, state, result)
     return changed
 
@@ -97,14 +97,15 @@ def _turned(state: TrackerState, number: int, alone: Tracker) -> TrackerState:
     fresh = first_state(alone, known.T_cam_obj, known.t_us)
     return replace(
         known,
-        velocity=-known.velocity,
-        covariance=_of_reverse(known.covariance),
-        doubted_s=fresh.doubted_s,
-        T_last_seen=fresh.T_last_seen,
-        unseen_s=fresh.unseen_s,
-        last_event_us=fresh.last_event_us,
-        burst_age_us=fresh.burst_age_us,
-        probation=fresh.probation,
+        motion=replace(known.motion, velocity=-known.motion.velocity, covariance=_of_reverse(known.motion.covariance)),
+        health=replace(
+            known.health,
+            drift_s=fresh.health.drift_s,
+            T_last_validated=fresh.health.T_last_validated,
+            time_since_validated_s=fresh.health.time_since_validated_s,
+        ),
+        maps=fresh.maps,
+        tentative=fresh.tentative,
     )
 
 
@@ -126,13 +127,14 @@ def _apart_px(step: Step, number: int, result: StepResult, alone: Tracker) -> fl
 def _with_object(step: Step, number: int, state: TrackerState, result: StepResult) -> Step:
     """The step with another state and result of one object, for which time runs backwards."""
     before, forward = step.state, step.result
-    state = replace(
-        before,
-        T_cam_obj=_row(before.T_cam_obj, number, state.T_cam_obj),
-        velocity=_row(before.velocity, number, -state.velocity),
-        covariance=_row(before.covariance, number, _of_reverse(state.covariance)),
-        score=_row(before.score, number, state.score),
+    motion = replace(
+        before.motion,
+        T_cam_obj=_row(before.motion.T_cam_obj, number, state.motion.T_cam_obj),
+        velocity=_row(before.motion.velocity, number, -state.motion.velocity),
+        covariance=_row(before.motion.covariance, number, _of_reverse(state.motion.covariance)),
     )
+    health = replace(before.health, score=_row(before.health.score, number, state.health.score))
+    state = replace(before, motion=motion, health=health)
     result = replace(
         forward,
         T_cam_obj=_row(forward.T_cam_obj, number, result.T_cam_obj),

@@ -85,11 +85,12 @@ def _with_pose(step: Step, objects: SmoothedObjects, T_cam_obj: Tensor, velocity
     T_cam_obj, velocity, covariance, left = (values.to(state.T_cam_obj.device) for values in (T_cam_obj, velocity, covariance, left))
     points = result.contours.points_cam
     contours = reproject(result.contours, T_cam_obj.to(points.dtype), objects.intrinsics.to(points))
-    state = replace(state, T_cam_obj=T_cam_obj, velocity=velocity.to(state.velocity.dtype), covariance=covariance)
+    motion = replace(state.motion, T_cam_obj=T_cam_obj, velocity=velocity.to(state.velocity.dtype), covariance=covariance)
+    state = replace(state, motion=motion)
     return replace(step, state=state, result=replace(result, T_cam_obj=T_cam_obj, covariance=left, contours=contours))
 
 
 def filtered_of(states: Sequence[TrackerState]) -> Filtered:
     """What the states of one stream after consecutive windows say."""
-    known = zip(*((state.T_cam_obj, state.velocity, state.covariance) for state in states), strict=True)
+    known = zip(*((state.T_cam_obj, state.velocity, state.motion.covariance) for state in states), strict=True)
     return Filtered(torch.cat([state.t_us for state in states]).cpu(), *(torch.stack(values).double().cpu() for values in known))

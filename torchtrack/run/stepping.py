@@ -56,10 +56,8 @@ def passed_over(tracker: Tracker, state: TrackerState, t_us: Int[Tensor, "s"]) -
     unknown = initial_covariance(tracker.diameter_m, tracker.config.motion)
     return replace(
         state,
-        velocity=torch.where(objects[:, None], 0.0, state.velocity),
-        acceleration=torch.where(objects[:, None], 0.0, state.acceleration),
-        covariance=torch.where(objects[:, None, None], unknown, state.covariance),
-        burst_age_us=torch.where(passed[:, None, None, None], LONG_AGO_US, state.burst_age_us),
+        motion=state.motion.at_rest(objects, state.T_cam_obj, unknown),
+        maps=replace(state.maps, burst_age_us=torch.where(passed[:, None, None, None], LONG_AGO_US, state.maps.burst_age_us)),
         t_us=torch.maximum(t_us, state.t_us),
     )
 

@@ -2,16 +2,21 @@
 
 from dataclasses import dataclass, replace
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
+from torchtrack.tracking.adaptation.pixel_latency import LOOK_US, late_share_after
 from torchtrack.tracking.adaptation.surface_learning import Surroundings, learn_after
+from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.polarity import expected_polarity, is_asked
 from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.schedule import is_time
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.scored_fit import Found
 from torchtrack.tracking.validation.status import Status
@@ -25,14 +30,15 @@ def objects_as_known(objects: ObjectBatch, state: TrackerState, on_surfaces: boo
     Args:
         on_surfaces: whether contours can be learned on any object.
     """
-    if state.learned is not None and on_surfaces:
-        counting = state.learned.that_count(config.learning)
+    appearance = state.appearance
+    if appearance.learned is not None and on_surfaces:
+        counting = appearance.learned.that_count(config.learning)
         if not host_sync.none_of(counting.mask):
             objects = replace(objects, learned=counting)
     if config.matching.polarity_memory_s:
-        explained = state.score.detach(), state.full_share.detach()
+        explained = state.health.score.detach(), state.health.reference_explained_ratio.detach()
         if not host_sync.none_of(is_asked(*explained)):
-            objects = replace(objects, polarity=expected_polarity(state.darker_outside, *explained))
+            objects = replace(objects, polarity=expected_polarity(appearance.darker_outside, *explained))
     return objects
 
 
@@ -64,19 +70,42 @@ def learned_after(
         prediction: of the objects, before the window.
         found: what ``state`` and ``result`` stand on.
     """
-    learned = state.learned
+    learned = state.appearance.learned
     if learned is None or lesson.on_surfaces is None:
         return state
     trusted = (result.status <= int(Status.UNCERTAIN)) & (lesson.sigma_px < config.learning.max_sigma_px)
     T_cam_obj = state.T_cam_obj.to(lesson.sigma_px.dtype)
     around = Surroundings(prediction.objects, T_cam_obj, state.velocity, lesson.window_s, result.contours, trusted)
     wanted = learned.wanted(lesson.on_surfaces, config.learning) if lesson.learns else None
-    return replace(state, learned=learn_after(learned, around, found, lesson.events, wanted, config))
+    learned = learn_after(learned, around, found, lesson.events, wanted, config)
+    return replace(state, appearance=replace(state.appearance, learned=learned))
 
 
 def learns_next(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, config: TrackerConfig) -> bool:
     """Whether contours are learned in the window after ``state``."""
-    if state.learned is None or on_surfaces is None:
+    learned = state.appearance.learned
+    if learned is None or on_surfaces is None:
         return False
-    wanted = state.learned.wanted(on_surfaces, config.learning)
+    wanted = learned.wanted(on_surfaces, config.learning)
     return wanted is not None and host_sync.AsyncValue.to(wanted).any()
+
+
+def with_late_share(
+    state: TrackerState,
+    result: StepResult,
+    matched: tuple[Observations, Contours, Matches, Prediction, Bool[Tensor, "b"]],
+    t_us: Int[Tensor, "s"],
+    config: TrackerConfig,
+) -> TrackerState:
+    """The state, before the window that ends at ``t_us`` by its clock, with how many events on contours came late in their bursts.
+
+    Args:
+        matched: observations, the contours they were matched with, the matches, where the objects were expected, and which of them the
+            matches are of.
+    """
+    if not config.matching.adaptive_bursts or host_sync.none_of(due := is_time(state.t_us, t_us, LOOK_US)):
+        return state
+    observations, contours, matches, prediction, known = matched
+    sure = due[0, prediction.objects.stream_index] & (result.status == int(Status.TRACKING)) & known
+    late_share = late_share_after(state.appearance.late_share, observations, contours, matches, prediction, sure, config.matching)
+    return replace(state, appearance=replace(state.appearance, late_share=late_share))

@@ -17,23 +17,25 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from inspect import signature
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, runtime_checkable
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import cells_within
 from torchtrack.core.events import EventBatch, check_on_sensor, pad_streams
 from torchtrack.errors import ConfigError
 from torchtrack.tracking.adapt import learns_next
 from torchtrack.tracking.cuda_graphs import CudaGraphs
+from torchtrack.tracking.expectation import near_tiles
 from torchtrack.tracking.frontend.bursts import update_bursts
-from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
+from torchtrack.tracking.frontend.tiles import NearbyEvents
+from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.state import S, StepResult, TrackerState, each_tensor
+from torchtrack.tracking.step import opened, steady_advance
 
 P, R = ParamSpec("P"), TypeVar("R")
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
@@ -44,38 +46,6 @@ _MANY = 16_384
 # Events are filled up to numbers of this many binary digits, so that a GPU needs few graphs, and to multiples of this: loops
 # of a compiled kernel take several at once.
 _DIGITS, _MULTIPLE = 3, 64
-
-
-@runtime_checkable
-class Steadily(Protocol):
-    """What graphs are made of: a tracker, as far as it takes steady windows."""
-
-    config: TrackerConfig
-    tiles: SensorTiles | None
-
-    @property
-    def shows_all(self) -> bool:
-        """Whether a weigher of one's own is shown all events."""
-        ...
-
-    @property
-    def on_surfaces(self) -> Tensor | None:
-        """On which objects contours can be learned."""
-        ...
-
-    def opened(self, state: TrackerState, events: EventBatch) -> TrackerState:
-        """The state with the newest events of a window in its map."""
-        ...
-
-    def near_tiles(self, state: TrackerState, t_us: Int[Tensor, "s"]) -> Tensor | None:
-        """Tiles with events that can have to do with each object."""
-        ...
-
-    def steady_advance(
-        self, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"], *, learns: bool = False
-    ) -> tuple[TrackerState, StepResult, Tensor]:
-        """A window with nothing to decide, and whether anything was."""
-        ...
 
 
 class CompiledStep:
@@ -89,7 +59,7 @@ class CompiledStep:
         ConfigError: if this version of PyTorch cannot.
     """
 
-    def __init__(self, tracker: Steadily, *, compiles: bool = True) -> None:
+    def __init__(self, tracker: TrackedObjects, *, compiles: bool = True) -> None:
         if compiles and "isolate_recompiles" not in signature(torch.compile).parameters:
             raise ConfigError(f"compiled: PyTorch {torch.__version__} cannot compile a tracker. Update it to 2.13 or later, or go without.")
         self._tracker, self._compiles = tracker, compiles
@@ -101,7 +71,8 @@ class CompiledStep:
         """State and result of a window, not counted yet; None where there is no graph, it is not steady, or there is hardly any event in it."""
         if not self._are_for(t_us):
             return None
-        starts = state.learned is not None and state.learned.windows < _FIRST_WINDOWS
+        learned = state.appearance.learned
+        starts = learned is not None and learned.windows < _FIRST_WINDOWS
         learns = learns_next(state, self._tracker.on_surfaces, self._tracker.config)
         if starts or (learns and not host_sync.on_gpu(t_us)):
             return None
@@ -111,7 +82,7 @@ class CompiledStep:
             nearby = self._near(plain, events, t_us) if len(events) > _MANY else NearbyEvents(events)
             if len(nearby.events) < 2:
                 return None
-            next_state, result, wrong = self._taken(self._tracker.opened(plain, events), nearby, t_us, learns)
+            next_state, result, wrong = self._taken(opened(self._tracker, plain, events), nearby, t_us, learns)
             is_wrong = host_sync.AsyncValue.to(wrong[None])
         return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
 
@@ -144,32 +115,38 @@ class CompiledStep:
         if tiles is None or self._tracker.shows_all or t_us.device.type != "cpu":
             return NearbyEvents(events)
         if self._near_tiles is None:
-            self._near_tiles = _compiled(self._tracker.near_tiles, t_us.device)
+            self._near_tiles = _compiled(self._tiles_near, t_us.device)
             near = _for_the_first_time(self._near_tiles, state, t_us)
         else:
             near = self._near_tiles(state, t_us)
         return NearbyEvents(events) if near is None else tiles.keep(events, near)
 
-    def _taken(self, opened: TrackerState, nearby: NearbyEvents, t_us: Tensor, learns: bool = False) -> tuple[TrackerState, StepResult, Tensor]:
+    def _tiles_near(self, state: TrackerState, t_us: Tensor) -> Tensor | None:
+        return near_tiles(self._tracker, state, t_us)
+
+    def _steady(self, state: TrackerState, events: NearbyEvents, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:
+        return steady_advance(self._tracker, state, events, t_us)
+
+    def _taken(self, before: TrackerState, nearby: NearbyEvents, t_us: Tensor, learns: bool = False) -> tuple[TrackerState, StepResult, Tensor]:
         """What the graph makes of a window, and whether that does not hold."""
         filled = _filled(nearby, len(t_us))
         if t_us.device.type == "cpu":
-            opened, filled = _in_bursts(opened, filled, t_us, self._tracker.config.matching.burst_us)
+            before, filled = _in_bursts(before, filled, t_us, self._tracker.config.matching.burst_us)
         kind = filled.events.most_of_one, learns
         if kind not in self._graphs:
             self._graphs[kind] = self._graph(t_us.device, learns=learns)
             if self._compiles:
-                return _for_the_first_time(self._graphs[kind], opened, _of_any_number(filled), t_us)
-        return self._graphs[kind](opened, filled, t_us)
+                return _for_the_first_time(self._graphs[kind], before, _of_any_number(filled), t_us)
+        return self._graphs[kind](before, filled, t_us)
 
     def _graph(self, device: torch.device, *, learns: bool) -> _Graph:
         """A graph, made when it is first called. Few windows are learned from: to compile theirs, too, would take longer than it saves."""
-        advance: _Graph = partial(self._tracker.steady_advance, learns=learns)
+        advance: _Graph = partial(steady_advance, self._tracker, learns=learns)
         if self._compiles and not learns:
-            advance = _compiled(self._tracker.steady_advance, device)
+            advance = _compiled(self._steady, device)
             if device.type == "cuda":
                 # What is recorded, and compiled for that, are copies.
-                return CudaGraphs(lambda opened, filled, t_us: advance(opened, _of_any_number(filled), t_us))
+                return CudaGraphs(lambda before, filled, t_us: advance(before, _of_any_number(filled), t_us))
         return CudaGraphs(advance) if device.type == "cuda" else advance
 
 
@@ -239,20 +216,20 @@ def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
     return NearbyEvents(filled, torch.arange(len(filled)) if streams == 1 and not host_sync.on_gpu(x) else None)
 
 
-def _in_bursts(opened: TrackerState, filled: NearbyEvents, t_us: Tensor, longest_us: int) -> tuple[TrackerState, NearbyEvents]:
+def _in_bursts(before: TrackerState, filled: NearbyEvents, t_us: Tensor, longest_us: int) -> tuple[TrackerState, NearbyEvents]:
     """The state with its map of bursts brought up, and the events with how far into them they are.
 
     Not in the graph: where 16 bits are enough, a CPU's compiler takes one pixel at a time.
     """
     streams, most = len(t_us), filled.events.most_of_one
     if host_sync.read_at_once(t_us):
-        height, width = opened.burst_age_us.shape[-2:]
+        height, width = before.maps.burst_age_us.shape[-2:]
         check_on_sensor(filled.events, width, height)
     window = pad_streams(filled.events, streams, t_us)
-    burst_age_us, into_burst_us = update_bursts(opened.burst_age_us, t_us - opened.t_us, window, longest_us)
+    burst_age_us, into_burst_us = update_bursts(before.maps.burst_age_us, t_us - before.t_us, window, longest_us)
     if most is not None:
         into_burst_us = pad(into_burst_us, (0, min(most, len(filled.events)) - into_burst_us.shape[1]))
-    return replace(opened, burst_age_us=burst_age_us), replace(filled, into_burst_us=into_burst_us)
+    return replace(before, maps=replace(before.maps, burst_age_us=burst_age_us)), replace(filled, into_burst_us=into_burst_us)
 
 
 def _of_any_number(filled: NearbyEvents) -> NearbyEvents:

@@ -14,34 +14,33 @@ from torchtrack.core.dispatch import accelerable
 from torchtrack.core.events import EventBatch, stream_bounds
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import PoseError
+from torchtrack.tracking.adaptation.appearance import Appearance
 from torchtrack.tracking.adaptation.learned_contours import LearnedContours
 from torchtrack.tracking.adaptation.pixel_latency import unknown_circuits
 from torchtrack.tracking.association.polarity import nothing_remembered
 from torchtrack.tracking.contours.objects import ObjectBatch
-from torchtrack.tracking.frontend.bursts import no_bursts
-from torchtrack.tracking.frontend.time_surface import empty_last_event
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.window_events import WindowEvents
-from torchtrack.tracking.motion.model import initial_covariance
+from torchtrack.tracking.motion.model import MotionState, initial_covariance
 from torchtrack.tracking.objects import TrackedObjects
-from torchtrack.tracking.state import Probation, TrackerState
+from torchtrack.tracking.state import TrackerState
+from torchtrack.tracking.validation.health import TentativeTrack, TrackHealth
 
 
 def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us: Int[Tensor, "s"]) -> TrackerState:
     """The state at ``t_us``, with the objects at these poses (float64) and at rest, as far as is known."""
     config = tracked.config
     at_rest = torch.zeros(len(T_cam_obj), 6, dtype=tracked.intrinsics.dtype, device=T_cam_obj.device)
-    nothing, covariance = torch.zeros_like(tracked.diameter_m), initial_covariance(tracked.diameter_m, config.motion)
-    last_event_us, burst_age_us = (empty(tracked.streams, *tracked.image_size, T_cam_obj.device) for empty in (empty_last_event, no_bursts))
+    covariance = initial_covariance(tracked.diameter_m, config.motion)
     learns = config.learning.points and config.contours.source == "mesh"
     learned = LearnedContours.none(len(at_rest), config.learning, at_rest) if learns else None
     return TrackerState(
-        T_cam_obj.clone(),
-        *(at_rest, at_rest, covariance),
-        *(nothing,) * 7,
-        *(T_cam_obj.clone(), nothing, nothing_remembered(at_rest), unknown_circuits(nothing)),
-        *(t_us, last_event_us, burst_age_us),
-        Probation.none(T_cam_obj, covariance),
-        learned,
+        t_us=t_us,
+        motion=MotionState(T_cam_obj.clone(), velocity=at_rest, acceleration=at_rest, covariance=covariance),
+        health=TrackHealth.unknown(T_cam_obj, at_rest.dtype),
+        tentative=TentativeTrack.none(T_cam_obj, covariance),
+        appearance=Appearance(nothing_remembered(at_rest), unknown_circuits(tracked.diameter_m), learned),
+        maps=SensorMaps.empty(tracked.streams, tracked.image_size, T_cam_obj.device),
     )
 
 
@@ -88,7 +87,8 @@ def held_back(
     """The state, with the speed of objects that are ``unfound`` yet limited by a window's events before them."""
     T_cam_obj = state.T_cam_obj.detach().to(objects.intrinsics.dtype)
     limit_m_s = torch.where(unfound, largest_speed(objects, T_cam_obj, events, window_s), torch.inf)
-    return replace(state, covariance=limit_speed(state.covariance, limit_m_s, objects.diameter_m, objects.depth_m(T_cam_obj)))
+    covariance = limit_speed(state.motion.covariance, limit_m_s, objects.diameter_m, objects.depth_m(T_cam_obj))
+    return replace(state, motion=replace(state.motion, covariance=covariance))
 
 
 # Fewer events than this do not make a part of a window.
@@ -132,9 +132,9 @@ def moves_unknown(state: TrackerState, t_us: Int[Tensor, "s"], objects: ObjectBa
     """:func:`of_unknown_motion` where windows are taken in parts."""
     window = config.window
     window_s = ((t_us - state.t_us) * 1e-6)[objects.stream_index]
-    unknown_m_s = unknown_speed(state.covariance, objects.diameter_m).to(objects.intrinsics.dtype)
+    unknown_m_s = unknown_speed(state.motion.covariance, objects.diameter_m).to(objects.intrinsics.dtype)
     px_per_m = objects.px_per_m(state.T_cam_obj.to(unknown_m_s.dtype))
-    sigma_m = state.covariance.diagonal(dim1=1, dim2=2)[:, 3:5].mean(1).sqrt().to(px_per_m.dtype)
+    sigma_m = state.motion.covariance.diagonal(dim1=1, dim2=2)[:, 3:5].mean(1).sqrt().to(px_per_m.dtype)
     # What is not known to be anywhere is looked for by all events of a window, and with the motion that leads to each place.
     return (unknown_m_s * window_s * px_per_m > window.max_unknown_px) & (px_per_m * sigma_m <= config.search.wide_sigma_px)
 

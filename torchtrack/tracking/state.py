@@ -8,97 +8,57 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.tracking.adaptation.learned_contours import LearnedContours
+from torchtrack.tracking.adaptation.appearance import Appearance
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.corners import Corners
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.motion.model import MotionState
-
-
-@dataclass(frozen=True)
-class Probation:
-    """Where to look for objects again, should what was found of them turn out to be wrong.
-
-    Args:
-        runs: which objects are on probation.
-        evidence: for what was found of each, in windows.
-        T_cam_obj, covariance: of the object before it was found.
-    """
-
-    runs: Bool[Tensor, "b"]
-    evidence: Float[Tensor, "b"]
-    T_cam_obj: Float[Tensor, "b 4 4"]
-    covariance: Float[Tensor, "b 12 12"]
-
-    @classmethod
-    def none(cls, T_cam_obj: Float[Tensor, "b 4 4"], covariance: Float[Tensor, "b 12 12"]) -> "Probation":
-        """Nothing on probation."""
-        return cls(torch.zeros_like(T_cam_obj[:, 0, 0], dtype=torch.bool), torch.zeros_like(T_cam_obj[:, 0, 0]), T_cam_obj, covariance)
+from torchtrack.tracking.validation.health import TentativeTrack, TrackHealth
 
 
 @dataclass(frozen=True)
 class TrackerState:
-    """Everything the tracker remembers between windows.
+    """Everything the tracker remembers between windows, in parts that belong to the rooms that use them.
 
     Args:
-        T_cam_obj: pose of each object at its stream's ``t_us`` (float64).
-        velocity: rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s).
-        acceleration: how they changed in the last window (rad/s², m/s²).
-        covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.tracking.motion.model`.
-        score: of the last window, :attr:`torchtrack.tracking.validation.scored_fit.Found.score`.
-        usual_score: its running mean.
-        full_share: of the moving contour, what events explain when the object is seen well: rises as fast, but falls slowly.
-        full_gathered: the same of how far events near its contours are on them.
-        full_count: matched observations when the object is seen well, likewise.
-        full_apart: how far apart the directions of contours with events on them are then (:func:`tracking.validation.measures.directions_apart`).
-        doubted_s: for how long, less the time it was not, the object has been in doubt of being elsewhere (s).
-        T_last_seen: pose of each object when it was last seen well (float64).
-        unseen_s: how long ago that was (s).
-        darker_outside: which side of each object's contours is the darker one, by the octant that they face: :mod:`tracking.association.polarity`.
-        late_share: how many of the events on its moving contours come late in their bursts: :mod:`torchtrack.tracking.adaptation.pixel_latency`.
         t_us: end of the last window of each stream (µs).
-        last_event_us: time of the newest event of every sensor pixel (µs).
-        burst_age_us: how long ago the newest burst of every sensor pixel and polarity began (µs).
-        probation: which finds are not certain yet.
-        learned: contours learned on the objects; none where that is switched off.
+        motion: pose and motion of each object at that time.
+        health: how well each object is seen.
+        tentative: which poses that objects were found in are not confirmed yet.
+        appearance: what was learned of how objects look.
+        maps: what is remembered of every pixel of the sensors.
     """
 
-    T_cam_obj: Float[Tensor, "b 4 4"]
-    velocity: Float[Tensor, "b 6"]
-    acceleration: Float[Tensor, "b 6"]
-    covariance: Float[Tensor, "b 12 12"]
-    score: Float[Tensor, "b"]
-    usual_score: Float[Tensor, "b"]
-    full_share: Float[Tensor, "b"]
-    full_gathered: Float[Tensor, "b"]
-    full_count: Float[Tensor, "b"]
-    full_apart: Float[Tensor, "b"]
-    doubted_s: Float[Tensor, "b"]
-    T_last_seen: Float[Tensor, "b 4 4"]
-    unseen_s: Float[Tensor, "b"]
-    darker_outside: Float[Tensor, "b 8"]
-    late_share: Float[Tensor, "b"]
     t_us: Int[Tensor, "s"]
-    last_event_us: Int[Tensor, "s h w"]
-    burst_age_us: Int[Tensor, "s 2 h w"]
-    probation: Probation
-    learned: LearnedContours | None = None
+    motion: MotionState
+    health: TrackHealth
+    tentative: TentativeTrack
+    appearance: Appearance
+    maps: SensorMaps
 
     @property
-    def motion(self) -> MotionState:
-        """What the motion model predicts from."""
-        return MotionState(self.T_cam_obj, self.velocity, self.acceleration, self.covariance)
+    def T_cam_obj(self) -> Float[Tensor, "b 4 4"]:  # noqa: N802 - frames have their letters
+        """Pose of each object (float64)."""
+        return self.motion.T_cam_obj
+
+    @property
+    def velocity(self) -> Float[Tensor, "b 6"]:
+        """Rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s)."""
+        return self.motion.velocity
 
     def numbered(self, before: "TrackerState", more: int = 0) -> "TrackerState":
         """The state with as many windows taken as ``before``, and some more."""
-        learned = self.learned
-        if learned is not None and before.learned is not None:
-            learned = replace(learned, windows=before.learned.windows + more)
-        return replace(self, learned=learned)
+        learned, earlier = self.appearance.learned, before.appearance.learned
+        if learned is None or earlier is None:
+            return self
+        learned = replace(learned, windows=earlier.windows + more)
+        return replace(self, appearance=replace(self.appearance, learned=learned))
 
     def without_maps(self) -> "TrackerState":
         """The state without what is known of every pixel of the sensors, which is most of it: to be looked at, not to go on from."""
-        streams = len(self.t_us)
-        return replace(self, last_event_us=self.last_event_us.new_empty(streams, 0, 0), burst_age_us=self.burst_age_us.new_empty(streams, 2, 0, 0))
+        streams, maps = len(self.t_us), self.maps
+        empty = SensorMaps(maps.last_event_us.new_empty(streams, 0, 0), maps.burst_age_us.new_empty(streams, 2, 0, 0))
+        return replace(self, maps=empty)
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,11 @@ from torchtrack.tracking.association.weights import ON_CONTOUR_PX
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.rounds import Fit, may_be_anywhere
 from torchtrack.tracking.frontend.corners import Corners
-from torchtrack.tracking.motion.model import fade, found_acceleration, left_covariance, with_dropped
+from torchtrack.tracking.motion.model import MotionState, fade, found_acceleration, left_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.triggers import is_smeared
 from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.validation.health import TrackHealth
 from torchtrack.tracking.validation.measures import visible_share
 from torchtrack.tracking.validation.scored_fit import Found
 from torchtrack.tracking.validation.status import (
@@ -54,11 +55,12 @@ def conclude(
         widening: of each object's first gate.
         dt_s: length of the window.
     """
-    after, covariance, status = judged_objects(state, prediction, widening, found, dt_s, config)
-    contours = _where_they_are(found.fit, after.T_cam_obj, status >= int(Status.LOST), prediction.objects.intrinsics)
-    result = StepResult(state.t_us, after.T_cam_obj, covariance, status, found.share, contours, corners, found.count)
-    sides = _darker_outside(state, found, status, dt_s, config)
-    return replace(after, score=found.score, darker_outside=sides, full_apart=_full_apart(state, after, found)), result
+    motion, health, covariance, status = judged_objects(state, prediction, widening, found, dt_s, config)
+    contours = _where_they_are(found.fit, motion.T_cam_obj, status >= int(Status.LOST), prediction.objects.intrinsics)
+    result = StepResult(state.t_us, motion.T_cam_obj, covariance, status, found.share, contours, corners, found.count)
+    appearance = replace(state.appearance, darker_outside=_darker_outside(state, found, status, dt_s, config))
+    health = replace(health, score=found.score, reference_normal_spread=_normal_spread(health, found))
+    return replace(state, motion=motion, health=health, appearance=appearance), result
 
 
 def _where_they_are(fit: Fit, T_cam_obj: Float[Tensor, "b 4 4"], failed: Bool[Tensor, "b"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
@@ -69,8 +71,8 @@ def _where_they_are(fit: Fit, T_cam_obj: Float[Tensor, "b 4 4"], failed: Bool[Te
     return reproject(fit.contours, torch.where(failed[:, None, None], T_cam_obj.to(fitted.dtype), fitted), intrinsics)
 
 
-# The state with what is known of poses and motions after a window, covariances of the poses' left perturbation, and statuses.
-Judgement = tuple[TrackerState, Float[Tensor, "b 6 6"], Int[Tensor, "b"]]
+# Motion and health after a window, covariances of the poses' left perturbation, and statuses.
+Judgement = tuple[MotionState, TrackHealth, Float[Tensor, "b 6 6"], Int[Tensor, "b"]]
 
 
 @accelerable
@@ -78,7 +80,8 @@ def judged_objects(
     state: TrackerState, prediction: Prediction, widening: Float[Tensor, "b"], found: Found, dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> Judgement:
     """What every object's pose is worth, and where it goes on from there: arguments as those of :func:`conclude`."""
-    objects, share, solution = prediction.objects, found.share, found.fit.solution
+    objects, share, solution, health = prediction.objects, found.share, found.fit.solution, state.health
+    reference = health.reference_explained_ratio
     in_view = visible_share(found.fit.contours, objects.image_size)
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     step = solution.from_prior[:, :6] * ~(found.elsewhere & may_be_anywhere(widening))[:, None]
@@ -90,34 +93,25 @@ def judged_objects(
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
-    trusted = torch.where(failed, 0, torch.maximum(hidden, trust(share, config.quality, state.full_share, widening)))
-    doubted = ~failed & is_smeared(found.score, state.full_share, found.gathered, found.full_gathered, config.search)
+    trusted = torch.where(failed, 0, torch.maximum(hidden, trust(share, config.quality, reference, widening)))
+    doubted = ~failed & is_smeared(found.score, reference, found.gathered, found.full_gathered, config.search)
     unsure = doubted | (~failed & found.turn_unclear)
     status = torch.where(unsure, status.clamp(min=int(Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
     # Of an object that is partly hidden too little is seen to tell.
-    seen_well = ~failed & (share >= config.quality.certain_at * state.full_share)
+    seen_well = ~failed & (share >= config.quality.certain_at * reference)
     acceleration = _acceleration(prediction, found, torch.where(seen_well, trusted, 0), dt_s)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
-    certain = (share >= CERTAIN * state.full_share) & (status == int(Status.TRACKING))
-    certain &= (found.count >= CERTAIN_COUNT * state.full_count) | (not config.search.by_events)
-    usual_score, full_share, full_gathered, full_count = _usual(state, found, failed)
-    after = replace(
-        state,
-        T_cam_obj=T_cam_obj,
-        velocity=velocity,
-        acceleration=acceleration,
-        covariance=covariance,
-        usual_score=usual_score,
-        full_share=full_share,
-        full_gathered=full_gathered,
-        full_count=full_count,
+    certain = (share >= CERTAIN * reference) & (status == int(Status.TRACKING))
+    certain &= (found.count >= CERTAIN_COUNT * health.reference_matches) | (not config.search.by_events)
+    health = replace(
+        _with_references(health, found, failed),
         # One good window among bad ones does not end a doubt.
-        doubted_s=(state.doubted_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0),
-        T_last_seen=torch.where(certain[:, None, None], T_cam_obj.detach(), state.T_last_seen),
-        unseen_s=torch.where(certain, 0, state.unseen_s + dt_s),
+        drift_s=(health.drift_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0),
+        T_last_validated=torch.where(certain[:, None, None], T_cam_obj.detach(), health.T_last_validated),
+        time_since_validated_s=torch.where(certain, 0, health.time_since_validated_s + dt_s),
     )
-    return after, left_covariance(covariance[:, :6, :6], centre_cam), status
+    return MotionState(T_cam_obj, velocity, acceleration, covariance), health, left_covariance(covariance[:, :6, :6], centre_cam), status
 
 
 def _darker_outside(
@@ -125,27 +119,31 @@ def _darker_outside(
 ) -> Float[Tensor, "b 8"]:
     """Which side of contours is the darker one, with what the events on those of objects that are seen well say of it."""
     if not config.matching.polarity_memory_s:
-        return state.darker_outside
+        return state.appearance.darker_outside
     matches = found.fit.matches
     # What a search found stands on other matches than these.
-    known = (status == int(Status.TRACKING)) & is_seen_well(found.share, state.full_share) & ~found.elsewhere
+    known = (status == int(Status.TRACKING)) & is_seen_well(found.share, state.health.reference_explained_ratio) & ~found.elsewhere
     # Chosen, not multiplied: what is not a number would stay.
     weights = torch.where(known[:, None] & (matches.offsets.abs() < ON_CONTOUR_PX), matches.weights, 0)
-    return remembered(state.darker_outside, matches.directions, matches.dark, weights, dt_s, config.matching.polarity_memory_s)
+    return remembered(state.appearance.darker_outside, matches.directions, matches.dark, weights, dt_s, config.matching.polarity_memory_s)
 
 
-def _usual(state: TrackerState, found: Found, failed: Bool[Tensor, "b"]) -> tuple[Float[Tensor, "b"], ...]:
-    """Score as a rule, and share, gathering and observations when seen well, with a window more; of objects that failed, as before."""
-    usual = torch.where(failed, state.usual_score, torch.lerp(state.usual_score, found.score, USUAL_GAIN))
-    full_share = torch.where(failed, state.full_share, _seen_well(state.full_share, found.share))
-    full_gathered = torch.where(failed | found.gathered.isnan(), state.full_gathered, _seen_well(state.full_gathered, found.gathered))
-    full_count = torch.where(failed, state.full_count, _seen_well(state.full_count, found.count.to(state.full_count.dtype)))
-    return usual, full_share, full_gathered, full_count
+def _with_references(health: TrackHealth, found: Found, failed: Bool[Tensor, "b"]) -> TrackHealth:
+    """Mean score and references with a window more; of objects that failed, as before."""
+    ratio, inliers, matches = health.reference_explained_ratio, health.reference_inlier_ratio, health.reference_matches
+    return replace(
+        health,
+        mean_score=torch.where(failed, health.mean_score, torch.lerp(health.mean_score, found.score, USUAL_GAIN)),
+        reference_explained_ratio=torch.where(failed, ratio, _seen_well(ratio, found.share)),
+        reference_inlier_ratio=torch.where(failed | found.gathered.isnan(), inliers, _seen_well(inliers, found.gathered)),
+        reference_matches=torch.where(failed, matches, _seen_well(matches, found.count.to(matches.dtype))),
+    )
 
 
-def _full_apart(state: TrackerState, after: TrackerState, found: Found) -> Float[Tensor, "b"]:
+def _normal_spread(health: TrackHealth, found: Found) -> Float[Tensor, "b"]:
     """How far apart the directions of contours are when objects are seen well, with a window more."""
-    return torch.where(after.unseen_s == 0, _seen_well(state.full_apart, found.apart), state.full_apart)
+    spread = health.reference_normal_spread
+    return torch.where(health.time_since_validated_s == 0, _seen_well(spread, found.apart), spread)
 
 
 def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, edge_events, pose, pose_errors
 from printed_plate import PLATE_CAMERA, PLATE_POSE, PRINTED, line_events, plate_model, starting
+from states import changed
 from tracked_boxes import assert_same, follow, merged, moving_box, poses_of, windows
 
 from torchtrack import Tracker
@@ -57,7 +58,7 @@ def test_a_plate_with_print_that_its_model_lacks_is_followed():
 
 def test_learned_contours_lie_on_the_print():
     state, results = plate_followed()
-    learned = state.learned
+    learned = state.appearance.learned
     points = learned.points_obj[0][trusted(learned)[0]].double()
     assert len(points) > 100
     start, end = PRINTED.unbind(1)
@@ -77,7 +78,7 @@ def test_an_object_that_its_model_explains_uses_nothing_learned():
     on, off = (Tracker([box_model()], SMALL_CAMERA, config) for config in (None, OFF))
     state, results = follow(on, on.init(pose()[None], 0), windows(events, 10))
     _, without = follow(off, off.init(pose()[None], 0), windows(events, 10))
-    assert not bool(state.learned.needed.any())
+    assert not bool(state.appearance.learned.needed.any())
     assert torch.equal(poses_of(results), poses_of(without))
 
 
@@ -87,14 +88,14 @@ def test_an_object_that_its_model_explains_learns_nothing_beside_one_that_lacks_
     tracker = Tracker([plate_model()] * 2, [PLATE_CAMERA] * 2, stream_index=[0, 1])
     both = [(concatenate([window, window.of_stream(1)]), end_us) for window, end_us in cut]
     state, _ = follow(tracker, tracker.init(PLATE_POSE.repeat(2, 1, 1), 0), both[:-1])
-    before = replace(state, learned=replace(state.learned, model_share=torch.tensor([0.3, 0.9])))
+    before = changed(state, learned=replace(state.appearance.learned, model_share=torch.tensor([0.3, 0.9])))
     after, _ = tracker.step(before, *both[-1])
     for name in ("drafts_obj", "drafted", "evidence"):
-        mine, theirs = getattr(after.learned, name), getattr(before.learned, name)
+        mine, theirs = getattr(after.appearance.learned, name), getattr(before.appearance.learned, name)
         assert not torch.equal(mine[0], theirs[0])
         assert torch.equal(mine[1], theirs[1])
     # Whether that is still so is looked at all the same.
-    assert (after.learned.model_share != before.learned.model_share).all()
+    assert (after.appearance.learned.model_share != before.appearance.learned.model_share).all()
 
 
 def test_an_occluder_that_passes_teaches_nothing():
@@ -108,7 +109,7 @@ def test_an_occluder_that_passes_teaches_nothing():
     both = merged(events, line_events(T_bars, bars, seed=1))
     state, results = follow(tracker, tracker.init(PLATE_POSE[None], 0), windows(both, COUNT))
     assert float(errors_of(results)[1].max()) < 6
-    points = state.learned.points_obj[0][trusted(state.learned)[0]].double()
+    points = state.appearance.learned.points_obj[0][trusted(state.appearance.learned)[0]].double()
     start, end = PRINTED.unbind(1)
     along = ((points[:, None] - start) * (end - start)).sum(-1) / (end - start).square().sum(-1)
     distance_m = (points[:, None] - start - along.clamp(0, 1)[..., None] * (end - start)).norm(dim=-1).min(1).values
@@ -122,11 +123,11 @@ def test_what_falls_silent_is_forgotten():
     # From now on only the border and the frame fire: the text is gone.
     later = starting((COUNT + 12) * 5_000)
     events = line_events(later, PRINTED[:6]).slice_time(COUNT * 5_000, (COUNT + 12) * 5_000)
-    before = state.learned
+    before = state.appearance.learned
     is_text = trusted(before)[0] & (before.points_obj[0, :, 0].abs() < 0.088) & (before.points_obj[0, :, 1].abs() < 0.062)
     after, _ = follow(tracker, state, windows(events, 12, COUNT * 5_000))
     assert int(is_text.sum()) > 50
-    assert float(after.learned.evidence[0, is_text].mean()) < 0.8 * float(before.evidence[0, is_text].mean())
+    assert float(after.appearance.learned.evidence[0, is_text].mean()) < 0.8 * float(before.evidence[0, is_text].mean())
 
 
 @pytest.mark.parametrize("points", [1, 40, 300])
@@ -134,16 +135,16 @@ def test_no_more_is_learned_than_there_is_room_for(points):
     _, events = plate_sequence()
     tracker = Tracker([plate_model()], PLATE_CAMERA, learning(points=points, drafts=500))
     state, results = follow(tracker, tracker.init(PLATE_POSE[None], 0), windows(events, 12))
-    assert state.learned.points_obj.shape == (1, points, 3)
-    assert state.learned.drafts_obj.shape == (1, 500, 3)
-    assert int((state.learned.evidence > 0).sum()) == points or points == 300
-    assert bool(torch.isfinite(state.learned.points_obj).all())
+    assert state.appearance.learned.points_obj.shape == (1, points, 3)
+    assert state.appearance.learned.drafts_obj.shape == (1, 500, 3)
+    assert int((state.appearance.learned.evidence > 0).sum()) == points or points == 300
+    assert bool(torch.isfinite(state.appearance.learned.points_obj).all())
     assert int((results[-1].contours.kind == int(ContourKind.LEARNED)).sum()) in (0, points)
 
 
 def test_learned_points_are_apart():
     state, results = plate_followed()
-    learned = state.learned
+    learned = state.appearance.learned
     pixels = learned.points(least=1e-6).contours(results[-1].T_cam_obj.float(), torch.tensor([[450.0, 450.0, 159.5, 119.5]])).pixels[0]
     known = pixels[learned.evidence[0] > 0]
     distance = torch.cdist(known, known) + 100 * torch.eye(len(known))
@@ -159,7 +160,7 @@ def test_a_batch_learns_what_each_object_alone_learns():
         alone = Tracker([plate_model()], PLATE_CAMERA, dtype=torch.float64)
         own, ours = follow(alone, alone.init(PLATE_POSE[None], 0), windows(plate_sequence(seed)[1], 8))
         torch.testing.assert_close(poses_of(results, number), poses_of(ours), rtol=0, atol=1e-6)
-        torch.testing.assert_close(state.learned.evidence[number], own.learned.evidence[0])
+        torch.testing.assert_close(state.appearance.learned.evidence[number], own.appearance.learned.evidence[0])
 
 
 def test_a_neighbour_that_fails_changes_nothing():
@@ -172,19 +173,21 @@ def test_a_neighbour_that_fails_changes_nothing():
             state.T_cam_obj[1, 0, 3] = torch.nan
         states.append(follow(tracker, state, windows(events, 6))[0])
     assert torch.equal(states[0].T_cam_obj[0], states[1].T_cam_obj[0])
-    for ours, theirs in zip(vars(states[0].learned).values(), vars(states[1].learned).values(), strict=True):
+    for ours, theirs in zip(vars(states[0].appearance.learned).values(), vars(states[1].appearance.learned).values(), strict=True):
         assert ours[0].equal(theirs[0]) if torch.is_tensor(ours) else ours == theirs
-    assert not bool(states[1].learned.evidence[1].any())
+    assert not bool(states[1].appearance.learned.evidence[1].any())
 
 
 def test_the_state_before_is_left_as_it_was():
     state, _ = plate_followed()
     tracker = Tracker([plate_model()], PLATE_CAMERA, learning(every=1))
-    kept = [value.clone() for value in vars(state.learned).values() if torch.is_tensor(value)]
+    kept = [value.clone() for value in vars(state.appearance.learned).values() if torch.is_tensor(value)]
     events = line_events(starting((COUNT + 1) * 5_000), PRINTED).slice_time(COUNT * 5_000, (COUNT + 1) * 5_000)
     once, again = (tracker.step(state, events, (COUNT + 1) * 5_000) for _ in range(2))
     assert_same(once, again)
-    assert all(torch.equal(value, before) for value, before in zip(filter(torch.is_tensor, vars(state.learned).values()), kept, strict=True))
+    assert all(
+        torch.equal(value, before) for value, before in zip(filter(torch.is_tensor, vars(state.appearance.learned).values()), kept, strict=True)
+    )
 
 
 def test_only_some_of_the_later_windows_are_learned_from():
@@ -196,14 +199,14 @@ def test_only_some_of_the_later_windows_are_learned_from():
 @pytest.mark.parametrize("config", [OFF, TrackerConfig(contours=ContourConfig(source="splat"))], ids=["off", "splat"])
 def test_switched_off_there_is_nothing(config):
     tracker = Tracker([box_model()], SMALL_CAMERA, config)
-    assert tracker.init(pose()[None], 0).learned is None
+    assert tracker.init(pose()[None], 0).appearance.learned is None
 
 
 def test_nothing_is_learned_on_dense_meshes():
     _, events = plate_sequence()
     tracker = Tracker([plate_model()], PLATE_CAMERA, TrackerConfig(contours=ContourConfig(exact_faces=0)))
     state, results = follow(tracker, tracker.init(PLATE_POSE[None], 0), windows(events, 2))
-    assert not bool(state.learned.drafted.any())
+    assert not bool(state.appearance.learned.drafted.any())
     assert not bool((results[-1].contours.kind == int(ContourKind.LEARNED)).any())
 
 
@@ -212,7 +215,7 @@ def test_a_search_takes_what_was_learned_along():
     tracker = Tracker([plate_model()], PLATE_CAMERA)
     away = state.T_cam_obj.clone()
     away[:, 0, 3] += 0.006
-    lost = replace(state, T_cam_obj=away, covariance=state.covariance * 400)
+    lost = changed(state, T_cam_obj=away, covariance=state.motion.covariance * 400)
     trajectory = starting((COUNT + 2) * 5_000)
     events = line_events(trajectory, PRINTED).slice_time(COUNT * 5_000, (COUNT + 2) * 5_000)
     _, results = follow(tracker, lost, windows(events, 2, COUNT * 5_000))
@@ -228,4 +231,4 @@ def test_boxes_in_one_stream_learn_each_their_own():
     still = edge_events(replace(trajectory, T_cam_obj=behind.repeat(len(trajectory.t_us), 1, 1)))
     tracker = Tracker([box_model()] * 2, SMALL_CAMERA)
     state, _ = follow(tracker, tracker.init(torch.stack([front, behind]), 0), windows(merged(events, still), 6))
-    assert int((state.learned.evidence[1] >= 3).sum()) <= 5
+    assert int((state.appearance.learned.evidence[1] >= 3).sum()) <= 5

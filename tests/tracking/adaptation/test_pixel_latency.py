@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from states import changed
 from tracked_boxes import in_motion, poses_of, started
 
 from torchtrack.config.tracker import MatchingConfig, TrackerConfig
@@ -97,7 +98,9 @@ def test_each_object_has_its_own():
 def test_it_is_remembered():
     # Circuits are looked at once in 20 ms: in the window that ends there.
     tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(matching=LONG), count=11)
-    after = [float(tracker.step(replace(state, late_share=torch.full((1,), before)), events, end_us)[0].late_share) for before in (0.0, 1.0)]
+    after = [
+        float(tracker.step(changed(state, late_share=torch.full((1,), before)), events, end_us)[0].appearance.late_share) for before in (0.0, 1.0)
+    ]
     assert 0.0 < after[0] < 0.02 and 0.98 < after[1] < 1.0
 
 
@@ -109,6 +112,8 @@ def test_with_fast_circuits_poses_are_as_without_bursts():
         again = replace(events, t_us=events.t_us + 300)
         both = replace(events, **{name: torch.cat([value, getattr(again, name)]) for name, value in vars(events).items() if torch.is_tensor(value)})
         both = both[both.t_us.sort(stable=True).indices].slice_time(end_us - 5_000, end_us)
-        _, result = tracker.step(replace(state, late_share=torch.zeros(1), unseen_s=torch.zeros(1), T_cam_obj=started()[1].T_cam_obj), both, end_us)
+        _, result = tracker.step(
+            changed(state, late_share=torch.zeros(1), time_since_validated_s=torch.zeros(1), T_cam_obj=started()[1].T_cam_obj), both, end_us
+        )
         found.append(poses_of([result]))
     torch.testing.assert_close(*found, atol=2e-5, rtol=0)

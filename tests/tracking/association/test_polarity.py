@@ -7,6 +7,7 @@ from functools import cache
 import pytest
 import torch
 from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
+from states import changed
 from tracked_boxes import WINDOW_US, follow, started
 
 from torchtrack import Tracker
@@ -179,15 +180,15 @@ def tracked(config=None, *, turned_round=False, dtype=torch.float32):
 def test_a_bright_object_before_a_dark_wall_is_darker_outside(turned_round, sign, dtype):
     _, state, results = tracked(turned_round=turned_round, dtype=dtype)
     assert int(results[-1].status[0]) == Status.TRACKING
-    sides = sign * state.darker_outside[0]
+    sides = sign * state.appearance.darker_outside[0]
     assert float(sides.min()) > -0.1
     assert float(sides.median()) > 0.6
 
 
 def test_nothing_is_remembered_where_it_is_switched_off():
     tracker, state, _ = tracked(OFF)
-    assert (state.darker_outside == 0).all()
-    hidden = replace(state, darker_outside=torch.ones_like(state.darker_outside), score=torch.zeros_like(state.score))
+    assert (state.appearance.darker_outside == 0).all()
+    hidden = changed(state, darker_outside=torch.ones_like(state.appearance.darker_outside), score=torch.zeros_like(state.health.score))
     assert known(tracker, hidden).polarity is None
 
 
@@ -197,9 +198,9 @@ def known(tracker, state):
 
 def test_nothing_is_asked_of_events_while_all_is_seen():
     tracker, state, _ = tracked()
-    assert known(tracker, replace(state, score=state.full_share)).polarity is None
-    hidden = replace(state, score=0.3 * state.full_share)
-    torch.testing.assert_close(known(tracker, hidden).polarity, state.darker_outside * state.darker_outside.abs())
+    assert known(tracker, changed(state, score=state.health.reference_explained_ratio)).polarity is None
+    hidden = changed(state, score=0.3 * state.health.reference_explained_ratio)
+    torch.testing.assert_close(known(tracker, hidden).polarity, state.appearance.darker_outside * state.appearance.darker_outside.abs())
 
 
 def test_copies_of_an_object_expect_what_it_does():
@@ -211,8 +212,8 @@ def test_copies_of_an_object_expect_what_it_does():
 
 def test_what_was_not_tracked_is_not_remembered():
     tracker, state, _, (events, end_us), _ = started()
-    blind = replace(state, darker_outside=torch.full_like(state.darker_outside, 0.5))
-    assert torch.equal(tracker.step(blind, events[:0], end_us)[0].darker_outside, blind.darker_outside)
+    blind = changed(state, darker_outside=torch.full_like(state.appearance.darker_outside, 0.5))
+    assert torch.equal(tracker.step(blind, events[:0], end_us)[0].appearance.darker_outside, blind.appearance.darker_outside)
 
 
 @pytest.mark.parametrize("name", ["paper", "nns"])

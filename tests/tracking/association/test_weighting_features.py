@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
+from states import changed
 from tracked_boxes import follow, merged, moving_box, tensors_of, windows
 
 from torchtrack import Tracker, preset
@@ -148,7 +149,7 @@ def test_gradients_pass_beside_the_network():
     (events, end_us), *_ = windows(moving_box(pose(), 1)[1], 1)
     state = tracker.init(pose()[None], 0)
     start = state.T_cam_obj.clone().requires_grad_()
-    next_state, _ = tracker.step(replace(state, T_cam_obj=start), events, end_us)
+    next_state, _ = tracker.step(changed(state, T_cam_obj=start), events, end_us)
     (gradient,) = torch.autograd.grad(next_state.T_cam_obj.sum(), start)
     assert gradient.isfinite().all() and gradient.abs().sum() > 0
     assert all(value is not None for value in tensors_of(next_state))

@@ -11,6 +11,7 @@ from tracked_boxes import WINDOW_US, follow, merged, moving_box, tracker_of, win
 from torchtrack import Tracker
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.camera import Camera, distort, undistortion_table
+from torchtrack.tracking.expectation import near_tiles, predicted_after
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 
 WIDE = Camera(240.0, 240.0, 320.0, 240.0, 640, 480)
@@ -19,7 +20,7 @@ ODD = Camera(240.0, 240.0, 100.0, 70.0, 201, 143, "plumb_bob", (-0.3, 0.1, 0.0, 
 
 def prediction_at(T_cam_obj):
     tracker = tracker_of()
-    return tracker, tracker._predict(tracker.init(T_cam_obj[None], 0), torch.tensor([0.0]))
+    return tracker, predicted_after(tracker, tracker.init(T_cam_obj[None], 0), torch.tensor([0.0]))
 
 
 @pytest.mark.parametrize("camera", [SMALL_CAMERA, ODD])
@@ -119,7 +120,7 @@ def test_a_step_is_the_same_without_the_events_that_are_left_out():
     noise = random_events(20_000, width=WIDE.width, height=WIDE.height, duration_us=WINDOW_US)
     noisy = merged(events, replace(noise, t_us=noise.t_us + 5 * WINDOW_US)).slice_time(5 * WINDOW_US, 6 * WINDOW_US)
     results = [tracker.step(state, noisy)[1]]
-    near = tracker.near_tiles(state, torch.tensor([6 * WINDOW_US]))
+    near = near_tiles(tracker, state, torch.tensor([6 * WINDOW_US]))
     assert len(tracker.tiles.keep(noisy, near).events) < len(noisy) // 2
     tracker.tiles = None
     results.append(tracker.step(state, noisy)[1])

@@ -1,12 +1,12 @@
 """Accelerations: found from a window, carried on to the next ones, left out where they hardly move anything, and what they do for fast motion."""
 
 import math
-from dataclasses import replace
 from functools import cache
 
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, edge_events, generator, pose, pose_errors
+from states import changed
 from tracked_boxes import WINDOW_US, follow, started, windows
 
 from torchtrack import Tracker
@@ -17,6 +17,7 @@ from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.lie import so3_exp
 from torchtrack.core.linalg import inverse
 from torchtrack.sim.trajectory import Trajectory
+from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.motion.model import (
     Acceleration,
     acceleration_counts,
@@ -175,18 +176,20 @@ def test_slow_objects_are_followed_as_without_it():
 
 def test_what_is_not_seen_has_no_acceleration():
     tracker, state, _, _, _ = started()
-    state = replace(state, acceleration=torch.full_like(state.acceleration, 100.0))
+    state = changed(state, acceleration=torch.full_like(state.motion.acceleration, 100.0))
     state, result = tracker.step(state, EventBatch.empty(), int(state.t_us) + WINDOW_US)
     assert int(result.status) >= int(Status.LOST)
-    assert not state.acceleration.any()
+    assert not state.motion.acceleration.any()
 
 
 def test_an_object_that_is_partly_hidden_has_none_either():
     # What is hidden is also matched with an eye on polarities, if these are remembered.
     tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(matching=MatchingConfig(polarity_memory_s=0.0)))
-    seen, hidden = (tracker.step(replace(state, full_share=torch.full_like(state.score, full)), events, end_us) for full in (1.0, 10.0))
-    assert seen[0].acceleration.any()
-    assert not hidden[0].acceleration.any()
+    seen, hidden = (
+        tracker.step(changed(state, reference_explained_ratio=torch.full_like(state.health.score, full)), events, end_us) for full in (1.0, 10.0)
+    )
+    assert seen[0].motion.acceleration.any()
+    assert not hidden[0].motion.acceleration.any()
     assert torch.equal(seen[1].T_cam_obj, hidden[1].T_cam_obj)
 
 
@@ -194,4 +197,4 @@ def test_without_a_prior_there_is_none():
     config = preset("paper")
     tracker = Tracker([box_model()], SMALL_CAMERA, config)
     state = tracker.init(pose()[None], 0)
-    assert tracker._predict(state, torch.tensor([DT_S])).acceleration is None
+    assert predicted_after(tracker, state, torch.tensor([DT_S])).acceleration is None

@@ -14,6 +14,7 @@ from torchtrack.core.camera import project
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.tracking.estimation.rounds import gate_widening
+from torchtrack.tracking.expectation import predicted_after
 
 
 def random_covariance(count=1, scale=1e-6, seed=0):
@@ -178,6 +179,6 @@ def test_a_first_gate_that_is_wider_than_the_limit_stays():
 
 def test_in_motion_the_prediction_is_certain_to_a_pixel_or_two():
     tracker, state, _, _, _ = started()
-    prediction = tracker._predict(state, torch.tensor([5e-3]))
+    prediction = predicted_after(tracker, state, torch.tensor([5e-3]))
     sigma = float(prediction.sigma_px(prediction.objects.contours(prediction.T_cam_obj, CONTOURS)))
     assert 0.2 < sigma < 2.0

@@ -8,6 +8,7 @@ import pytest
 import torch
 import trimesh
 from helpers import drifting, generator, pose, pose_errors
+from states import changed
 from tracked_boxes import WINDOW_US, follow, tensors_of, windows
 
 from torchtrack import Camera, EventBatch, ObjectModel, Tracker
@@ -15,6 +16,7 @@ from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg, so3_exp, transform_points
+from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.axis_rotation import _peaks
 from torchtrack.tracking.relocalization.symmetric import RotationAxes
@@ -71,7 +73,9 @@ def after_a_while(config=None, angle=0.0, wrong=0.0, unseen_s=0.2, kernels=True,
     cut = windows(events, COUNT)
     with torch.no_grad():
         state, _ = follow(tracker, tracker.init(trajectory.T_cam_obj[:1], 0), cut[:first])
-        state = replace(state, T_cam_obj=turned(state.T_cam_obj, wrong), unseen_s=torch.full_like(state.unseen_s, unseen_s))
+        state = changed(
+            state, T_cam_obj=turned(state.T_cam_obj, wrong), time_since_validated_s=torch.full_like(state.health.time_since_validated_s, unseen_s)
+        )
         state, results = follow(tracker, state, cut[first:])
     return state, results, trajectory.at(state.t_us)
 
@@ -104,7 +108,7 @@ def test_without_it_the_can_stays_turned_and_is_sure_of_that():
 def test_what_is_right_is_confirmed_and_left():
     state, results, T_true = after_a_while()
     assert float(pose_errors(state.T_cam_obj, T_true)[0]) < 2
-    assert float(state.unseen_s) == 0
+    assert float(state.health.time_since_validated_s) == 0
     statuses = [Status(int(result.status)) for result in results]
     assert statuses[0] == Status.UNCERTAIN and statuses[-1] == Status.TRACKING
 
@@ -112,7 +116,7 @@ def test_what_is_right_is_confirmed_and_left():
 def test_while_the_handle_is_hidden_nothing_is_told():
     """Neither that it is right, nor that it is not; what is known of it before stays."""
     state, results, T_true = after_a_while(angle=math.pi / 2, wrong=0.3)
-    assert float(state.unseen_s) > 0.25
+    assert float(state.health.time_since_validated_s) > 0.25
     assert {Status(int(result.status)) for result in results} == {Status.UNCERTAIN}
     assert float(rotation_angle_deg(state.T_cam_obj[:, :3, :3], turned(T_true, 0.3)[:, :3, :3])) < 20
 
@@ -120,7 +124,7 @@ def test_while_the_handle_is_hidden_nothing_is_told():
 def test_what_was_seen_all_the_time_is_not_looked_at(monkeypatch):
     monkeypatch.setattr("torchtrack.tracking.relocalization.axis_rotation._peaks", lambda *args: pytest.fail("looked at"))
     state, _, _ = after_a_while(unseen_s=0.0)
-    assert float(state.unseen_s) == 0
+    assert float(state.health.time_since_validated_s) == 0
 
 
 def test_a_neighbour_in_another_stream_is_not_disturbed():
@@ -134,7 +138,7 @@ def test_a_neighbour_in_another_stream_is_not_disturbed():
             state, _ = follow(tracker, tracker.init(trajectory.T_cam_obj[:1].repeat(2, 1, 1), 0), both[:8])
             poses = torch.stack([state.T_cam_obj[0], turned(state.T_cam_obj[1], wrong)])
             unseen_s = torch.tensor([0.0, 0.2], dtype=torch.float64)
-            states.append(follow(tracker, replace(state, T_cam_obj=poses, unseen_s=unseen_s), both[8:])[0])
+            states.append(follow(tracker, changed(state, T_cam_obj=poses, time_since_validated_s=unseen_s), both[8:])[0])
     torch.testing.assert_close(states[0].T_cam_obj[0], states[1].T_cam_obj[0])
     assert float(pose_errors(states[1].T_cam_obj[1:], trajectory.at(states[1].t_us[1:]))[0]) < 2
 
@@ -145,8 +149,8 @@ def test_a_neighbour_in_another_stream_is_not_disturbed():
 def predicted(dtype):
     tracker = Tracker([can()], CAMERA, dtype=dtype)
     state = tracker.init(pose(rotation=(1.1, 0.2, 0.4))[None], 0)
-    state = replace(state, velocity=torch.tensor([[0.5, -1.0, 2.0, 0.1, 0.2, -0.1]], dtype=dtype))
-    return tracker, tracker._predict(state, torch.tensor([5e-3], dtype=dtype))
+    state = changed(state, velocity=torch.tensor([[0.5, -1.0, 2.0, 0.1, 0.2, -0.1]], dtype=dtype))
+    return tracker, predicted_after(tracker, state, torch.tensor([5e-3], dtype=dtype))
 
 
 def velocity_at(prediction: Prediction, point_obj):

@@ -1,11 +1,10 @@
 """Where objects are looked for that were not seen well for long: around the pose that they had then."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose
 from lost_states import moved_away, uncertain, unseen
+from states import changed
 from tracked_boxes import follow, in_motion, moving_box, started, windows
 
 from torchtrack import Tracker
@@ -32,28 +31,28 @@ def test_the_longer_it_was_not_seen_the_farther_it_is_looked_for_and_one_look_af
         for unseen_s, look in ((0.1, 0), (0.1, 1), (0.1, 2), (0.2, 2), (5.0, 2))
     ]
     assert [float(values[0]) for values in sigma[:3]] == pytest.approx([1 / 3, 2 / 3, 1.0])
-    px_per_m = float(tracker.objects.px_per_m(state.T_last_seen.float()))
+    px_per_m = float(tracker.objects.px_per_m(state.health.T_last_validated.float()))
     assert [float(values[3]) * px_per_m for values in sigma[2:]] == pytest.approx([40.0, _WIDEST_PX, _WIDEST_PX], rel=1e-5)
-    assert float(sigma[2][5]) == pytest.approx(0.1 * float(tracker.objects.depth_m(state.T_last_seen.float())), rel=1e-6)
+    assert float(sigma[2][5]) == pytest.approx(0.1 * float(tracker.objects.depth_m(state.health.T_last_validated.float())), rel=1e-6)
 
 
 def test_what_is_lost_rests_where_it_was_seen_well_and_its_neighbour_goes_on():
     tracker = Tracker([box_model()] * 2, SMALL_CAMERA)
     _, state, *_ = started()
     both = joined([unseen(state), state])
-    both = replace(both, t_us=state.t_us, last_event_us=state.last_event_us, burst_age_us=state.burst_age_us)
-    both = replace(both, T_cam_obj=moved_away(tracker, both, 0.4), velocity=both.velocity + 1)
+    both = changed(both, t_us=state.t_us, last_event_us=state.maps.last_event_us, burst_age_us=state.maps.burst_age_us)
+    both = changed(both, T_cam_obj=moved_away(tracker, both, 0.4), velocity=both.velocity + 1)
     last_seen = LastSeen.of(both, tracker.objects, torch.tensor([30_000]), CONFIG)
     after = last_seen.in_place_of(both, torch.tensor([True, False]))
-    assert torch.equal(after.T_cam_obj[0], both.T_last_seen[0]) and torch.equal(after.T_cam_obj[1], both.T_cam_obj[1])
+    assert torch.equal(after.T_cam_obj[0], both.health.T_last_validated[0]) and torch.equal(after.T_cam_obj[1], both.T_cam_obj[1])
     assert not after.velocity[0].any() and torch.equal(after.velocity[1], both.velocity[1])
-    assert torch.equal(after.covariance[1], both.covariance[1]) and torch.equal(after.covariance[0], last_seen.covariance[0])
+    assert torch.equal(after.motion.covariance[1], both.motion.covariance[1]) and torch.equal(after.motion.covariance[0], last_seen.covariance[0])
 
 
 def test_an_object_that_may_be_anywhere_has_a_covariance_without_bounds_of_its_own():
     _, state, *_ = started()
-    assert torch.equal(anywhere(state.covariance, torch.tensor([False])), state.covariance)
-    assert torch.equal(anywhere(state.covariance, torch.tensor([True]))[0], torch.eye(12, dtype=torch.float64))
+    assert torch.equal(anywhere(state.motion.covariance, torch.tensor([False])), state.motion.covariance)
+    assert torch.equal(anywhere(state.motion.covariance, torch.tensor([True]))[0], torch.eye(12, dtype=torch.float64))
 
 
 # ---- how far what drifts may be
@@ -113,15 +112,15 @@ def test_of_what_slipped_all_is_less_certain_alike():
 def test_an_object_seen_by_few_events_is_not_remembered_as_seen_well(way):
     """Far more were explained when it was seen well than now, though they explain all of it."""
     tracker, state, _, (events, end_us), _ = started()
-    much = replace(state, full_count=10 * state.full_count)
-    assert float(state.full_count) > 0
+    much = changed(state, reference_matches=10 * state.health.reference_matches)
+    assert float(state.health.reference_matches) > 0
     after, result = tracker.step(much, events, end_us)
     assert int(result.status) == Status.TRACKING
-    assert torch.equal(after.T_last_seen, much.T_last_seen) and float(after.unseen_s) > 0
+    assert torch.equal(after.health.T_last_validated, much.health.T_last_validated) and float(after.health.time_since_validated_s) > 0
     usual, _ = tracker.step(state, events, end_us)
-    assert not torch.equal(usual.T_last_seen, state.T_last_seen) and float(usual.unseen_s) == 0
+    assert not torch.equal(usual.health.T_last_validated, state.health.T_last_validated) and float(usual.health.time_since_validated_s) == 0
     by_share = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(by_events=False)))
-    assert float(by_share.step(much, events, end_us)[0].unseen_s) == 0
+    assert float(by_share.step(much, events, end_us)[0].health.time_since_validated_s) == 0
 
 
 # ---- all together

@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers import SMALL_CAMERA, pose_errors
 from lost_objects import acceptance_test, lost_object, searched
+from states import changed
 from tracked_boxes import in_motion, tensors_of
 
 from torchtrack.config.search import SearchConfig
@@ -105,5 +106,5 @@ def test_what_slipped_goes_on_as_certain_as_if_it_had_been_predicted():
     from_events = better.fit.solution.hessian[0, :12, :12].double() - predicted
     scale = predicted.diagonal().rsqrt()
     assert float(torch.linalg.eigvalsh(from_events * scale[:, None] * scale).min()) > -1e-3
-    unmet = replace(lost, sigma_px=1.0)
+    unmet = changed(lost, sigma_px=1.0)
     assert searched(unmet, acceptance_test(min_score=1.1), around_prediction_released) is scored

@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors, random_events
 from lost_objects import acceptance_test, evidence, lost_object
+from states import changed
 from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, poses_of, started, tensors_of, windows
 
 from torchtrack import Tracker
@@ -131,7 +132,7 @@ def displaced_runs(config, covariance_scale, count=10, displaced=DISPLACED):
     state = replace(
         state,
         T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()),
-        covariance=covariance_scale * state.covariance,
+        covariance=covariance_scale * state.motion.covariance,
     )
     _, results = follow(tracker, state, windows(events, count, 5 * WINDOW_US))
     return results, trajectory.at(results[-1].t_us)
@@ -187,10 +188,10 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
     for name, config in (("with", SEARCHED), ("without", UNSEARCHED)):
         tracker = Tracker([box_model()] * 3, [SMALL_CAMERA] * 3, config, stream_index=[0, 1, 2], dtype=dtype)
         state, _ = follow(tracker, tracker.init(starts, 0), batches[:2])
-        T, covariance = state.T_cam_obj.clone(), state.covariance.clone()
+        T, covariance = state.T_cam_obj.clone(), state.motion.covariance.clone()
         T[1] = retract_about(T[1:2], DISPLACED, tracker.centre_obj[1:2].double())[0]
         covariance[1] *= 100
-        runs[name] = follow(tracker, replace(state, T_cam_obj=T, covariance=covariance), batches[2:])[1]
+        runs[name] = follow(tracker, changed(state, T_cam_obj=T, covariance=covariance), batches[2:])[1]
     for number in (0, 2):
         assert torch.equal(poses_of(runs["with"], number), poses_of(runs["without"], number))
         for ours, theirs in zip(runs["with"], runs["without"], strict=True):
@@ -207,7 +208,7 @@ def test_without_enough_events_there_is_nothing_to_search_in(count, times, monke
     monkeypatch.setattr(f"{LOOP}._tried", lambda lost, calls: searched.append(lost.number) or lost.window)
     tracker, state, _, _, _ = started(config=TrackerConfig(search=SearchConfig(interval_us=0, new_share=0)))
     noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
-    after, result = tracker.step(replace(state, covariance=1e3 * state.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)
+    after, result = tracker.step(changed(state, covariance=1e3 * state.motion.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)
     assert len(searched) == times
     assert count > 0 or Status(int(result.status)) == Status.TOO_FEW_EVENTS
-    assert torch.isfinite(after.covariance).all()
+    assert torch.isfinite(after.motion.covariance).all()

@@ -1,10 +1,9 @@
 """When it is time to look for objects, and which of them the state alone says are lost, or are looked for all around."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from lost_states import moved_away, uncertain, unseen
+from states import changed
 from tracked_boxes import started
 
 from torchtrack.config.search import SearchConfig
@@ -39,7 +38,7 @@ def test_an_object_is_lost_once_nothing_is_known_of_it_and_it_was_not_seen_for_l
     assert is_lost(tracker, gone)
     assert not is_lost(tracker, unseen(gone, 0.05))
     assert not is_lost(tracker, unseen(state))
-    assert not is_lost(tracker, replace(gone, usual_score=torch.zeros(1)))
+    assert not is_lost(tracker, changed(gone, mean_score=torch.zeros(1)))
     assert not is_lost(tracker, gone, TrackerConfig(search=SearchConfig(anew_us=0)))
     # Without searches nothing would find it there.
     assert not is_lost(tracker, gone, TrackerConfig(search=SearchConfig(hypotheses=0)))
@@ -53,7 +52,7 @@ def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(m
     assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, away, state.t_us)
     assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, unseen(away, 0.05), due)
     # What is lost is expected there as it is.
-    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, replace(away, covariance=uncertain(away)), due)
+    assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, changed(away, covariance=uncertain(away)), due)
 
 
 @pytest.mark.parametrize(("score", "is_below"), [(0.6, True), (0.7, False)])
@@ -64,6 +63,6 @@ def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_
     assert is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due) == is_below
     assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, state.t_us)
     assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, unseen(low, 0.05), due)
-    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, replace(low, covariance=uncertain(low)), due)
+    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, changed(low, covariance=uncertain(low)), due)
     for never in ({"anew_below": 0}, {"anew_us": 0}, {"hypotheses": 0}):
         assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due, TrackerConfig(search=SearchConfig(**never)))

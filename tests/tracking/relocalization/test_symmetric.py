@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors, random_pose
+from states import changed
 from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, windows
 
 from torchtrack import Tracker
@@ -134,18 +135,18 @@ def runs_on(config, change, count=8):
     tracker = Tracker([box_model()], SMALL_CAMERA, config)
     trajectory, events = moving_box(pose(), count + 5)
     state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 5))
-    state = change(tracker, replace(state, full_share=state.usual_score))
+    state = change(tracker, changed(state, reference_explained_ratio=state.health.mean_score))
     _, results = follow(tracker, state, windows(events, count, 5 * WINDOW_US))
     return results, trajectory
 
 
 def mirrored_state(tracker, state):
     """The state of a box that follows the mirror image of its pose."""
-    prediction = Prediction(tracker.objects, state.T_cam_obj.float(), torch.ones(1, dtype=torch.bool), state.velocity, state.covariance)
+    prediction = Prediction(tracker.objects, state.T_cam_obj.float(), torch.ones(1, dtype=torch.bool), state.velocity, state.motion.covariance)
     point, normals = symmetry_planes(box_model())
     other = mirrored(prediction, point.float(), normals[0].float())
     assert float(rotation_angle_deg(other.T_cam_obj[:, :3, :3].double(), state.T_cam_obj[:, :3, :3])) > 20
-    return replace(state, T_cam_obj=other.T_cam_obj.double(), velocity=other.velocity, covariance=other.covariance)
+    return changed(state, T_cam_obj=other.T_cam_obj.double(), velocity=other.velocity, covariance=other.covariance)
 
 
 @pytest.mark.parametrize("mirrored_to", [0.0, 0.8])
@@ -180,12 +181,12 @@ def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(unseen_us):
 def test_where_an_object_was_last_seen_well_is_remembered_and_not_where_it_was_not():
     tracker, trajectory, events = Tracker([box_model()], SMALL_CAMERA), *moving_box(pose(), 8)
     state = tracker.init(pose()[None], 0)
-    assert torch.equal(state.T_last_seen, state.T_cam_obj)
+    assert torch.equal(state.health.T_last_validated, state.T_cam_obj)
     state, results = follow(tracker, state, windows(events, 8))
     assert int(results[-1].status) == Status.TRACKING
-    assert torch.equal(state.T_last_seen, state.T_cam_obj)
+    assert torch.equal(state.health.T_last_validated, state.T_cam_obj)
     later, results = follow(tracker, state, windows(events[:0], 2, 8 * WINDOW_US))
     assert int(results[-1].status) == Status.TOO_FEW_EVENTS
-    assert float(state.unseen_s) == 0 and float(later.unseen_s) == pytest.approx(0.01)
-    assert torch.equal(later.T_last_seen, state.T_last_seen) and not torch.equal(later.T_cam_obj, state.T_cam_obj)
-    assert trajectory.at(state.t_us).shape == state.T_last_seen.shape
+    assert float(state.health.time_since_validated_s) == 0 and float(later.unseen_s) == pytest.approx(0.01)
+    assert torch.equal(later.health.T_last_validated, state.health.T_last_validated) and not torch.equal(later.T_cam_obj, state.T_cam_obj)
+    assert trajectory.at(state.t_us).shape == state.health.T_last_validated.shape

@@ -6,11 +6,13 @@ from functools import cache
 import pytest
 import torch
 from helpers import pose
+from states import changed
 from tracked_boxes import assert_same, started, tracker_of
 
 from torchtrack.config.search import SearchConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import EventBatch
+from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.relocalization.tentative import after_probation
 from torchtrack.tracking.validation.status import Status
 
@@ -22,18 +24,18 @@ WIDE, TIGHT = 3.0, 1.0
 def two_boxes():
     """Two boxes that are explained by 0.8 when seen well: before a window, what was predicted, and after it."""
     tracker = tracker_of(2)
-    before = replace(tracker.init(pose().expand(2, 4, 4), t_us=0), full_share=torch.full((2,), FULL_SHARE))
+    before = changed(tracker.init(pose().expand(2, 4, 4), t_us=0), reference_explained_ratio=torch.full((2,), FULL_SHARE))
     after, result = tracker.step(before, EventBatch.empty(), 5_000)
     found = pose((0.1, -0.2, 0.4), (0.05, 0.02, 0.6)).expand(2, 4, 4)
-    after = replace(after, T_cam_obj=found, covariance=0.1 * after.covariance, velocity=torch.ones_like(after.velocity))
-    return before, tracker._predict(before, torch.full((2,), 5e-3)), after, replace(result, T_cam_obj=found)
+    after = changed(after, T_cam_obj=found, covariance=0.1 * after.motion.covariance, velocity=torch.ones_like(after.velocity))
+    return before, predicted_after(tracker, before, torch.full((2,), 5e-3)), after, replace(result, T_cam_obj=found)
 
 
 def window(before, shares, widening=TIGHT, status=Status.TRACKING, config=None):
     """One window in which the boxes are explained by ``shares``."""
     _, prediction, after, result = two_boxes()
     result = replace(result, quality=torch.tensor(shares), status=torch.full((2,), int(status)))
-    after = replace(after, probation=before.probation)
+    after = changed(after, tentative=before.tentative)
     return after_probation(before, after, result, prediction, torch.tensor([widening, TIGHT]), config or TrackerConfig())
 
 
@@ -45,27 +47,27 @@ def begun(share=FULL_SHARE):
 def test_a_find_of_an_uncertain_object_is_on_probation():
     _, prediction, after, _ = two_boxes()
     state, told = begun()
-    assert state.probation.runs.tolist() == [True, False]
-    torch.testing.assert_close(state.probation.T_cam_obj[0], prediction.T_cam_obj[0].double())
-    assert torch.equal(state.probation.covariance[0], prediction.covariance[0])
-    assert torch.equal(state.T_cam_obj, after.T_cam_obj) and torch.equal(state.covariance, after.covariance)
+    assert state.tentative.is_tentative.tolist() == [True, False]
+    torch.testing.assert_close(state.tentative.T_cam_obj[0], prediction.T_cam_obj[0].double())
+    assert torch.equal(state.tentative.covariance[0], prediction.covariance[0])
+    assert torch.equal(state.T_cam_obj, after.T_cam_obj) and torch.equal(state.motion.covariance, after.motion.covariance)
     assert told.status.tolist() == [Status.TRACKING] * 2
-    assert not two_boxes()[0].probation.runs.any()
+    assert not two_boxes()[0].tentative.is_tentative.any()
 
 
 def test_what_was_not_found_is_not_on_probation():
     state, _ = window(two_boxes()[0], [FULL_SHARE] * 2, WIDE, Status.LOST)
-    assert not state.probation.runs.any()
+    assert not state.tentative.is_tentative.any()
 
 
 @pytest.mark.parametrize(("share", "windows"), [(0.8, 8), (0.6, 8), (0.5, 13)])
 def test_a_find_that_explains_about_as_much_as_when_seen_well_is_kept(share, windows):
     state, _ = begun(share)
     for _ in range(windows - 2):
-        state, _ = window(replace(state, full_share=two_boxes()[0].full_share), [share, 0.0])
-        assert state.probation.runs[0]
-    state, result = window(replace(state, full_share=two_boxes()[0].full_share), [share, 0.0])
-    assert not state.probation.runs.any()
+        state, _ = window(changed(state, reference_explained_ratio=two_boxes()[0].health.reference_explained_ratio), [share, 0.0])
+        assert state.tentative.is_tentative[0]
+    state, result = window(changed(state, reference_explained_ratio=two_boxes()[0].health.reference_explained_ratio), [share, 0.0])
+    assert not state.tentative.is_tentative.any()
     assert torch.equal(state.T_cam_obj, two_boxes()[2].T_cam_obj)
     assert result.status.tolist() == [Status.TRACKING] * 2
 
@@ -75,11 +77,11 @@ def test_a_find_that_explains_too_little_is_taken_back_and_its_neighbour_stays(s
     before, prediction, after, _ = two_boxes()
     state, _ = begun(share)
     for _ in range(windows - 1):
-        assert state.probation.runs[0]
-        state, result = window(replace(state, full_share=before.full_share), [share, share])
-    assert not state.probation.runs.any()
+        assert state.tentative.is_tentative[0]
+        state, result = window(changed(state, reference_explained_ratio=before.health.reference_explained_ratio), [share, share])
+    assert not state.tentative.is_tentative.any()
     torch.testing.assert_close(state.T_cam_obj[0], prediction.T_cam_obj[0].double())
-    assert torch.equal(state.covariance[0], prediction.covariance[0])
+    assert torch.equal(state.motion.covariance[0], prediction.covariance[0])
     assert not state.velocity[0].any()
     assert result.status.tolist() == [Status.LOST, Status.TRACKING]
     for name in ("T_cam_obj", "covariance", "velocity"):
@@ -90,25 +92,27 @@ def test_a_find_that_explains_too_little_is_taken_back_and_its_neighbour_stays(s
 def test_what_became_of_one_find_says_nothing_of_the_next(share):
     state, _ = begun(share)
     for _ in range(8):
-        state, _ = window(replace(state, full_share=two_boxes()[0].full_share), [share, share])
-    assert not state.probation.runs.any()
-    again, _ = window(replace(state, full_share=two_boxes()[0].full_share), [FULL_SHARE] * 2, WIDE)
-    assert torch.equal(again.probation.evidence, begun()[0].probation.evidence)
-    assert again.probation.runs.tolist() == [True, False]
+        state, _ = window(changed(state, reference_explained_ratio=two_boxes()[0].health.reference_explained_ratio), [share, share])
+    assert not state.tentative.is_tentative.any()
+    again, _ = window(changed(state, reference_explained_ratio=two_boxes()[0].health.reference_explained_ratio), [FULL_SHARE] * 2, WIDE)
+    assert torch.equal(again.tentative.evidence, begun()[0].tentative.evidence)
+    assert again.tentative.is_tentative.tolist() == [True, False]
 
 
 def test_a_graver_status_stays():
     state, _ = begun(0.0)
     for _ in range(2):
-        state, result = window(replace(state, full_share=two_boxes()[0].full_share), [0.0, 0.0], status=Status.DIVERGED)
+        state, result = window(
+            changed(state, reference_explained_ratio=two_boxes()[0].health.reference_explained_ratio), [0.0, 0.0], status=Status.DIVERGED
+        )
     assert result.status.tolist() == [Status.DIVERGED] * 2
 
 
 def test_an_object_that_was_never_seen_well_keeps_what_is_found():
-    state, _ = window(replace(two_boxes()[0], full_share=torch.zeros(2)), [0.05, 0.05], WIDE)
+    state, _ = window(changed(two_boxes()[0], reference_explained_ratio=torch.zeros(2)), [0.05, 0.05], WIDE)
     for _ in range(7):
-        state, _ = window(replace(state, full_share=torch.zeros(2)), [0.05, 0.05])
-    assert not state.probation.runs.any()
+        state, _ = window(changed(state, reference_explained_ratio=torch.zeros(2)), [0.05, 0.05])
+    assert not state.tentative.is_tentative.any()
     assert torch.equal(state.T_cam_obj, two_boxes()[2].T_cam_obj)
 
 
@@ -117,7 +121,7 @@ def test_switched_off_and_where_nothing_is_uncertain_a_window_is_the_same():
     _, on, last, (events, end_us), _ = started()
     with_it, of_it = tracker_of().step(on, events, end_us)
     without, of_none = tracker_of(config=config).step(on, events, end_us)
-    assert not with_it.probation.runs.any()
+    assert not with_it.tentative.is_tentative.any()
     assert torch.equal(with_it.T_cam_obj, without.T_cam_obj)
     assert_same(of_it, of_none)
     assert int(last.status[0]) == Status.TRACKING

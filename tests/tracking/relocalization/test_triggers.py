@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors
 from lost_objects import SEEN_WELL, evidence
+from states import changed
 from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, windows
 
 from torchtrack import Tracker
@@ -247,8 +248,8 @@ def slipped(config, count=10, streams=1, displaced=0):
     moved = retract_about(state.T_cam_obj, SLIPPED.expand(streams, 6), tracker.centre_obj.double())
     T_cam_obj = torch.where(torch.arange(streams)[:, None, None] == displaced, moved, state.T_cam_obj)
     # As after a while of being seen well.
-    known = torch.full_like(state.full_share, 0.95)
-    state = replace(state, T_cam_obj=T_cam_obj, full_share=known, full_gathered=known)
+    known = torch.full_like(state.health.reference_explained_ratio, 0.95)
+    state = changed(state, T_cam_obj=T_cam_obj, reference_explained_ratio=known, reference_inlier_ratio=known)
     after, results = follow(tracker, state, batches[10:])
     return after, results, tracks[0][0].at(results[-1].t_us)
 
@@ -261,7 +262,7 @@ def test_a_pose_that_slipped_is_in_doubt_and_found_again():
     degrees, millimetres = pose_errors(results[-1].T_cam_obj, T_true)
     assert float(degrees) < 0.5
     assert float(millimetres) < 1.0
-    assert float(after.doubted_s) == 0
+    assert float(after.health.drift_s) == 0
     assert float(pose_errors(without[-1].T_cam_obj, T_true)[0]) > 5
     assert float(doubted.doubted_s) > 0.05
 
@@ -272,10 +273,10 @@ def test_a_pose_that_strayed_is_found_again_though_it_was_never_in_doubt():
     degrees, millimetres = pose_errors(results[-1].T_cam_obj, T_true)
     assert float(degrees) < 0.5
     assert float(millimetres) < 1.0
-    assert float(after.unseen_s) == 0
+    assert float(after.health.time_since_validated_s) == 0
     assert float(pose_errors(without[-1].T_cam_obj, T_true)[0]) > 5
-    assert float(lost.unseen_s) > 0.1
-    assert float(after.doubted_s) == float(lost.doubted_s) == 0
+    assert float(lost.health.time_since_validated_s) > 0.1
+    assert float(after.health.drift_s) == float(lost.health.drift_s) == 0
 
 
 @pytest.mark.parametrize(("config", "count"), [(SEARCHING, 10), (STRAYING, 20)])
@@ -290,15 +291,15 @@ def test_finding_one_that_slipped_changes_nothing_for_its_neighbour(config, coun
 def test_what_is_tracked_well_is_never_in_doubt():
     state, results, _ = slipped(SEARCHING, displaced=-1)
     assert [int(result.status) for result in results] == [Status.TRACKING] * len(results)
-    assert float(state.doubted_s) == 0
-    assert 0.5 < float(state.full_gathered) <= 1
+    assert float(state.health.drift_s) == 0
+    assert 0.5 < float(state.health.reference_inlier_ratio) <= 1
 
 
 def test_how_far_events_gather_can_be_left_out():
     """Then poses are compared by what they explain alone."""
     config = TrackerConfig(search=SearchConfig(by_gathering=False))
     state, results, _ = slipped(config, displaced=-1)
-    assert_same(state.score, results[-1].quality)
+    assert_same(state.health.score, results[-1].quality)
     assert float(slipped(config)[0].doubted_s) == 0
 
 

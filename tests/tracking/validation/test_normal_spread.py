@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from measured_matches import matches_at
+from states import changed
 from tracked_boxes import started
 
 from torchtrack.config.search import QualityConfig
@@ -98,18 +99,18 @@ def last_window(unseen_s, full_apart, *, all_directions=True, upright=False):
     if upright:
         events = of_upright_edges(events, result.contours)
     well = dict.fromkeys(("full_share", "usual_score", "score"), torch.full((1,), 0.9))
-    state = replace(state, unseen_s=torch.full((1,), unseen_s), full_apart=torch.full((1,), full_apart), **well)
+    state = changed(state, time_since_validated_s=torch.full((1,), unseen_s), reference_normal_spread=torch.full((1,), full_apart), **well)
     return tracker.step(state, events, end_us)
 
 
 def test_how_far_apart_is_remembered_of_what_is_seen_well():
     _, state, *_ = started()
-    assert 0.1 < float(state.full_apart) < 0.5
+    assert 0.1 < float(state.health.reference_normal_spread) < 0.5
     after, _ = last_window(0.0, 0.0)
-    assert float(after.unseen_s) == 0 and 0 < float(after.full_apart) < 0.1
+    assert float(after.health.time_since_validated_s) == 0 and 0 < float(after.health.reference_normal_spread) < 0.1
     partly, _ = last_window(0.0, 0.0, upright=True)
-    assert float(partly.unseen_s) > 0
-    assert float(partly.full_apart) == 0
+    assert float(partly.health.time_since_validated_s) > 0
+    assert float(partly.health.reference_normal_spread) == 0
 
 
 def test_a_pose_that_only_parallel_lines_hold_explains_nothing_while_the_object_may_be_hidden():

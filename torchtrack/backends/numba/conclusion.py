@@ -16,6 +16,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking import update
 from torchtrack.tracking.estimation.rounds import ANYWHERE
+from torchtrack.tracking.motion.model import MotionState
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.triggers import SMEARED
 from torchtrack.tracking.state import TrackerState
@@ -302,8 +303,10 @@ def judged_objects_numba(
         raise ValueError("a kernel needs the prediction's acceleration.")
     in_view = visible_share(found.fit.contours, objects.image_size)
     told = torch.stack([found.share, found.score, found.gathered, found.full_gathered, in_view, widening])
-    remembered = torch.stack([state.usual_score, state.full_share, state.full_gathered, state.full_count, state.doubted_s, state.unseen_s])
-    T_last_seen = state.T_last_seen.clone(memory_format=torch.contiguous_format)
+    health = state.health
+    references = health.reference_explained_ratio, health.reference_inlier_ratio, health.reference_matches
+    remembered = torch.stack([health.mean_score, *references, health.drift_s, health.time_since_validated_s])
+    T_last_seen = health.T_last_validated.clone(memory_format=torch.contiguous_format)
     T_cam_obj, covariance, left = (T_last_seen.new_empty(batch, size, size) for size in (4, 12, 6))
     (velocity, acceleration), status_of = dt_s.new_empty(2, batch, 6), found.count.new_empty(batch)
     conclude(
@@ -313,22 +316,18 @@ def judged_objects_numba(
         _settings(config),
         *as_arrays(remembered, T_last_seen, T_cam_obj, velocity, acceleration, covariance, left, status_of),
     )
-    usual_score, full_share, full_gathered, full_count, doubted_s, unseen_s = remembered.unbind()
-    after = replace(
-        state,
-        T_cam_obj=T_cam_obj,
-        velocity=velocity,
-        acceleration=acceleration,
-        covariance=covariance,
-        usual_score=usual_score,
-        full_share=full_share,
-        full_gathered=full_gathered,
-        full_count=full_count,
-        doubted_s=doubted_s,
-        T_last_seen=T_last_seen,
-        unseen_s=unseen_s,
+    mean_score, explained_ratio, inlier_ratio, matches, drift_s, time_since_validated_s = remembered.unbind()
+    health = replace(
+        health,
+        mean_score=mean_score,
+        reference_explained_ratio=explained_ratio,
+        reference_inlier_ratio=inlier_ratio,
+        reference_matches=matches,
+        drift_s=drift_s,
+        T_last_validated=T_last_seen,
+        time_since_validated_s=time_since_validated_s,
     )
-    return after, left, status_of
+    return MotionState(T_cam_obj, velocity, acceleration, covariance), health, left, status_of
 
 
 def _settings(config: TrackerConfig) -> ConclusionSettings:

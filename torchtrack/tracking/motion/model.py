@@ -40,6 +40,15 @@ class MotionState:
     acceleration: Float[Tensor, "b 6"]
     covariance: Float[Tensor, "b 12 12"]
 
+    def at_rest(self, chosen: Bool[Tensor, "b"], T_cam_obj: Float[Tensor, "b 4 4"], covariance: Float[Tensor, "b 12 12"]) -> "MotionState":
+        """The same with the ``chosen`` objects at rest at other poses, as uncertain as that."""
+        return MotionState(
+            T_cam_obj=torch.where(chosen[:, None, None], T_cam_obj, self.T_cam_obj),
+            velocity=torch.where(chosen[:, None], 0, self.velocity),
+            acceleration=torch.where(chosen[:, None], 0, self.acceleration),
+            covariance=torch.where(chosen[:, None, None], covariance, self.covariance),
+        )
+
 
 @dataclass(frozen=True)
 class Acceleration:

@@ -68,28 +68,21 @@ class LastSeen:
         Args:
             t_us: end of the window: it says which look it is.
         """
-        T_cam_obj = state.T_last_seen.to(objects.intrinsics.dtype)
+        T_cam_obj = state.health.T_last_validated.to(objects.intrinsics.dtype)
         look = (t_us // max(config.search.interval_us, 1) % _LOOKS)[objects.stream_index]
         share = (look + 1).double() / _LOOKS
         height, width = objects.image_size
-        across_px = (_SPEED_PX_S * state.unseen_s.double()).clamp(max=_DIAGONALS * (height**2 + width**2) ** 0.5)
+        across_px = (_SPEED_PX_S * state.health.time_since_validated_s.double()).clamp(max=_DIAGONALS * (height**2 + width**2) ** 0.5)
         across_m, depth_m = across_px / objects.px_per_m(T_cam_obj).double(), _DEPTH_SHARE * objects.depth_m(T_cam_obj).double()
         rotation_rad = torch.full_like(depth_m, _ROTATION_RAD)
         pose = share[:, None] * torch.stack([rotation_rad, rotation_rad, rotation_rad, across_m, across_m, depth_m], 1)
         diameter_m = objects.diameter_m.double()[:, None]
         rate = rim_and_centre(torch.full_like(diameter_m, config.motion.initial_speed_m_s), diameter_m)
-        return cls(state.T_last_seen, torch.diag_embed(torch.cat([pose, rate], 1).square()))
+        return cls(state.health.T_last_validated, torch.diag_embed(torch.cat([pose, rate], 1).square()))
 
     def in_place_of(self, state: TrackerState, lost: Bool[Tensor, "b"]) -> TrackerState:
         """The state with objects that are ``lost`` at rest where they were last seen well."""
-        chosen = lost[:, None, None]
-        return replace(
-            state,
-            T_cam_obj=torch.where(chosen, self.T_cam_obj, state.T_cam_obj),
-            velocity=torch.where(lost[:, None], 0, state.velocity),
-            acceleration=torch.where(lost[:, None], 0, state.acceleration),
-            covariance=torch.where(chosen, self.covariance, state.covariance),
-        )
+        return replace(state, motion=state.motion.at_rest(lost, self.T_cam_obj, self.covariance))
 
     def prediction(self, number: int, prediction: Prediction) -> Prediction:
         """The prediction of an object alone, at rest there."""

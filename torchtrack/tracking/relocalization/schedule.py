@@ -44,20 +44,20 @@ def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_
         return unseen.long()
     lost = unseen & _is_unknown(state, objects.diameter_m)
     due = unseen & is_drift_due & ~lost
-    now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.T_last_seen))
+    now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.health.T_last_validated))
     changed = due & (torch.maximum(now_m / then_m, then_m / now_m) > _DEPTH_FACTOR)
-    below = due & (state.score < config.search.anew_below * state.full_share)
+    below = due & (state.health.score < config.search.anew_below * state.health.reference_explained_ratio)
     bits = Trigger.LOST, Trigger.DEPTH_CHANGED, Trigger.FAR_BELOW_REFERENCE
     return (torch.stack([lost, changed, below]) * constant(tuple((int(bit),) for bit in bits), torch.int64, lost.device)).sum(0)
 
 
 def _is_unseen_for_long(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
     if not (config.search.anew_us and searches(config)):
-        return torch.zeros_like(state.unseen_s, dtype=torch.bool)
-    return (state.unseen_s >= 1e-6 * config.search.anew_us) & (state.usual_score > 0)
+        return torch.zeros_like(state.health.time_since_validated_s, dtype=torch.bool)
+    return (state.health.time_since_validated_s >= 1e-6 * config.search.anew_us) & (state.health.mean_score > 0)
 
 
 def _is_unknown(state: TrackerState, diameter_m: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
-    sigma = state.covariance.diagonal(dim1=-2, dim2=-1)[:, :6].sqrt()
+    sigma = state.motion.covariance.diagonal(dim1=-2, dim2=-1)[:, :6].sqrt()
     rotation_rad, move_m = sigma.unflatten(1, (2, 3)).amax(-1).unbind(1)
     return (rotation_rad > _NOTHING_KNOWN * MOST_UNCERTAIN) | (move_m > _NOTHING_KNOWN * MOST_UNCERTAIN * diameter_m)

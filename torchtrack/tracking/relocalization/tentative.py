@@ -14,7 +14,8 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.tracking.estimation.rounds import may_be_anywhere
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.state import Probation, StepResult, TrackerState
+from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.validation.health import TentativeTrack
 from torchtrack.tracking.validation.status import Status
 
 # A window speaks for a find by its share of what is wanted, as far as it is more than this.
@@ -33,37 +34,29 @@ def after_probation(
         state, result: after it.
         prediction: of the objects, with ``widening`` of their first gates.
     """
-    concerned = before.probation.runs | may_be_anywhere(widening)
+    concerned = before.tentative.is_tentative | may_be_anywhere(widening)
     if host_sync.none_of(concerned):
         return state, result
     probation = _begun(before, result, prediction, widening)
-    wanted = config.quality.certain_at * before.full_share
+    wanted = config.quality.certain_at * before.health.reference_explained_ratio
     speaks_for = (result.quality / wanted.clamp(min=1e-3)).clamp(max=1) - _NEUTRAL
     evidence = probation.evidence + speaks_for
-    wrong = probation.runs & (evidence <= _TAKEN_BACK_AT)
-    runs = probation.runs & ~wrong & (evidence < _KEPT_AT)
+    wrong = probation.is_tentative & (evidence <= _TAKEN_BACK_AT)
+    runs = probation.is_tentative & ~wrong & (evidence < _KEPT_AT)
     # The next find of the object begins without any.
-    probation = replace(probation, runs=runs, evidence=torch.where(runs, evidence, 0))
-    back = wrong[:, None, None]
-    state = replace(
-        state,
-        T_cam_obj=torch.where(back, probation.T_cam_obj, state.T_cam_obj),
-        velocity=torch.where(wrong[:, None], 0, state.velocity),
-        acceleration=torch.where(wrong[:, None], 0, state.acceleration),
-        covariance=torch.where(back, probation.covariance, state.covariance),
-        probation=probation,
-    )
+    probation = replace(probation, is_tentative=runs, evidence=torch.where(runs, evidence, 0))
+    state = replace(state, motion=state.motion.at_rest(wrong, probation.T_cam_obj, probation.covariance), tentative=probation)
     lost = torch.where(wrong & (result.status < int(Status.LOST)), int(Status.LOST), result.status)
     return state, replace(result, status=lost)
 
 
-def _begun(before: TrackerState, result: StepResult, prediction: Prediction, widening: Float[Tensor, "b"]) -> Probation:
+def _begun(before: TrackerState, result: StepResult, prediction: Prediction, widening: Float[Tensor, "b"]) -> TentativeTrack:
     """The probation with those objects that were found in this window although hardly anything was known of them."""
-    old = before.probation
-    begins = ~old.runs & may_be_anywhere(widening) & (result.status < int(Status.LOST))
+    old = before.tentative
+    begins = ~old.is_tentative & may_be_anywhere(widening) & (result.status < int(Status.LOST))
     first = begins[:, None, None]
-    return Probation(
-        runs=old.runs | begins,
+    return TentativeTrack(
+        is_tentative=old.is_tentative | begins,
         evidence=old.evidence,
         T_cam_obj=torch.where(first, prediction.T_cam_obj.to(old.T_cam_obj.dtype), old.T_cam_obj),
         covariance=torch.where(first, prediction.covariance, old.covariance),

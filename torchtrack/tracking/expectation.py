@@ -1,0 +1,90 @@
+"""Stage 1 of a window: where the objects are expected at its end, and which events can have to do with them."""
+
+from dataclasses import dataclass, replace
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack.core import host_sync
+from torchtrack.core.events import EventBatch, pad_streams
+from torchtrack.tracking.adapt import objects_as_known
+from torchtrack.tracking.frontend.sensors import farthest_event_px
+from torchtrack.tracking.frontend.tiles import NearbyEvents
+from torchtrack.tracking.initialization import held_back
+from torchtrack.tracking.motion.predict import forecast
+from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.objects import TrackedObjects
+from torchtrack.tracking.relocalization.evidence import Schedule
+from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere
+from torchtrack.tracking.relocalization.schedule import schedule
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, Trigger, has
+from torchtrack.tracking.state import TrackerState
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Where objects are expected at a window's end.
+
+    Args:
+        prediction: with gradients, where they are recorded.
+        window_s: length of the window, of each stream (s).
+        dt_s: the same, of each object.
+        scheduled: what relocalization has to do with the window, as far as the state says.
+    """
+
+    prediction: Prediction
+    window_s: Float[Tensor, "s"]
+    dt_s: Float[Tensor, "b"]
+    scheduled: Schedule
+
+
+def expect(tracked: TrackedObjects, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], reads: host_sync.HostReads) -> Expected:
+    """Where objects are expected at a window's end: objects that are lost for long, where they were last seen well.
+
+    Args:
+        events: of the window that ends at ``t_us``.
+        reads: asks for what has to be decided.
+    """
+    window_s = _seconds_after(tracked, state, t_us)
+    dt_s = window_s[tracked.stream_index]
+    scheduled = schedule(state, tracked.objects, t_us, tracked.config)
+    lost = has(scheduled.triggers, Trigger.LOST)
+    # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.
+    never_found = ~(state.health.mean_score > 0)
+    if tracked.config.motion.speed_from_events and not reads.none_of(never_found):
+        state = held_back(state, never_found, tracked.objects, tracked.sensors.seen(pad_streams(events, tracked.streams, t_us)), dt_s)
+    if not reads.none_of(lost):
+        state = LastSeen.of(state, tracked.objects, t_us, tracked.config).in_place_of(state, lost)
+    return Expected(predicted_after(tracked, state, dt_s), window_s, dt_s, scheduled)
+
+
+def predicted_after(tracked: TrackedObjects, state: TrackerState, dt_s: Float[Tensor, "b"]) -> Prediction:
+    """Predicted pose and motion of each object after a time, and how certain they are."""
+    config = tracked.config
+    objects = objects_as_known(tracked.objects, state, tracked.on_surfaces is not None, config)
+    axes_obj = tracked.revolution_axes if tracked.revolves and config.motion.spin_fades else None
+    return forecast(state.motion, dt_s, objects, axes_obj, tracked.far_pose, config)
+
+
+def near_objects(tracked: TrackedObjects, expected: Expected, events: NearbyEvents) -> NearbyEvents:
+    """Those of the events that can have to do with the objects: any, for objects that are looked for anywhere.
+
+    A weighting network of one's own is shown all.
+    """
+    if tracked.shows_all:
+        return events
+    prediction, anew = expected.prediction.detached(), has(expected.scheduled.triggers, AROUND_LAST_SEEN)
+    if not host_sync.none_of(anew):
+        prediction = replace(prediction, covariance=anywhere(prediction.covariance, anew))
+    return tracked.sensors.near_objects(events, prediction, expected.dt_s, tracked.config)
+
+
+def near_tiles(tracked: TrackedObjects, state: TrackerState, t_us: Int[Tensor, "s"]) -> Bool[Tensor, "b t"] | None:
+    """Tiles of the one sensor with events of the window after ``state`` that can have to do with each object; none of several sensors."""
+    dt_s = _seconds_after(tracked, state, t_us)[tracked.stream_index]
+    return None if tracked.tiles is None else tracked.tiles.near(predicted_after(tracked, state, dt_s), dt_s, farthest_event_px(tracked.config))
+
+
+def _seconds_after(tracked: TrackedObjects, state: TrackerState, t_us: Int[Tensor, "s"]) -> Float[Tensor, "s"]:
+    """Length of the window after ``state`` that ends at ``t_us``, of each stream (s)."""
+    return (t_us - state.t_us).to(tracked.intrinsics.dtype) * 1e-6

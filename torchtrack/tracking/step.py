@@ -1,0 +1,178 @@
+"""One window of a tracker, from its events to poses: :func:`advance` calls the six stages in their order, and each is a function below."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack.core import host_sync
+from torchtrack.core.events import EventBatch
+from torchtrack.tracking.adapt import Lesson, learned_after, with_late_share
+from torchtrack.tracking.adaptation.pixel_latency import dated
+from torchtrack.tracking.association.observations import Observations, corner_observations, join, select_events
+from torchtrack.tracking.association.weighting_features import Evidence, judged
+from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.estimation.rounds import Fit, align, gate_widening, index_for, index_radius, usual_index_radius
+from torchtrack.tracking.expectation import Expected, expect, near_objects
+from torchtrack.tracking.frontend.corners import Corners
+from torchtrack.tracking.frontend.tiles import NearbyEvents
+from torchtrack.tracking.frontend.time_surface import update_last_event
+from torchtrack.tracking.frontend.window_events import ObjectEvents
+from torchtrack.tracking.initialization import of_unknown_motion
+from torchtrack.tracking.objects import TrackedObjects
+from torchtrack.tracking.relocalization.evidence import gather_evidence
+from torchtrack.tracking.relocalization.last_seen import LastSeen
+from torchtrack.tracking.relocalization.lost_object import OtherPoses, Relocalized
+from torchtrack.tracking.relocalization.relocalize import relocalize
+from torchtrack.tracking.relocalization.tentative import after_probation
+from torchtrack.tracking.relocalization.triggers import SEARCHED, has, may_have_rotated, reference_where_known, triggers
+from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.update import conclude
+from torchtrack.tracking.validation.measures import asked_apart
+from torchtrack.tracking.validation.scored_fit import Found, explained_at_rest, judge_fit
+
+_READS = host_sync.HostReads()
+
+
+@dataclass(frozen=True)
+class StepInput:
+    """What a step is given beside the state.
+
+    Args:
+        events: of the window, as far as they can have to do with the objects.
+        t_us: end of the window, of each stream.
+        is_starting: objects whose motion is not known yet; none where not given.
+        reads: asks for what has to be decided.
+        learns: whether anything may be learned from the window.
+    """
+
+    events: NearbyEvents
+    t_us: Int[Tensor, "s"]
+    is_starting: Bool[Tensor, "b"] | None = None
+    reads: host_sync.HostReads = _READS
+    learns: bool = True
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What a window shows of the objects.
+
+    Args:
+        events: as each object sees them.
+        burst_age_us: the sensors' map of bursts after the window.
+        contours: visible where the objects are expected, and ``index`` of them.
+        sigma_px: standard deviation of each object's prediction in the image.
+        gate_scale: how many times wider than configured the first gate of each object is.
+        corners: corners and their flow, where the settings ask for any.
+        observations: what is matched with the contours, each with how far it is to be believed.
+    """
+
+    events: ObjectEvents
+    burst_age_us: Int[Tensor, "s 2 h w"]
+    contours: Contours
+    index: ContourIndex
+    sigma_px: Float[Tensor, "b"]
+    gate_scale: Float[Tensor, "b"]
+    corners: Corners
+    observations: Observations
+
+
+def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> tuple[TrackerState, StepResult]:
+    """A window from its events to poses.
+
+    Args:
+        tracked: the objects, cameras and settings.
+        state: from :func:`opened`.
+        given: the window.
+    """
+    expected = expect(tracked, state, given.events.events, given.t_us, given.reads)
+    seen = observe(tracked, state, expected, given)
+    as_late = dated(seen.observations, state.appearance.late_share, state.health.time_since_validated_s, tracked.config.matching)
+    fit = align(expected.prediction, seen.contours, seen.index, seen.gate_scale, as_late, tracked.config)
+    scored = validate(tracked, state, expected, seen, fit)
+    located = relocalized(tracked, state, expected, seen, scored, given)
+    return update(tracked, state, (expected, seen, fit, located), given)
+
+
+def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, given: StepInput) -> Observed:
+    """Stage 2: events, corners and flow near the objects, and the contours that they are matched with."""
+    config, sensors, maps, t_us = tracked.config, tracked.sensors, state.maps, given.t_us
+    prediction, nearby = expected.prediction.detached(), near_objects(tracked, expected, given.events)
+    events, burst_age_us = sensors.window_events(nearby, maps.burst_age_us, t_us, t_us - state.t_us, config.matching.burst_us)
+    contours = prediction.contours(expected.dt_s, config.contours)
+    sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(tracked.diameter_m)
+    gate_scale = gate_widening(sigma_px, config)
+    # Asked for here: a GPU answers while corners are looked for.
+    radius_px = given.reads.ask(index_radius(gate_scale, config), usual_index_radius(config))
+    corners = sensors.corners(contours, maps.last_event_us, t_us, expected.window_s, config)
+    index = index_for(contours, tracked.image_size, config, gate_scale, radius_px)
+    observations, most = corner_observations(corners), config.matching.max_events
+    if most:
+        observations = join(observations, select_events(events, index, prediction.moving(compensated=True), most))
+    if tracked.weigher is not None:
+        history = sensors.history(maps.last_event_us, t_us)
+        observations = judged(Evidence(observations, events, prediction, contours, index, history), tracked.weigher)
+    return Observed(events, burst_age_us, contours, index, sigma_px, gate_scale, corners, observations)
+
+
+def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, fit: Fit) -> Found:
+    """Stage 4, after the alignment: what each pose explains of its contours, and of the events around them."""
+    config, health = tracked.config, state.health
+    reference = reference_where_known(seen.sigma_px, health.reference_inlier_ratio, config.search)
+    spread = asked_apart(health.reference_normal_spread, health.time_since_validated_s, config.quality)
+    scored = judge_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference, spread)
+    if tracked.turns:
+        return replace(scored, turn_unclear=may_have_rotated(tracked.has_turning_axis, health.time_since_validated_s, config.search))
+    return scored
+
+
+def relocalized(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, scored: Found, given: StepInput) -> Relocalized:
+    """Stage 5: other poses for the objects that have a trigger, and for no others."""
+    config = tracked.config
+    is_starting = torch.zeros_like(tracked.stream_index, dtype=torch.bool) if given.is_starting is None else given.is_starting
+    evidence = gather_evidence(state, expected.scheduled, scored, seen.sigma_px, is_starting, tracked.ambiguities)
+    flags, window = triggers(evidence, config), Relocalized(scored, expected.prediction, seen.gate_scale)
+    # A GPU is waited for: a pose that begins to slip is farther off a window later.
+    if not given.reads.ask(has(flags, SEARCHED), False).any():
+        return window
+    others = OtherPoses(LastSeen.of(state, tracked.objects, given.t_us, config), tracked.ambiguities)
+    return relocalize(window, flags, evidence, seen.events, others, config)
+
+
+def update(
+    tracked: TrackedObjects, state: TrackerState, made: tuple[Expected, Observed, Fit, Relocalized], given: StepInput
+) -> tuple[TrackerState, StepResult]:
+    """Stage 6: the filter's update, statuses, and what is learned.
+
+    Args:
+        made: what the stages before made.
+    """
+    (expected, seen, fit, located), config = made, tracked.config
+    scored, prediction = located.scored, located.prediction.detached()
+    next_state, result = conclude(state, located.prediction, located.gate_scale, scored, seen.corners, expected.dt_s, config)
+    if config.search.probation:
+        next_state, result = after_probation(state, next_state, result, prediction, located.gate_scale, config)
+    lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, given.learns)
+    next_state = learned_after(next_state, result, prediction, scored, lesson, config)
+    sure = ~scored.elsewhere
+    next_state = with_late_share(next_state, result, (seen.observations, seen.contours, fit.matches, prediction, sure), given.t_us, config)
+    maps = replace(next_state.maps, burst_age_us=seen.burst_age_us)
+    return replace(next_state, t_us=given.t_us, maps=maps), replace(result, t_us=given.t_us)
+
+
+def opened(tracked: TrackedObjects, state: TrackerState, events: EventBatch) -> TrackerState:
+    """The state with the newest events of a window in its map, where they are remembered."""
+    if not tracked.looks_back:
+        return state
+    return replace(state, maps=replace(state.maps, last_event_us=update_last_event(state.maps.last_event_us, events)))
+
+
+def steady_advance(
+    tracked: TrackedObjects, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"], *, learns: bool = False
+) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
+    """:func:`advance` with nothing to decide; and whether anything was, or the window may be called for in parts."""
+    steady = host_sync.SteadyState()
+    steady.ask(of_unknown_motion(state, t_us, tracked.objects, tracked.config), False)
+    return *advance(tracked, state, StepInput(events, t_us, reads=steady, learns=learns)), steady.wrong()

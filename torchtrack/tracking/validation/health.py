@@ -1,0 +1,74 @@
+"""How well each object was seen so far, and what is not confirmed yet."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class TrackHealth:
+    """How well each object is seen, against how well it was when its pose was right.
+
+    References are running means that rise as fast as what they follow, but fall slowly.
+
+    Args:
+        score: of the last window, :attr:`torchtrack.tracking.validation.scored_fit.Found.score`.
+        mean_score: its running mean; zero of an object that was never found.
+        reference_explained_ratio: of the moving contour, what events explain when the object is seen well.
+        reference_inlier_ratio: of the events near its contours, how many are on them then.
+        reference_matches: matched observations then.
+        reference_normal_spread: how far apart the directions of contours with events on them are then
+            (:func:`torchtrack.tracking.validation.measures.directions_apart`).
+        drift_s: for how long, less the time it was not, the object has been in doubt of being elsewhere (s).
+        T_last_validated: pose of each object when it was last seen well (float64).
+        time_since_validated_s: how long ago that was (s).
+    """
+
+    score: Float[Tensor, "b"]
+    mean_score: Float[Tensor, "b"]
+    reference_explained_ratio: Float[Tensor, "b"]
+    reference_inlier_ratio: Float[Tensor, "b"]
+    reference_matches: Float[Tensor, "b"]
+    reference_normal_spread: Float[Tensor, "b"]
+    drift_s: Float[Tensor, "b"]
+    T_last_validated: Float[Tensor, "b 4 4"]
+    time_since_validated_s: Float[Tensor, "b"]
+
+    @classmethod
+    def unknown(cls, T_cam_obj: Float[Tensor, "b 4 4"], dtype: torch.dtype) -> "TrackHealth":
+        """Of objects that no window has been seen of yet, at these poses."""
+        zero = torch.zeros(len(T_cam_obj), dtype=dtype, device=T_cam_obj.device)
+        return cls(
+            score=zero,
+            mean_score=zero,
+            reference_explained_ratio=zero,
+            reference_inlier_ratio=zero,
+            reference_matches=zero,
+            reference_normal_spread=zero,
+            drift_s=zero,
+            T_last_validated=T_cam_obj.clone(),
+            time_since_validated_s=zero,
+        )
+
+
+@dataclass(frozen=True)
+class TentativeTrack:
+    """Where to look for objects again, should the pose that they were found in turn out to be wrong.
+
+    Args:
+        is_tentative: objects whose new pose is not confirmed yet.
+        evidence: for it, in windows.
+        T_cam_obj, covariance: of the object before it was found.
+    """
+
+    is_tentative: Bool[Tensor, "b"]
+    evidence: Float[Tensor, "b"]
+    T_cam_obj: Float[Tensor, "b 4 4"]
+    covariance: Float[Tensor, "b 12 12"]
+
+    @classmethod
+    def none(cls, T_cam_obj: Float[Tensor, "b 4 4"], covariance: Float[Tensor, "b 12 12"]) -> "TentativeTrack":
+        """All confirmed."""
+        return cls(torch.zeros_like(T_cam_obj[:, 0, 0], dtype=torch.bool), torch.zeros_like(T_cam_obj[:, 0, 0]), T_cam_obj, covariance)
