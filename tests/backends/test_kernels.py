@@ -11,8 +11,8 @@ from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator,
 from predicted_boxes import boxes
 from solid_models import ball, l_prism
 
-from torchtrack.config.search import QualityConfig
 from torchtrack.config.tracker import ContourConfig
+from torchtrack.config.validation import ValidationConfig
 from torchtrack.core.camera import undistortion_table
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
 from torchtrack.core.image_velocity import MovingObjects
@@ -240,7 +240,7 @@ def random_matches(batch=3, count=900):
 @pytest.mark.parametrize("settings", [{}, {"min_on_contour": 1, "min_speed_px_s": 100.0}, {"min_observations": 5000}])
 def test_what_events_explain(speed, settings):
     contours, objects = random_contours(), moving_objects((speed, 0.5 * speed), 3)
-    by_kernels, plain = both_ways(lambda: shares(contours, random_matches(), objects, IMAGE_SIZE, QualityConfig(**settings)))
+    by_kernels, plain = both_ways(lambda: shares(contours, random_matches(), objects, IMAGE_SIZE, ValidationConfig(**settings)))
     assert_as_close(by_kernels, plain, tolerance=1e-6)
 
 
@@ -261,7 +261,7 @@ def test_what_is_not_a_number_stays_with_its_object(what):
     (spoilt.points_cam if what == "points" else spoilt.pixels)[1] = torch.nan
     objects = MovingObjects(torch.eye(4).double().expand(3, 4, 4), random_twist(3), torch.ones(3, 3).double(), torch.ones(3, 4).double())
     with torch.inference_mode():
-        alone, beside = (shares(of, random_matches(), objects, IMAGE_SIZE, QualityConfig()) for of in (contours, spoilt))
+        alone, beside = (shares(of, random_matches(), objects, IMAGE_SIZE, ValidationConfig()) for of in (contours, spoilt))
         index, other = (index_contours(of, IMAGE_SIZE, 7, 2) for of in (contours, spoilt))
     for first, second in zip(alone, beside, strict=True):
         assert torch.equal(first[[0, 2]], second[[0, 2]])

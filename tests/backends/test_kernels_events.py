@@ -37,7 +37,7 @@ def window_of(objects: int, count: int, window_us: int, camera: Camera = SMALL_C
 
     def seen():
         nearby = sensors.near_objects(NearbyEvents(events), prediction, dt_s, tracker.config)
-        return sensors.window_events(nearby, ages, t_us, t_us, tracker.config.matching.burst_us)
+        return sensors.window_events(nearby, ages, t_us, t_us, tracker.config.association.burst_us)
 
     return tracker, events, prediction, seen
 

@@ -167,10 +167,10 @@ def conclusions(config, dtype, spoil=lambda found: None):
 CONCLUDED = {
     "as it is": {},
     "hold": {"motion": {"without_events": "hold"}},
-    "nothing asked": {"quality": {"lost_below": 0.0, "uncertain_below": 0.0, "min_observations": 6, "max_step_rotation_rad": 9.0}},
-    "much asked": {"quality": {"min_observations": 450, "max_step_translation": 0.3, "certain_at": 1.0}},
-    "no sides": {"matching": {"polarity_memory_s": 0.0}},
-    "doubted": {"search": {"doubted_below": 1.0}},
+    "nothing asked": {"validation": {"lost_below": 0.0, "uncertain_below": 0.0, "min_observations": 6, "max_step_rotation_rad": 9.0}},
+    "much asked": {"validation": {"min_observations": 450, "max_step_translation": 0.3, "validated_from": 1.0}},
+    "no sides": {"association": {"polarity_prior_s": 0.0}},
+    "doubted": {"relocalization": {"drift_below": 1.0}},
 }
 
 
@@ -189,7 +189,7 @@ def test_conclusions_of_what_may_be_partly_hidden(partly_hidden, holds_on, dtype
         found.full_gathered[:] = torch.linspace(0.4, 0.9, OBJECTS)
         found.gathered[:] = found.full_gathered * torch.tensor([1.0, 0.95, 0.9, 0.85, 1.0, 1.1, torch.nan])
 
-    config = TrackerConfig.model_validate({"quality": {"partly_hidden": partly_hidden, "holds_on": holds_on}})
+    config = TrackerConfig.model_validate({"validation": {"partly_hidden": partly_hidden, "holds_on": holds_on}})
     (state, result), (other_state, other_result) = both_ways(conclusions(config, dtype, spoil))
     assert_as_close((state, result), (other_state, other_result), tolerance=CONCLUDED_TO[dtype])
     # Looked for in many places, it would be lost.

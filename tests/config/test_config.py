@@ -95,7 +95,7 @@ def test_preset_is_weaker_than_file_and_file_weaker_than_command_line(tmp_path):
     paper = preset("paper")
     assert tracker.window.duration_us == 7000
     assert tracker.flow.iterations == 11
-    assert tracker.matching == paper.matching != preset("default").matching
+    assert tracker.association == paper.association != preset("default").association
 
 
 def test_paths_are_relative_to_the_file_or_the_working_folder(tmp_path, monkeypatch):
@@ -152,7 +152,7 @@ def test_a_pose_is_given_in_exactly_one_way(values, expected):
         ({"camera": {"fx": 100, "fy": 100}}, "cx, cy, width, height missing"),
         ({"camera": {"calibration": "calib.txt", "fx": 100}}, "not both"),
         ({"device": "gpu"}, "device"),
-        ({"tracker": {"matching": {"max_events": 0}}}, "nothing would be observed: .* set matching.max_events"),
+        ({"tracker": {"association": {"max_events": 0}}}, "nothing would be observed: .* set matching.max_events"),
     ],
 )
 def test_settings_that_contradict_themselves(values, expected):

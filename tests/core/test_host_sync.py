@@ -9,7 +9,7 @@ from states import changed
 from tracked_boxes import SCENES, assert_same, follow, started
 
 from torchtrack import Tracker
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig, WindowConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
@@ -21,7 +21,7 @@ from torchtrack.tracking.frontend.time_surface import empty_last_event, object_r
 
 COUNT = 6
 # In their first windows boxes are searched for as new ones, once in a while: not in all windows.
-STEADY = TrackerConfig(search=SearchConfig(new_share=0))
+STEADY = TrackerConfig(relocalization=RelocalizationConfig(new_below=0))
 
 
 @pytest.fixture
@@ -176,7 +176,7 @@ def test_of_a_larger_object_the_middle_is_taken(nothing_is_read):
     [
         TrackerConfig(),
         TrackerConfig(window=WindowConfig(parts=2, max_unknown_px=0.01)),
-        TrackerConfig(search=SearchConfig(from_sigma_px=1e-3, hypotheses=4, drawn=50)),
+        TrackerConfig(relocalization=RelocalizationConfig(from_sigma_px=1e-3, hypotheses=4, samples=50)),
     ],
     ids=["default", "in parts", "searched"],
 )

@@ -135,12 +135,12 @@ def test_a_start_is_in_haste_and_haste_ends_a_while_after_the_last_joined_window
 def test_in_haste_no_other_poses_are_tried_and_few_to_find_what_is_lost():
     usual = TrackerConfig()
     none, few = (in_haste(usual, searches=searches) for searches in (False, True))
-    assert none.search.hypotheses == 0
-    assert 0 < few.search.hypotheses < usual.search.hypotheses
-    assert few.search.drawn < usual.search.drawn
-    assert not few.search.at_start
+    assert none.relocalization.hypotheses == 0
+    assert 0 < few.relocalization.hypotheses < usual.relocalization.hypotheses
+    assert few.relocalization.samples < usual.relocalization.samples
+    assert not few.relocalization.at_start
     assert none.window.parts == few.window.parts == 1
-    assert none.matching == few.matching == usual.matching
+    assert none.association == few.association == usual.association
 
 
 def test_what_is_lost_is_searched_for_once_in_a_while():
@@ -151,7 +151,7 @@ def test_what_is_lost_is_searched_for_once_in_a_while():
     lost = replace(result, status=torch.full_like(result.status, int(Status.LOST)))
 
     def hypotheses(end_us: int, before) -> int:
-        return pace.tracker([HastyWindow(EventBatch.empty(), end_us - WINDOW_US, end_us)], before).config.search.hypotheses
+        return pace.tracker([HastyWindow(EventBatch.empty(), end_us - WINDOW_US, end_us)], before).config.relocalization.hypotheses
 
     assert pace.tracker([EventWindow(EventBatch.empty(), 0, WINDOW_US)], lost) is tracker
     assert hypotheses(WINDOW_US, None) == hypotheses(2 * WINDOW_US, seen) == 0

@@ -303,7 +303,7 @@ def test_two_million_events_over_tcp_are_tracked_without_loss(tmp_path, sender):
     count = 2_000_000
     port = sender(count, 5_000_000)
     # Noise has no pose: a search for one would take nearly all of the time.
-    settings = {"end_us": count // 5, "events": {"live_windows": 1000}, "tracker": {"search": {"hypotheses": 0}}}
+    settings = {"end_us": count // 5, "events": {"live_windows": 1000}, "tracker": {"relocalization": {"hypotheses": 0}}}
     summary = run(RunConfig.model_validate(live_config(tmp_path, f"dv://127.0.0.1:{port}", **settings)))
     assert summary.dropped_windows == 0
     assert summary.events + summary.dropped_events == count

@@ -9,17 +9,17 @@ from host_reads import host_reads
 from tracked_boxes import SCENES, follow
 
 from torchtrack import Tracker
-from torchtrack.config.search import SearchConfig
-from torchtrack.config.tracker import LearningConfig, TrackerConfig
+from torchtrack.config.relocalization import RelocalizationConfig
+from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.tracking.graphs import CompiledStep
 from torchtrack.tracking.validation.status import Status
 
 COUNT = 8
 # All objects are searched for in all windows.
-SEARCHED = TrackerConfig(search=SearchConfig(from_sigma_px=1e-3, hypotheses=4, drawn=50))
+SEARCHED = TrackerConfig(relocalization=RelocalizationConfig(from_sigma_px=1e-3, hypotheses=4, samples=50))
 # What is new is not looked for elsewhere, and nothing is learned: windows are steady.
-ONE_POSE = TrackerConfig(search=SearchConfig(new_share=0), learning=LearningConfig(points=0))
+ONE_POSE = TrackerConfig(relocalization=RelocalizationConfig(new_below=0), adaptation=AdaptationConfig(points=0))
 
 
 @pytest.fixture

@@ -12,11 +12,11 @@ from helpers import SMALL_CAMERA, box_model, pose
 from tracked_boxes import follow, moving_box, windows
 
 from torchtrack import Tracker
-from torchtrack.config.tracker import CornerConfig, LearningConfig, MatchingConfig, TrackerConfig
+from torchtrack.config.tracker import AdaptationConfig, AssociationConfig, CornerConfig, TrackerConfig
 from torchtrack.tracking import graphs
 
 # What is compiled for each round of matching is the same: two are enough to see that they follow one another.
-SMALL = TrackerConfig(learning=LearningConfig(points=0), corners=CornerConfig(max_corners=0), matching=MatchingConfig(gates_px=(5.0, 1.5)))
+SMALL = TrackerConfig(adaptation=AdaptationConfig(points=0), corners=CornerConfig(max_corners=0), association=AssociationConfig(gates_px=(5.0, 1.5)))
 
 
 class Counting(graphs.CompiledStep):

@@ -3,14 +3,14 @@
 import torch
 from helpers import IMAGE_SIZE, moving_objects
 
-from torchtrack.config.tracker import MatchingConfig
+from torchtrack.config.tracker import AssociationConfig
 from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.contours.index import index_contours
 
 
 def matching(**settings):
     """Settings without what corrects and weights the matches, unless it is asked for."""
-    return MatchingConfig(**{"dark_shift_px": 0.0, "limb_dark_shift_px": 0.0, "concentration": False, "polarity": False, **settings})
+    return AssociationConfig(**{"dark_shift_px": 0.0, "silhouette_dark_shift_px": 0.0, "concentration": False, "polarity": False, **settings})
 
 
 def nearest(observations, contours, *, velocity=(0.0, 0.0), believed=None, gate_px=3.0, index=None, cell_px=1, **settings):

@@ -16,7 +16,7 @@ WINDOW_S = 0.01
 FASTER = torch.tensor([0.6, -0.4, 0.8, 0.1, -0.08, 0.06], dtype=torch.float64)
 
 
-def windowed(T_true, *, count=300, faster=FASTER, swelling_px=0.0, noise_px=0.0, prior=1e-6, age_s=None, seed=0, dtype=torch.float64):
+def windowed(T_true, *, count=300, faster=FASTER, silhouette_offset_px=0.0, noise_px=0.0, prior=1e-6, age_s=None, seed=0, dtype=torch.float64):
     """A body that moves by ``faster`` more than predicted, seen at random times of a window; every other point is a limb's."""
     rng = generator(seed)
     batch = len(T_true)
@@ -31,7 +31,9 @@ def windowed(T_true, *, count=300, faster=FASTER, swelling_px=0.0, noise_px=0.0,
     T_then = retract_about(T_true[:, None].expand(batch, count, 4, 4), -ages[..., None] * faster, centre[:, None].expand(batch, count, 3))
     then = transform_points(T_then.flatten(0, 1), points.flatten(0, 1)[:, None])
     targets = project(then, intrinsics.repeat_interleave(count, 0))[:, 0].unflatten(0, (batch, count))
-    targets = targets + swelling_px * outward[..., None] * directions + noise_px * torch.randn(targets.shape, generator=rng, dtype=torch.float64)
+    targets = (
+        targets + silhouette_offset_px * outward[..., None] * directions + noise_px * torch.randn(targets.shape, generator=rng, dtype=torch.float64)
+    )
     problem = PoseProblem(
         points_obj=points.to(dtype),
         targets=targets.to(dtype),

@@ -10,7 +10,7 @@ from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import follow, moving_box, windows
 
 from torchtrack import Tracker
-from torchtrack.config.tracker import LearningConfig, TrackerConfig
+from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.events import concatenate
 from torchtrack.tracking import cuda_graphs, graphs
@@ -19,7 +19,7 @@ from torchtrack.tracking.state import each_tensor
 
 COUNT = 12
 # Windows that something is learned from are taken without a graph: every third.
-LEARNING = TrackerConfig(learning=LearningConfig(first_windows=0, every=3, up_to_share=1.0))
+LEARNING = TrackerConfig(adaptation=AdaptationConfig(first_windows=0, every=3, up_to_ratio=1.0))
 
 
 @dataclass(frozen=True)

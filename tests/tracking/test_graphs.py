@@ -15,9 +15,9 @@ from states import changed
 from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, tensors_of, windows
 
 from torchtrack import Tracker
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.run import RunConfig
-from torchtrack.config.search import SearchConfig
-from torchtrack.config.tracker import LearningConfig, TrackerConfig
+from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import ConfigError
@@ -26,7 +26,7 @@ from torchtrack.tracking import graphs as room
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 
 # Something is learned from every third window.
-LEARNING = TrackerConfig(learning=LearningConfig(first_windows=0, every=3, up_to_share=1.0))
+LEARNING = TrackerConfig(adaptation=AdaptationConfig(first_windows=0, every=3, up_to_ratio=1.0))
 TESTS = Path(__file__).resolve().parents[1] / "support"
 COUNT = 12
 
@@ -163,7 +163,7 @@ def test_of_many_events_those_far_from_all_objects_are_left_out(graphs, monkeypa
         kept.clear()
         monkeypatch.setattr(room, "_MANY", most)
         # Searches for a new object would be steps without a graph.
-        tracker = Tracker([box_model()], WIDE_CAMERA, TrackerConfig(search=SearchConfig(new_share=0)), compiled=is_compiled)
+        tracker = Tracker([box_model()], WIDE_CAMERA, TrackerConfig(relocalization=RelocalizationConfig(new_below=0)), compiled=is_compiled)
         with torch.inference_mode():
             results.append(follow(tracker, tracker.init(pose()[None], 0), cut)[1][-1])
     assert kept and all(len(nearby.events) < 0.5 * len(window[0]) for nearby, window in zip(kept, cut[-len(kept) :], strict=True))

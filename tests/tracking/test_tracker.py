@@ -20,13 +20,14 @@ from tracked_boxes import (
 )
 
 from torchtrack import Tracker, preset
-from torchtrack.config.search import QualityConfig, SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import (
     CornerConfig,
     FlowConfig,
     MotionConfig,
     TrackerConfig,
 )
+from torchtrack.config.validation import ValidationConfig
 from torchtrack.core.camera import project
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import retract_about, transform_points
@@ -236,7 +237,7 @@ def test_without_events_the_pose_is_held_and_the_status_says_so(dtype):
 
 def test_without_events_the_motion_goes_on_where_asked_for_and_dies_away(dtype):
     # What is lost for long rests where it was last seen well, unless it is never looked for there.
-    config = PREDICT.model_copy(update={"motion": MotionConfig(turn_s=0), "search": SearchConfig(anew_us=0)})
+    config = PREDICT.model_copy(update={"motion": MotionConfig(turn_s=0), "relocalization": RelocalizationConfig(not_validated_us=0)})
     tracker, state, _, _, trajectory = started(dtype, config)
     after, result = tracker.step(state, EventBatch.empty(), 30_000)
     assert Status(int(result.status)) == Status.TOO_FEW_EVENTS
@@ -314,7 +315,9 @@ def test_an_object_that_others_explain_better_is_lost():
 
 
 def test_a_jump_is_told_as_diverged():
-    config = TrackerConfig(quality=QualityConfig(max_step_rotation_rad=1e-6, max_step_translation=1e-6), motion=MotionConfig(without_events="hold"))
+    config = TrackerConfig(
+        validation=ValidationConfig(max_step_rotation_rad=1e-6, max_step_translation=1e-6), motion=MotionConfig(without_events="hold")
+    )
     _, events = moving_box(pose(), 2)
     tracker = tracker_of(config=config)
     _, results = follow(tracker, tracker.init(pose()[None], 0), windows(events, 2))

@@ -13,17 +13,17 @@ from torch.utils.data import DataLoader, Dataset
 from tracked_boxes import assert_same, moving_box, started, windows
 
 from torchtrack import Status, Tracker, TrackerConfig
-from torchtrack.config.search import SearchConfig
-from torchtrack.config.tracker import MatchingConfig, SolverConfig
+from torchtrack.config.relocalization import RelocalizationConfig
+from torchtrack.config.tracker import AssociationConfig, SolverConfig
 from torchtrack.core.camera import project
 from torchtrack.core.lie import cayley, se3_exp, se3_log, transform_points
 from torchtrack.tracking.estimation.robust_loss import robust_loss
 
 # One round that converges: its problem is that of the whole window.
 ONE_ROUND = TrackerConfig(
-    matching=MatchingConfig(gates_px=(3.0,), concentration=False, polarity=False),
+    association=AssociationConfig(gates_px=(3.0,), concentration=False, polarity=False),
     solver=SolverConfig(iterations=20),
-    search=SearchConfig(hypotheses=0),
+    relocalization=RelocalizationConfig(hypotheses=0),
 )
 
 

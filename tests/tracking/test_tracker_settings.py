@@ -9,16 +9,16 @@ from pydantic import ValidationError
 from tracked_boxes import HOLD, SAME_POSE, WINDOW_US, assert_same, follow, moving_box, poses_of, started, tracker_of, windows
 
 from torchtrack import Tracker, preset
-from torchtrack.config.search import QualityConfig
 from torchtrack.config.tracker import (
+    AssociationConfig,
     ContourConfig,
     CornerConfig,
-    MatchingConfig,
     MotionConfig,
     SolverConfig,
     SurfaceConfig,
     TrackerConfig,
 )
+from torchtrack.config.validation import ValidationConfig
 from torchtrack.tracking.validation.status import Status
 
 # ---- precision, devices, saved settings
@@ -75,8 +75,8 @@ def test_a_tracker_can_be_saved_and_loaded(tmp_path):
         TrackerConfig(contours=ContourConfig(remove_hidden=False)),
         TrackerConfig(contours=ContourConfig(refresh_rounds=(0, 1, 2))),
         TrackerConfig(contours=ContourConfig(exact_faces=0, depth_cell_px=2)),
-        TrackerConfig(matching=MatchingConfig(index_cell_px=1)),
-        TrackerConfig(matching=MatchingConfig(gates_px=(4.0, 2.0))),
+        TrackerConfig(association=AssociationConfig(index_cell_px=1)),
+        TrackerConfig(association=AssociationConfig(gates_px=(4.0, 2.0))),
         TrackerConfig(corners=CornerConfig(max_corners=32), surface=SurfaceConfig(filters="kornia")),
         TrackerConfig(motion=MotionConfig(model="hold")),
     ],
@@ -94,8 +94,8 @@ def test_a_box_is_tracked_with_other_settings(config):
 
 def test_without_events_beside_the_corners_the_corners_are_all_that_is_observed():
     # Few corners share a patch of the image: one has to be enough to explain it.
-    quality = QualityConfig(min_observations=6, min_on_contour=1)
-    config = TrackerConfig(corners=CornerConfig(max_corners=32), matching=MatchingConfig(max_events=0), quality=quality)
+    quality = ValidationConfig(min_observations=6, min_on_contour=1)
+    config = TrackerConfig(corners=CornerConfig(max_corners=32), association=AssociationConfig(max_events=0), quality=quality)
     _, _, result, _, _ = started(config=config)
     assert 6 <= int(result.observation_count) <= int(result.corners.mask.sum())
 
@@ -105,7 +105,7 @@ def test_matches_count_once_also_where_both_coordinates_do():
     _, events = moving_box(pose(), 8)
     paper, counts = preset("paper"), {}
     for residual in ("normal", "point"):
-        config = paper.model_copy(update={"matching": paper.matching.model_copy(update={"residual": residual, "gates_px": (8.0,)})})
+        config = paper.model_copy(update={"association": paper.association.model_copy(update={"residual": residual, "gates_px": (8.0,)})})
         tracker = tracker_of(config=config)
         counts[residual] = int(tracker.step(tracker.init(pose()[None], 0), events.slice_time(0, 25_000), 25_000)[1].observation_count)
     assert counts["normal"] > 6
@@ -115,7 +115,7 @@ def test_matches_count_once_also_where_both_coordinates_do():
 @pytest.mark.parametrize("residual", ["point", "normal"])
 def test_the_papers_settings_run(residual, dtype):
     settings = preset("paper")
-    settings = settings.model_copy(update={"matching": settings.matching.model_copy(update={"residual": residual})})
+    settings = settings.model_copy(update={"association": settings.association.model_copy(update={"residual": residual})})
     _, _, result, _, _ = started(dtype, settings, count=10)
     assert torch.isfinite(result.T_cam_obj).all()
     assert (result.contours.pixels.dtype, result.corners.mask.shape[0]) == (dtype, 1)
@@ -137,4 +137,4 @@ def test_noise_alone_moves_a_pose_hardly():
 @pytest.mark.parametrize("shares", [(0.5, 0.5), (0.6, 0.4)])
 def test_shares_in_the_wrong_order_are_refused(shares):
     with pytest.raises(ValidationError, match="must be larger than smeared_share"):
-        MatchingConfig(smeared_share=shares[0], gathered_share=shares[1])
+        AssociationConfig(smeared_share=shares[0], gathered_share=shares[1])

@@ -145,7 +145,7 @@ class EventLineTracker(Tracker):
         seen = self.sensors.seen(pad_streams(events, self.streams, window.t_us))
         pixels, age_s = seen.pixels, seen.age_s
         velocity = object_plane_velocity(pixels, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
-        matching = self.config.matching
+        matching = self.config.association
         index = index_contours(contours, self.image_size, int(max(matching.gates_px)) + 1, matching.index_cell_px)
         near = seen.mask & (index.look_up(torch.addcmul(pixels, velocity, age_s[..., None])) >= 0)
         chosen, exists = select_ranked(near, matching.max_events)
@@ -166,14 +166,14 @@ class EventLineTracker(Tracker):
         near = self._events_near(window, events, contours)
         plane = object_plane_velocity(near.pixels, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
         targets = torch.addcmul(near.pixels, plane, near.age_s[..., None])
-        for number, gate_px in enumerate(self.config.matching.gates_px):
+        for number, gate_px in enumerate(self.config.association.gates_px):
             if number == 1:
                 contours = self.objects.contours(T_cam_obj, self.config.contours)
             point, belongs = nearest_lines(targets, contours, gate_px, apart_px)
             motion = take_points(self._contour_velocity(window, contours), point)
             targets = torch.addcmul(near.pixels, motion, near.age_s[..., None])
             matched = near.mask & belongs
-            matched = matched & (matched.sum(-1, keepdim=True) >= self.config.quality.min_observations)
+            matched = matched & (matched.sum(-1, keepdim=True) >= self.config.validation.min_observations)
             matches = Matches(
                 contour=point,
                 mask=matched,
@@ -214,7 +214,7 @@ class EventLineTracker(Tracker):
         self, window: Window, solution: Linearisation, contours: Contours, matches: Matches
     ) -> tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]]:
         """Status and quality of each object, and which poses are taken."""
-        settings = self.config.quality
+        settings = self.config.validation
         share = explained_share(contours, matches, self._contour_velocity(window, contours), self.image_size, settings)
         step = lie.small_difference_about(window.T_start, solution.T_cam_obj, self.centre_obj)
         in_view = visible_share(contours, self.image_size)

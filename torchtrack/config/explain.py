@@ -7,6 +7,8 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from torchtrack.config.renamed import renamed
+
 Location = tuple[int | str, ...]
 # What was got may be a whole file in the wrong place.
 _MOST_TOLD, _LONGEST_TOLD = 50, 200
@@ -29,6 +31,8 @@ def _line(details: ErrorDetails, settings: type[BaseModel], from_command_line: C
 
 def _reason(details: ErrorDetails, settings: type[BaseModel]) -> str:
     if details["type"] == "extra_forbidden":
+        if now := renamed(details["loc"], details["input"]):
+            return f"renamed to {now}"
         return f"unknown setting{_suggestion(details['loc'], settings)}"
     if details["type"] == "missing":
         return f"missing: {_description(details['loc'], settings)}"

@@ -1,6 +1,6 @@
 """Settings of a tracker that has come to be behind a live stream."""
 
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 
 # A search that takes about as long as ten windows, where one takes as long as a hundred.
@@ -15,16 +15,18 @@ def in_haste(config: TrackerConfig, *, searches: bool) -> TrackerConfig:
         searches: whether objects that are lost are searched for, by fewer poses than otherwise.
     """
     window = config.window.model_copy(update={"parts": 1})
-    return config.model_copy(update={"window": window, "search": _brief(config.search) if searches else _without(config.search)})
+    return config.model_copy(
+        update={"window": window, "relocalization": _brief(config.relocalization) if searches else _without(config.relocalization)}
+    )
 
 
-def _without(search: SearchConfig) -> SearchConfig:
+def _without(search: RelocalizationConfig) -> RelocalizationConfig:
     return search.model_copy(update={"hypotheses": 0})
 
 
-def _brief(search: SearchConfig) -> SearchConfig:
+def _brief(search: RelocalizationConfig) -> RelocalizationConfig:
     """A search for what is very uncertain alone."""
-    fewer = {"hypotheses": _HYPOTHESES, "drawn": _DRAWN, "turns": _TURNS, "kept": _KEPT, "pulled": _PULLED}
+    fewer = {"hypotheses": _HYPOTHESES, "samples": _DRAWN, "rotations": _TURNS, "kept_rotations": _KEPT, "pulled": _PULLED}
     least: dict[str, object] = {name: min(count, getattr(search, name)) for name, count in fewer.items()}
-    none = {"dropped_to": 0.0, "slipped_to": 0.0, "mirrored_to": 0.0, "strayed_to": 0.0, "new_share": 0.0, "at_start": False}
-    return search.model_copy(update={**least, **none, "realigned": 0, "from_sigma_px": max(search.from_sigma_px, search.wide_sigma_px)})
+    none = {"low_score_below": 0.0, "score_drop_below": 0.0, "mirrored_below": 0.0, "slow_drift_below": 0.0, "new_below": 0.0, "at_start": False}
+    return search.model_copy(update={**least, **none, "realignments": 0, "from_sigma_px": max(search.from_sigma_px, search.wide_sigma_px)})

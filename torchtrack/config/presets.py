@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from typing import Literal, get_args
 
-from torchtrack.config.search import QualityConfig, SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import (
+    AdaptationConfig,
+    AssociationConfig,
     ContourConfig,
     CornerConfig,
     FlowConfig,
-    LearningConfig,
-    MatchingConfig,
     MotionConfig,
     SmoothingConfig,
     SolverConfig,
@@ -17,6 +17,7 @@ from torchtrack.config.tracker import (
     TrackerConfig,
     WindowConfig,
 )
+from torchtrack.config.validation import ValidationConfig
 from torchtrack.errors import ConfigError
 
 PresetName = Literal["default", "causal", "learned", "paper", "line", "ls", "nns"]
@@ -36,7 +37,11 @@ def _learned() -> TrackerConfig:
 
     It believes less where an object is seen badly, and explains less there: that is no sign of having strayed.
     """
-    return TrackerConfig(matching=MatchingConfig(learned_trust="all"), search=SearchConfig(strayed_to=0, anew_below=0), smoothing=_SMOOTHED)
+    return TrackerConfig(
+        association=AssociationConfig(weighting_network="all"),
+        relocalization=RelocalizationConfig(slow_drift_below=0, not_validated_below=0),
+        smoothing=_SMOOTHED,
+    )
 
 
 def _paper() -> TrackerConfig:
@@ -51,20 +56,20 @@ def _paper() -> TrackerConfig:
         corners=CornerConfig(max_corners=400, cell_px=5),
         flow=FlowConfig(radius_px=6, iterations=10),
         contours=ContourConfig(source="splat", texture=False, creases=False, refresh_rounds=(0, 1, 2)),
-        matching=MatchingConfig(
+        association=AssociationConfig(
             along_flow=True,
             gates_px=(8.0, 8.0, 8.0),
             motion_compensation=False,
             max_events=0,
             concentration=False,
             polarity=False,
-            polarity_memory_s=0.0,
-            learned_trust="none",
+            polarity_prior_s=0.0,
+            weighting_network="none",
         ),
         solver=SolverConfig(iterations=5, damping=1e-3, prior=False),
         motion=MotionConfig(model="hold", without_events="hold"),
-        learning=LearningConfig(points=0),
-        quality=QualityConfig(min_observations=6, min_on_contour=1, all_directions=False),
+        adaptation=AdaptationConfig(points=0),
+        validation=ValidationConfig(min_observations=6, min_on_contour=1, all_directions=False),
     )
 
 
@@ -73,10 +78,10 @@ def _lines(loss: Literal["tukey", "none"]) -> TrackerConfig:
     return TrackerConfig(
         window=WindowConfig(duration_us=3_000),
         corners=CornerConfig(max_corners=0),
-        matching=MatchingConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500, learned_trust="none"),
+        association=AssociationConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500, weighting_network="none"),
         solver=SolverConfig(iterations=3, loss=loss, damping=1e-4, prior=False),
-        learning=LearningConfig(points=0),
-        quality=QualityConfig(all_directions=False),
+        adaptation=AdaptationConfig(points=0),
+        validation=ValidationConfig(all_directions=False),
     )
 
 
@@ -98,12 +103,12 @@ def _nns() -> TrackerConfig:
     return TrackerConfig(
         window=WindowConfig(duration_us=3_000),
         corners=CornerConfig(max_corners=400, cell_px=5),
-        matching=MatchingConfig(
-            gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False, polarity=False, polarity_memory_s=0.0, learned_trust="none"
+        association=AssociationConfig(
+            gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False, polarity=False, polarity_prior_s=0.0, weighting_network="none"
         ),
         solver=SolverConfig(iterations=2),
-        learning=LearningConfig(points=0),
-        quality=QualityConfig(min_observations=10, min_on_contour=1, all_directions=False),
+        adaptation=AdaptationConfig(points=0),
+        validation=ValidationConfig(min_observations=10, min_on_contour=1, all_directions=False),
     )
 
 

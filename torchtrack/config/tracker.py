@@ -4,8 +4,9 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from torchtrack.config.search import QualityConfig, SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.settings import Settings
+from torchtrack.config.validation import ValidationConfig
 
 
 class WindowConfig(Settings):
@@ -85,7 +86,7 @@ class ContourConfig(Settings):
     refresh_rounds: tuple[int, ...] = Field((0,), description="Rounds of matching before which contours are extracted anew.")
 
 
-class MatchingConfig(Settings):
+class AssociationConfig(Settings):
     """Association of corners and events with contours."""
 
     along_flow: bool = Field(False, description="Corners search along their flow (the paper), instead of the nearest contour.")
@@ -107,8 +108,8 @@ class MatchingConfig(Settings):
     gathered_share: float = Field(0.6, gt=0, le=1, description="Share of observations on the contour at which a patch counts in full.")
     least_trust: float = Field(0.02, ge=0, le=1, description="What a smeared patch still counts.")
     polarity: bool = Field(True, description="Trust events less whose polarity is not that of most others on the contour around them.")
-    print_polarity: bool = Field(True, description="Trust events on print less whose polarity is not that of its darker side.")
-    polarity_memory_s: float = Field(
+    texture_polarity: bool = Field(True, description="Trust events on print less whose polarity is not that of its darker side.")
+    polarity_prior_s: float = Field(
         0.05,
         ge=0,
         le=10,
@@ -117,27 +118,29 @@ class MatchingConfig(Settings):
     )
     polarity_gain: float = Field(1.5, ge=0, description="How fast trust falls with the majority of the others.")
     least_agreement: float = Field(0.05, ge=0, le=1, description="What an event of the wrong polarity still counts.")
-    close_edges_px: float = Field(
+    edge_ambiguity_px: float = Field(
         1.7, ge=0, le=10, description="Parallel edges closer than about this may be taken for each other, and tell less (px); 0 for never."
     )
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
-    limb_dark_shift_px: float = Field(0.06, ge=0, le=2, description="The same of the limb of a smooth surface, towards which its shading fades (px).")
+    silhouette_dark_shift_px: float = Field(
+        0.06, ge=0, le=2, description="The same of the limb of a smooth surface, towards which its shading fades (px)."
+    )
     burst_px: float = Field(
         1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow circuits fire on (px)."
     )
-    adaptive_bursts: bool = Field(
+    pixel_latency: bool = Field(
         True, description="Date them back less far, the fewer are seen to come late: in good light the circuits of a sensor are fast."
     )
     burst_us: int = Field(10_000, ge=0, le=30_000, description="A burst is what a pixel fires of one polarity in this time (µs); 0 for no bursts.")
-    learned_trust: Literal["none", "limbs", "all"] = Field(
+    weighting_network: Literal["none", "limbs", "all"] = Field(
         "limbs", description="Which observations to trust as a small network has learned from the events around them: those of smooth limbs, or all."
     )
     max_events: int = Field(1500, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
     @model_validator(mode="after")
-    def _shares_in_order(self) -> "MatchingConfig":
+    def _shares_in_order(self) -> "AssociationConfig":
         if self.gathered_share <= self.smeared_share:
             raise ValueError(f"gathered_share ({self.gathered_share}) must be larger than smeared_share ({self.smeared_share})")
         return self
@@ -159,7 +162,9 @@ class SolverConfig(Settings):
     acceleration_in_window: bool = Field(
         True, description="A velocity that is other than predicted became so steadily over the window, as far as it was certain."
     )
-    swelling_px: float = Field(0.2, ge=0, description="Standard deviation of how far smooth limbs stand out, in a window (px); 0 for not at all.")
+    silhouette_offset_px: float = Field(
+        0.2, ge=0, description="Standard deviation of how far smooth limbs stand out, in a window (px); 0 for not at all."
+    )
 
 
 class MotionConfig(Settings):
@@ -185,15 +190,15 @@ class MotionConfig(Settings):
     spin_fades: bool = Field(True, description="So does the spin of a surface of revolution about its axis, which no event can show.")
 
 
-class LearningConfig(Settings):
+class AdaptationConfig(Settings):
     """Contours learned online on the surface of objects whose models have few faces: print that a model does not show."""
 
     points: int = Field(512, ge=0, le=10_000, description="Learned contour points per object, at most; 0 switches learning off.")
     events: int = Field(1000, ge=10, le=100_000, description="Events that are learned from in a window, per object.")
     drafts: int = Field(4096, ge=16, le=100_000, description="Unexplained events that are kept until they make a contour, per object.")
     trusted_from: float = Field(3.0, ge=1, le=10, description="Evidence from which a learned contour counts: about the windows that confirmed it.")
-    below_share: float = Field(0.6, ge=0, le=1, description="Learned contours count once the model's own explain less than this share of themselves.")
-    up_to_share: float = Field(0.8, ge=0, le=1, description="Nothing is learned where the model's own explain this share of themselves or more.")
+    below_ratio: float = Field(0.6, ge=0, le=1, description="Learned contours count once the model's own explain less than this share of themselves.")
+    up_to_ratio: float = Field(0.8, ge=0, le=1, description="Nothing is learned where the model's own explain this share of themselves or more.")
     max_sigma_px: float = Field(2.0, gt=0, description="Nothing is learned while the standard deviation of the prediction is larger (px).")
     first_windows: int = Field(20, ge=0, description="The first windows are all learned from.")
     every: int = Field(10, ge=1, description="After them, one window of this many is.")
@@ -223,17 +228,17 @@ class TrackerConfig(Settings):
     corners: CornerConfig = CornerConfig()
     flow: FlowConfig = FlowConfig()
     contours: ContourConfig = ContourConfig()
-    matching: MatchingConfig = MatchingConfig()
+    association: AssociationConfig = AssociationConfig()
     solver: SolverConfig = SolverConfig()
     motion: MotionConfig = MotionConfig()
-    learning: LearningConfig = LearningConfig()
-    search: SearchConfig = SearchConfig()
-    quality: QualityConfig = QualityConfig()
+    adaptation: AdaptationConfig = AdaptationConfig()
+    relocalization: RelocalizationConfig = RelocalizationConfig()
+    validation: ValidationConfig = ValidationConfig()
     smoothing: SmoothingConfig = SmoothingConfig()
 
     @model_validator(mode="after")
     def _observes_something(self) -> "TrackerConfig":
-        if not (self.corners.max_corners or self.matching.max_events):
+        if not (self.corners.max_corners or self.association.max_events):
             raise ValueError(
                 "nothing would be observed: corners.max_corners and matching.max_events are both 0; "
                 "set matching.max_events, such as to 1500, or for corners alone corners.max_corners, such as to 400"

@@ -13,7 +13,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.utils.data import DataLoader
 
 from torchtrack.config.presets import preset
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.settings import Settings
 from torchtrack.config.tracker import TrackerConfig, WindowConfig
 from torchtrack.core.lie import difference_about
@@ -200,7 +200,7 @@ class Trainer:
 
 def tracker_config(config: TrackerConfig) -> TrackerConfig:
     """Settings for training: without search, and without windows in parts."""
-    return config.model_copy(update={"search": SearchConfig(hypotheses=0), "window": WindowConfig(parts=1)})
+    return config.model_copy(update={"relocalization": RelocalizationConfig(hypotheses=0), "window": WindowConfig(parts=1)})
 
 
 def _error_px(tracker: Tracker, T_cam_obj: Float[Tensor, "b 4 4"], T_true: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b"]:

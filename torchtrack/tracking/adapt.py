@@ -32,10 +32,10 @@ def objects_as_known(objects: ObjectBatch, state: TrackerState, on_surfaces: boo
     """
     appearance = state.appearance
     if appearance.learned is not None and on_surfaces:
-        counting = appearance.learned.that_count(config.learning)
+        counting = appearance.learned.that_count(config.adaptation)
         if not host_sync.none_of(counting.mask):
             objects = replace(objects, learned=counting)
-    if config.matching.polarity_memory_s:
+    if config.association.polarity_prior_s:
         explained = state.health.score.detach(), state.health.reference_explained_ratio.detach()
         if not host_sync.none_of(is_asked(*explained)):
             objects = replace(objects, polarity=expected_polarity(appearance.darker_outside, *explained))
@@ -73,10 +73,10 @@ def learned_after(
     learned = state.appearance.learned
     if learned is None or lesson.on_surfaces is None:
         return state
-    trusted = (result.status <= int(Status.UNCERTAIN)) & (lesson.sigma_px < config.learning.max_sigma_px)
+    trusted = (result.status <= int(Status.UNCERTAIN)) & (lesson.sigma_px < config.adaptation.max_sigma_px)
     T_cam_obj = state.T_cam_obj.to(lesson.sigma_px.dtype)
     around = Surroundings(prediction.objects, T_cam_obj, state.velocity, lesson.window_s, result.contours, trusted)
-    wanted = learned.wanted(lesson.on_surfaces, config.learning) if lesson.learns else None
+    wanted = learned.wanted(lesson.on_surfaces, config.adaptation) if lesson.learns else None
     learned = learn_after(learned, around, found, lesson.events, wanted, config)
     return replace(state, appearance=replace(state.appearance, learned=learned))
 
@@ -86,7 +86,7 @@ def learns_next(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, conf
     learned = state.appearance.learned
     if learned is None or on_surfaces is None:
         return False
-    wanted = learned.wanted(on_surfaces, config.learning)
+    wanted = learned.wanted(on_surfaces, config.adaptation)
     return wanted is not None and host_sync.AsyncValue.to(wanted).any()
 
 
@@ -103,9 +103,9 @@ def with_late_share(
         matched: observations, the contours they were matched with, the matches, where the objects were expected, and which of them the
             matches are of.
     """
-    if not config.matching.adaptive_bursts or host_sync.none_of(due := is_time(state.t_us, t_us, LOOK_US)):
+    if not config.association.pixel_latency or host_sync.none_of(due := is_time(state.t_us, t_us, LOOK_US)):
         return state
     observations, contours, matches, prediction, known = matched
     sure = due[0, prediction.objects.stream_index] & (result.status == int(Status.TRACKING)) & known
-    late_share = late_share_after(state.appearance.late_share, observations, contours, matches, prediction, sure, config.matching)
+    late_share = late_share_after(state.appearance.late_share, observations, contours, matches, prediction, sure, config.association)
     return replace(state, appearance=replace(state.appearance, late_share=late_share))

@@ -131,7 +131,7 @@ class CompiledStep:
         """What the graph makes of a window, and whether that does not hold."""
         filled = _filled(nearby, len(t_us))
         if t_us.device.type == "cpu":
-            before, filled = _in_bursts(before, filled, t_us, self._tracker.config.matching.burst_us)
+            before, filled = _in_bursts(before, filled, t_us, self._tracker.config.association.burst_us)
         kind = filled.events.most_of_one, learns
         if kind not in self._graphs:
             self._graphs[kind] = self._graph(t_us.device, learns=learns)

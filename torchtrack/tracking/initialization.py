@@ -32,8 +32,8 @@ def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us
     config = tracked.config
     at_rest = torch.zeros(len(T_cam_obj), 6, dtype=tracked.intrinsics.dtype, device=T_cam_obj.device)
     covariance = initial_covariance(tracked.diameter_m, config.motion)
-    learns = config.learning.points and config.contours.source == "mesh"
-    learned = LearnedContours.none(len(at_rest), config.learning, at_rest) if learns else None
+    learns = config.adaptation.points and config.contours.source == "mesh"
+    learned = LearnedContours.none(len(at_rest), config.adaptation, at_rest) if learns else None
     return TrackerState(
         t_us=t_us,
         motion=MotionState(T_cam_obj.clone(), velocity=at_rest, acceleration=at_rest, covariance=covariance),
@@ -136,7 +136,7 @@ def moves_unknown(state: TrackerState, t_us: Int[Tensor, "s"], objects: ObjectBa
     px_per_m = objects.px_per_m(state.T_cam_obj.to(unknown_m_s.dtype))
     sigma_m = state.motion.covariance.diagonal(dim1=1, dim2=2)[:, 3:5].mean(1).sqrt().to(px_per_m.dtype)
     # What is not known to be anywhere is looked for by all events of a window, and with the motion that leads to each place.
-    return (unknown_m_s * window_s * px_per_m > window.max_unknown_px) & (px_per_m * sigma_m <= config.search.wide_sigma_px)
+    return (unknown_m_s * window_s * px_per_m > window.max_unknown_px) & (px_per_m * sigma_m <= config.relocalization.wide_sigma_px)
 
 
 def check_poses(T_cam_obj: Tensor, centre_obj: Float[Tensor, "b 3"], names: Sequence[str]) -> None:

@@ -83,7 +83,7 @@ class TrackedObjects(nn.Module):
         self.register_buffer("has_turning_axis", directions.any(1))
         self.turns = bool(directions.any())
         self.register_buffer("far_pose", far_pose(self.centre_obj))
-        self.weigher = shipped_weigher(self.models, self.config.matching) if weigher is None else weigher
+        self.weigher = shipped_weigher(self.models, self.config.association) if weigher is None else weigher
         # On dense meshes no line of sight is followed.
         with_surface = torch.zeros(len(objects), dtype=torch.bool)
         for model in self.models:

@@ -89,7 +89,7 @@ def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> t
     """
     expected = expect(tracked, state, given.events.events, given.t_us, given.reads)
     seen = observe(tracked, state, expected, given)
-    as_late = dated(seen.observations, state.appearance.late_share, state.health.time_since_validated_s, tracked.config.matching)
+    as_late = dated(seen.observations, state.appearance.late_share, state.health.time_since_validated_s, tracked.config.association)
     fit = align(expected.prediction, seen.contours, seen.index, seen.gate_scale, as_late, tracked.config)
     scored = validate(tracked, state, expected, seen, fit)
     located = relocalized(tracked, state, expected, seen, scored, given)
@@ -100,7 +100,7 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     """Stage 2: events, corners and flow near the objects, and the contours that they are matched with."""
     config, sensors, maps, t_us = tracked.config, tracked.sensors, state.maps, given.t_us
     prediction, nearby = expected.prediction.detached(), near_objects(tracked, expected, given.events)
-    events, burst_age_us = sensors.window_events(nearby, maps.burst_age_us, t_us, t_us - state.t_us, config.matching.burst_us)
+    events, burst_age_us = sensors.window_events(nearby, maps.burst_age_us, t_us, t_us - state.t_us, config.association.burst_us)
     contours = prediction.contours(expected.dt_s, config.contours)
     sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(tracked.diameter_m)
     gate_scale = gate_widening(sigma_px, config)
@@ -108,7 +108,7 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     radius_px = given.reads.ask(index_radius(gate_scale, config), usual_index_radius(config))
     corners = sensors.corners(contours, maps.last_event_us, t_us, expected.window_s, config)
     index = index_for(contours, tracked.image_size, config, gate_scale, radius_px)
-    observations, most = corner_observations(corners), config.matching.max_events
+    observations, most = corner_observations(corners), config.association.max_events
     if most:
         observations = join(observations, select_events(events, index, prediction.moving(compensated=True), most))
     if tracked.weigher is not None:
@@ -120,11 +120,11 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
 def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, fit: Fit) -> Found:
     """Stage 4, after the alignment: what each pose explains of its contours, and of the events around them."""
     config, health = tracked.config, state.health
-    reference = reference_where_known(seen.sigma_px, health.reference_inlier_ratio, config.search)
-    spread = asked_apart(health.reference_normal_spread, health.time_since_validated_s, config.quality)
+    reference = reference_where_known(seen.sigma_px, health.reference_inlier_ratio, config.relocalization)
+    spread = asked_apart(health.reference_normal_spread, health.time_since_validated_s, config.validation)
     scored = judge_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference, spread)
     if tracked.turns:
-        return replace(scored, turn_unclear=may_have_rotated(tracked.has_turning_axis, health.time_since_validated_s, config.search))
+        return replace(scored, turn_unclear=may_have_rotated(tracked.has_turning_axis, health.time_since_validated_s, config.relocalization))
     return scored
 
 
@@ -152,7 +152,7 @@ def update(
     (expected, seen, fit, located), config = made, tracked.config
     scored, prediction = located.scored, located.prediction.detached()
     next_state, result = conclude(state, located.prediction, located.gate_scale, scored, seen.corners, expected.dt_s, config)
-    if config.search.probation:
+    if config.relocalization.tentative:
         next_state, result = after_probation(state, next_state, result, prediction, located.gate_scale, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)

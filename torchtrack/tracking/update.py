@@ -85,25 +85,25 @@ def judged_objects(
     in_view = visible_share(found.fit.contours, objects.image_size)
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     step = solution.from_prior[:, :6] * ~(found.elsewhere & may_be_anywhere(widening))[:, None]
-    hidden = partly_hidden(found.gathered, found.full_gathered, found.count, found.elsewhere, config.quality)
-    asked_less = torch.where(holding_on(found.count, found.elsewhere, config.quality), 1, hidden)
-    status = judge(share, found.count, in_view, step, objects.diameter_m, config.quality, widening, asked_less)
+    hidden = partly_hidden(found.gathered, found.full_gathered, found.count, found.elsewhere, config.validation)
+    asked_less = torch.where(holding_on(found.count, found.elsewhere, config.validation), 1, hidden)
+    status = judge(share, found.count, in_view, step, objects.diameter_m, config.validation, widening, asked_less)
     status = torch.where(prediction.usable, status, int(Status.DIVERGED))
     failed = status >= int(Status.LOST)
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
-    trusted = torch.where(failed, 0, torch.maximum(hidden, trust(share, config.quality, reference, widening)))
-    doubted = ~failed & is_smeared(found.score, reference, found.gathered, found.full_gathered, config.search)
+    trusted = torch.where(failed, 0, torch.maximum(hidden, trust(share, config.validation, reference, widening)))
+    doubted = ~failed & is_smeared(found.score, reference, found.gathered, found.full_gathered, config.relocalization)
     unsure = doubted | (~failed & found.turn_unclear)
     status = torch.where(unsure, status.clamp(min=int(Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
     # Of an object that is partly hidden too little is seen to tell.
-    seen_well = ~failed & (share >= config.quality.certain_at * reference)
+    seen_well = ~failed & (share >= config.validation.validated_from * reference)
     acceleration = _acceleration(prediction, found, torch.where(seen_well, trusted, 0), dt_s)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     certain = (share >= CERTAIN * reference) & (status == int(Status.TRACKING))
-    certain &= (found.count >= CERTAIN_COUNT * health.reference_matches) | (not config.search.by_events)
+    certain &= (found.count >= CERTAIN_COUNT * health.reference_matches) | (not config.relocalization.by_matches)
     health = replace(
         _with_references(health, found, failed),
         # One good window among bad ones does not end a doubt.
@@ -118,14 +118,14 @@ def _darker_outside(
     state: TrackerState, found: Found, status: Int[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> Float[Tensor, "b 8"]:
     """Which side of contours is the darker one, with what the events on those of objects that are seen well say of it."""
-    if not config.matching.polarity_memory_s:
+    if not config.association.polarity_prior_s:
         return state.appearance.darker_outside
     matches = found.fit.matches
     # What a search found stands on other matches than these.
     known = (status == int(Status.TRACKING)) & is_seen_well(found.share, state.health.reference_explained_ratio) & ~found.elsewhere
     # Chosen, not multiplied: what is not a number would stay.
     weights = torch.where(known[:, None] & (matches.offsets.abs() < ON_CONTOUR_PX), matches.weights, 0)
-    return remembered(state.appearance.darker_outside, matches.directions, matches.dark, weights, dt_s, config.matching.polarity_memory_s)
+    return remembered(state.appearance.darker_outside, matches.directions, matches.dark, weights, dt_s, config.association.polarity_prior_s)
 
 
 def _with_references(health: TrackHealth, found: Found, failed: Bool[Tensor, "b"]) -> TrackHealth:

@@ -11,14 +11,14 @@ from states import changed
 from tracked_boxes import assert_same, follow, merged, moving_box, poses_of, windows
 
 from torchtrack import Tracker
-from torchtrack.config.tracker import ContourConfig, LearningConfig, TrackerConfig
+from torchtrack.config.tracker import AdaptationConfig, ContourConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.adaptation.learned_contours import LearnedContours
 
 COUNT = 24
-OFF = TrackerConfig(learning=LearningConfig(points=0))
+OFF = TrackerConfig(adaptation=AdaptationConfig(points=0))
 
 
 @cache
@@ -35,11 +35,11 @@ def plate_followed(config=None):
 
 
 def learning(**kwargs):
-    return TrackerConfig(learning=LearningConfig(**kwargs))
+    return TrackerConfig(adaptation=AdaptationConfig(**kwargs))
 
 
 def trusted(learned):
-    return learned.evidence >= LearningConfig().trusted_from
+    return learned.evidence >= AdaptationConfig().trusted_from
 
 
 def errors_of(results):
@@ -191,7 +191,7 @@ def test_the_state_before_is_left_as_it_was():
 
 
 def test_only_some_of_the_later_windows_are_learned_from():
-    config = LearningConfig(first_windows=3, every=4)
+    config = AdaptationConfig(first_windows=3, every=4)
     learned = LearnedContours.none(1, config, torch.zeros(1))
     assert [number for number in range(13) if replace(learned, windows=number).due(config)] == [0, 1, 2, 4, 8, 12]
 

@@ -7,15 +7,15 @@ import torch
 from states import changed
 from tracked_boxes import in_motion, poses_of, started
 
-from torchtrack.config.tracker import MatchingConfig, TrackerConfig
+from torchtrack.config.tracker import AssociationConfig, TrackerConfig
 from torchtrack.tracking.adaptation.pixel_latency import dated, late_share_after, slowness, unknown_circuits
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.estimation.rounds import gate_widening, index_for
 
 # Bursts so long that what moves as the boxes of these tests do comes far enough.
-LONG = MatchingConfig(adaptive_bursts=True, burst_us=30_000)
+LONG = AssociationConfig(pixel_latency=True, burst_us=30_000)
 SEEN = torch.zeros(1)
-OFF = [LONG.model_copy(update=change) for change in ({"adaptive_bursts": False}, {"burst_us": 0}, {"max_events": 0})]
+OFF = [LONG.model_copy(update=change) for change in ({"pixel_latency": False}, {"burst_us": 0}, {"max_events": 0})]
 
 
 def observed(dtype=torch.float32):
@@ -49,7 +49,7 @@ def test_what_an_object_that_is_not_sure_of_its_pose_sees_does_not_count():
 
 
 def test_edges_too_slow_to_come_far_in_a_burst_tell_nothing():
-    assert share_after(0.001, config=MatchingConfig(adaptive_bursts=True, burst_us=1000)) == pytest.approx(0.1)
+    assert share_after(0.001, config=AssociationConfig(pixel_latency=True, burst_us=1000)) == pytest.approx(0.1)
 
 
 def test_corners_tell_nothing():
@@ -97,7 +97,7 @@ def test_each_object_has_its_own():
 
 def test_it_is_remembered():
     # Circuits are looked at once in 20 ms: in the window that ends there.
-    tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(matching=LONG), count=11)
+    tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(association=LONG), count=11)
     after = [
         float(tracker.step(changed(state, late_share=torch.full((1,), before)), events, end_us)[0].appearance.late_share) for before in (0.0, 1.0)
     ]
@@ -107,7 +107,7 @@ def test_it_is_remembered():
 def test_with_fast_circuits_poses_are_as_without_bursts():
     found = []
     for burst_us in (10_000, 0):
-        tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(matching=MatchingConfig(adaptive_bursts=True, burst_us=burst_us)))
+        tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(association=AssociationConfig(pixel_latency=True, burst_us=burst_us)))
         # Each event once more, a little later: bursts of two.
         again = replace(events, t_us=events.t_us + 300)
         both = replace(events, **{name: torch.cat([value, getattr(again, name)]) for name, value in vars(events).items() if torch.is_tensor(value)})

@@ -8,7 +8,7 @@ import torch
 from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_pose, seen, upright_line
 from nearest_cases import matching, nearest
 
-from torchtrack.config.tracker import ContourConfig, MatchingConfig
+from torchtrack.config.tracker import AssociationConfig, ContourConfig
 from torchtrack.core.image_velocity import MovingObjects, object_plane_velocity
 from torchtrack.core.lie import retract_about
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
@@ -212,12 +212,12 @@ def test_events_are_moved_back_from_the_dark_side(polarity, speed, shift):
 def test_the_limb_of_a_smooth_surface_has_a_shift_of_its_own(kind, shift, dtype):
     contours = upright_line(80.0, kind=kind, dtype=dtype)
     seen_there = seen([[[80.0, 60.0]]], polarity=1.0, dtype=dtype)
-    matches, _ = nearest(seen_there, contours, velocity=(490.0, 0.0), dark_shift_px=1.0, limb_dark_shift_px=0.5)
+    matches, _ = nearest(seen_there, contours, velocity=(490.0, 0.0), dark_shift_px=1.0, silhouette_dark_shift_px=0.5)
     assert matches.targets[0, 0].tolist() == pytest.approx([80.0 + shift, 60.0])
 
 
 def test_a_limb_is_shifted_less_than_a_step_by_default():
-    assert 0 < MatchingConfig().limb_dark_shift_px < MatchingConfig().dark_shift_px
+    assert 0 < AssociationConfig().silhouette_dark_shift_px < AssociationConfig().dark_shift_px
 
 
 def test_the_dark_side_does_not_depend_on_the_sign_of_the_normal(dtype):
@@ -318,7 +318,7 @@ def test_a_smeared_patch_is_trusted_least_and_a_gathered_one_fully(least_trust, 
     targets = torch.stack([patches, patches], -1)[None]
     on = torch.cat([torch.ones(100), torch.zeros(100), torch.arange(100) % 2]).to(dtype)
     offsets = torch.where(on > 0, 0.3, -2.0).to(dtype)[None]
-    config = MatchingConfig(smeared_share=0.25, gathered_share=0.75, least_trust=least_trust)
+    config = AssociationConfig(smeared_share=0.25, gathered_share=0.75, least_trust=least_trust)
     weights = trust(offsets, targets, torch.ones(1, 300, dtype=torch.bool), config)[0].view(3, 100)
     assert weights.dtype == dtype
     torch.testing.assert_close(weights, torch.tensor([1.0, least_trust, 0.5], dtype=dtype)[:, None].expand(3, 100), rtol=0, atol=1e-6)
@@ -329,9 +329,9 @@ def test_trust_rises_with_the_share_on_the_contour():
     for on in range(0, 101, 10):
         offsets = torch.where(torch.arange(100) < on, 0.0, 2.0).double()[None]
         near, targets = torch.ones(1, 100, dtype=torch.bool), torch.full((1, 100, 2), 50.0, dtype=torch.float64)
-        shares.append(float(trust(offsets, targets, near, MatchingConfig())[0, 0]))
+        shares.append(float(trust(offsets, targets, near, AssociationConfig())[0, 0]))
     assert shares == sorted(shares)
-    assert shares[:3] == [MatchingConfig().least_trust] * 3
+    assert shares[:3] == [AssociationConfig().least_trust] * 3
     assert shares[-3:] == [1.0] * 3
     assert len(set(shares)) >= 5
 
@@ -339,7 +339,7 @@ def test_trust_rises_with_the_share_on_the_contour():
 @pytest.mark.parametrize(("offset", "near", "expected"), [(0.0, True, 1.0), (2.0, True, 0.02), (2.0, False, 0.6)], ids=["on", "beside", "none"])
 def test_of_a_single_observation_the_share_is_drawn_towards_a_half(offset, near, expected):
     """One on the contour counts as two of three, one beside it as one of three, and none as one of two."""
-    config = MatchingConfig(smeared_share=0.35, gathered_share=0.6, least_trust=0.02)
+    config = AssociationConfig(smeared_share=0.35, gathered_share=0.6, least_trust=0.02)
     weight = trust(torch.tensor([[offset]]), torch.full((1, 1, 2), 50.0), torch.tensor([[near]]), config)
     assert float(weight) == pytest.approx(expected, abs=1e-6)
 
@@ -347,12 +347,12 @@ def test_of_a_single_observation_the_share_is_drawn_towards_a_half(offset, near,
 def test_observations_far_from_the_contour_count_neither_way():
     offsets = torch.cat([torch.zeros(40), torch.full((40,), 3.5)]).double()[None]
     targets, near = torch.full((1, 80, 2), 50.0, dtype=torch.float64), torch.ones(1, 80, dtype=torch.bool)
-    assert (trust(offsets, targets, near, MatchingConfig()) == 1).all()
+    assert (trust(offsets, targets, near, AssociationConfig()) == 1).all()
 
 
 def test_places_outside_the_image_have_patches_too():
     targets = torch.tensor([[[-1e9, 50.0], [1e9, 1e9], [50.0, -3.0]]])
-    weights = trust(torch.zeros(1, 3), targets, torch.ones(1, 3, dtype=torch.bool), MatchingConfig())
+    weights = trust(torch.zeros(1, 3), targets, torch.ones(1, 3, dtype=torch.bool), AssociationConfig())
     assert torch.isfinite(weights).all()
 
 
@@ -364,7 +364,7 @@ def test_without_concentration_every_match_is_trusted():
 def test_observations_without_a_contour_nearby_do_not_count_against_others():
     targets = torch.cat([torch.full((1, 40, 2), 70.0), torch.full((1, 40, 2), 71.0)], 1)
     offset = torch.cat([torch.zeros(1, 40), torch.full((1, 40), 2.0)], 1)
-    config = MatchingConfig(smeared_share=0.35, gathered_share=0.6)
+    config = AssociationConfig(smeared_share=0.35, gathered_share=0.6)
     near = torch.arange(80)[None] < 40
     assert (trust(offset, targets, near, config)[0, :40] == 1).all()
     assert (trust(offset, targets, torch.ones_like(near), config)[0, :40] < 1).all()
@@ -384,7 +384,7 @@ def test_the_concentration_of_an_object_does_not_depend_on_the_others():
 
 def along(observations, contours, *, gate_px=8.0, velocity=(0.0, 0.0), **settings):
     moving = moving_objects(velocity, len(contours.pixels), contours.pixels.dtype)
-    return match_along_flow(observations, contours, moving, gate_px, MatchingConfig(along_flow=True, **settings))
+    return match_along_flow(observations, contours, moving, gate_px, AssociationConfig(along_flow=True, **settings))
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])

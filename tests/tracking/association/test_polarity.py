@@ -12,7 +12,7 @@ from tracked_boxes import WINDOW_US, follow, started
 
 from torchtrack import Tracker
 from torchtrack.config.presets import preset
-from torchtrack.config.tracker import MatchingConfig, TrackerConfig
+from torchtrack.config.tracker import AssociationConfig, TrackerConfig
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.sim.scenes import SceneConfig
@@ -24,7 +24,7 @@ from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.validation.measures import explained_share
 from torchtrack.tracking.validation.status import Status
 
-OFF = TrackerConfig(matching=MatchingConfig(polarity_memory_s=0.0))
+OFF = TrackerConfig(association=AssociationConfig(polarity_prior_s=0.0))
 RIGHT = 5  # the octant of (1, 0)
 
 
@@ -109,7 +109,7 @@ def matched(dark, *, expected=1.0, kind=ContourKind.LIMB):
     polarity = None if expected is None else torch.zeros(1, 8, dtype=torch.float64).index_fill(1, torch.tensor([RIGHT]), expected)
     table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1), polarity)
     observations = seen(places, polarity=torch.tensor(dark, dtype=torch.float64)[None])
-    config = MatchingConfig(concentration=False, dark_shift_px=0.0, limb_dark_shift_px=0.0)
+    config = AssociationConfig(concentration=False, dark_shift_px=0.0, silhouette_dark_shift_px=0.0)
     return contours, match_nearest(observations, table, places, moving_objects((500.0, 0.0)), 3.0, config)[0]
 
 
@@ -218,4 +218,4 @@ def test_what_was_not_tracked_is_not_remembered():
 
 @pytest.mark.parametrize("name", ["paper", "nns"])
 def test_corners_have_no_polarity_to_remember(name):
-    assert preset(name).matching.polarity_memory_s == 0
+    assert preset(name).association.polarity_prior_s == 0

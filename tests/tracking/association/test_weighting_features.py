@@ -9,7 +9,7 @@ from states import changed
 from tracked_boxes import follow, merged, moving_box, tensors_of, windows
 
 from torchtrack import Tracker, preset
-from torchtrack.config.tracker import MatchingConfig, TrackerConfig
+from torchtrack.config.tracker import AssociationConfig, TrackerConfig
 from torchtrack.core.dispatch import backend
 from torchtrack.core.events import concatenate
 from torchtrack.tracking.association.weighting_features import limb_features
@@ -100,7 +100,7 @@ def test_where_there_is_no_limb_there_is_nothing_to_describe():
 def test_it_is_in_the_default_where_an_object_has_limbs():
     assert isinstance(Tracker([BOX, SMOOTH], SMALL_CAMERA).weigher, LimbTrust)
     assert Tracker([BOX], SMALL_CAMERA).weigher is None
-    assert Tracker([SMOOTH], SMALL_CAMERA, TrackerConfig(matching=MatchingConfig(learned_trust="none"))).weigher is None
+    assert Tracker([SMOOTH], SMALL_CAMERA, TrackerConfig(association=AssociationConfig(weighting_network="none"))).weigher is None
     assert Tracker([SMOOTH], SMALL_CAMERA, preset("paper")).weigher is None
     own = LimbTrust(TrustNetwork())
     assert Tracker([BOX], SMALL_CAMERA, weigher=own).weigher is own
@@ -118,7 +118,7 @@ def test_it_changes_the_poses_of_what_is_smooth_and_of_nothing_else():
     for model in (BOX, SMOOTH):
         found = []
         for trust in ("limbs", "none"):
-            tracker = Tracker([model], SMALL_CAMERA, TrackerConfig(matching=MatchingConfig(learned_trust=trust)))
+            tracker = Tracker([model], SMALL_CAMERA, TrackerConfig(association=AssociationConfig(weighting_network=trust)))
             with torch.no_grad():
                 found.append(follow(tracker, tracker.init(pose()[None], 0), events)[0].T_cam_obj)
         assert torch.equal(*found) == (model is BOX)

@@ -4,13 +4,13 @@ import pytest
 import torch
 from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
 
-from torchtrack.config.tracker import MatchingConfig
+from torchtrack.config.tracker import AssociationConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.weights import on_and_around, patch, patch_sums, polarity_agreement
 from torchtrack.tracking.contours.index import index_contours
 
-CONFIG = MatchingConfig(polarity_gain=1.5, least_agreement=0.05)
+CONFIG = AssociationConfig(polarity_gain=1.5, least_agreement=0.05)
 
 
 def agreement(dark, *, offsets=0.0, near=True, place=50.0, config=CONFIG):
@@ -66,7 +66,7 @@ def test_other_patches_do_not_vote():
 
 @pytest.mark.parametrize(("gain", "least"), [(0.0, 1.0), (0.5, 0.5), (100.0, 0.2)])
 def test_gain_and_least_are_those_of_the_settings(gain, least):
-    weights = agreement([1.0] * 1000 + [-1.0], config=MatchingConfig(polarity_gain=gain, least_agreement=0.2))
+    weights = agreement([1.0] * 1000 + [-1.0], config=AssociationConfig(polarity_gain=gain, least_agreement=0.2))
     assert float(weights[-1]) == pytest.approx(least, abs=3e-3)
 
 
@@ -85,7 +85,7 @@ def weights_on_a_line(polarity, *, speed=500.0, kind=ContourKind.CREASE, polarit
     places = torch.stack([torch.full_like(v, 80.0), v], -1)[None]
     observations = seen(places, polarity=torch.tensor(polarity, dtype=torch.float64)[None])
     table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1), of_print=print_counts)
-    config = MatchingConfig(concentration=False, dark_shift_px=0.0, limb_dark_shift_px=0.0, polarity=polarity_counts)
+    config = AssociationConfig(concentration=False, dark_shift_px=0.0, silhouette_dark_shift_px=0.0, polarity=polarity_counts)
     return match_nearest(observations, table, places, moving_objects((speed, 0.0)), 3.0, config)[0].weights[0]
 
 

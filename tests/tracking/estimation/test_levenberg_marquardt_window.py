@@ -59,12 +59,12 @@ def test_noise_leaves_pose_and_velocity_unbiased():
         assert (error.mean(0).abs() < 4 * error.std(0) / 200**0.5 + 2e-3 * error.std(0)).all()
 
 
-@pytest.mark.parametrize("swelling_px", [-0.7, 0.4])
-def test_the_swelling_of_limbs_is_found(swelling_px, dtype):
+@pytest.mark.parametrize("silhouette_offset_px", [-0.7, 0.4])
+def test_the_swelling_of_limbs_is_found(silhouette_offset_px, dtype):
     T_true = random_pose(3, seed=3)
-    problem = windowed(T_true, faster=torch.zeros(6, dtype=torch.float64), swelling_px=swelling_px, dtype=dtype)
+    problem = windowed(T_true, faster=torch.zeros(6, dtype=torch.float64), silhouette_offset_px=silhouette_offset_px, dtype=dtype)
     found = solve_pose(problem, T_true.to(dtype), THOROUGH)
-    torch.testing.assert_close(found.from_prior[:, 12], torch.full((3,), swelling_px, dtype=dtype), rtol=0, atol=2e-3)
+    torch.testing.assert_close(found.from_prior[:, 12], torch.full((3,), silhouette_offset_px, dtype=dtype), rtol=0, atol=2e-3)
     degrees, millimetres = pose_errors(found.T_cam_obj.double(), T_true)
     assert float(degrees.max()) < 0.01
     assert float(millimetres.max()) < 0.01
@@ -122,7 +122,7 @@ def cost_with(problem, T_cam_obj, further):
 
 def test_the_gradient_by_all_unknowns_is_that_of_the_cost():
     T = random_pose(2, seed=7)
-    problem = windowed(T, noise_px=0.8, swelling_px=0.3, prior=0.0)
+    problem = windowed(T, noise_px=0.8, silhouette_offset_px=0.3, prior=0.0)
     at = solve_pose(problem, T, SolverConfig(iterations=1, loss="tukey"))
     for axis in range(13):
         step = 1e-6 if axis < 6 else 1e-4
@@ -155,7 +155,7 @@ def test_the_hessian_by_all_unknowns_is_that_of_residuals_near_zero():
 
 def test_a_batch_is_its_elements(dtype):
     T_true = random_pose(3, seed=9)
-    problem = windowed(T_true, noise_px=0.5, swelling_px=0.2, prior=0.1, dtype=dtype)
+    problem = windowed(T_true, noise_px=0.5, silhouette_offset_px=0.2, prior=0.1, dtype=dtype)
     together = solve_pose(problem, T_true.to(dtype), THOROUGH)
     for row in range(3):
         part = slice(row, row + 1)

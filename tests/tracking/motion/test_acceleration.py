@@ -11,7 +11,7 @@ from tracked_boxes import WINDOW_US, follow, started, windows
 
 from torchtrack import Tracker
 from torchtrack.config.presets import preset
-from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig, SolverConfig, TrackerConfig
+from torchtrack.config.tracker import AssociationConfig, CornerConfig, MotionConfig, SolverConfig, TrackerConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.lie import so3_exp
@@ -33,12 +33,12 @@ DT_S = 0.005
 # Exact events, though few of them: corners are observed as well. Nothing is common to their errors.
 CORNERS, EXACT = CornerConfig(max_corners=32), SolverConfig(observation_px=0.2, common_px=0.0)
 # Which events count as late does not change while velocities are compared.
-DATED = MatchingConfig(adaptive_bursts=False)
+DATED = AssociationConfig(pixel_latency=False)
 STEADY = TrackerConfig(
-    corners=CORNERS, matching=DATED, motion=MotionConfig(acceleration_s=0.0), solver=EXACT.model_copy(update={"acceleration_in_window": False})
+    corners=CORNERS, association=DATED, motion=MotionConfig(acceleration_s=0.0), solver=EXACT.model_copy(update={"acceleration_in_window": False})
 )
-ALWAYS = TrackerConfig(corners=CORNERS, matching=DATED, motion=MotionConfig(acceleration_px=0.0), solver=EXACT)
-DEFAULT = TrackerConfig(corners=CORNERS, matching=DATED, solver=EXACT)
+ALWAYS = TrackerConfig(corners=CORNERS, association=DATED, motion=MotionConfig(acceleration_px=0.0), solver=EXACT)
+DEFAULT = TrackerConfig(corners=CORNERS, association=DATED, solver=EXACT)
 COUNT = 20
 # Windows after the start.
 SWINGING = slice(4, COUNT)
@@ -184,7 +184,7 @@ def test_what_is_not_seen_has_no_acceleration():
 
 def test_an_object_that_is_partly_hidden_has_none_either():
     # What is hidden is also matched with an eye on polarities, if these are remembered.
-    tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(matching=MatchingConfig(polarity_memory_s=0.0)))
+    tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(association=AssociationConfig(polarity_prior_s=0.0)))
     seen, hidden = (
         tracker.step(changed(state, reference_explained_ratio=torch.full_like(state.health.score, full)), events, end_us) for full in (1.0, 10.0)
     )

@@ -12,7 +12,7 @@ from states import changed
 from tracked_boxes import WINDOW_US, follow, tensors_of, windows
 
 from torchtrack import Camera, EventBatch, ObjectModel, Tracker
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg, so3_exp, transform_points
@@ -100,7 +100,7 @@ def test_it_does_not_turn_farther_than_it_can_have_spun_unseen():
 
 
 def test_without_it_the_can_stays_turned_and_is_sure_of_that():
-    state, results, T_true = after_a_while(TrackerConfig(search=SearchConfig(turned=False)), wrong=2.2)
+    state, results, T_true = after_a_while(TrackerConfig(relocalization=RelocalizationConfig(axis_rotation=False)), wrong=2.2)
     assert float(pose_errors(state.T_cam_obj, T_true)[0]) > 60
     assert Status(int(results[-1].status)) == Status.TRACKING
 
@@ -196,11 +196,11 @@ def test_turns_out_of_reach_are_left_out():
 
 def test_what_was_not_seen_for_a_while_may_have_rotated():
     has_axis, unseen_s = torch.tensor([True, True, False]), torch.tensor([0.06, 0.04, 0.06])
-    assert may_have_rotated(has_axis, unseen_s, SearchConfig(doubt_us=50_000)).tolist() == [True, False, False]
+    assert may_have_rotated(has_axis, unseen_s, RelocalizationConfig(drift_us=50_000)).tolist() == [True, False, False]
 
 
-@pytest.mark.parametrize("search", [{"turned": False}, {"hypotheses": 0}, {"doubt_us": 0}])
+@pytest.mark.parametrize("search", [{"axis_rotation": False}, {"hypotheses": 0}, {"drift_us": 0}])
 def test_where_nothing_is_compared_no_axis_is_looked_for(search):
-    tracker = Tracker([can()], CAMERA, TrackerConfig(search=SearchConfig(**search)))
+    tracker = Tracker([can()], CAMERA, TrackerConfig(relocalization=RelocalizationConfig(**search)))
     assert not tracker.turns
     assert not any(value.any() for value in tensors_of(RotationAxes(tracker.turning_points, tracker.turning_directions)))

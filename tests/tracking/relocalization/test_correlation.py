@@ -6,12 +6,12 @@ from both_ways import both_ways
 from helpers import generator
 from tracked_boxes import in_motion
 
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization.correlation import peaks, shifted
 from torchtrack.tracking.relocalization.view_sphere import outlines_at
 
-CONFIG = TrackerConfig(search=SearchConfig(kept=12))
+CONFIG = TrackerConfig(relocalization=RelocalizationConfig(kept_rotations=12))
 
 
 def events_at(prediction, shift_px, dtype):

@@ -9,14 +9,14 @@ from lost_objects import acceptance_test, lost_object, searched
 from states import changed
 from tracked_boxes import in_motion, tensors_of
 
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization.hypotheses import around_prediction_released
 from torchtrack.tracking.relocalization.refine import align_and_score
 from torchtrack.tracking.validation.scored_fit import explained_at_rest
 
 SEARCHED = TrackerConfig()
-UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
+UNSEARCHED = TrackerConfig(relocalization=RelocalizationConfig(hypotheses=0))
 IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
 # Ten degrees and some millimetres: edges are several pixels off, farther than the tight gate reaches.
 DISPLACED = torch.tensor([[0.09, -0.06, 0.12, 0.008, -0.006, 0.0]], dtype=torch.float64)
@@ -38,7 +38,7 @@ def test_a_displaced_box_is_found_again_by_the_search(dtype):
     assert float(pose_errors(before.fit.solution.T_cam_obj.double(), T_true)[0]) > 3
     assert float(degrees) < 1.0
     assert float(millimetres) < 3.0
-    assert float(better.share) > float(before.share) + tracker.config.search.margin
+    assert float(better.share) > float(before.share) + tracker.config.relocalization.margin
     assert better.fit.contours.pixels.shape[1] >= before.fit.contours.pixels.shape[1]
 
 
@@ -85,7 +85,7 @@ def test_the_best_poses_are_aligned_again_where_hardly_anything_is_known_and_now
 
 
 def replace_settings(config, **search_settings):
-    return config.model_copy(update={"search": config.search.model_copy(update=search_settings)})
+    return config.model_copy(update={"relocalization": config.relocalization.model_copy(update=search_settings)})
 
 
 def test_a_search_leaves_what_it_was_given_as_it_was():

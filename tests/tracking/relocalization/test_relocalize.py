@@ -10,7 +10,7 @@ from states import changed
 from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, poses_of, started, tensors_of, windows
 
 from torchtrack import Tracker
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
@@ -22,7 +22,7 @@ from torchtrack.tracking.validation.status import Status
 
 LOOP = "torchtrack.tracking.relocalization.relocalize"
 SEARCHED = TrackerConfig()
-UNSEARCHED = TrackerConfig(search=SearchConfig(hypotheses=0))
+UNSEARCHED = TrackerConfig(relocalization=RelocalizationConfig(hypotheses=0))
 # Ten degrees and some millimetres: edges are several pixels off, farther than the tight gate reaches.
 DISPLACED = torch.tensor([[0.09, -0.06, 0.12, 0.008, -0.006, 0.0]], dtype=torch.float64)
 
@@ -152,7 +152,9 @@ def test_a_lost_box_is_found_again_and_without_the_search_it_is_not():
 @pytest.mark.parametrize("farther", [1.0, 1.3, 1.5])
 def test_a_box_that_slipped_is_found_within_a_window_however_sure_it_is_of_itself(farther):
     """Ten to fifteen degrees off, with the covariance of one that is tracked well; held by that, no search finds it."""
-    slips, never = (TrackerConfig(search=SearchConfig(doubt_us=0, slipped_to=to)) for to in (SearchConfig().slipped_to, 0))
+    slips, never = (
+        TrackerConfig(relocalization=RelocalizationConfig(drift_us=0, score_drop_below=to)) for to in (RelocalizationConfig().score_drop_below, 0)
+    )
     found, T_true = displaced_runs(slips, 1.0, displaced=farther * DISPLACED)
     held, _ = displaced_runs(never, 1.0, displaced=farther * DISPLACED)
     assert int(found[0].status) == int(found[-1].status) == Status.TRACKING
@@ -174,7 +176,7 @@ def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     monkeypatch.setattr(f"{LOOP}._tried", lambda lost, calls: searched.append(lost.number) or lost.window)
     _, events = moving_box(pose(), 10)
     # As a new object it would be, once in a while.
-    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(new_share=0)))
+    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(relocalization=RelocalizationConfig(new_below=0)))
     follow(tracker, tracker.init(pose()[None], 0), windows(events, 10))
     assert len(searched) <= 1
 
@@ -206,7 +208,7 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
 def test_without_enough_events_there_is_nothing_to_search_in(count, times, monkeypatch):
     searched = []
     monkeypatch.setattr(f"{LOOP}._tried", lambda lost, calls: searched.append(lost.number) or lost.window)
-    tracker, state, _, _, _ = started(config=TrackerConfig(search=SearchConfig(interval_us=0, new_share=0)))
+    tracker, state, _, _, _ = started(config=TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, new_below=0)))
     noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
     after, result = tracker.step(changed(state, covariance=1e3 * state.motion.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)
     assert len(searched) == times

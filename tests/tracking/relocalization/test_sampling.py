@@ -6,7 +6,7 @@ from helpers import SMALL_CAMERA, box_model, generator, pose, pose_errors
 from tracked_boxes import in_motion
 
 from torchtrack import Tracker
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import backend_is_installed
 from torchtrack.tracking.relocalization.event_image import event_density
@@ -118,7 +118,7 @@ def test_a_pose_near_the_true_one_is_among_the_sample(rotation_rad, dtype):
     displaced = torch.tensor([[rotation_rad, -rotation_rad, rotation_rad, 0.02, -0.02, 0.01]], dtype=torch.float64)
     tracker, prediction, seen, scored, T_true = in_motion(displaced=displaced, dtype=dtype)
     sigma = torch.tensor([rotation_rad] * 3 + [0.03] * 3 + [1.0] * 3 + [0.1] * 3, dtype=torch.float64)
-    once = TrackerConfig(search=SearchConfig(wide_sigma_px=100.0))
+    once = TrackerConfig(relocalization=RelocalizationConfig(wide_sigma_px=100.0))
     places, covariance = places_of(prediction, seen), torch.diag(sigma.square())
     shifted, drawn = (sample(prediction, scored.fit.contours, covariance, 30.0, places, config) for config in (tracker.config, once))
     assert shifted.shape == drawn.shape == (24, 13)
@@ -131,12 +131,12 @@ def test_as_many_are_sampled_as_are_to_be_tried_or_kept():
     _, prediction, seen, scored, _ = in_motion()
     covariance = 1e-2 * torch.eye(12, dtype=torch.float64)
     for few, count in (
-        (SearchConfig(hypotheses=5, turns=40), 5),
-        (SearchConfig(kept=3, turns=2), 4),
-        (SearchConfig(pulled=3), 4),
-        (SearchConfig(hypotheses=1), 1),
+        (RelocalizationConfig(hypotheses=5, rotations=40), 5),
+        (RelocalizationConfig(kept_rotations=3, rotations=2), 4),
+        (RelocalizationConfig(pulled=3), 4),
+        (RelocalizationConfig(hypotheses=1), 1),
     ):
-        config = TrackerConfig(search=few)
+        config = TrackerConfig(relocalization=few)
         assert len(sample(prediction, scored.fit.contours, covariance, 30.0, places_of(prediction, seen), config)) == count
 
 
@@ -151,7 +151,7 @@ def test_where_the_prediction_is_good_only_what_it_allows_is_sample():
     tracker, prediction, seen, scored, _ = in_motion()
     covariance = 1e-6 * torch.eye(12, dtype=torch.float64)
     offsets = sample(prediction, scored.fit.contours, covariance, 3.0, (seen.pixels, seen.mask), tracker.config)
-    drawn = draw_offsets(covariance, SearchConfig().drawn).float()
+    drawn = draw_offsets(covariance, RelocalizationConfig().drawn).float()
     assert ((offsets[:, None] == drawn).all(-1).any(-1)).all()
     assert float(offsets[:, :6].abs().max()) < 5e-3
 
@@ -165,6 +165,6 @@ def test_a_search_is_rehearsed_before_the_first_window(hypotheses, times, monkey
     monkeypatch.setattr(
         "torchtrack.tracking.tracker.rehearse", lambda prediction, config: (rehearsed.append(prediction), rehearse(prediction, config))
     )
-    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(search=SearchConfig(hypotheses=hypotheses)))
+    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(relocalization=RelocalizationConfig(hypotheses=hypotheses)))
     tracker.prepare(tracker.init(pose()[None], 0))
     assert len(rehearsed) == times * backend_is_installed()

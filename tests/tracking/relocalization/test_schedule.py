@@ -6,7 +6,7 @@ from lost_states import moved_away, uncertain, unseen
 from states import changed
 from tracked_boxes import started
 
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization.schedule import is_time, schedule
 from torchtrack.tracking.relocalization.triggers import Trigger, has
@@ -39,9 +39,9 @@ def test_an_object_is_lost_once_nothing_is_known_of_it_and_it_was_not_seen_for_l
     assert not is_lost(tracker, unseen(gone, 0.05))
     assert not is_lost(tracker, unseen(state))
     assert not is_lost(tracker, changed(gone, mean_score=torch.zeros(1)))
-    assert not is_lost(tracker, gone, TrackerConfig(search=SearchConfig(anew_us=0)))
+    assert not is_lost(tracker, gone, TrackerConfig(relocalization=RelocalizationConfig(not_validated_us=0)))
     # Without searches nothing would find it there.
-    assert not is_lost(tracker, gone, TrackerConfig(search=SearchConfig(hypotheses=0)))
+    assert not is_lost(tracker, gone, TrackerConfig(relocalization=RelocalizationConfig(hypotheses=0)))
 
 
 @pytest.mark.parametrize(("metres", "off"), [(0.0, False), (0.05, False), (0.3, True), (-0.2, True)])
@@ -64,5 +64,5 @@ def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_
     assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, state.t_us)
     assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, unseen(low, 0.05), due)
     assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, changed(low, covariance=uncertain(low)), due)
-    for never in ({"anew_below": 0}, {"anew_us": 0}, {"hypotheses": 0}):
-        assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due, TrackerConfig(search=SearchConfig(**never)))
+    for never in ({"not_validated_below": 0}, {"not_validated_us": 0}, {"hypotheses": 0}):
+        assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due, TrackerConfig(relocalization=RelocalizationConfig(**never)))

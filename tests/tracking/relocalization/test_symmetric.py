@@ -9,7 +9,7 @@ from states import changed
 from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, windows
 
 from torchtrack import Tracker
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.camera import project
 from torchtrack.core.lie import difference_about, retract_about, rotation_angle_deg, transform_points
@@ -123,7 +123,7 @@ def test_an_object_is_mirrored_in_its_own_planes_alone():
 # ---- in the tracker
 
 
-@pytest.mark.parametrize(("changes", "count"), [({}, 3), ({"search": {"mirrored_to": 0}}, 0), ({"search": {"hypotheses": 0}}, 0)])
+@pytest.mark.parametrize(("changes", "count"), [({}, 3), ({"relocalization": {"mirrored_below": 0}}, 0), ({"relocalization": {"hypotheses": 0}}, 0)])
 def test_planes_are_looked_for_only_where_mirrored_poses_are_tried(changes, count):
     tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig.model_validate(changes))
     assert tracker.ambiguities.planes.counts == (count,)
@@ -149,20 +149,22 @@ def mirrored_state(tracker, state):
     return changed(state, T_cam_obj=other.T_cam_obj.double(), velocity=other.velocity, covariance=other.covariance)
 
 
-@pytest.mark.parametrize("mirrored_to", [0.0, 0.8])
-def test_a_box_that_followed_its_mirror_image_is_found(mirrored_to):
-    search = SearchConfig(doubt_us=10_000, mirrored_to=mirrored_to, slipped_to=0, adrift_share=1, unseen_us=0, dropped_to=0)
-    results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), search=search), mirrored_state)
+@pytest.mark.parametrize("mirrored_below", [0.0, 0.8])
+def test_a_box_that_followed_its_mirror_image_is_found(mirrored_below):
+    search = RelocalizationConfig(
+        drift_us=10_000, mirrored_below=mirrored_below, score_drop_below=0, drift_min_ratio=1, last_seen_us=0, low_score_below=0
+    )
+    results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), relocalization=search), mirrored_state)
     degrees, millimetres = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
-    if mirrored_to:
+    if mirrored_below:
         assert float(degrees) < 1 and float(millimetres) < 2
         assert int(results[-1].status) == Status.TRACKING
     else:
         assert float(degrees) > 5
 
 
-@pytest.mark.parametrize("unseen_us", [0, 200_000])
-def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(unseen_us):
+@pytest.mark.parametrize("last_seen_us", [0, 200_000])
+def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(last_seen_us):
     """Turned off by nearly a right angle and far away: much farther than it is looked for from there."""
 
     def run_off(tracker, state):
@@ -172,10 +174,10 @@ def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(unseen_us):
             state, T_cam_obj=T_cam_obj, doubted_s=torch.full((1,), 0.1), unseen_s=torch.full((1,), 0.2), velocity=torch.zeros_like(state.velocity)
         )
 
-    search = SearchConfig(doubt_us=10_000, mirrored_to=0, unseen_us=unseen_us, anew_us=0)
-    results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), search=search), run_off)
+    search = RelocalizationConfig(drift_us=10_000, mirrored_below=0, last_seen_us=last_seen_us, not_validated_us=0)
+    results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), relocalization=search), run_off)
     degrees, _ = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
-    assert (float(degrees) < 1) == (unseen_us > 0)
+    assert (float(degrees) < 1) == (last_seen_us > 0)
 
 
 def test_where_an_object_was_last_seen_well_is_remembered_and_not_where_it_was_not():

@@ -10,8 +10,8 @@ from states import changed
 from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, windows
 
 from torchtrack import Tracker
-from torchtrack.config.search import SearchConfig
-from torchtrack.config.tracker import CornerConfig, MatchingConfig, MotionConfig, TrackerConfig
+from torchtrack.config.relocalization import RelocalizationConfig
+from torchtrack.config.tracker import AssociationConfig, CornerConfig, MotionConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization.triggers import NONE, SEARCHED, Trigger, is_smeared, reference_where_known, triggers
@@ -20,23 +20,30 @@ from torchtrack.tracking.validation.status import Status
 # The box fires few events: with corners beside them, enough is observed of one that slipped to say more than that it is too little.
 # Polarities of these events are drawn by lot: there is nothing to remember of them.
 # Were close edges taken for each other, it would come back by itself.
-FORGETFUL = MatchingConfig(polarity_memory_s=0.0, close_edges_px=0.0)
+FORGETFUL = AssociationConfig(polarity_prior_s=0.0, edge_ambiguity_px=0.0)
 # What slips turns on: with turns that die away it would be drawn back.
 TURNING = MotionConfig(turn_s=0)
 SEARCHING = TrackerConfig(
-    corners=CornerConfig(max_corners=32), matching=FORGETFUL, motion=TURNING, search=SearchConfig(doubt_us=10_000, drift_diameters_s=4)
+    corners=CornerConfig(max_corners=32),
+    matching=FORGETFUL,
+    motion=TURNING,
+    relocalization=RelocalizationConfig(drift_us=10_000, drift_diameters_s=4),
 )
-NEVER_ADRIFT = TrackerConfig(corners=CornerConfig(max_corners=32), matching=FORGETFUL, motion=TURNING, search=SearchConfig(doubt_us=0, slipped_to=0))
+NEVER_ADRIFT = TrackerConfig(
+    corners=CornerConfig(max_corners=32), matching=FORGETFUL, motion=TURNING, relocalization=RelocalizationConfig(drift_us=0, score_drop_below=0)
+)
 # Nothing is ever in doubt, and looks farther away are for what was not seen well for long, or for nothing.
-UNDOUBTED = {"doubt_us": 10_000, "drift_diameters_s": 4, "doubted_below": 0, "slipped_to": 0, "anew_below": 0}
-STRAYING, NEVER_STRAYED = (SEARCHING.model_copy(update={"search": SearchConfig(strayed_to=share, **UNDOUBTED)}) for share in (0.85, 0.0))
+UNDOUBTED = {"drift_us": 10_000, "drift_diameters_s": 4, "drift_below": 0, "score_drop_below": 0, "not_validated_below": 0}
+STRAYING, NEVER_STRAYED = (
+    SEARCHING.model_copy(update={"relocalization": RelocalizationConfig(slow_drift_below=share, **UNDOUBTED)}) for share in (0.85, 0.0)
+)
 # Twenty degrees, onto other edges: farther than a pose that is sure of itself is looked for.
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
 
 def flags_of(given, **settings):
     """The triggers of each object."""
-    config = TrackerConfig(search=SearchConfig(**settings))
+    config = TrackerConfig(relocalization=RelocalizationConfig(**settings))
     return [Trigger(number) for number in triggers(given, config).tolist()]
 
 
@@ -95,7 +102,7 @@ def test_without_searches_there_are_no_triggers(trigger):
 def test_uncertain_objects_and_those_explained_worse_than_usual_are_searched_for():
     changes = {"last_score": [0.9, 0.71, 0.73, 0.9, 0.0], "mean_score": [0.9, 0.9, 0.9, 0.9, 0.0]}
     given = evidence(5, sigma_px=[1.0, 1.0, 1.0, 4.1, 1.0], score=changes["last_score"], **changes)
-    settings = {"from_sigma_px": 4.0, "dropped_to": 0.8}
+    settings = {"from_sigma_px": 4.0, "low_score_below": 0.8}
     assert having(Trigger.UNCERTAIN, given, **settings) == [False, False, False, True, False]
     assert having(Trigger.LOW_SCORE, given, **settings) == [False, True, False, False, False]
     # One window that is a little worse is no reason.
@@ -111,9 +118,9 @@ def test_what_is_sure_of_its_place_and_explains_far_less_at_once_has_dropped():
         drift_s=[0.0] * 4 + [0.1],
         is_drift_due=True,
     )
-    settings = {"slipped_to": 0.7, "slip_sigma_px": 6.0}
+    settings = {"score_drop_below": 0.7, "score_drop_sigma_px": 6.0}
     assert having(Trigger.SCORE_DROP, given, **settings) == [True, False, False, False, False]
-    assert not any(having(Trigger.SCORE_DROP, given, slipped_to=0))
+    assert not any(having(Trigger.SCORE_DROP, given, score_drop_below=0))
 
 
 @pytest.mark.parametrize("at_start", [True, False])
@@ -135,29 +142,29 @@ def test_objects_that_drift_are_searched_for_however_certain_they_are():
 def test_new_objects_that_leave_much_unexplained_are_searched_for_when_it_is_time():
     score = torch.tensor([0.8, 0.95, 0.8])
     given = evidence(3, is_due=[True, True, False], score=score, last_score=score, mean_score=score, reference_explained_ratio=0.5)
-    assert having(Trigger.NEW, given, new_share=0.9) == having(SEARCHED, given, new_share=0.9) == [True, False, False]
+    assert having(Trigger.NEW, given, new_below=0.9) == having(SEARCHED, given, new_below=0.9) == [True, False, False]
     # Of one that explained about as much when it was seen well, nothing is new.
     assert not any(having(Trigger.NEW, replace(given, reference_explained_ratio=torch.full((3,), 0.75))))
     # One window that is a little worse is no reason.
     assert not any(having(Trigger.NEW, replace(given, last_score=torch.full((3,), 0.95))))
-    assert not any(having(Trigger.NEW, given, new_share=0))
+    assert not any(having(Trigger.NEW, given, new_below=0))
 
 
 def test_what_has_a_plane_of_symmetry_and_does_not_explain_all_may_be_mirrored_when_it_is_time():
-    settings, score = {"mirrored_to": 0.8, "slip_sigma_px": 6.0}, torch.tensor([0.7, 0.73, 0.7, 0.7, 0.7, 0.7])
+    settings, score = {"mirrored_below": 0.8, "score_drop_sigma_px": 6.0}, torch.tensor([0.7, 0.73, 0.7, 0.7, 0.7, 0.7])
     flags = {name: [at != number for at in range(6)] for name, number in (("is_drift_due", 2), ("has_symmetry", 3))}
     given = evidence(6, sigma_px=[1.0] * 4 + [6.1, 1.0], score=score, last_score=0.7, is_starting=[False] * 5 + [True], **flags)
     assert having(Trigger.MIRROR_AMBIGUOUS, given, **settings) == [True] + [False] * 5
     # One window that is a little worse is no reason.
     assert not any(having(Trigger.MIRROR_AMBIGUOUS, replace(given, last_score=torch.full((6,), 0.73)), **settings))
-    only_mirrors = {"slipped_to": 0, "dropped_to": 0, "from_sigma_px": 9.0, "at_start": False}
+    only_mirrors = {"score_drop_below": 0, "low_score_below": 0, "from_sigma_px": 9.0, "at_start": False}
     assert having(SEARCHED, given, **only_mirrors) == [True] + [False] * 5
-    for never in ({"mirrored_to": 0}, {"doubt_us": 0}):
+    for never in ({"mirrored_below": 0}, {"drift_us": 0}):
         assert not any(having(Trigger.MIRROR_AMBIGUOUS, given, **never))
 
 
 def test_what_may_have_rotated_is_looked_at_once_it_is_seen_well_again_and_sure_of_its_place():
-    settings = {"slip_share": 0.9, "slip_sigma_px": 6.0}
+    settings = {"elsewhere_min_ratio": 0.9, "score_drop_sigma_px": 6.0}
     axis, known, due = ([number != wrong for number in range(5)] for wrong in (2, 3, 4))
     given = evidence(
         5,
@@ -179,14 +186,14 @@ def test_what_drifts_or_is_very_uncertain_is_looked_for_as_it_was_last_seen_when
     assert having(Trigger.NOT_VALIDATED, given, wide_sigma_px=10.0) == [True, False, True, False]
     later = replace(given, time_since_validated_s=torch.tensor([0.21, 0.21, 0.19, 0.21]))
     assert having(Trigger.NOT_VALIDATED, later) == [True, False, False, False]
-    for never in ({"unseen_us": 0}, {"doubt_us": 0}):
+    for never in ({"last_seen_us": 0}, {"drift_us": 0}):
         assert not any(having(Trigger.NOT_VALIDATED, given, **never))
 
 
-@pytest.mark.parametrize(("doubt_us", "expected"), [(50_000, [False, True, False]), (20_000, [True, True, False]), (0, [False] * 3)])
-def test_an_object_drifts_once_it_explained_too_little_for_long_and_it_is_time(doubt_us, expected):
+@pytest.mark.parametrize(("drift_us", "expected"), [(50_000, [False, True, False]), (20_000, [True, True, False]), (0, [False] * 3)])
+def test_an_object_drifts_once_it_explained_too_little_for_long_and_it_is_time(drift_us, expected):
     given = evidence(3, drift_s=[0.045, 0.051, 0.051], is_drift_due=[True, True, False])
-    assert having(Trigger.DRIFT, given, doubt_us=doubt_us) == expected
+    assert having(Trigger.DRIFT, given, drift_us=drift_us) == expected
 
 
 def test_what_is_sure_of_its_place_and_was_not_seen_well_for_long_may_drift_slowly_when_it_is_time():
@@ -198,9 +205,9 @@ def test_what_is_sure_of_its_place_and_was_not_seen_well_for_long_may_drift_slow
         sigma_px=[1.0, 1.0, 1.0, 6.1, 1.0, 1.0],
         is_drift_due=[True] * 4 + [False, True],
     )
-    settings = {"strayed_to": 0.85, "doubt_us": 50_000, "slip_sigma_px": 6.0}
+    settings = {"slow_drift_below": 0.85, "drift_us": 50_000, "score_drop_sigma_px": 6.0}
     assert having(Trigger.SLOW_DRIFT, given, **settings) == [True] + [False] * 5
-    for never in ({"strayed_to": 0}, {"doubt_us": 0}):
+    for never in ({"slow_drift_below": 0}, {"drift_us": 0}):
         assert not any(having(Trigger.SLOW_DRIFT, given, **{**settings, **never}))
     # What drifts at once does not drift slowly, nor does what only starts.
     for other in ({"drift_s": torch.full((6,), 0.1)}, {"is_starting": torch.ones(6, dtype=torch.bool)}):
@@ -213,25 +220,25 @@ def test_what_drifts_but_explains_enough_by_many_events_is_held():
     given = evidence(5, score=[0.21, 0.19, 0.21, 0.21, 0.21], matches=[120, 120, 119, 120, 120], sigma_px=[1.0] * 3 + [6.5, 1.0], **drifts)
     given = replace(given, is_starting=torch.tensor([False] * 4 + [True]))
     assert having(Trigger.HELD, given) == [True] + [False] * 4
-    assert not any(having(Trigger.HELD, given, stands_from=0))
+    assert not any(having(Trigger.HELD, given, held_from=0))
     slowly = evidence(is_drift_due=True, time_since_validated_s=0.2, last_score=0.3)
     assert having(Trigger.SLOW_DRIFT, slowly) == [True] and having(Trigger.HELD, slowly) == [False]
 
 
 def test_what_explains_much_less_than_when_seen_well_by_smeared_events_is_smeared():
     score, full = torch.tensor([0.5, 0.2, 0.0, 0.2, 0.5]), torch.tensor([0.9, 0.3, 0.0, 0.9, 0.9])
-    smeared = is_smeared(score, full, torch.full((5,), 0.6), torch.full((5,), 0.8), SearchConfig(doubted_below=0.6))
+    smeared = is_smeared(score, full, torch.full((5,), 0.6), torch.full((5,), 0.8), RelocalizationConfig(drift_below=0.6))
     assert smeared.tolist() == [True, False, False, True, True]
 
 
 def test_what_is_partly_hidden_is_not_smeared():
     """Less is explained, but what is seen gathers as ever; nor does it tell anything where too few events are seen."""
     gathered = torch.tensor([0.7, 0.9, torch.nan])
-    assert not is_smeared(torch.full((3,), 0.3), torch.full((3,), 0.9), gathered, torch.full((3,), 0.8), SearchConfig()).any()
+    assert not is_smeared(torch.full((3,), 0.3), torch.full((3,), 0.9), gathered, torch.full((3,), 0.8), RelocalizationConfig()).any()
 
 
 def test_of_those_whose_place_is_not_known_events_need_not_gather():
-    full = reference_where_known(torch.tensor([1.0, 3.9, 4.1]), torch.tensor([0.9, 0.8, 0.7]), SearchConfig(from_sigma_px=4.0))
+    full = reference_where_known(torch.tensor([1.0, 3.9, 4.1]), torch.tensor([0.9, 0.8, 0.7]), RelocalizationConfig(from_sigma_px=4.0))
     torch.testing.assert_close(full, torch.tensor([0.9, 0.8, 0.0]))
 
 
@@ -297,7 +304,7 @@ def test_what_is_tracked_well_is_never_in_doubt():
 
 def test_how_far_events_gather_can_be_left_out():
     """Then poses are compared by what they explain alone."""
-    config = TrackerConfig(search=SearchConfig(by_gathering=False))
+    config = TrackerConfig(relocalization=RelocalizationConfig(by_inlier_ratio=False))
     state, results, _ = slipped(config, displaced=-1)
     assert_same(state.health.score, results[-1].quality)
     assert float(slipped(config)[0].doubted_s) == 0

@@ -6,14 +6,14 @@ import pytest
 import torch
 from measured_matches import matches_at
 
-from torchtrack.config.search import QualityConfig
+from torchtrack.config.validation import ValidationConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.validation.measures import explained_share, gathered_share, visible_share
 from torchtrack.tracking.validation.status import Status, holding_on, judge, needed_share, partly_hidden, trust
 
 IMAGE_SIZE = (150, 200)
-CONFIG = QualityConfig()
+CONFIG = ValidationConfig()
 
 
 def verdict(*, quality=1.0, count=100, in_view=1.0, turned=0.0, moved=0.0, config=CONFIG):
@@ -61,11 +61,11 @@ def test_a_good_pose_is_tracking():
         ({"count": 0}, Status.TOO_FEW_EVENTS),
         ({"in_view": 0.19}, Status.OUT_OF_VIEW),
         ({"in_view": 0.2}, Status.TRACKING),
-        ({"turned": 0.51}, Status.DIVERGED),
-        ({"turned": 0.49}, Status.TRACKING),
+        ({"axis_rotation": 0.51}, Status.DIVERGED),
+        ({"axis_rotation": 0.49}, Status.TRACKING),
         ({"moved": 0.51}, Status.DIVERGED),
         ({"moved": 0.49}, Status.TRACKING),
-        ({"turned": float("nan")}, Status.DIVERGED),
+        ({"axis_rotation": float("nan")}, Status.DIVERGED),
         ({"moved": float("inf")}, Status.DIVERGED),
     ],
     ids=lambda value: value.name if isinstance(value, Status) else "-".join(f"{k}={v}" for k, v in value.items()),
@@ -79,7 +79,7 @@ def test_each_reason_has_its_status(change, expected):
     [
         ({"quality": 0.0, "count": 0}, Status.TOO_FEW_EVENTS),
         ({"quality": 0.0, "count": 0, "in_view": 0.0}, Status.OUT_OF_VIEW),
-        ({"quality": 0.0, "count": 0, "in_view": 0.0, "turned": 1.0}, Status.DIVERGED),
+        ({"quality": 0.0, "count": 0, "in_view": 0.0, "axis_rotation": 1.0}, Status.DIVERGED),
     ],
 )
 def test_the_gravest_reason_is_told(change, expected):
@@ -87,7 +87,7 @@ def test_the_gravest_reason_is_told(change, expected):
 
 
 def test_thresholds_are_those_of_the_settings():
-    config = QualityConfig(min_observations=200, uncertain_below=0.9, lost_below=0.8, min_visible_share=0.7, max_step_rotation_rad=0.1)
+    config = ValidationConfig(min_observations=200, uncertain_below=0.9, lost_below=0.8, min_visible_ratio=0.7, max_step_rotation_rad=0.1)
     assert verdict(count=150, config=config) == Status.TOO_FEW_EVENTS
     assert verdict(count=250, quality=0.85, config=config) == Status.UNCERTAIN
     assert verdict(count=250, quality=0.75, config=config) == Status.LOST
@@ -105,7 +105,7 @@ def test_objects_are_judged_each_for_itself():
 @pytest.mark.parametrize(("widening", "expected"), [(1.0, Status.UNCERTAIN), (1.25, Status.UNCERTAIN), (1.5, Status.LOST), (3.0, Status.LOST)])
 def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(widening, expected):
     """Between lost below 0.2 and caught above 0.45: 0.2625 is needed at 1.25 times the gate, 0.325 at 1.5, and no more than 0.45."""
-    config = QualityConfig(lost_below=0.2, caught_above=0.45)
+    config = ValidationConfig(lost_below=0.2, refound_above=0.45)
     status = judge(*(torch.tensor(value) for value in ([0.3], [100], [1.0])), torch.zeros(1, 6), torch.ones(1), config, torch.tensor([widening]))
     assert Status(int(status)) == expected
 
@@ -115,20 +115,20 @@ def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(widening,
 
 def test_the_share_that_is_needed_rises_with_the_gate_to_its_limit():
     widening = torch.tensor([1.0, 1.5, 2.0, 3.2])
-    assert needed_share(widening, QualityConfig(lost_below=0.2, caught_above=0.4)).tolist() == pytest.approx([0.2, 0.3, 0.4, 0.4])
+    assert needed_share(widening, ValidationConfig(lost_below=0.2, refound_above=0.4)).tolist() == pytest.approx([0.2, 0.3, 0.4, 0.4])
     # A share to be caught at that is less than that of a lost one asks for nothing more.
-    assert needed_share(widening, QualityConfig(lost_below=0.3, caught_above=0.1)).tolist() == pytest.approx([0.3] * 4)
+    assert needed_share(widening, ValidationConfig(lost_below=0.3, refound_above=0.1)).tolist() == pytest.approx([0.3] * 4)
 
 
 def test_trust_rises_from_lost_to_certain():
     share = torch.tensor([0.0, 0.2, 0.3, 0.4, 1.0])
-    assert trust(share, QualityConfig(lost_below=0.2, uncertain_below=0.4)).tolist() == pytest.approx([0, 0, 0.5, 1, 1])
-    step = trust(torch.tensor([0.29, 0.31]), QualityConfig(lost_below=0.3, uncertain_below=0.3))
+    assert trust(share, ValidationConfig(lost_below=0.2, uncertain_below=0.4)).tolist() == pytest.approx([0, 0, 0.5, 1, 1])
+    step = trust(torch.tensor([0.29, 0.31]), ValidationConfig(lost_below=0.3, uncertain_below=0.3))
     assert step.tolist() == [0, 1]
 
 
 def test_more_is_asked_of_finds_in_many_places_by_what_is_usual():
-    config = QualityConfig(lost_below=0.1, uncertain_below=0.4, certain_at=0.75)
+    config = ValidationConfig(lost_below=0.1, uncertain_below=0.4, validated_from=0.75)
     share, usual, widening = torch.tensor([0.4, 0.4, 0.6, 0.4]), torch.tensor([0.8, 0.8, 0.8, 0.2]), torch.tensor([1.0, 2.0, 3.0, 2.0])
     assert trust(share, config, usual, widening).tolist() == pytest.approx([1.0, 0.6, 1.0, 1.0])
 
@@ -145,12 +145,12 @@ def test_what_gathers_as_ever_counts_however_little_is_explained(gathered, expec
 def test_nothing_counts_as_hidden_that_does_not_tell():
     # Found by a search, too few observations, hardly gathering when seen well, never seen well, switched off.
     assert hidden(elsewhere=True) == hidden(count=100) == hidden(0.5, 0.5) == hidden(usually=0.0) == 0
-    assert hidden(config=QualityConfig(partly_hidden=False)) == 0
-    assert hidden(count=30, config=QualityConfig(min_observations=7)) == 1
+    assert hidden(config=ValidationConfig(partly_hidden=False)) == 0
+    assert hidden(count=30, config=ValidationConfig(min_observations=7)) == 1
 
 
 def test_of_a_hidden_object_no_more_is_asked_in_more_places():
-    config, widening = QualityConfig(lost_below=0.2, caught_above=0.4), torch.full((3,), 2.0)
+    config, widening = ValidationConfig(lost_below=0.2, refound_above=0.4), torch.full((3,), 2.0)
     assert needed_share(widening, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.4, 0.3, 0.2])
     told = torch.full((2,), 0.3), torch.full((2,), 100), torch.ones(2), torch.zeros(2, 6), torch.ones(2)
     assert judge(*told, config, widening[:2], torch.tensor([0.0, 1.0])).tolist() == [Status.LOST, Status.UNCERTAIN]
@@ -158,7 +158,7 @@ def test_of_a_hidden_object_no_more_is_asked_in_more_places():
 
 def test_what_goes_on_by_many_events_holds_on():
     count, elsewhere = torch.tensor([120, 119, 120]), torch.tensor([False, False, True])
-    config = QualityConfig(min_observations=30)
+    config = ValidationConfig(min_observations=30)
     assert holding_on(count, elsewhere, config).tolist() == [True, False, False]
     assert not holding_on(count, elsewhere, config.model_copy(update={"holds_on": False})).any()
 
@@ -166,7 +166,7 @@ def test_what_goes_on_by_many_events_holds_on():
 def test_an_uncertain_object_may_be_found_farther_away():
     step = torch.zeros(2, 6)
     step[:, 0] = 0.8
-    status = judge(torch.ones(2), torch.full((2,), 100), torch.ones(2), step, torch.ones(2), QualityConfig(), torch.tensor([1.0, 2.0]))
+    status = judge(torch.ones(2), torch.full((2,), 100), torch.ones(2), step, torch.ones(2), ValidationConfig(), torch.tensor([1.0, 2.0]))
     assert status.tolist() == [Status.DIVERGED, Status.TRACKING]
 
 
@@ -185,7 +185,7 @@ def test_a_contour_without_matches_is_not():
 @pytest.mark.parametrize(("least", "count", "expected"), [(3, 2, 0), (3, 3, 1), (1, 1, 1), (5, 4, 0)])
 def test_a_patch_needs_a_few_observations_on_its_contours(least, count, expected):
     contours = contours_at(upright_line(count=16, first=32.0))
-    found = share(contours, matches_at(upright_line(count=count, first=36.0)), config=QualityConfig(min_on_contour=least))
+    found = share(contours, matches_at(upright_line(count=count, first=36.0)), config=ValidationConfig(min_on_contour=least))
     assert float(found) == expected
 
 
@@ -213,8 +213,8 @@ def test_what_does_not_move_need_not_be_explained():
     moving[:, 80:, 0] = 100.0
     moving[:, :80, 0] = 20.0
     matches = matches_at(upright_line(80.0))
-    assert float(explained_share(contours, matches, moving, IMAGE_SIZE, QualityConfig(min_speed_px_s=30.0))) == 1
-    assert float(explained_share(contours, matches, moving, IMAGE_SIZE, QualityConfig(min_speed_px_s=10.0))) == 0.5
+    assert float(explained_share(contours, matches, moving, IMAGE_SIZE, ValidationConfig(min_speed_px_s=30.0))) == 1
+    assert float(explained_share(contours, matches, moving, IMAGE_SIZE, ValidationConfig(min_speed_px_s=10.0))) == 0.5
 
 
 def test_only_motion_across_the_contour_counts():

@@ -8,12 +8,12 @@ from measured_matches import matches_at
 from states import changed
 from tracked_boxes import started
 
-from torchtrack.config.search import QualityConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.config.validation import ValidationConfig
 from torchtrack.tracking.validation.measures import PARALLEL_AFTER_S, asked_apart, directions_apart, held_all_ways
 from torchtrack.tracking.validation.status import Status
 
-CONFIG = QualityConfig()
+CONFIG = ValidationConfig()
 
 
 def matches_of(angles_rad, **changes):
@@ -67,7 +67,7 @@ def test_only_what_lies_on_a_contour_counts():
 def test_what_is_seen_well_or_was_until_now_is_asked_nothing():
     assert held(unseen_s=0.0, apart=0.0) == held(unseen_s=0.9 * PARALLEL_AFTER_S, apart=0.0) == 1.0
     assert held(unseen_s=1.1 * PARALLEL_AFTER_S, apart=0.0) == 0.0
-    assert held(apart=0.0, config=QualityConfig(all_directions=False)) == 1.0
+    assert held(apart=0.0, config=ValidationConfig(all_directions=False)) == 1.0
 
 
 def test_what_fires_along_parallel_edges_as_a_rule_may_do_so_for_ever():
@@ -94,7 +94,7 @@ def of_upright_edges(events, contours):
 
 def last_window(unseen_s, full_apart, *, all_directions=True, upright=False):
     """State and result of the next window of a box that is seen well as a rule, of which only upright edges may be seen."""
-    config = TrackerConfig(quality=QualityConfig(all_directions=all_directions))
+    config = TrackerConfig(validation=ValidationConfig(all_directions=all_directions))
     tracker, state, result, (events, end_us), _ = started(config=config)
     if upright:
         events = of_upright_edges(events, result.contours)

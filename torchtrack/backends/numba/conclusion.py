@@ -93,7 +93,7 @@ def conclude(
             status[b] = max(status[b], UNCERTAIN)
         inverse(hessian[b], inverses)
         _update(trusted, failed, dt, velocity[b], covariance[b], offset[b], inverses, settings, new_velocity[b], posterior[b])
-        seen_well = not failed and share >= settings.certain_at * full_share
+        seen_well = not failed and share >= settings.validated_from * full_share
         _accelerate(trusted if seen_well else 0.0, dt, information[b], offset[b], expected[b], variance[b], acceleration[b])
         centre_of(T_cam_obj[b], centre_obj[b], centre)
         _to_left(posterior[b], centre, left[b])
@@ -135,11 +135,11 @@ def _judge(
         moved += (counts * offset[b, 3 + k]) ** 2
     if share < settings.uncertain_below:
         status = UNCERTAIN
-    if share < settings.lost_below + (max(settings.caught_above, settings.lost_below) - settings.lost_below) * wider:
+    if share < settings.lost_below + (max(settings.refound_above, settings.lost_below) - settings.lost_below) * wider:
         status = LOST
     if matched[b] < settings.min_observations:
         status = TOO_FEW_EVENTS
-    if found[IN_VIEW, b] < settings.min_visible_share:
+    if found[IN_VIEW, b] < settings.min_visible_ratio:
         status = OUT_OF_VIEW
     turned_ok = np.sqrt(turned) / widening < settings.max_step_rotation_rad
     if not (turned_ok and np.sqrt(moved) / widening < settings.max_step_translation * diameter_m) or not usable[b]:
@@ -161,7 +161,7 @@ def _hidden(b: int, elsewhere: Array, matched: Array, found: Array, settings: Co
 @kernel()
 def _trust(share: float, full_share: float, widening: float, settings: ConclusionSettings) -> float:
     """How far a pose counts against the prediction: :func:`torchtrack.tracking.validation.status.trust`."""
-    full = max(settings.uncertain_below, settings.certain_at * full_share * _clamped(widening - 1.0, 0.0, 1.0))
+    full = max(settings.uncertain_below, settings.validated_from * full_share * _clamped(widening - 1.0, 0.0, 1.0))
     return _clamped((share - settings.lost_below) / max(full - settings.lost_below, _LEAST_RANGE), 0.0, 1.0)
 
 
@@ -169,7 +169,7 @@ def _trust(share: float, full_share: float, widening: float, settings: Conclusio
 def _in_doubt(b: int, found: Array, full_share: float, settings: ConclusionSettings) -> bool:
     """Whether an object may be elsewhere: :func:`torchtrack.tracking.relocalization.triggers.in_doubt`."""
     smeared = found[GATHERED, b] < settings.smeared * found[USUALLY_GATHERED, b]
-    return smeared and found[SCORE, b] < settings.doubted_below * full_share
+    return smeared and found[SCORE, b] < settings.drift_below * full_share
 
 
 @kernel()
@@ -334,8 +334,8 @@ def _settings(config: TrackerConfig) -> ConclusionSettings:
     """What a kernel goes by that concludes."""
     return filled(
         ConclusionSettings,
-        config.quality,
-        config.search,
+        config.validation,
+        config.relocalization,
         config.solver,
         config.motion,
         status,
@@ -343,7 +343,7 @@ def _settings(config: TrackerConfig) -> ConclusionSettings:
         holds=config.motion.without_events == "hold",
         anywhere=ANYWHERE,
         smeared=SMEARED,
-        hidden_observations=status.HIDDEN_TIMES * config.quality.min_observations,
+        hidden_observations=status.HIDDEN_TIMES * config.validation.min_observations,
         certain_share=update.CERTAIN,
-        certain_count=update.CERTAIN_COUNT if config.search.by_events else 0.0,
+        certain_count=update.CERTAIN_COUNT if config.relocalization.by_matches else 0.0,
     )

@@ -114,7 +114,7 @@ def _match_one(
     age = seen[AGE, i] + max(seen[INTO_BURST, i] - settings.burst_px / max(abs(crossing), 1e-3), 0.0)
     carried_u = seen[U, i] + age * (speed_u - 0.5 * age * change_u)
     carried_v = seen[V, i] + age * (speed_v - 0.5 * age * change_v)
-    shift = dark * (settings.dark_shift_px + table[found, LIMB] * (settings.limb_dark_shift_px - settings.dark_shift_px))
+    shift = dark * (settings.dark_shift_px + table[found, LIMB] * (settings.silhouette_dark_shift_px - settings.dark_shift_px))
     target_u, target_v = carried_u - nu * shift, carried_v - nv * shift
     du, dv = u - target_u, v - target_v
     is_matched, offset = du * du + dv * dv < (gate_px * wider) ** 2, (du * nu + dv * nv) / wider

@@ -10,7 +10,7 @@ from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import across, drift, inverse_depth, lens
 from torchtrack.backends.numba.matching import patch
 from torchtrack.backends.numba.parameters import QualitySettings, filled
-from torchtrack.config.search import QualityConfig
+from torchtrack.config.validation import ValidationConfig
 from torchtrack.core.dispatch import accelerates
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.tracking.association import polarity, weights
@@ -198,7 +198,7 @@ def sigma_px_numba(prediction: Prediction, contours: Contours) -> Float[Tensor, 
 
 @accelerates(measures.shares)
 def shares_numba(
-    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: QualityConfig
+    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: ValidationConfig
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """Point by point."""
     measured, gathered, apart = contours.pixels.new_empty(3, len(contours.mask))

@@ -25,7 +25,7 @@ class MatchingSettings(NamedTuple):
 
     burst_px: float
     dark_shift_px: float
-    limb_dark_shift_px: float
+    silhouette_dark_shift_px: float
     polarity_gain: float
     least_agreement: float
     smeared_share: float
@@ -243,8 +243,8 @@ class ConclusionSettings(NamedTuple):
     anywhere: float
     uncertain_below: float
     lost_below: float
-    caught_above: float
-    certain_at: float
+    refound_above: float
+    validated_from: float
     partly_hidden: bool
     hidden_from: float
     hidden_fully: float
@@ -252,12 +252,12 @@ class ConclusionSettings(NamedTuple):
     hidden_observations: int
     holds_on: bool
     min_observations: int
-    min_visible_share: float
+    min_visible_ratio: float
     max_step_rotation_rad: float
     max_step_translation: float
     observation_px: float
     coast_s: float
-    doubted_below: float
+    drift_below: float
     smeared: float
     usual_gain: float
     fall_gain: float

@@ -12,7 +12,7 @@ from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, at_depth, centre_of, drift, entries, lens
 from torchtrack.backends.numba.index import cells_of
-from torchtrack.backends.numba.matching import (
+from torchtrack.backends.numba.association import (
     AGE,
     DIRECTION_U,
     DIRECTION_V,
@@ -164,7 +164,7 @@ def _linearise(
 
 def knows(config: TrackerConfig) -> bool:
     """Whether the kernel does all that is set: the settings of the preset ``default``, and most beside them."""
-    matching, solver = config.matching, config.solver
+    matching, solver = config.association, config.solver
     usual = solver.prior and solver.iterations == 1 and solver.loss == "tukey" and not any(config.contours.refresh_rounds)
     return usual and not matching.along_flow and matching.residual == "normal"
 
@@ -182,14 +182,14 @@ def align_rounds_numba(
     contour = torch.empty(batch, count, dtype=torch.int64)
     is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool)
     matches = torch.empty(batch, ROWS, count, dtype=offset.dtype)
-    common = {"min_observations": config.quality.min_observations, "common_px2": config.solver.common_px**2}
+    common = {"min_observations": config.validation.min_observations, "common_px2": config.solver.common_px**2}
     align(
         *as_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
         cells_of(table.index),
         *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, objects.intrinsics, objects.centre_obj),
-        *as_arrays(constant(config.matching.gates_px, offset.dtype, offset.device), gates.wider, gates.finely),
-        filled(MatchingSettings, config.matching, config.solver, weights, **common),
-        RoundSettings(config.matching.motion_compensation, config.solver.velocity_in_window),
+        *as_arrays(constant(config.association.gates_px, offset.dtype, offset.device), gates.wider, gates.finely),
+        filled(MatchingSettings, config.association, config.solver, weights, **common),
+        RoundSettings(config.association.motion_compensation, config.solver.velocity_in_window),
         damping_settings(config.solver, information),
         *as_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
     )

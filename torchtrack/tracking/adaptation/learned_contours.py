@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.tracker import LearningConfig, TrackerConfig
+from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.contours.objects import LearnedPoints
 from torchtrack.tracking.contours.points import Contours
@@ -52,7 +52,7 @@ class LearnedContours:
     windows: int
 
     @classmethod
-    def none(cls, batch: int, config: LearningConfig, like: Tensor) -> "LearnedContours":
+    def none(cls, batch: int, config: AdaptationConfig, like: Tensor) -> "LearnedContours":
         """Nothing learned yet."""
         drafts, points = like.new_zeros(batch, config.drafts, 3), like.new_zeros(batch, config.points, 3)
         drafted = torch.zeros(batch, dtype=torch.int64, device=like.device)
@@ -71,16 +71,16 @@ class LearnedContours:
         """The learned points with at least that evidence."""
         return LearnedPoints(self.points_obj, self.tangents_obj, self.evidence >= least)
 
-    def that_count(self, config: LearningConfig) -> LearnedPoints:
+    def that_count(self, config: AdaptationConfig) -> LearnedPoints:
         """The points that are confirmed, of objects whose models do not explain their events."""
         points = self.points(config.trusted_from)
         return replace(points, mask=points.mask & self.needed[:, None])
 
-    def wanted(self, on_surfaces: Bool[Tensor, "b"], config: LearningConfig) -> Bool[Tensor, "b"] | None:
+    def wanted(self, on_surfaces: Bool[Tensor, "b"], config: AdaptationConfig) -> Bool[Tensor, "b"] | None:
         """Objects to learn of in this window: those whose models may lack contours, of ``on_surfaces``; None where it is not due."""
-        return on_surfaces & (self.model_share < config.up_to_share) if self.due(config) else None
+        return on_surfaces & (self.model_share < config.up_to_ratio) if self.due(config) else None
 
-    def due(self, config: LearningConfig) -> bool:
+    def due(self, config: AdaptationConfig) -> bool:
         """Whether this window may be learned from: all of the first ones, and then some."""
         return self.windows < config.first_windows or self.windows % config.every == 0
 
@@ -107,10 +107,10 @@ def judge_model(
     share = _share_of_own(found, velocity(contours), image_size, config) if any_count else found.measured
     known = torch.isfinite(share) & (found.count > 0)
     share = torch.where(known, torch.lerp(learned.model_share, share, _SHARE_GAIN), learned.model_share)
-    enough = share > config.learning.below_share + _MORE_SHARE
+    enough = share > config.adaptation.below_ratio + _MORE_SHARE
     if learned.windows < _START_WINDOWS:
         enough = enough | _in_motion(contours, velocity(contours))
-    return replace(learned, model_share=share, needed=(learned.needed & ~enough) | (share < config.learning.below_share))
+    return replace(learned, model_share=share, needed=(learned.needed & ~enough) | (share < config.adaptation.below_ratio))
 
 
 def _share_of_own(found: Found, velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: TrackerConfig) -> Float[Tensor, "b"]:
@@ -118,7 +118,7 @@ def _share_of_own(found: Found, velocity: Float[Tensor, "b m 2"], image_size: tu
     contours, matches = found.fit.contours, found.fit.matches
     own = contours.kind != int(ContourKind.LEARNED)
     matches = replace(matches, near=matches.near & own.gather(1, matches.contour))
-    return measured_share(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config.quality)
+    return measured_share(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config.validation)
 
 
 def _in_motion(contours: Contours, velocity: Float[Tensor, "b m 2"]) -> Bool[Tensor, "b"]:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.linalg import vecdot
 
-from torchtrack.config.tracker import MatchingConfig
+from torchtrack.config.tracker import AssociationConfig
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.weights import on_and_around
@@ -41,7 +41,7 @@ def slowness(late_share: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     return ((late_share - _FAST) / (_SLOW - _FAST)).clamp(0, 1)
 
 
-def dated(observations: Observations, late_share: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], config: MatchingConfig) -> Observations:
+def dated(observations: Observations, late_share: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], config: AssociationConfig) -> Observations:
     """The observations as late in their bursts as counts: less so, and then not dated back so far, the faster circuits are.
 
     Of what is not seen well all are dated back: less exact, but events of what moves otherwise gather less.
@@ -63,7 +63,7 @@ def late_share_after(
     matches: Matches,
     prediction: Prediction,
     known: Bool[Tensor, "b"],
-    config: MatchingConfig,
+    config: AssociationConfig,
 ) -> Float[Tensor, "b"]:
     """Share of the events on moving contours that are late, with a window more.
 
@@ -83,6 +83,6 @@ def late_share_after(
     return torch.lerp(late_share, late / count.clamp(min=1), count / (count + _REMEMBERED))
 
 
-def _tells(config: MatchingConfig) -> bool:
+def _tells(config: AssociationConfig) -> bool:
     """Whether there is anything to tell."""
-    return config.adaptive_bursts and config.burst_us > 0 and config.max_events > 0
+    return config.pixel_latency and config.burst_us > 0 and config.max_events > 0

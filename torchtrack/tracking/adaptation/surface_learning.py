@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchtrack.config.tracker import LearningConfig, TrackerConfig
+from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.camera import project
 from torchtrack.core.constants import constant
@@ -118,14 +118,14 @@ def learn(learned: LearnedContours, around: Surroundings, events: WindowEvents, 
     """What is known after a window: confirmed or doubted, and added to."""
     centre_px = project(around.centre_cam[:, None], around.objects.intrinsics)
     grid = CellGrid.around(centre_px, around.objects.size_px(around.T_cam_obj))
-    sample = _sample(around, grid, events, config.learning.events)
+    sample = _sample(around, grid, events, config.adaptation.events)
     known = learned.points(least=1e-6).contours(around.T_cam_obj, around.objects.intrinsics)
     known = around.objects.visible(known, around.T_cam_obj, config.contours)
     learned = replace(learned, evidence=_weighed(learned.evidence, known, around, grid, sample))
     explained = joined(around.contours, known)
     taken = tallied(grid.place(explained.pixels), explained.mask[:, None].to(sample.places.dtype))[:, 0]
     learned, added = _with_drafts(learned, around, sample, sample.mask & ~is_near(taken, sample.places, _EXPLAINED_CELLS), config)
-    return _with_lines(learned, around, grid, taken, added, config.learning)
+    return _with_lines(learned, around, grid, taken, added, config.adaptation)
 
 
 def _sample(around: Surroundings, grid: CellGrid, events: WindowEvents, count: int) -> _Sample:
@@ -191,7 +191,7 @@ def _put(values: Tensor, slot: Tensor, new: Tensor) -> Tensor:
 
 
 def _with_lines(
-    learned: LearnedContours, around: Surroundings, grid: CellGrid, taken: Tensor, added: Tensor, config: LearningConfig
+    learned: LearnedContours, around: Surroundings, grid: CellGrid, taken: Tensor, added: Tensor, config: AdaptationConfig
 ) -> LearnedContours:
     """New contour points where drafts gather on a line that no contour has, in the place of those without evidence."""
     drafts_px = project(transform_points(around.T_cam_obj, learned.drafts_obj), around.objects.intrinsics)

@@ -2,7 +2,7 @@
 
 import torch
 
-from torchtrack.config.tracker import MatchingConfig
+from torchtrack.config.tracker import AssociationConfig
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.padded import take_points
 from torchtrack.object_model.contour_source import ContourKind
@@ -14,7 +14,7 @@ from torchtrack.tracking.contours.points import Contours
 _MIN_CROSSING = 0.3
 
 
-def match_along_flow(observations: Observations, contours: Contours, objects: MovingObjects, gate_px: float, config: MatchingConfig) -> Matches:
+def match_along_flow(observations: Observations, contours: Contours, objects: MovingObjects, gate_px: float, config: AssociationConfig) -> Matches:
     """Match each corner with the contour point nearest to it along the line of its flow, either way (the paper's 3.3).
 
     The paper moves corners along the flow "to locate the edge points"; seen from a pose that is a window old the edge

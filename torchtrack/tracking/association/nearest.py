@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.linalg import vecdot
 
-from torchtrack.config.tracker import MatchingConfig
+from torchtrack.config.tracker import AssociationConfig
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.object_model.contour_source import ContourKind
@@ -76,7 +76,7 @@ def match_nearest(
     place: Float[Tensor, "b n 2"],
     objects: MovingObjects,
     gate_px: float,
-    config: MatchingConfig,
+    config: AssociationConfig,
     wider: Float[Tensor, "b"] | None = None,
     finely: Bool[Tensor, "b"] | None = None,
 ) -> tuple[Matches, Float[Tensor, "b n 2"]]:

@@ -9,7 +9,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from torchtrack.config.tracker import MatchingConfig
+from torchtrack.config.tracker import AssociationConfig
 from torchtrack.errors import UnknownFormatError
 from torchtrack.object_model.contour_source import ContourModel
 from torchtrack.tracking.association.weighting_features import FEATURES, Evidence, limb_features, trust_features
@@ -81,10 +81,10 @@ class LimbTrust(nn.Module):
         return torch.where(is_limb, trust, 1.0)
 
 
-def shipped_weigher(models: Sequence[ContourModel], config: MatchingConfig) -> nn.Module | None:
-    """The weigher that ``learned_trust`` asks for; none where it has nothing to say of these models."""
-    if config.learned_trust == "all":
+def shipped_weigher(models: Sequence[ContourModel], config: AssociationConfig) -> nn.Module | None:
+    """The weigher that ``weighting_network`` asks for; none where it has nothing to say of these models."""
+    if config.weighting_network == "all":
         return TrustNetwork.shipped()
-    if config.learned_trust == "limbs" and any(bool(model.is_bent.any()) for model in models):
+    if config.weighting_network == "limbs" and any(bool(model.is_bent.any()) for model in models):
         return LimbTrust(TrustNetwork.shipped())
     return None

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.linalg import vecdot
 
-from torchtrack.config.tracker import MatchingConfig
+from torchtrack.config.tracker import AssociationConfig
 from torchtrack.core.constants import constant, scalar_one
 from torchtrack.core.padded import take_points
 from torchtrack.tracking.contours.index import ContourIndex
@@ -99,12 +99,14 @@ def leading_side(speed_px_s: Tensor) -> Tensor:
     return speed_px_s / (speed_px_s.abs() + constant((SLOW_PX_S,), speed_px_s.dtype, speed_px_s.device))
 
 
-def dark_shift_px(limb: Tensor, config: MatchingConfig) -> Tensor:
+def dark_shift_px(limb: Tensor, config: AssociationConfig) -> Tensor:
     """How far events lie to the dark side of their edge: a step's, or, less, that of a limb, towards which shading fades."""
-    return torch.add(constant((config.dark_shift_px,), limb.dtype, limb.device), limb, alpha=config.limb_dark_shift_px - config.dark_shift_px)
+    return torch.add(constant((config.dark_shift_px,), limb.dtype, limb.device), limb, alpha=config.silhouette_dark_shift_px - config.dark_shift_px)
 
 
-def match_weights(offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, as_expected: Tensor, config: MatchingConfig) -> tuple[Tensor, Tensor]:
+def match_weights(
+    offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, as_expected: Tensor, config: AssociationConfig
+) -> tuple[Tensor, Tensor]:
     """How far each observation is to be trusted, by those around it, and how many of these are on the contour."""
     cell, on_and_near = patch(targets), on_and_around(offsets, near) * as_expected[:, None]
     values = torch.cat([on_and_near, on_and_near[:, :1] * dark[:, None]], 1)
@@ -113,7 +115,7 @@ def match_weights(offsets: Tensor, targets: Tensor, near: Tensor, dark: Tensor, 
     return weights * polarity_agreement(dark, votes, on_count, config) if config.polarity else weights, on_count
 
 
-def concentration(on_count: Float[Tensor, "b n"], near_count: Float[Tensor, "b n"], config: MatchingConfig) -> Float[Tensor, "b n"]:
+def concentration(on_count: Float[Tensor, "b n"], near_count: Float[Tensor, "b n"], config: AssociationConfig) -> Float[Tensor, "b n"]:
     """How closely the observations around each one lie on the contour, 0 to 1, by their numbers in its patch of the image.
 
     Events of a contour, moved to the window's end with the contour's own motion, gather within a pixel of it. What moves
@@ -127,7 +129,7 @@ def concentration(on_count: Float[Tensor, "b n"], near_count: Float[Tensor, "b n
 
 
 def polarity_agreement(
-    dark: Float[Tensor, "b n"], votes: Float[Tensor, "b n"], voters: Float[Tensor, "b n"], config: MatchingConfig
+    dark: Float[Tensor, "b n"], votes: Float[Tensor, "b n"], voters: Float[Tensor, "b n"], config: AssociationConfig
 ) -> Float[Tensor, "b n"]:
     """How far each observation's polarity agrees with that of most others on the contour in its patch of the image.
 
@@ -141,7 +143,7 @@ def polarity_agreement(
     return agreeing(dark * votes / (voters + two_of(voters)), config)
 
 
-def agreeing(agreement: Tensor, config: MatchingConfig) -> Tensor:
+def agreeing(agreement: Tensor, config: AssociationConfig) -> Tensor:
     """Trust in events whose polarity is what it should be, 1, or the opposite, -1, as far as that is known."""
     return torch.add(scalar_one(agreement), agreement, alpha=config.polarity_gain).clamp_(config.least_agreement, 1)
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchtrack.config.tracker import MatchingConfig, TrackerConfig
+from torchtrack.config.tracker import AssociationConfig, TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.host_sync import AsyncValue
@@ -49,7 +49,7 @@ class Fit:
 
 def gate_widening(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[Tensor, "b"]:
     """How many times wider than configured the first gate is, for predictions of that standard deviation: at least 1."""
-    matching = config.matching
+    matching = config.association
     first_px = matching.gates_px[0]
     return (matching.gate_sigmas * sigma_px / first_px).clamp(1, max(matching.max_gate_px / first_px, 1))
 
@@ -61,12 +61,12 @@ def may_be_anywhere(widening: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
 
 def index_radius(widening: Float[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:
     """How far contours are to be found for each object's first gate (px)."""
-    return (widening * max(config.matching.gates_px)).long() + _INDEX_MARGIN_PX
+    return (widening * max(config.association.gates_px)).long() + _INDEX_MARGIN_PX
 
 
 def usual_index_radius(config: TrackerConfig) -> int:
     """The same for an object whose first gate is as configured."""
-    return int(max(config.matching.gates_px)) + _INDEX_MARGIN_PX
+    return int(max(config.association.gates_px)) + _INDEX_MARGIN_PX
 
 
 def index_for(
@@ -77,7 +77,7 @@ def index_for(
     Args:
         radius_px: :func:`index_radius`, where it was asked for ahead.
     """
-    return index_contours(contours, image_size, radius_px or AsyncValue.to(index_radius(widening, config)), config.matching.index_cell_px)
+    return index_contours(contours, image_size, radius_px or AsyncValue.to(index_radius(widening, config)), config.association.index_cell_px)
 
 
 def align(
@@ -101,7 +101,7 @@ def align(
         offset: of the beginning from the prediction: pose, velocity and swelling; none when not given.
         extra_terms: of the cost, beside contour distances and prior.
     """
-    objects, matching = prediction.objects, config.matching
+    objects, matching = prediction.objects, config.association
     information = _information(prediction, config)
     begin = prediction if offset is None else prediction.moved(offset)
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
@@ -158,7 +158,7 @@ def align_rounds(
         table: of the contours where the rounds begin.
     """
     prediction, begin, offset, contours = start.prediction, start.begin, start.offset, start.contours
-    objects, matching = prediction.objects, config.matching
+    objects, matching = prediction.objects, config.association
     place = _first_place(begin, observations, config)
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, gates.wider, strict=True)):
         if number and number in config.contours.refresh_rounds:
@@ -180,7 +180,7 @@ def align_rounds(
 
 
 def _looked_up_finely(
-    objects: ObjectBatch, begin: Prediction, table: ContourTable, widening: Float[Tensor, "b"], config: MatchingConfig
+    objects: ObjectBatch, begin: Prediction, table: ContourTable, widening: Float[Tensor, "b"], config: AssociationConfig
 ) -> Bool[Tensor, "b"]:
     """Of which objects contours are looked up between the cells of the index: of small ones, and those of which print or smooth limbs are seen.
 
@@ -193,9 +193,9 @@ def _looked_up_finely(
     return finely & (widening <= 1)
 
 
-def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config: MatchingConfig) -> ContourTable:
+def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config: AssociationConfig) -> ContourTable:
     """What observations take from their contours, with the polarity that is expected of them."""
-    return contour_table(contours, index, objects.polarity, of_print=config.print_polarity, close_px=config.close_edges_px)
+    return contour_table(contours, index, objects.polarity, of_print=config.texture_polarity, close_px=config.edge_ambiguity_px)
 
 
 def _narrowing(widening: Float[Tensor, "b"], rounds: int) -> Float[Tensor, "r b"]:
@@ -206,7 +206,7 @@ def _narrowing(widening: Float[Tensor, "b"], rounds: int) -> Float[Tensor, "r b"
 
 def _first_place(begin: Prediction, observations: Observations, config: TrackerConfig) -> Float[Tensor, "b n 2"]:
     """Where the first round looks for each observation: carried to the window's end with the object's plane."""
-    if not config.matching.motion_compensation:
+    if not config.association.motion_compensation:
         return observations.pixels
     return begin.carried(observations.pixels, observations.age_s)
 
@@ -215,9 +215,9 @@ def _information(prediction: Prediction, config: TrackerConfig) -> Tensor:
     """Information of the prediction in the solver's chart, for observations of unit weight: 13 of them, or none for the pose."""
     if not config.solver.prior:
         return prediction.velocity.new_zeros(len(prediction.velocity), 6, 6)
-    swelling_px = config.solver.swelling_px or _NO_SWELLING_PX
+    silhouette_offset_px = config.solver.silhouette_offset_px or _NO_SWELLING_PX
     information = pad((config.solver.observation_px**2 * prediction.information).to(prediction.velocity.dtype), (0, 1, 0, 1))
-    information[:, 12, 12] = config.solver.observation_px**2 * swelling_px**-2
+    information[:, 12, 12] = config.solver.observation_px**2 * silhouette_offset_px**-2
     return information
 
 
@@ -226,7 +226,7 @@ def _believed(matches: Matches, observations: Observations, config: TrackerConfi
     weights = matches.weights * matches.mask
     if observations.trust is not None:
         weights = weights * observations.trust
-    enough = weights.sum(-1, keepdim=True) >= config.quality.min_observations
+    enough = weights.sum(-1, keepdim=True) >= config.validation.min_observations
     # The model of a smooth limb, which has facets, and its shading put a whole piece of it off.
     common_px2 = torch.add(matches.mistaken_px2, matches.limb, alpha=config.solver.common_px**2)
     told = told_by_each(matches.beside, common_px2, config.solver.observation_px)
@@ -236,7 +236,7 @@ def _believed(matches: Matches, observations: Observations, config: TrackerConfi
 def _problem(start: Start, matches: Matches, offset: Float[Tensor, "b k"], gate_px: Float[Tensor, "b"], config: TrackerConfig) -> PoseProblem:
     """The least squares problem of one round; objects without a match stay where they are."""
     prediction = start.prediction
-    rows = both_coordinates(matches) if config.matching.residual == "point" else matches
+    rows = both_coordinates(matches) if config.association.residual == "point" else matches
     return PoseProblem(
         points_obj=rows.points_obj,
         targets=rows.targets,
@@ -255,7 +255,7 @@ def _problem(start: Start, matches: Matches, offset: Float[Tensor, "b k"], gate_
 def _window_terms(prediction: Prediction, rows: Matches, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
     """What observations tell beside the pose: of the velocity by their ages, and of how far limbs stand out."""
     age_s, outward = rows.age_s, rows.limb
-    if config.matching.residual != "normal":
+    if config.association.residual != "normal":
         outward = torch.zeros_like(outward)
     if not config.solver.velocity_in_window:
         age_s = torch.zeros_like(age_s)

@@ -39,7 +39,7 @@ def sensor_tables(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "s h w 2"], 
 
 def farthest_event_px(config: TrackerConfig) -> float:
     """How far from an object events can have to do with it (px)."""
-    return max(config.matching.max_gate_px, *config.matching.gates_px) + _DRAWN_SIGMAS * config.search.least_sigma_px
+    return max(config.association.max_gate_px, *config.association.gates_px) + _DRAWN_SIGMAS * config.relocalization.least_sigma_px
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Sensors:
         regions = object_regions(self.on_sensor(contours.pixels), contours.mask, self.stream_index, self.image_size, margin_px, largest_px)
         surface = time_surface(last_event_us, t_us, regions, config.surface.tau_s, self.ideal_pixels.dtype)
         corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config.surface, config.corners)
-        if not (config.flow.always or config.matching.along_flow):
+        if not (config.flow.always or config.association.along_flow):
             return corners
         return estimate_flow(corners, last_event_us, t_us, self.stream_index, self.ideal_pixels, config.flow)
 

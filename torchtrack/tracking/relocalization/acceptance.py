@@ -76,9 +76,9 @@ class AcceptanceTest:
         config, prediction, offsets = lost.config, hypotheses.prediction, tried.fit.solution.from_prior
         eligible = self.is_passed(tried, config) & is_likely(offsets, hypotheses.covariance)
         score, asked = torch.where(eligible, tried.score, 0), self.asked_score(lost.window.scored, lost.number, config)
-        if config.search.line_ends and hypotheses.is_wide:
+        if config.relocalization.line_ends and hypotheses.is_wide:
             score = less_where_lines_run_on(score, score > asked, tried.fit.contours, hypotheses.places, prediction.objects.image_size)
-        by_events = config.search.by_events and hypotheses.is_wide
+        by_events = config.relocalization.by_matches and hypotheses.is_wide
         best = likeliest(less_by_few_events(score, tried.count) if by_events else score, offsets, prediction.covariance[0])
         return Choice(best, score.index_select(0, best) > asked)
 
@@ -86,11 +86,11 @@ class AcceptanceTest:
         """Which hypotheses match enough observations that gather enough."""
         # Written so that what does not tell how far it gathers passes.
         gathers = ~(tried.gathered < self.min_inlier_ratio)
-        return (tried.count >= self.min_matches.clamp(min=config.quality.min_observations)) & gathers
+        return (tried.count >= self.min_matches.clamp(min=config.validation.min_observations)) & gathers
 
     def asked_score(self, scored: Found, number: int, config: TrackerConfig) -> Float[Tensor, ""]:
         """The score that has to be surpassed."""
-        own = torch.where(scored.count[number] >= config.quality.min_observations, scored.score[number], 0.0)
+        own = torch.where(scored.count[number] >= config.validation.min_observations, scored.score[number], 0.0)
         return torch.maximum(own + self.margin, self.min_score)
 
 
@@ -103,18 +103,18 @@ def near_prediction(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: 
     While a motion is not known nothing says how far events gather when all is well, and dense print explains as much of many poses:
     a pose that smears the events more than the prediction's own is not better.
     """
-    search, starting, reference = config.search, evidence.is_starting, evidence.reference_explained_ratio
+    search, starting, reference = config.relocalization, evidence.is_starting, evidence.reference_explained_ratio
     margin = torch.where(starting, search.start_margin, search.margin)
     # What is far away has to explain about as much as usual; so has what is reached step by step, while a motion is lost, ever farther away.
-    min_score = torch.where(has(flags, DRIFTS) | starting, search.adrift_share * reference, 0)
+    min_score = torch.where(has(flags, DRIFTS) | starting, search.drift_min_ratio * reference, 0)
     # What is partly hidden explains less, too: nothing but the whole object, seen elsewhere by no fewer events, speaks against that.
     # A part of its edges does not.
     slow = has(flags, Trigger.SLOW_DRIFT)
-    margin = torch.where(slow, search.slip_margin, margin)
-    min_score = torch.where(slow, search.slip_share * reference, min_score)
+    margin = torch.where(slow, search.elsewhere_margin, margin)
+    min_score = torch.where(slow, search.elsewhere_min_ratio * reference, min_score)
     # Of a new object, only what explains nearly all is surely better: edges of what hides it explain half.
     new = has(flags, Trigger.NEW)
-    min_score = torch.where(new, search.new_share, min_score)
+    min_score = torch.where(new, search.new_below, min_score)
     min_inlier_ratio = torch.where(starting | new, scored.gathered.nan_to_num(0.0) - AS_MUCH, 0)
     return AcceptanceTest(margin, min_score, min_inlier_ratio, torch.where(slow, _matches(scored), 0))
 
@@ -123,7 +123,7 @@ def elsewhere(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found,
     """Of poses that are not around the prediction, or farther away than it allows."""
     reference = evidence.reference_explained_ratio
     nothing = torch.zeros_like(reference)
-    return AcceptanceTest(nothing + config.search.slip_margin, config.search.slip_share * reference, nothing, nothing)
+    return AcceptanceTest(nothing + config.relocalization.elsewhere_margin, config.relocalization.elsewhere_min_ratio * reference, nothing, nothing)
 
 
 def as_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found, config: TrackerConfig) -> AcceptanceTest:
@@ -140,9 +140,9 @@ def around_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored:
 
     A small thing that is all explained says nothing against a pose of which far more events are explained. What is partly hidden does.
     """
-    changed, search = has(flags, Trigger.DEPTH_CHANGED), config.search
-    margin = torch.where(changed, -torch.inf, search.slip_margin)
-    min_score = torch.where(changed, config.quality.certain_at, search.slip_share) * evidence.reference_explained_ratio
+    changed, search = has(flags, Trigger.DEPTH_CHANGED), config.relocalization
+    margin = torch.where(changed, -torch.inf, search.elsewhere_margin)
+    min_score = torch.where(changed, config.validation.validated_from, search.elsewhere_min_ratio) * evidence.reference_explained_ratio
     min_matches = torch.where(changed, _FAR_MORE, 1) * _matches(scored)
     return AcceptanceTest(margin, min_score, torch.zeros_like(min_score), min_matches)
 

@@ -105,7 +105,7 @@ class RotationTest:
         strength = torch.where(hypotheses.exists, explained + score / score.max().clamp(min=1e-6), -torch.inf)
         first, second = strength.topk(2).values
         best = strength.argmax()[None]
-        clear = (first - second >= _CLEARLY) & (tried.count[best] >= lost.config.quality.min_observations)
+        clear = (first - second >= _CLEARLY) & (tried.count[best] >= lost.config.validation.min_observations)
         larger = (tried.score[best] >= tried.score[0] + _LARGER_RATIO) | (score[best] >= _MORE_EVENTS * score[0])
         accepted = clear & (best > 0) & (explained[best] >= explained[0] + _CLEARLY) & larger
         # What was rotated has to be confirmed by the next look.

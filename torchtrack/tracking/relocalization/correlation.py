@@ -57,7 +57,7 @@ class _Square:
 def shifted(
     prediction: Prediction, steps: Float[Tensor, "n 6"], sigma_m: Float[Tensor, ""], places: tuple[Tensor, Tensor], config: TrackerConfig
 ) -> tuple[Float[Tensor, "k 6"], Contours]:
-    """Offsets of one object's pose at which its contours lie on most events, ``search.kept`` of them, the best first, and its outlines there.
+    """Offsets of one object's pose with most events on its contours, ``relocalization.kept_rotations`` of them, best first; and its outlines.
 
     Args:
         prediction: of the object.
@@ -72,7 +72,7 @@ def shifted(
     square = _Square(ray[:2] * focal + objects.intrinsics[0, 2:], cell_px)
     steps = torch.cat([steps[:, :3], steps[:, 5:] * ray], 1)
     outlines = outlines_by_view(prediction, prediction.poses_at(steps), config)
-    number, shift = _best(square, places, outlines, sigma_px / cell_px, config.search.kept)
+    number, shift = _best(square, places, outlines, sigma_px / cell_px, config.relocalization.kept_rotations)
     moved_m = shift * cell_px * ((centre[2] + steps[number, 5:]) / focal)
     return torch.cat([steps[number, :3], steps[number, 3:5] + moved_m, steps[number, 5:]], 1), outlines.rows(number)
 

@@ -63,7 +63,7 @@ def around_prediction_released(lost: LostObject) -> Hypotheses:
     Held by its prediction, no pose some pixels away is reached, however much it explains. What is accepted goes on as certain as
     if it had been predicted: an object that is not held at all wanders off from a hypothesis to the next.
     """
-    config, sigma_px, slip_px = lost.config, lost.sigma_px, lost.config.search.slip_sigma_px
+    config, sigma_px, slip_px = lost.config, lost.sigma_px, lost.config.relocalization.score_drop_sigma_px
     hypotheses = sampled_around(lost, less_certain(lost.predicted(), sigma_px, slip_px), slip_px, lost.contours())
     released = config.solver.observation_px**2 * (1 - (sigma_px / slip_px) ** 2) * lost.widened.information[lost.number]
     return replace(hypotheses, released=released)
@@ -80,7 +80,7 @@ def mirrored(lost: LostObject, plane: int) -> Hypotheses | None:
     other = lost.others.ambiguities.planes.mirrored(lost.number, plane, lost.as_scored())
     if other is None:
         return None
-    slip_px = lost.config.search.slip_sigma_px
+    slip_px = lost.config.relocalization.score_drop_sigma_px
     return _sampled_elsewhere(lost, less_certain(other, lost.predicted_sigma_px, slip_px), slip_px)
 
 
@@ -88,7 +88,7 @@ def around_last_seen(lost: LostObject) -> Hypotheses:
     """All around where it was last validated, at rest there."""
     other = lost.others.last_seen.prediction(lost.number, lost.window.prediction)
     # A look from there is a wide one, however far this one goes.
-    hypotheses = _sampled_elsewhere(lost, other, 2 * lost.config.search.wide_sigma_px)
+    hypotheses = _sampled_elsewhere(lost, other, 2 * lost.config.relocalization.wide_sigma_px)
     return replace(hypotheses, gate_scale=gate_widening(torch.full_like(lost.window.gate_scale[:1], torch.inf), lost.config))
 
 
@@ -98,7 +98,7 @@ def sampled_around(lost: LostObject, prediction: Prediction, sigma_px: float, ou
     Args:
         sigma_px: standard deviation of the prediction in the image.
     """
-    search = lost.config.search
+    search = lost.config.relocalization
     widened_px = max(sigma_px, search.least_sigma_px)
     covariance = less_certain(prediction, sigma_px, widened_px).covariance[0]
     places = prediction.carried(lost.events.pixels, lost.events.age_s), lost.events.mask

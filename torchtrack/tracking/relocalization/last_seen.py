@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import rim_and_centre
@@ -17,7 +17,7 @@ from torchtrack.tracking.state import TrackerState
 _LONGEST_S, _LONGEST_ROTATION_S = 0.4, 1.0
 
 
-def with_drift(prediction: Prediction, is_adrift: Bool[Tensor, "b"], drift_s: Float[Tensor, "b"], config: SearchConfig) -> Prediction:
+def with_drift(prediction: Prediction, is_adrift: Bool[Tensor, "b"], drift_s: Float[Tensor, "b"], config: RelocalizationConfig) -> Prediction:
     """The prediction, of objects that drift so uncertain as if they had moved otherwise, at some constant velocity, for that long."""
     objects = prediction.objects
     speed_m_s = torch.minimum(config.drift_px_s / objects.px_per_m(prediction.T_cam_obj), config.drift_diameters_s * objects.diameter_m).double()
@@ -69,7 +69,7 @@ class LastSeen:
             t_us: end of the window: it says which look it is.
         """
         T_cam_obj = state.health.T_last_validated.to(objects.intrinsics.dtype)
-        look = (t_us // max(config.search.interval_us, 1) % _LOOKS)[objects.stream_index]
+        look = (t_us // max(config.relocalization.interval_us, 1) % _LOOKS)[objects.stream_index]
         share = (look + 1).double() / _LOOKS
         height, width = objects.image_size
         across_px = (_SPEED_PX_S * state.health.time_since_validated_s.double()).clamp(max=_DIAGONALS * (height**2 + width**2) ** 0.5)

@@ -23,9 +23,9 @@ _ALIGNED_AGAIN = 8
 
 def refined(hypotheses: Hypotheses, lost: LostObject) -> Found:
     """The hypotheses aligned on the events of their object, and scored; of a very uncertain object, the best of them once more."""
-    search = lost.config.search
+    search = lost.config.relocalization
     tried = align_and_score(hypotheses.rows(len(hypotheses.offsets)), hypotheses.offsets, lost)
-    for _ in range(search.realigned if hypotheses.is_wide else 0):
+    for _ in range(search.realignments if hypotheses.is_wide else 0):
         # From some way off, a pose comes near the right one before its contours are those that are seen there.
         best = tried.score.topk(min(_ALIGNED_AGAIN, len(tried.score))).indices
         tried = align_and_score(hypotheses.rows(len(best)), tried.fit.solution.from_prior[best], lost)
@@ -40,7 +40,7 @@ def align_and_score(rows: Prediction, offsets: Float[Tensor, "n 13"], lost: Lost
     tight = torch.ones_like(offsets[:, 0])
     index = index_for(contours, rows.objects.image_size, config, tight)
     events = lost.events.repeated(len(offsets))
-    observations = select_events(events, index, begin.moving(compensated=True), config.matching.max_events)
+    observations = select_events(events, index, begin.moving(compensated=True), config.association.max_events)
     fit = align(rows, contours, index, tight, observations, config, offsets)
     references = (value[number].expand_as(tight) for value in (scored.full_gathered, scored.asked_apart))
     tried = judge_fit(rows, fit, config, torch.zeros_like(tight), *references)

@@ -41,10 +41,10 @@ def relocalize(
     tests = [source.test(evidence, triggers, window.scored, config) for source in sources]
     drifts = has(triggers, DRIFTS) & ~has(triggers, Trigger.HELD)
     drift_s = torch.where(has(triggers, Trigger.SLOW_DRIFT), evidence.time_since_validated_s, evidence.drift_s)
-    widened = with_drift(window.prediction, drifts, drift_s, config.search)
+    widened = with_drift(window.prediction, drifts, drift_s, config.relocalization)
     sigma_px = torch.where(drifts, widened.sigma_px(window.scored.fit.contours), evidence.sigma_px)
     # Without events no pose is better than another; what is looked for all around may have its own there.
-    enough = events.counts() >= config.quality.min_observations
+    enough = events.counts() >= config.validation.min_observations
     flags = AsyncValue.to(torch.where(enough, triggers, triggers & int(AROUND_LAST_SEEN))).numbers()
     sigmas_px = AsyncValue.to(torch.stack([sigma_px, evidence.sigma_px], 1)).numbers()
     for comes_last in (False, True):

@@ -44,14 +44,14 @@ def sample(
         sigma_px: what it comes to in the image.
         places: pixels of the events at the window's end, and which of them exist.
     """
-    settings = config.search
+    settings = config.relocalization
     enough = event_density(*places, prediction.objects.image_size).clamp(max=ENOUGH_EVENTS)
     if sigma_px > settings.wide_sigma_px:
         poses, outlines = _anywhere(prediction, covariance, places, enough, config)
         offsets = difference_about(prediction.T_cam_obj.expand(len(poses), 4, 4), poses, prediction.objects.centre_obj.expand(len(poses), 3))
         offsets = _with_velocity(offsets, covariance)
     else:
-        offsets, outlines = draw_offsets(covariance, settings.drawn).to(prediction.velocity.dtype), thinned(outline)
+        offsets, outlines = draw_offsets(covariance, settings.samples).to(prediction.velocity.dtype), thinned(outline)
         poses = prediction.poses_at(offsets[:, :6])
     scores = score_outlines(outlines, poses, prediction.objects.intrinsics, enough)
     chosen = scores.topk(min(settings.hypotheses - 1, len(scores))).indices
@@ -62,13 +62,13 @@ def _anywhere(
     prediction: Prediction, covariance: Tensor, places: tuple[Tensor, Tensor], enough: Float[Tensor, "h w"], config: TrackerConfig
 ) -> tuple[Float[Tensor, "k 4 4"], Contours]:
     """Poses of a very uncertain object whose contours lie on events, and these: rotated as drawn, shifted to where most are, and pulled onto them."""
-    steps = draw_offsets(covariance, config.search.turns)[:, :6].to(prediction.velocity.dtype)
+    steps = draw_offsets(covariance, config.relocalization.rotations)[:, :6].to(prediction.velocity.dtype)
     sigma_m = covariance.diagonal()[3:5].mean().sqrt().to(steps.dtype)
     steps, outlines = shifted(prediction, steps, sigma_m, places, config)
     around = avg_pool2d(enough[None], 3, 1, 1)[0]
     onto = (around, covariance[:6, :6])
     poses = pulled(prediction, prediction.poses_at(steps), outlines, *onto, FAR_PX)
-    best = score_outlines(outlines, poses, prediction.objects.intrinsics, enough).topk(min(config.search.pulled, len(poses))).indices
+    best = score_outlines(outlines, poses, prediction.objects.intrinsics, enough).topk(min(config.relocalization.pulled, len(poses))).indices
     poses = poses[best]
     # What was seen from near there does not do any more.
     poses = pulled(prediction, poses, outlines_at(prediction, poses, config), *onto, NEAR_PX)
@@ -129,4 +129,4 @@ def rehearse(prediction: Prediction, config: TrackerConfig) -> None:
     """Call what the search of a very uncertain object calls and other windows do not: kernels are compiled, or read from the disk, at that."""
     alone = prediction.copies(0, 1)
     outline, nowhere = alone.objects.contours(alone.T_cam_obj, config.contours), alone.T_cam_obj.new_zeros(1, 1, 2)
-    sample(alone, outline, alone.covariance[0], 2 * config.search.wide_sigma_px, (nowhere, torch.zeros(1, 1, dtype=torch.bool)), config)
+    sample(alone, outline, alone.covariance[0], 2 * config.relocalization.wide_sigma_px, (nowhere, torch.zeros(1, 1, dtype=torch.bool)), config)

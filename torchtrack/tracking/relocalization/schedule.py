@@ -21,8 +21,8 @@ _DEPTH_FACTOR = 1.25
 
 def schedule(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> Schedule:
     """What the state alone says of the window that ends at ``t_us``: which objects are lost, and which are looked for all around."""
-    search = config.search
-    is_due, is_drift_due = is_time(state.t_us, t_us, search.interval_us, search.doubt_us)[:, objects.stream_index]
+    search = config.relocalization
+    is_due, is_drift_due = is_time(state.t_us, t_us, search.interval_us, search.drift_us)[:, objects.stream_index]
     return Schedule(_not_validated_for_long(state, objects, is_drift_due, config), is_due, is_drift_due)
 
 
@@ -46,15 +46,15 @@ def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_
     due = unseen & is_drift_due & ~lost
     now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.health.T_last_validated))
     changed = due & (torch.maximum(now_m / then_m, then_m / now_m) > _DEPTH_FACTOR)
-    below = due & (state.health.score < config.search.anew_below * state.health.reference_explained_ratio)
+    below = due & (state.health.score < config.relocalization.not_validated_below * state.health.reference_explained_ratio)
     bits = Trigger.LOST, Trigger.DEPTH_CHANGED, Trigger.FAR_BELOW_REFERENCE
     return (torch.stack([lost, changed, below]) * constant(tuple((int(bit),) for bit in bits), torch.int64, lost.device)).sum(0)
 
 
 def _is_unseen_for_long(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    if not (config.search.anew_us and searches(config)):
+    if not (config.relocalization.not_validated_us and searches(config)):
         return torch.zeros_like(state.health.time_since_validated_s, dtype=torch.bool)
-    return (state.health.time_since_validated_s >= 1e-6 * config.search.anew_us) & (state.health.mean_score > 0)
+    return (state.health.time_since_validated_s >= 1e-6 * config.relocalization.not_validated_us) & (state.health.mean_score > 0)
 
 
 def _is_unknown(state: TrackerState, diameter_m: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:

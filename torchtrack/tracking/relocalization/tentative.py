@@ -38,7 +38,7 @@ def after_probation(
     if host_sync.none_of(concerned):
         return state, result
     probation = _begun(before, result, prediction, widening)
-    wanted = config.quality.certain_at * before.health.reference_explained_ratio
+    wanted = config.validation.validated_from * before.health.reference_explained_ratio
     speaks_for = (result.quality / wanted.clamp(min=1e-3)).clamp(max=1) - _NEUTRAL
     evidence = probation.evidence + speaks_for
     wrong = probation.is_tentative & (evidence <= _TAKEN_BACK_AT)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.search import SearchConfig
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import none_of
@@ -86,8 +86,8 @@ def _bits(conditions: Mapping[int, Condition], evidence: TriggerEvidence, config
 
 def is_drifting(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """DRIFT: objects that have explained too little, by smeared events, for so long that they are looked for farther away."""
-    due, search = evidence.is_drift_due, config.search
-    return due & (evidence.drift_s >= 1e-6 * search.doubt_us) if search.doubt_us else torch.zeros_like(due)
+    due, search = evidence.is_drift_due, config.relocalization
+    return due & (evidence.drift_s >= 1e-6 * search.drift_us) if search.drift_us else torch.zeros_like(due)
 
 
 def is_drifting_slowly(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
@@ -95,15 +95,15 @@ def is_drifting_slowly(evidence: TriggerEvidence, config: TrackerConfig) -> Bool
 
     The mean follows a drift that is slow, and the covariance forgets the direction that it went in.
     """
-    due, search = evidence.is_drift_due, config.search
+    due, search = evidence.is_drift_due, config.relocalization
     if none_of(due):
         return due
-    if not (search.doubt_us and search.strayed_to):
+    if not (search.drift_us and search.slow_drift_below):
         return torch.zeros_like(due)
-    low = evidence.last_score < search.strayed_to * evidence.reference_explained_ratio
-    long = evidence.time_since_validated_s >= 1e-6 * search.doubt_us
+    low = evidence.last_score < search.slow_drift_below * evidence.reference_explained_ratio
+    long = evidence.time_since_validated_s >= 1e-6 * search.drift_us
     other = is_drifting(evidence, config) | evidence.is_starting
-    return ~other & (due & low & long & (evidence.sigma_px < search.slip_sigma_px))
+    return ~other & (due & low & long & (evidence.sigma_px < search.score_drop_sigma_px))
 
 
 def is_held(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
@@ -111,27 +111,27 @@ def is_held(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b
 
     Where something passes before an object, its edges smear the events around it, and what is laid along them explains more.
     """
-    drifts, search = has(evidence.earlier, Trigger.DRIFT), config.search
+    drifts, search = has(evidence.earlier, Trigger.DRIFT), config.relocalization
     if none_of(drifts):
         return drifts
-    sure = drifts & ~evidence.is_starting & (evidence.sigma_px < search.slip_sigma_px)
-    explains = evidence.score >= search.stands_from * evidence.reference_explained_ratio
-    return sure & explains & are_many(evidence.matches, config.quality) & (search.stands_from > 0)
+    sure = drifts & ~evidence.is_starting & (evidence.sigma_px < search.score_drop_sigma_px)
+    explains = evidence.score >= search.held_from * evidence.reference_explained_ratio
+    return sure & explains & are_many(evidence.matches, config.validation) & (search.held_from > 0)
 
 
 def is_starting(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """STARTING: objects whose motion is not known yet."""
-    return evidence.is_starting if config.search.at_start else torch.zeros_like(evidence.is_starting)
+    return evidence.is_starting if config.relocalization.at_start else torch.zeros_like(evidence.is_starting)
 
 
 def is_uncertain(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """UNCERTAIN: objects whose prediction is not certain; of those where it is very uncertain, when it is time."""
-    return _is_near_or_due(evidence, config) & (evidence.sigma_px > config.search.from_sigma_px)
+    return _is_near_or_due(evidence, config) & (evidence.sigma_px > config.relocalization.from_sigma_px)
 
 
 def is_scored_low(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """LOW_SCORE: objects whose score stays below the mean; of the very uncertain ones, when it is time."""
-    return _is_near_or_due(evidence, config) & evidence.stays_below(config.search.dropped_to * evidence.mean_score)
+    return _is_near_or_due(evidence, config) & evidence.stays_below(config.relocalization.low_score_below * evidence.mean_score)
 
 
 def is_new(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
@@ -143,40 +143,40 @@ def is_new(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"
         return evidence.is_due
     best = torch.maximum(evidence.score, evidence.last_score)
     new = ~evidence.is_starting & evidence.is_due & (evidence.reference_explained_ratio < _NEW * best)
-    return new & (best < config.search.new_share)
+    return new & (best < config.relocalization.new_below)
 
 
 def has_score_dropped(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """SCORE_DROP: objects that are sure of their place, and explain far less all at once."""
-    dropped = evidence.score < config.search.slipped_to * evidence.mean_score
-    return _is_sure(evidence, config.search) & ~has(evidence.earlier, DRIFTS) & dropped
+    dropped = evidence.score < config.relocalization.score_drop_below * evidence.mean_score
+    return _is_sure(evidence, config.relocalization) & ~has(evidence.earlier, DRIFTS) & dropped
 
 
 def is_mirror_ambiguous(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """MIRROR_AMBIGUOUS: objects that may be in a pose that has the outline of the right one: sure of it, they do not explain all."""
     if none_of(evidence.is_drift_due):
         return evidence.is_drift_due
-    low = evidence.stays_below(config.search.mirrored_to * evidence.reference_explained_ratio)
-    return _is_sure(evidence, config.search) & low & _looks_far(evidence, config.search) & evidence.has_symmetry
+    low = evidence.stays_below(config.relocalization.mirrored_below * evidence.reference_explained_ratio)
+    return _is_sure(evidence, config.relocalization) & low & _looks_far(evidence, config.relocalization) & evidence.has_symmetry
 
 
 def is_axis_ambiguous(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """AXIS_AMBIGUOUS: objects that may be rotated about their axis: sure of their place, they explain as much as when seen well again."""
     if none_of(evidence.is_drift_due):
         return evidence.is_drift_due
-    unseen = may_have_rotated(evidence.has_axis, evidence.time_since_validated_s, config.search)
+    unseen = may_have_rotated(evidence.has_axis, evidence.time_since_validated_s, config.relocalization)
     if none_of(unseen):
         return unseen
-    well = evidence.score >= config.search.slip_share * evidence.reference_explained_ratio
-    return unseen & _is_sure(evidence, config.search) & well & _looks_far(evidence, config.search)
+    well = evidence.score >= config.relocalization.elsewhere_min_ratio * evidence.reference_explained_ratio
+    return unseen & _is_sure(evidence, config.relocalization) & well & _looks_far(evidence, config.relocalization)
 
 
 def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """NOT_VALIDATED: objects that drift or are very uncertain, and were not seen well for long: they are also looked for as they were then."""
     if none_of(evidence.is_drift_due):
         return evidence.is_drift_due
-    search = config.search
-    long = (evidence.time_since_validated_s >= 1e-6 * search.unseen_us) & (search.unseen_us > 0)
+    search = config.relocalization
+    long = (evidence.time_since_validated_s >= 1e-6 * search.last_seen_us) & (search.last_seen_us > 0)
     return _looks_far(evidence, search) & long & (has(evidence.earlier, DRIFTS) | (evidence.sigma_px > search.wide_sigma_px))
 
 
@@ -197,16 +197,16 @@ _CONDITIONS: tuple[dict[int, Condition], ...] = (
 )
 
 
-def _is_sure(evidence: TriggerEvidence, config: SearchConfig) -> Bool[Tensor, "b"]:
-    return ~evidence.is_starting & (evidence.sigma_px < config.slip_sigma_px)
+def _is_sure(evidence: TriggerEvidence, config: RelocalizationConfig) -> Bool[Tensor, "b"]:
+    return ~evidence.is_starting & (evidence.sigma_px < config.score_drop_sigma_px)
 
 
 def _is_near_or_due(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    return evidence.is_due | (evidence.sigma_px <= config.search.wide_sigma_px)
+    return evidence.is_due | (evidence.sigma_px <= config.relocalization.wide_sigma_px)
 
 
-def _looks_far(evidence: TriggerEvidence, config: SearchConfig) -> Bool[Tensor, "b"]:
-    return evidence.is_drift_due & (config.doubt_us > 0)
+def _looks_far(evidence: TriggerEvidence, config: RelocalizationConfig) -> Bool[Tensor, "b"]:
+    return evidence.is_drift_due & (config.drift_us > 0)
 
 
 # ---- what else hangs on the same settings
@@ -214,22 +214,22 @@ def _looks_far(evidence: TriggerEvidence, config: SearchConfig) -> Bool[Tensor, 
 
 def searches(config: TrackerConfig) -> bool:
     """Whether other poses are ever tried."""
-    return config.search.hypotheses > 0 and config.solver.prior
+    return config.relocalization.hypotheses > 0 and config.solver.prior
 
 
 def tries_mirrored(config: TrackerConfig) -> bool:
     """Whether mirrored ones are."""
-    return searches(config) and config.search.mirrored_to > 0
+    return searches(config) and config.relocalization.mirrored_below > 0
 
 
 def tries_rotated(config: TrackerConfig) -> bool:
     """Whether those rotated about an axis are."""
-    return searches(config) and config.search.turned and config.search.doubt_us > 0
+    return searches(config) and config.relocalization.axis_rotation and config.relocalization.drift_us > 0
 
 
-def may_have_rotated(has_axis: Bool[Tensor, "b"], time_since_validated_s: Float[Tensor, "b"], config: SearchConfig) -> Bool[Tensor, "b"]:
+def may_have_rotated(has_axis: Bool[Tensor, "b"], time_since_validated_s: Float[Tensor, "b"], config: RelocalizationConfig) -> Bool[Tensor, "b"]:
     """Which objects with an axis were not seen well for so long that they may have rotated about it unseen."""
-    return has_axis & (time_since_validated_s >= 1e-6 * config.doubt_us)
+    return has_axis & (time_since_validated_s >= 1e-6 * config.drift_us)
 
 
 def is_smeared(
@@ -237,16 +237,18 @@ def is_smeared(
     reference_explained_ratio: Float[Tensor, "b"],
     inlier_ratio: Float[Tensor, "b"],
     reference_inlier_ratio: Float[Tensor, "b"],
-    config: SearchConfig,
+    config: RelocalizationConfig,
 ) -> Bool[Tensor, "b"]:
     """Which objects explain so much less than when they are seen well, by smeared events, that they may be elsewhere.
 
     Where less is explained but events gather as ever, an object is right, and partly hidden.
     """
-    return (inlier_ratio < SMEARED * reference_inlier_ratio) & (score < config.doubted_below * reference_explained_ratio)
+    return (inlier_ratio < SMEARED * reference_inlier_ratio) & (score < config.drift_below * reference_explained_ratio)
 
 
-def reference_where_known(sigma_px: Float[Tensor, "b"], reference_inlier_ratio: Float[Tensor, "b"], config: SearchConfig) -> Float[Tensor, "b"]:
+def reference_where_known(
+    sigma_px: Float[Tensor, "b"], reference_inlier_ratio: Float[Tensor, "b"], config: RelocalizationConfig
+) -> Float[Tensor, "b"]:
     """How far events gather on contours when objects are seen well; zero, for nothing, of objects whose place is not known.
 
     They were hidden, as a rule, and the events of what hides them do not gather where they are seen again.

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.config.search import QualityConfig
+from torchtrack.config.validation import ValidationConfig
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.host_sync import none_of
 from torchtrack.core.image_velocity import MovingObjects, pixel_velocity
@@ -36,14 +36,14 @@ AROUND_PX = 5.0
 
 
 def explained_share(
-    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: QualityConfig
+    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: ValidationConfig
 ) -> Float[Tensor, "b"]:
     """:func:`measured_share`; where hardly anything moves, nothing speaks against the pose: all is explained."""
     return measured_share(contours, matches, contour_velocity, image_size, config).nan_to_num(1.0)
 
 
 def measured_share(
-    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: QualityConfig
+    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: ValidationConfig
 ) -> Float[Tensor, "b"]:
     """Of the visible contour that should fire given its motion, the share with observations on it; not a number where hardly any moves.
 
@@ -62,7 +62,7 @@ def measured_share(
 
 @accelerable
 def shares(
-    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: QualityConfig
+    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: ValidationConfig
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """:func:`measured_share` of contours that move with their objects, :func:`gathered_share`, and :func:`directions_apart`."""
     velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
@@ -70,7 +70,7 @@ def shares(
     return measured, gathered_share(matches, config), directions_apart(matches)
 
 
-def gathered_share(matches: Matches, config: QualityConfig) -> Float[Tensor, "b"]:
+def gathered_share(matches: Matches, config: ValidationConfig) -> Float[Tensor, "b"]:
     """Of the observations near an object's contours, the share that is on them; not a number where they are too few to tell.
 
     Contours that slipped onto others are explained by events of those, but what is around them is no longer theirs alone.
@@ -95,7 +95,7 @@ def directions_apart(matches: Matches) -> Float[Tensor, "b"]:
     return 0.5 * (count - (doubled * on[:, None]).sum(-1).norm(dim=1)) / count.clamp(min=1)
 
 
-def asked_apart(full_apart: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], config: QualityConfig) -> Float[Tensor, "b"] | None:
+def asked_apart(full_apart: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], config: ValidationConfig) -> Float[Tensor, "b"] | None:
     """How far apart the directions of an object's contours should be, which was not seen well for a while: as far as when it was.
 
     Less and less: an object may go on along its own edges, of which only those across its way fire then. None where it is certain

@@ -71,9 +71,9 @@ def judge_fit(
         asked_apart: how far apart directions have to be to count in full; zero, or none at all, for nothing asked.
     """
     moving = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).moving(compensated=True)
-    measured, gathered, apart = shares(fit.contours, fit.matches, moving, prediction.objects.image_size, config.quality)
+    measured, gathered, apart = shares(fit.contours, fit.matches, moving, prediction.objects.image_size, config.validation)
     # Of what does not move, events are noise.
-    gathered = torch.where(measured.isnan(), torch.nan, gathered) if config.search.by_gathering else torch.full_like(measured, torch.nan)
+    gathered = torch.where(measured.isnan(), torch.nan, gathered) if config.relocalization.by_inlier_ratio else torch.full_like(measured, torch.nan)
     if asked_apart is not None:
         measured = measured * held_all_ways(apart, asked_apart)
     nothing = torch.zeros_like(measured)

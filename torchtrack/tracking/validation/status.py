@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.search import QualityConfig
+from torchtrack.config.validation import ValidationConfig
 from torchtrack.core.constants import constant
 
 # What gathers no more than this share of how far it does when an object is seen well says nothing for a pose; from the other one on, all.
@@ -28,7 +28,7 @@ class Status(IntEnum):
     DIVERGED = 5
 
 
-def needed_share(widening: Float[Tensor, "b"], config: QualityConfig, hidden: Float[Tensor, "b"] | None = None) -> Float[Tensor, "b"]:
+def needed_share(widening: Float[Tensor, "b"], config: ValidationConfig, hidden: Float[Tensor, "b"] | None = None) -> Float[Tensor, "b"]:
     """The explained share below which an object is lost: the more places it was looked for in, the more is asked of a find.
 
     No more than of any, as far as it is ``hidden``, as :func:`partly_hidden` has it.
@@ -36,11 +36,11 @@ def needed_share(widening: Float[Tensor, "b"], config: QualityConfig, hidden: Fl
     wider = (widening - 1).clamp(0, 1)
     if hidden is not None:
         wider = wider * (1 - hidden)
-    return config.lost_below + (max(config.caught_above, config.lost_below) - config.lost_below) * wider
+    return config.lost_below + (max(config.refound_above, config.lost_below) - config.lost_below) * wider
 
 
 def partly_hidden(
-    gathered: Float[Tensor, "b"], full_gathered: Float[Tensor, "b"], count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: QualityConfig
+    gathered: Float[Tensor, "b"], full_gathered: Float[Tensor, "b"], count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: ValidationConfig
 ) -> Float[Tensor, "b"]:
     """How far a pose counts, 0 to 1, by events that gather on its contours as they do when the object is seen well, however few these are.
 
@@ -60,12 +60,12 @@ def partly_hidden(
     return torch.where(tells & config.partly_hidden, ramp.clamp(max=1), 0)
 
 
-def are_many(count: Int[Tensor, "b"], config: QualityConfig) -> Bool[Tensor, "b"]:
+def are_many(count: Int[Tensor, "b"], config: ValidationConfig) -> Bool[Tensor, "b"]:
     """Whether observations are so many that they tell of an object of which little is explained."""
     return count >= HIDDEN_TIMES * config.min_observations
 
 
-def holding_on(count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: QualityConfig) -> Bool[Tensor, "b"]:
+def holding_on(count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: ValidationConfig) -> Bool[Tensor, "b"]:
     """Which poses go on from the one before by many events: what little is explained of an object that is hidden ever more is still it.
 
     Given up, it would coast away from where it is, and be looked for among the edges of what hides it. Arguments are those of
@@ -75,7 +75,7 @@ def holding_on(count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: Qu
 
 
 def trust(
-    share: Float[Tensor, "b"], config: QualityConfig, full_share: Float[Tensor, "b"] | None = None, widening: Float[Tensor, "b"] | None = None
+    share: Float[Tensor, "b"], config: ValidationConfig, full_share: Float[Tensor, "b"] | None = None, widening: Float[Tensor, "b"] | None = None
 ) -> Float[Tensor, "b"]:
     """How far a pose that was found counts against the prediction: nothing where it is lost, fully once it is certain.
 
@@ -83,7 +83,7 @@ def trust(
     """
     full = torch.full_like(share, config.uncertain_below)
     if full_share is not None and widening is not None:
-        full = torch.maximum(full, config.certain_at * full_share * (widening - 1).clamp(0, 1))
+        full = torch.maximum(full, config.validated_from * full_share * (widening - 1).clamp(0, 1))
     return ((share - config.lost_below) / (full - config.lost_below).clamp(min=1e-6)).clamp(0, 1)
 
 
@@ -93,7 +93,7 @@ def judge(
     in_view: Float[Tensor, "b"],
     step_from_prediction: Float[Tensor, "b 6"],
     diameters_m: Float[Tensor, "b"],
-    config: QualityConfig,
+    config: ValidationConfig,
     widening: Float[Tensor, "b"] | None = None,
     hidden: Float[Tensor, "b"] | None = None,
 ) -> Int[Tensor, "b"]:
@@ -108,7 +108,7 @@ def judge(
         Status.UNCERTAIN: quality < config.uncertain_below,
         Status.LOST: quality < needed_share(widening, config, hidden),
         Status.TOO_FEW_EVENTS: observation_count < config.min_observations,
-        Status.OUT_OF_VIEW: in_view < config.min_visible_share,
+        Status.OUT_OF_VIEW: in_view < config.min_visible_ratio,
         # Written so that what is not a number has diverged.
         Status.DIVERGED: ~((turned < config.max_step_rotation_rad) & (moved < config.max_step_translation * diameters_m)),
     }

@@ -1,0 +1,31 @@
+"""Settings by names that they had before are refused with those that they have now."""
+
+import pytest
+
+from torchtrack.config.explain import dotted_keys
+from torchtrack.config.load import load
+from torchtrack.config.renamed import KEYS, SECTIONS
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("old", "message"),
+    [
+        ("search.turns", "search.*: renamed to 'relocalization', 'turns' is now 'rotations'"),
+        ("search.hypotheses", "search.*: renamed to 'relocalization'$"),
+        ("relocalization.doubt_us", "relocalization.doubt_us .*: renamed to 'relocalization.drift_us'"),
+        ("quality.certain_at", "quality.*: renamed to 'validation', 'certain_at' is now 'validated_from'"),
+        ("solver.swelling_px", "solver.swelling_px .*: renamed to 'solver.silhouette_offset_px'"),
+    ],
+)
+def test_a_name_that_a_setting_had_before_is_refused_with_the_name_it_has(old, message):
+    with pytest.raises(ConfigError, match=message):
+        load(TrackerConfig, overrides={old: 1})
+
+
+def test_all_the_names_that_settings_have_now_are_settings():
+    known = set(dotted_keys(TrackerConfig))
+    for section, keys in KEYS.items():
+        assert {f"{SECTIONS.get(section, section)}.{key}" for key in keys.values()} <= known
+        assert not known & {f"{section}.{key}" for key in keys}

@@ -1,0 +1,72 @@
+"""Names that settings of the tracker had before: they are refused with the name that they have now."""
+
+from collections.abc import Mapping
+from typing import Any
+
+SECTIONS = {"search": "relocalization", "quality": "validation", "matching": "association", "learning": "adaptation"}
+KEYS = {
+    "search": {
+        "drawn": "samples",
+        "turns": "rotations",
+        "kept": "kept_rotations",
+        "realigned": "realignments",
+        "dropped_to": "low_score_below",
+        "slipped_to": "score_drop_below",
+        "mirrored_to": "mirrored_below",
+        "turned": "axis_rotation",
+        "unseen_us": "last_seen_us",
+        "anew_us": "not_validated_us",
+        "anew_below": "not_validated_below",
+        "by_events": "by_matches",
+        "slip_sigma_px": "score_drop_sigma_px",
+        "new_share": "new_below",
+        "probation": "tentative",
+        "by_gathering": "by_inlier_ratio",
+        "doubted_below": "drift_below",
+        "doubt_us": "drift_us",
+        "strayed_to": "slow_drift_below",
+        "stands_from": "held_from",
+        "adrift_share": "drift_min_ratio",
+        "slip_margin": "elsewhere_margin",
+        "slip_share": "elsewhere_min_ratio",
+    },
+    "quality": {
+        "certain_at": "validated_from",
+        "caught_above": "refound_above",
+        "min_visible_share": "min_visible_ratio",
+    },
+    "matching": {
+        "print_polarity": "texture_polarity",
+        "limb_dark_shift_px": "silhouette_dark_shift_px",
+        "adaptive_bursts": "pixel_latency",
+        "learned_trust": "weighting_network",
+        "polarity_memory_s": "polarity_prior_s",
+        "close_edges_px": "edge_ambiguity_px",
+    },
+    "learning": {
+        "below_share": "below_ratio",
+        "up_to_share": "up_to_ratio",
+    },
+    "solver": {
+        "swelling_px": "silhouette_offset_px",
+    },
+}
+
+
+def renamed(location: tuple[int | str, ...], value: Any) -> str | None:
+    """What a setting at a place that is not known is called now; None where it never had another name.
+
+    Args:
+        location: its keys, from the outermost.
+        value: that was given: of a whole section, the keys in it may have other names too.
+    """
+    *before, name = location
+    if name in SECTIONS:
+        inner = KEYS[str(name)]
+        keys = [f"'{key}' is now '{inner[key]}'" for key in value if key in inner] if isinstance(value, Mapping) else []
+        return ", ".join([f"'{'.'.join(map(str, (*before, SECTIONS[str(name)])))}'", *keys])
+    section = str(before[-1]) if before else ""
+    for old, new in (*SECTIONS.items(), ("solver", "solver")):
+        if section == new and name in KEYS[old]:
+            return f"'{'.'.join(map(str, (*before, KEYS[old][str(name)])))}'"
+    return None
