@@ -12,17 +12,6 @@ import pytest
 REPOSITORY = Path(__file__).parents[1]
 BANNED = frozenset({"told", "found", "of", "beside", "little", "one"})
 
-# Folders and files that still have such names. The list only ever gets shorter.
-OPEN = (
-    "torchtrack/backends",
-    "torchtrack/baselines",
-    "torchtrack/tracking",
-    "tests/backends",
-    "tests/baselines",
-    "tests/tracking",
-    "tests/support/measured_matches.py",
-)
-
 
 def banned_names(path: Path) -> Iterator[str]:
     """``file:line: name`` of each identifier in a file that is a banned word."""
@@ -38,13 +27,9 @@ def python_files(folder: str) -> list[Path]:
     return files
 
 
-def is_open(path: Path) -> bool:
-    return any(path.is_relative_to(REPOSITORY / part) for part in OPEN)
-
-
 @pytest.mark.parametrize("folder", ["torchtrack", "tests", "scripts"])
 def test_no_name_is_a_banned_word(folder):
-    assert [name for path in python_files(folder) if not is_open(path) for name in banned_names(path)] == []
+    assert [name for path in python_files(folder) for name in banned_names(path)] == []
 
 
 def test_attributes_and_parameters_count_and_strings_do_not(tmp_path):

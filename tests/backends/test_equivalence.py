@@ -90,7 +90,7 @@ SCENES = (
 @pytest.fixture(scope="module")
 def samples():
     """By operation, the arguments that some scenes call it with."""
-    found = {name: [] for name in NAMES}
+    actual = {name: [] for name in NAMES}
 
     def recorded(name, accelerated, calls):
         def call(*args, **kwargs):
@@ -109,8 +109,8 @@ def samples():
                     own.setattr(operation, "accelerated", recorded(name, operation.accelerated, calls[name]))
                 scene()
             for name in NAMES:
-                found[name] += calls[name]
-    return found
+                actual[name] += calls[name]
+    return actual
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -122,10 +122,10 @@ def test_what_is_accelerated_gives_what_its_reference_gives(name, samples):
             ours = operation.accelerated(*args, **kwargs)
             with dispatch.backend(wanted=False):
                 theirs = operation.reference(*args, **kwargs)
-        assert_alike(told(name, ours, args), told(name, theirs, args))
+        assert_alike(stated(name, ours, args), stated(name, theirs, args))
 
 
-def told(name, value, args):
+def stated(name, value, args):
     """What counts of a result: of padding, nothing does."""
     operation = name.rpartition(".")[2]
     if operation == "mesh_points":
@@ -143,11 +143,11 @@ def told(name, value, args):
     if operation == "strongest_along_normals":
         # So it is which of several places with as many events.
         return [value[1]]
-    if operation == "limb_features":
-        features, is_limb, objects = value
-        own = is_limb[objects]
+    if operation == "silhouette_features":
+        features, is_smooth, objects = value
+        own = is_smooth[objects]
         # The reference tells of all objects, a kernel of those with limbs.
-        return [is_limb, features[own]]
+        return [is_smooth, features[own]]
     return [tensor for part in (value if isinstance(value, tuple) else (value,)) for tensor in _of(part)]
 
 

@@ -144,8 +144,8 @@ def test_the_nearest_contour_of_every_cell(radius_px, cell_px):
     contours, places = random_contours(), uniform(3, 5000, 2, low=-30, high=220, seed=9)
     places[0, :3] = torch.tensor([torch.nan, torch.inf, 1e30])[:, None]
     (ours, theirs) = both_ways(lambda: index_contours(contours, IMAGE_SIZE, radius_px, cell_px))
-    for finely in (None, torch.tensor([True, False, True])):
-        assert torch.equal(ours.look_up(places, finely), theirs.look_up(places, finely))
+    for subcell_lookup in (None, torch.tensor([True, False, True])):
+        assert torch.equal(ours.look_up(places, subcell_lookup), theirs.look_up(places, subcell_lookup))
 
 
 def test_of_no_contours_nothing_is_found():
@@ -186,7 +186,7 @@ def test_which_events_are_chosen(count, kind):
     if kind == "numbered":
         events = replace(events, number=torch.arange(4000).mul(3).expand(3, -1).contiguous())
     if kind == "of all":
-        events = events.of(0).repeated(3)
+        events = events.of_object(0).repeated(3)
     if kind == "none":
         events = replace(events, mask=torch.zeros_like(events.mask))
     index, objects = index_contours(contours, IMAGE_SIZE, 7, 2), moving_objects((300.0, -200.0), 3)
@@ -232,8 +232,8 @@ def random_matches(batch=3, count=900):
     offsets, near = uniform(batch, count, low=-6, high=6, seed=1), uniform(batch, count, seed=2) < 0.7
     zeros, points = torch.zeros_like(offsets), torch.zeros(batch, count, 3).double()
     targets, directions = uniform(batch, count, 2, high=180, seed=3), uniform(batch, count, 2, low=-1, seed=4)
-    told = zeros, zeros, zeros, torch.where(near, 1.0, -1.0).double(), uniform(batch, count, low=0.5, seed=5)
-    return Matches(zeros.long(), near, uniform(batch, count, seed=6), zeros, points, targets, directions, offsets, near, *told)
+    stated = zeros, zeros, zeros, torch.where(near, 1.0, -1.0).double(), uniform(batch, count, low=0.5, seed=5)
+    return Matches(zeros.long(), near, uniform(batch, count, seed=6), zeros, points, targets, directions, offsets, near, *stated)
 
 
 @pytest.mark.parametrize("speed", [0.0, 40.0, 900.0])
@@ -261,9 +261,9 @@ def test_what_is_not_a_number_stays_with_its_object(what):
     (spoilt.points_cam if what == "points" else spoilt.pixels)[1] = torch.nan
     objects = MovingObjects(torch.eye(4).double().expand(3, 4, 4), random_twist(3), torch.ones(3, 3).double(), torch.ones(3, 4).double())
     with torch.inference_mode():
-        alone, beside = (shares(of, random_matches(), objects, IMAGE_SIZE, ValidationConfig()) for of in (contours, spoilt))
-        index, other = (index_contours(of, IMAGE_SIZE, 7, 2) for of in (contours, spoilt))
-    for first, second in zip(alone, beside, strict=True):
+        alone, neighbours = (shares(owner, random_matches(), objects, IMAGE_SIZE, ValidationConfig()) for owner in (contours, spoilt))
+        index, other = (index_contours(owner, IMAGE_SIZE, 7, 2) for owner in (contours, spoilt))
+    for first, second in zip(alone, neighbours, strict=True):
         assert torch.equal(first[[0, 2]], second[[0, 2]])
     assert torch.equal(index.look_up(contours.pixels)[[0, 2]], other.look_up(contours.pixels)[[0, 2]])
 
@@ -293,5 +293,5 @@ def test_marks_of_poses(each, dtype):
 def test_of_no_events_none_are_near(objects):
     tiles = SensorTiles(undistortion_table(SMALL_CAMERA))
     near = torch.ones(objects, len(tiles.middle), dtype=torch.bool)
-    for found in both_ways(lambda: tiles.keep(EventBatch.empty(), near)):
-        assert len(found.events) == 0 and found.of_each is None
+    for actual in both_ways(lambda: tiles.keep(EventBatch.empty(), near)):
+        assert len(actual.events) == 0 and actual.of_each is None

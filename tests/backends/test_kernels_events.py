@@ -70,10 +70,10 @@ def test_events_of_several_objects_are_not_copied_for_each():
     assert isinstance(events, SharedEvents)
     assert events.shared.mask.shape[0] == 1
     for number in range(4):
-        one, row = entries_of(events.of(number), 0), entries_of(events.rows(), number)
-        assert all(torch.equal(one[name], row[name]) for name in row)
+        single, row = entries_of(events.of_object(number), 0), entries_of(events.rows(), number)
+        assert all(torch.equal(single[name], row[name]) for name in row)
     assert int(events.counts()[3]) == 0
-    assert not events.of(3).mask.any()
+    assert not events.of_object(3).mask.any()
 
 
 @pytest.mark.parametrize("count", [100, 5000])

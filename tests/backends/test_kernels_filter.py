@@ -18,7 +18,7 @@ from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.motion.predict import forecast
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.health import TentativeTrack
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import Status
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
@@ -62,7 +62,7 @@ def forecasts(tracker, state, axes_obj=None):
     return lambda: forecast(state.motion, dt_s, tracker.objects, axes_obj, tracker.far_pose, tracker.config)
 
 
-def told(prediction):
+def stated(prediction):
     """What a prediction says."""
     accelerations = [] if prediction.acceleration is None else tensors_of(prediction.acceleration)
     return (prediction.T_cam_obj, prediction.velocity, prediction.covariance, prediction.usable, *accelerations)
@@ -83,7 +83,7 @@ def test_forecasts(settings, spins, dtype):
     tracker, state = boxes(TrackerConfig(motion=MotionConfig(**settings)), dtype)
     axes_obj = torch.nn.functional.normalize(random_twist(OBJECTS, seed=4)[:, :3], dim=1).to(dtype)
     axes_obj[2] = 0
-    for by_kernel, plain in zip(*map(told, both_ways(forecasts(tracker, state, axes_obj if spins else None))), strict=True):
+    for by_kernel, plain in zip(*map(stated, both_ways(forecasts(tracker, state, axes_obj if spins else None))), strict=True):
         assert_as_close(by_kernel, plain, tolerance=TOLERANCE[dtype])
 
 
@@ -98,15 +98,15 @@ def test_what_would_be_lost_is_no_less_certain_than_before():
 @pytest.mark.parametrize("spoilt", ["not a number", "behind the camera", "much too far away"])
 def test_a_forecast_that_is_of_no_use_is_told_and_disturbs_no_other(spoilt):
     tracker, state = boxes()
-    expected = told(forecasts(tracker, state)())
+    expected = stated(forecasts(tracker, state)())
     state.T_cam_obj[3, 2, 3] = {"not a number": torch.nan, "behind the camera": -0.4, "much too far away": 1e6}[spoilt]
     with torch.inference_mode():
-        found = forecasts(tracker, state)()
-    assert found.usable.tolist() == [number != 3 for number in range(OBJECTS)]
-    assert torch.equal(found.T_cam_obj[3], tracker.far_pose[3])
-    assert not found.velocity[3].any()
+        scored = forecasts(tracker, state)()
+    assert scored.usable.tolist() == [number != 3 for number in range(OBJECTS)]
+    assert torch.equal(scored.T_cam_obj[3], tracker.far_pose[3])
+    assert not scored.velocity[3].any()
     others = torch.arange(OBJECTS) != 3
-    for ours, theirs in zip(told(found), expected, strict=True):
+    for ours, theirs in zip(stated(scored), expected, strict=True):
         assert_as_close(ours[others], theirs[others])
 
 
@@ -145,23 +145,23 @@ def random_find(tracker, prediction, dtype):
         *(exists, nothing, nothing, nothing, of_each[1].sign(), torch.ones_like(nothing)),
     )
     solution = Linearisation(T_cam_obj, offset.to(dtype), hessian.to(dtype), offset.to(dtype))
-    measured, gathered = uniform(OBJECTS, low=0.3, seed=23).to(dtype), uniform(OBJECTS, seed=24).to(dtype)
-    measured[0], measured[1], measured[5], gathered[2] = 0.05, 0.3, torch.nan, torch.nan
-    elsewhere, turn_unclear = torch.arange(OBJECTS) % 3 == 0, torch.arange(OBJECTS) % 4 == 2
-    full_gathered, apart, asked_apart = (uniform(OBJECTS, seed=seed).to(dtype) for seed in (26, 30, 31))
-    told = measured, torch.ones_like(measured), count, gathered, full_gathered, apart, asked_apart
-    return Found(Fit(solution, contours, matches), *told, elsewhere, turn_unclear)
+    measured, inlier_ratio = uniform(OBJECTS, low=0.3, seed=23).to(dtype), uniform(OBJECTS, seed=24).to(dtype)
+    measured[0], measured[1], measured[5], inlier_ratio[2] = 0.05, 0.3, torch.nan, torch.nan
+    elsewhere, rotation_unclear = torch.arange(OBJECTS) % 3 == 0, torch.arange(OBJECTS) % 4 == 2
+    reference_inlier_ratio, apart, required_spread = (uniform(OBJECTS, seed=seed).to(dtype) for seed in (26, 30, 31))
+    stated = measured, torch.ones_like(measured), count, inlier_ratio, reference_inlier_ratio, apart, required_spread
+    return ScoredFit(Fit(solution, contours, matches), *stated, elsewhere, rotation_unclear)
 
 
-def conclusions(config, dtype, spoil=lambda found: None):
+def conclusions(config, dtype, spoil=lambda scored: None):
     """What is concluded from a random find."""
     tracker, state = boxes(config, dtype)
     prediction = forecasts(tracker, state)()
-    found = random_find(tracker, prediction, dtype)
-    spoil(found)
-    widening = torch.tensor([1.0, 1.5, 3.0, 1.0, 1.0, 2.5, 1.2]).to(dtype)
+    scored = random_find(tracker, prediction, dtype)
+    spoil(scored)
+    gate_scale = torch.tensor([1.0, 1.5, 3.0, 1.0, 1.0, 2.5, 1.2]).to(dtype)
     dt_s = uniform(OBJECTS, low=1e-3, high=2e-2, seed=11).to(dtype)
-    return lambda: conclude(state, prediction, widening, found, no_corners(found.fit.contours.pixels), dt_s, tracker.config)
+    return lambda: conclude(state, prediction, gate_scale, scored, no_corners(scored.fit.contours.pixels), dt_s, tracker.config)
 
 
 CONCLUDED = {
@@ -184,10 +184,10 @@ def test_conclusions(settings, dtype):
 
 @pytest.mark.parametrize(("partly_hidden", "holds_on"), [(True, False), (False, True), (False, False)])
 def test_conclusions_of_what_may_be_partly_hidden(partly_hidden, holds_on, dtype):
-    def spoil(found):
-        found.measured[:] = 0.2
-        found.full_gathered[:] = torch.linspace(0.4, 0.9, OBJECTS)
-        found.gathered[:] = found.full_gathered * torch.tensor([1.0, 0.95, 0.9, 0.85, 1.0, 1.1, torch.nan])
+    def spoil(scored):
+        scored.measured[:] = 0.2
+        scored.reference_inlier_ratio[:] = torch.linspace(0.4, 0.9, OBJECTS)
+        scored.inlier_ratio[:] = scored.reference_inlier_ratio * torch.tensor([1.0, 0.95, 0.9, 0.85, 1.0, 1.1, torch.nan])
 
     config = TrackerConfig.model_validate({"validation": {"partly_hidden": partly_hidden, "holds_on": holds_on}})
     (state, result), (other_state, other_result) = both_ways(conclusions(config, dtype, spoil))
@@ -198,8 +198,8 @@ def test_conclusions_of_what_may_be_partly_hidden(partly_hidden, holds_on, dtype
 
 @pytest.mark.parametrize("what", ["T_cam_obj", "hessian", "from_prior"])
 def test_a_solution_that_is_not_a_number_stays_with_its_object(what):
-    def spoil(found):
-        getattr(found.fit.solution, what)[4] = torch.nan
+    def spoil(scored):
+        getattr(scored.fit.solution, what)[4] = torch.nan
 
     with torch.inference_mode():
         (state, result), (plain_state, plain) = conclusions(None, torch.float64, spoil)(), conclusions(None, torch.float64)()
@@ -217,10 +217,10 @@ def test_what_is_not_concluded_is_left_as_it_was():
     tracker, state = boxes()
     before = [tensor.clone() for tensor in tensors_of(state)]
     prediction = forecasts(tracker, state)()
-    found = random_find(tracker, prediction, torch.float64)
+    scored = random_find(tracker, prediction, torch.float64)
     dt_s = torch.full((OBJECTS,), 5e-3).double()
     with torch.inference_mode():
-        after, _ = conclude(state, prediction, torch.ones_like(dt_s), found, no_corners(found.fit.contours.pixels), dt_s, tracker.config)
+        after, _ = conclude(state, prediction, torch.ones_like(dt_s), scored, no_corners(scored.fit.contours.pixels), dt_s, tracker.config)
     for ours, theirs in zip(tensors_of(state), before, strict=True):
         assert torch.equal(ours, theirs)
     assert isinstance(after.tentative, TentativeTrack)

@@ -130,8 +130,8 @@ def test_without_numba_all_is_done_by_pytorch(monkeypatch):
         _, expected = tracker.step(state, events, end_us)
         tracker.kernels = True
         monkeypatch.setattr(dispatch, "backend_is_installed", lambda: False)
-        _, found = tracker.step(state, events, end_us)
-    assert_same(found, expected)
+        _, actual = tracker.step(state, events, end_us)
+    assert_same(actual, expected)
 
 
 def test_a_run_without_kernels_gives_the_same_poses(folder, tmp_path):

@@ -43,12 +43,12 @@ def test_a_box_is_tracked(name, most_deg, most_mm):
 @pytest.mark.parametrize("name", ["line", "ls"])
 def test_objects_do_not_disturb_each_other(name):
     _, events = moving_box(pose(), 2)
-    alone, beside = tracker_for(name, [box_model()]), tracker_for(name, [box_model(), box_model((0.1, 0.1, 0.1))], stream_index=[0, 0])
+    alone, neighbours = tracker_for(name, [box_model()]), tracker_for(name, [box_model(), box_model((0.1, 0.1, 0.1))], stream_index=[0, 0])
     away = pose((0.1, 0.2, 0.3), (0.0, 5.0, 1.0))
     _, first = follow(alone, alone.init(pose()[None], 0), windows(events, 2))
-    state = beside.init(pose().expand(2, 4, 4), 0)
+    state = neighbours.init(pose().expand(2, 4, 4), 0)
     state = changed(state, T_cam_obj=torch.stack([pose(), away]))
-    _, both = follow(beside, state, windows(events, 2))
+    _, both = follow(neighbours, state, windows(events, 2))
     torch.testing.assert_close(poses_of(both), poses_of(first), rtol=0, atol=1e-5)
     assert int(both[-1].status[1]) == Status.OUT_OF_VIEW
 
@@ -123,7 +123,7 @@ def test_the_filter_starts_with_its_own_uncertainty_and_carries_it_on():
 
 
 def joined(*contours):
-    return Contours(*(torch.cat([getattr(one, name) for one in contours], 1) for name in vars(contours[0])))
+    return Contours(*(torch.cat([getattr(single, name) for single in contours], 1) for name in vars(contours[0])))
 
 
 def test_an_event_belongs_to_a_line_within_the_gate():

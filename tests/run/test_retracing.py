@@ -216,8 +216,8 @@ def test_a_tracker_of_one_object_alone_is_as_the_one_of_all(two):
 
 
 def test_a_weigher_of_ones_own_judges_what_is_followed_back_too():
-    weigher = torch.nn.Identity()
-    assert Tracker([box_model()], SMALL_CAMERA, weigher=weigher).alone(0).weigher is weigher
+    weighting_network = torch.nn.Identity()
+    assert Tracker([box_model()], SMALL_CAMERA, weighting_network=weighting_network).alone(0).weighting_network is weighting_network
 
 
 def test_track_follows_objects_back_where_the_tracker_is_set_so():

@@ -50,7 +50,7 @@ def lost_object(tracker, prediction, seen, scored, sigma_px, config=None):
         sigma_px=sigma_px,
         predicted_sigma_px=sigma_px,
         time_since_validated_s=torch.zeros(()),
-        events=seen.of(0),
+        events=seen.of_object(0),
         others=others,
         config=config or tracker.config,
     )

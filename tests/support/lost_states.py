@@ -6,9 +6,9 @@ from states import changed
 from torchtrack.core.lie import retract_about
 
 
-def unseen(state, unseen_s=0.2, **changes):
+def unseen(state, time_since_validated_s=0.2, **changes):
     """The state of an object that was seen well once, but not for a while."""
-    return changed(state, time_since_validated_s=torch.full_like(state.health.time_since_validated_s, unseen_s), **changes)
+    return changed(state, time_since_validated_s=torch.full_like(state.health.time_since_validated_s, time_since_validated_s), **changes)
 
 
 def uncertain(state, turn_rad=0.45):

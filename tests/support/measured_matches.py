@@ -14,4 +14,15 @@ def matches_at(targets, near=None, offsets=0.0):
     points = torch.zeros(*near.shape, 3, dtype=torch.float64)
     directions, zeros, ones = torch.zeros_like(targets), torch.zeros_like(offsets), torch.ones_like(offsets)
     place = points, targets, directions, offsets, near
-    return Matches(nothing, torch.zeros_like(near), ones, zeros, *place, limb=zeros, beside=zeros, mistaken_px2=zeros, dark=zeros, as_expected=ones)
+    return Matches(
+        nothing,
+        torch.zeros_like(near),
+        ones,
+        zeros,
+        *place,
+        silhouette=zeros,
+        neighbours=zeros,
+        edge_ambiguity_px2=zeros,
+        dark=zeros,
+        as_expected=ones,
+    )

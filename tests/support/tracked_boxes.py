@@ -17,7 +17,7 @@ from torchtrack.core.camera import Camera
 from torchtrack.core.events import concatenate, pad_streams
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.association.observations import select_events
-from torchtrack.tracking.estimation.rounds import align, gate_widening, index_for
+from torchtrack.tracking.estimation.rounds import align, gate_scale_of, index_for
 from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.validation.scored_fit import judge_fit
 
@@ -89,7 +89,7 @@ def in_motion(config=None, displaced=None, dtype=torch.float32):
     prediction = predicted_after(tracker, state, torch.tensor([5e-3], dtype=dtype))
     seen = tracker.sensors.seen(pad_streams(events, 1, torch.tensor([end_us])))
     contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
-    tight = gate_widening(torch.zeros(1, dtype=dtype), tracker.config)
+    tight = gate_scale_of(torch.zeros(1, dtype=dtype), tracker.config)
     index = index_for(contours, tracker.image_size, tracker.config, tight)
     observations = select_events(seen, index, prediction.moving(compensated=True), 1000)
     scored = judge_fit(

@@ -67,8 +67,8 @@ def advance(pair, by):
 
 
 def pair_of(random, size=4):
-    one, two, three, four = (torch.randn(size, 3, generator=random) for _ in range(4))
-    return Pair(one, two.T.contiguous().T, 5, Pair(three.double(), four > 0))
+    single, two, three, four = (torch.randn(size, 3, generator=random) for _ in range(4))
+    return Pair(single, two.T.contiguous().T, 5, Pair(three.double(), four > 0))
 
 
 def test_what_a_graph_gives_is_what_the_function_does(recorded):
@@ -77,16 +77,16 @@ def test_what_a_graph_gives_is_what_the_function_does(recorded):
     earlier = []
     for _ in range(3):
         by = torch.randn((), generator=random)
-        (expected, any_positive), (found, told) = advance(pair, by), graphs(pair, by)
-        assert told == any_positive
-        assert found.number == 5
+        (expected, any_positive), (actual, stated) = advance(pair, by), graphs(pair, by)
+        assert stated == any_positive
+        assert actual.number == 5
         for name in ("moved", "kept"):
-            assert torch.equal(getattr(found, name), getattr(expected, name))
-            assert torch.equal(getattr(found.inner, name), getattr(expected.inner, name))
+            assert torch.equal(getattr(actual, name), getattr(expected, name))
+            assert torch.equal(getattr(actual.inner, name), getattr(expected.inner, name))
         # Nothing that was given out is written to again.
         assert all(torch.equal(value, copy) for value, copy in earlier)
-        earlier += [(value, value.clone()) for value in cuda_graphs._tensors(found)]
-        pair = found
+        earlier += [(value, value.clone()) for value in cuda_graphs._tensors(actual)]
+        pair = actual
     assert recorded[0].starts == 3
 
 
@@ -114,7 +114,7 @@ def test_there_is_a_graph_for_each_size(recorded):
 def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams):
     parts = [moving_box(pose(), COUNT, SMALL_CAMERA, seed=stream, stream=stream)[1] for stream in range(streams)]
     cut = [(concatenate([window[0] for window in step]), step[0][1]) for step in zip(*(windows(events, COUNT) for events in parts), strict=True)]
-    found = []
+    actual = []
     for by_graphs in (False, True):
         tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, LEARNING, list(range(streams)))
         if by_graphs:
@@ -131,10 +131,10 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
             monkeypatch.setattr(graphs.CompiledStep, "_near", lambda self, state, events, t_us: graphs.NearbyEvents(events))
             monkeypatch.setattr(graphs, "_in_bursts", lambda opened, filled, t_us, longest_us: (opened, filled))
         with torch.inference_mode():
-            found.append(follow(tracker, tracker.init(pose().expand(streams, 4, 4), 0), cut)[1])
+            actual.append(follow(tracker, tracker.init(pose().expand(streams, 4, 4), 0), cut)[1])
     assert sum(graph.starts for graph in recorded) >= COUNT // 3
-    for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(other.T_cam_obj, one.T_cam_obj, rtol=0, atol=1e-6)
+    for single, other in zip(*actual, strict=True):
+        torch.testing.assert_close(other.T_cam_obj, single.T_cam_obj, rtol=0, atol=1e-6)
 
 
 def test_trackers_that_are_copied_or_moved_begin_without_graphs():
@@ -147,7 +147,9 @@ def test_trackers_that_are_copied_or_moved_begin_without_graphs():
 
 
 def test_with_a_weigher_of_ones_own_graphs_have_to_be_asked_for(monkeypatch):
-    plain, judged = (Tracker([box_model()], SMALL_CAMERA, weigher=weigher).graphs for weigher in (None, torch.nn.Identity()))
+    plain, judged = (
+        Tracker([box_model()], SMALL_CAMERA, weighting_network=weighting_network).graphs for weighting_network in (None, torch.nn.Identity())
+    )
     t_us = torch.zeros(1, dtype=torch.int64)
     assert not plain._are_for(t_us)
     monkeypatch.setattr(host_sync, "on_gpu", lambda values: True)

@@ -73,28 +73,28 @@ def both_ways(config=None, streams=1, count=COUNT, mode=torch.inference_mode, mo
     """Results of a box per stream without graphs and with them, and the last states."""
     parts = [moving_box(pose(), count, SMALL_CAMERA, seed=stream, stream=stream)[1] for stream in range(streams)]
     cut = [(concatenate([window[0] for window in step]), step[0][1]) for step in zip(*(windows(events, count) for events in parts), strict=True)]
-    found = []
+    actual = []
     for is_compiled in (False, True):
         tracker = Tracker([model()] * streams, [SMALL_CAMERA] * streams, config, list(range(streams)), compiled=is_compiled)
         with mode():
             state = tracker.init(pose().expand(streams, 4, 4), 0)
             tracker.prepare(state)
-            found.append(follow(tracker, state, cut))
-    return found
+            actual.append(follow(tracker, state, cut))
+    return actual
 
 
 @pytest.mark.parametrize("streams", [1, 2])
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_poses_are_those_of_a_step(graphs, streams, mode):
-    (state, expected), (compiled_state, found) = both_ways(LEARNING, streams, mode=mode)
+    (state, expected), (compiled_state, actual) = both_ways(LEARNING, streams, mode=mode)
     assert sum(graphs.calls) >= COUNT // 3
-    for one, other in zip(expected, found, strict=True):
-        torch.testing.assert_close(other.T_cam_obj, one.T_cam_obj, rtol=0, atol=1e-6)
-        assert torch.equal(other.status, one.status)
+    for single, other in zip(expected, actual, strict=True):
+        torch.testing.assert_close(other.T_cam_obj, single.T_cam_obj, rtol=0, atol=1e-6)
+        assert torch.equal(other.status, single.status)
     assert torch.equal(compiled_state.maps.last_event_us, state.maps.last_event_us)
     assert torch.equal(compiled_state.maps.burst_age_us, state.maps.burst_age_us)
     assert compiled_state.appearance.learned.windows == state.appearance.learned.windows == COUNT
-    assert found[-1].T_cam_obj.is_inference() == (mode is torch.inference_mode)
+    assert actual[-1].T_cam_obj.is_inference() == (mode is torch.inference_mode)
 
 
 def test_each_tensor_of_the_state_that_a_graph_is_compiled_for_is_one_alone(graphs):
@@ -117,9 +117,9 @@ def test_windows_that_are_learned_from_are_taken_without_a_graph(graphs):
     (state, _), (compiled_state, _) = both_ways(LEARNING)
     # One call prepares the graph.
     assert graphs.calls == [1 + sum(window % 3 > 0 for window in range(5, COUNT))]
-    expected, found = (vars(of.learned) for of in (state, compiled_state))
+    expected, actual = (vars(owner.learned) for owner in (state, compiled_state))
     for name, value in expected.items():
-        assert torch.equal(found[name], value) if torch.is_tensor(value) else found[name] == value
+        assert torch.equal(actual[name], value) if torch.is_tensor(value) else actual[name] == value
 
 
 def test_the_graph_of_one_stream_is_prepared(graphs):
@@ -261,26 +261,26 @@ def in_own_process(backend, device="cpu"):
 
 
 def test_a_compiler_takes_a_step_as_one_graph():
-    told = in_own_process("eager")
-    assert told["prepared"] == told["graphs"] == 1
-    assert told["took"] >= COUNT // 4
-    assert told["apart"] < 1e-6
-    assert told["status"] == 0
+    stated = in_own_process("eager")
+    assert stated["prepared"] == stated["graphs"] == 1
+    assert stated["took"] >= COUNT // 4
+    assert stated["apart"] < 1e-6
+    assert stated["status"] == 0
 
 
 @pytest.mark.skipif(shutil.which("g++") is None and shutil.which("clang++") is None, reason="needs a C++ compiler")
 def test_compiled_poses_are_those_of_a_step():
-    told = in_own_process("inductor")
-    assert told["graphs"] == 1
-    assert told["took"] >= COUNT // 4
-    assert told["apart"] < 1e-5
-    assert told["status"] == 0
+    stated = in_own_process("inductor")
+    assert stated["graphs"] == 1
+    assert stated["took"] >= COUNT // 4
+    assert stated["apart"] < 1e-5
+    assert stated["status"] == 0
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no GPU here")
 def test_poses_of_cuda_graphs_are_those_of_the_cpu():
-    told = in_own_process("inductor", "cuda")
-    assert told["graphs"] == 1
-    assert told["took"] >= COUNT // 4
-    assert told["apart"] < 1e-4
-    assert told["status"] == 0
+    stated = in_own_process("inductor", "cuda")
+    assert stated["graphs"] == 1
+    assert stated["took"] >= COUNT // 4
+    assert stated["apart"] < 1e-4
+    assert stated["status"] == 0

@@ -38,8 +38,8 @@ def test_a_limit_is_on_what_moves_across_the_image():
 
 def test_the_largest_speed_grows_with_the_events_before_the_object():
     objects, T = tracker_of().objects, pose()[None].float()
-    before, beside = torch.full((400, 2), 100.0), torch.full((4000, 2), 5.0)
-    seen = (before[:200], before, torch.cat([before, beside]))
+    before, neighbours = torch.full((400, 2), 100.0), torch.full((4000, 2), 5.0)
+    seen = (before[:200], before, torch.cat([before, neighbours]))
     speed = [float(largest_speed(objects, T, events_at(pixels), torch.tensor([0.005]))) for pixels in seen]
     assert speed[1] == pytest.approx(2 * speed[0])
     assert speed[2] == speed[1]

@@ -182,8 +182,8 @@ def test_the_window_ends_with_its_newest_event_unless_told():
     tracker, state, _, (events, _), _ = started()
     assert tracker.step(state, events)[1].t_us.tolist() == [int(events.t_us[-1])]
     assert tracker.step(state, events, 31_000)[1].t_us.tolist() == [31_000]
-    told, as_tensor = (tracker.step(state, events, end)[1] for end in (30_000, torch.tensor([30_000])))
-    assert_same(told, as_tensor)
+    stated, as_tensor = (tracker.step(state, events, end)[1] for end in (30_000, torch.tensor([30_000])))
+    assert_same(stated, as_tensor)
 
 
 def test_the_newest_events_are_remembered_where_corners_are_looked_for():

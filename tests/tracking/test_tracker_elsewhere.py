@@ -53,15 +53,15 @@ def test_two_trackers_in_two_threads(alone):
 
     with ThreadPoolExecutor(2) as pool:
         for _ in range(3):
-            for found, expected in zip(pool.map(run, range(2)), alone, strict=True):
-                assert torch.equal(found, expected)
+            for actual, expected in zip(pool.map(run, range(2)), alone, strict=True):
+                assert torch.equal(actual, expected)
 
 
 def test_one_tracker_in_two_threads(alone):
     tracker, _, _ = scene(0)
     with ThreadPoolExecutor(2) as pool:
-        found = pool.map(lambda number: tracked(tracker, *scene(number)[1:]), range(2))
-        assert all(torch.equal(*pair) for pair in zip(found, alone, strict=True))
+        actual = pool.map(lambda number: tracked(tracker, *scene(number)[1:]), range(2))
+        assert all(torch.equal(*pair) for pair in zip(actual, alone, strict=True))
 
 
 class TrackedScenes(Dataset):
@@ -78,8 +78,8 @@ class TrackedScenes(Dataset):
 def test_forked_workers_of_a_data_loader(alone):
     # The parent has used kernels and threads by now.
     loader = DataLoader(TrackedScenes(), batch_size=None, num_workers=2, multiprocessing_context="fork", timeout=120)
-    for found, expected in zip(loader, alone, strict=True):
-        assert torch.equal(found, expected)
+    for actual, expected in zip(loader, alone, strict=True):
+        assert torch.equal(actual, expected)
 
 
 def test_a_pickled_tracker_goes_on_as_it_was(alone):
@@ -95,5 +95,5 @@ def test_a_pickled_tracker_goes_on_as_it_was(alone):
 
 def test_a_pickled_tracker_works_in_a_new_process(alone):
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        found = pool.submit(tracked_from_pickle, pickle.dumps(scene(0))).result(timeout=240)
-    assert found == alone[0].tolist()
+        actual = pool.submit(tracked_from_pickle, pickle.dumps(scene(0))).result(timeout=240)
+    assert actual == alone[0].tolist()

@@ -38,10 +38,10 @@ class ByAge(nn.Module):
         return torch.sigmoid(self.offset + self.slope * 1e3 * evidence.observations.age_s)
 
 
-def weighing(weigher, config=None, dtype=torch.float64, count=5):
+def weighing(weighting_network, config=None, dtype=torch.float64, count=5):
     """A tracker with a weigher in the middle of a motion, and its next window."""
     plain, state, _, window, _ = started(dtype, config, count)
-    tracker = Tracker([box_model()], SMALL_CAMERA, config, dtype=dtype, weigher=weigher)
+    tracker = Tracker([box_model()], SMALL_CAMERA, config, dtype=dtype, weighting_network=weighting_network)
     tracker.load_state_dict(plain.state_dict(), strict=False)
     return tracker, state, window
 
@@ -70,13 +70,13 @@ def test_without_trust_there_is_nothing_to_go_by_and_no_gradient():
     state = changed(state, T_cam_obj=state.T_cam_obj.clone().requires_grad_())
     next_state, result = tracker.step(state, *window)
     assert result.status.tolist() == [int(Status.TOO_FEW_EVENTS)]
-    by_offset, by_pose = torch.autograd.grad(seen_from(next_state.T_cam_obj), [tracker.weigher.offset, state.T_cam_obj], allow_unused=True)
+    by_offset, by_pose = torch.autograd.grad(seen_from(next_state.T_cam_obj), [tracker.weighting_network.offset, state.T_cam_obj], allow_unused=True)
     assert (by_offset is None or by_offset == 0) and torch.isfinite(by_pose).all()
 
 
 def test_trust_decides_what_is_followed():
     tracker, state, window = weighing(ByAge())
-    tracker.weigher.offset.data, tracker.weigher.slope.data = torch.tensor(6.0).double(), torch.tensor(-4.0).double()
+    tracker.weighting_network.offset.data, tracker.weighting_network.slope.data = torch.tensor(6.0).double(), torch.tensor(-4.0).double()
     plain = started(torch.float64)[0]
     with torch.no_grad():
         assert not torch.equal(tracker.step(state, *window)[0].T_cam_obj, plain.step(state, *window)[0].T_cam_obj)
@@ -94,16 +94,16 @@ def test_a_weigher_must_judge_every_observation(shape):
 
 
 def test_a_weigher_sees_the_time_surface():
-    found = []
+    actual = []
 
     class Looking(nn.Module):
         def forward(self, evidence):
-            found.append((evidence.age_s(evidence.observations.pixels), evidence.observations))
+            actual.append((evidence.age_s(evidence.observations.pixels), evidence.observations))
             return torch.ones_like(evidence.observations.age_s)
 
     tracker, state, (events, end_us) = weighing(Looking())
     tracker.step(state, events, end_us)
-    age_s, observations = found[-1]
+    age_s, observations = actual[-1]
     # The newest event of a pixel is not older than any that was observed there.
     assert (age_s <= observations.age_s + 1e-9)[observations.mask].all() and (age_s >= 0).all()
     assert (age_s == observations.age_s)[observations.mask].float().mean() > 0.5
@@ -115,7 +115,7 @@ def test_a_weigher_sees_the_time_surface():
 @pytest.mark.parametrize("name", ["slope", "offset"])
 def test_gradients_by_a_weigher_are_those_of_finite_differences(name):
     tracker, state, window = weighing(ByAge(slope=-0.5, offset=1.0), ONE_ROUND)
-    parameter = getattr(tracker.weigher, name)
+    parameter = getattr(tracker.weighting_network, name)
     (ours,) = torch.autograd.grad(seen_from(tracker.step(state, *window)[0].T_cam_obj), parameter)
     values, small = [], 1e-3
     for sign in (1, -1):
@@ -145,11 +145,11 @@ def test_gradients_by_the_initial_pose_are_those_of_finite_differences():
 
 def test_gradients_flow_through_windows_to_everything():
     trajectory, events = moving_box(pose(), 3)
-    tracker = Tracker([box_model()], SMALL_CAMERA, dtype=torch.float64, weigher=ByAge(slope=-0.5, offset=1.0))
+    tracker = Tracker([box_model()], SMALL_CAMERA, dtype=torch.float64, weighting_network=ByAge(slope=-0.5, offset=1.0))
     wanted = {"intrinsics": tracker.intrinsics, "ideal pixels": tracker.ideal_pixels, "contour points": tracker.models[0].edges}
     for value in wanted.values():
         value.requires_grad_()
-    wanted |= {"slope": tracker.weigher.slope, "initial pose": trajectory.T_cam_obj[:1].clone().requires_grad_()}
+    wanted |= {"slope": tracker.weighting_network.slope, "initial pose": trajectory.T_cam_obj[:1].clone().requires_grad_()}
     state = tracker.init(wanted["initial pose"], 0)
     for batch, end_us in windows(events, 3):
         state, result = tracker(batch, state, end_us)
@@ -208,14 +208,14 @@ def test_pure_functions_can_be_mapped_and_differentiated(name):
 
 
 def test_the_weigher_moves_with_the_tracker():
-    tracker = Tracker([box_model()], SMALL_CAMERA, weigher=ByAge()).to(torch.float64)
+    tracker = Tracker([box_model()], SMALL_CAMERA, weighting_network=ByAge()).to(torch.float64)
     assert {value.dtype for value in tracker.parameters()} == {torch.float64} and len(list(tracker.parameters())) == 2
     assert all(value.dtype != torch.float32 for value in tracker.state_dict().values())
 
 
 def test_its_state_can_be_kept_and_restored():
     tracker, state, window = weighing(ByAge(slope=-0.5, offset=1.0))
-    other = Tracker([box_model()], replace(SMALL_CAMERA, fx=230.0), dtype=torch.float64, weigher=ByAge())
+    other = Tracker([box_model()], replace(SMALL_CAMERA, fx=230.0), dtype=torch.float64, weighting_network=ByAge())
     other.load_state_dict(tracker.state_dict())
     with torch.no_grad():
         assert_same(other(window[0], state, window[1]), tracker.step(state, *window))
@@ -234,12 +234,12 @@ def send_gradient_in_parallel(store, sender):
     torch.distributed.init_process_group("gloo", init_method=f"file://{store}", rank=0, world_size=1)
     parallel = nn.parallel.DistributedDataParallel(tracker)
     seen_from(parallel(window[0], state, window[1])[0].T_cam_obj).backward()
-    sender.send(float(tracker.weigher.slope.grad))
+    sender.send(float(tracker.weighting_network.slope.grad))
 
 
 def test_it_learns_in_distributed_data_parallel(tmp_path):
     tracker, state, window = weighing(ByAge(slope=-0.5, offset=1.0))
-    (theirs,) = torch.autograd.grad(seen_from(tracker.step(state, *window)[0].T_cam_obj), tracker.weigher.slope)
+    (theirs,) = torch.autograd.grad(seen_from(tracker.step(state, *window)[0].T_cam_obj), tracker.weighting_network.slope)
     # The end of a process group may wait for ever for a thread of its own that waits for Python's lock: that of the process is not waited for.
     spawn = multiprocessing.get_context("spawn")
     receiver, sender = spawn.Pipe(duplex=False)
@@ -272,8 +272,8 @@ class Tracked(Dataset):
 
 def test_it_tracks_in_the_workers_of_a_loader():
     data = Tracked(*weighing(ByAge(slope=-0.5, offset=1.0)))
-    (found,) = DataLoader(data, batch_size=3, num_workers=1)
-    assert torch.equal(found, torch.stack([data[number] for number in range(3)]))
+    (actual,) = DataLoader(data, batch_size=3, num_workers=1)
+    assert torch.equal(actual, torch.stack([data[number] for number in range(3)]))
 
 
 def test_it_can_be_pickled():

@@ -184,9 +184,9 @@ class EventLineTracker(Tracker):
                 directions=take_points(contours.normals, point),
                 offsets=((take_points(contours.pixels, point) - targets) * take_points(contours.normals, point)).sum(-1),
                 near=near.mask & belongs,
-                limb=torch.zeros_like(near.age_s),
-                beside=torch.zeros_like(near.age_s),
-                mistaken_px2=torch.zeros_like(near.age_s),
+                silhouette=torch.zeros_like(near.age_s),
+                neighbours=torch.zeros_like(near.age_s),
+                edge_ambiguity_px2=torch.zeros_like(near.age_s),
                 dark=torch.zeros_like(near.age_s),
                 as_expected=torch.ones_like(near.age_s),
             )

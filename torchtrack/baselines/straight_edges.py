@@ -102,8 +102,8 @@ def straight_texture(model: ObjectModel) -> Bool[ndarray, " q"]:
     for number, near in enumerate(cKDTree(points).query_ball_point(points, least)):
         offset = points[near] - points[number]
         along = offset @ tangents[number]
-        beside = np.linalg.norm(offset - along[:, None] * tangents[number], axis=1)
-        on_line = along[(beside < tube) & (np.abs(tangents[near] @ tangents[number]) > _TUBE_COSINE)]
+        across_m = np.linalg.norm(offset - along[:, None] * tangents[number], axis=1)
+        on_line = along[(across_m < tube) & (np.abs(tangents[near] @ tangents[number]) > _TUBE_COSINE)]
         filled = np.unique(np.floor(on_line / least * _PIECES))
         # Of the stretches that are as long as the least run and hold the point, the one with the most points counts.
         straight[number] = max(np.count_nonzero((filled >= low) & (filled < low + _PIECES)) for low in range(-_PIECES, 1)) >= _FILLED_PIECES

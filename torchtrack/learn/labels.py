@@ -5,13 +5,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.core.padded import take_points
-from torchtrack.tracking.association.weighting_features import Evidence
+from torchtrack.tracking.association.weighting_features import WeightingInputs
 from torchtrack.tracking.estimation.rounds import index_for
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.tracker import Tracker
 
 
-def true_distance(tracker: Tracker, evidence: Evidence, T_cam_obj: Float[Tensor, "b 4 4"], velocity: Float[Tensor, "b 6"]) -> Float[Tensor, "b n"]:
+def true_distance(
+    tracker: Tracker, evidence: WeightingInputs, T_cam_obj: Float[Tensor, "b 4 4"], velocity: Float[Tensor, "b 6"]
+) -> Float[Tensor, "b n"]:
     """How far each observation lies from the true contour once both are at the window's end (px); infinite where none is near.
 
     Args:

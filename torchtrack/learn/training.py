@@ -22,7 +22,7 @@ from torchtrack.learn.dataset import ClipConfig, SequenceBatches, WindowDataset
 from torchtrack.learn.labels import true_distance
 from torchtrack.learn.samples import Batch, collate, start_state, state_velocity
 from torchtrack.object_model import ObjectModel
-from torchtrack.tracking.association.weighting_features import Evidence, trust_features
+from torchtrack.tracking.association.weighting_features import WeightingInputs, trust_features
 from torchtrack.tracking.association.weighting_network import TrustNetwork
 from torchtrack.tracking.tracker import Tracker
 
@@ -79,7 +79,7 @@ class _Watched(nn.Module):
         super().__init__()
         self.network, self.believed = network, True
 
-    def forward(self, evidence: Evidence) -> Tensor:
+    def forward(self, evidence: WeightingInputs) -> Tensor:
         self.evidence, self.features = evidence, trust_features(evidence)
         self.logits = self.network.logits(self.features)
         return torch.sigmoid(self.logits) if self.believed else torch.ones_like(self.logits)
@@ -195,7 +195,7 @@ class Trainer:
         source, count = self.dataset.sequences[sequence], self.config.batch_size
         model = ObjectModel.from_file(source.objects[number].model_path())
         config = tracker_config(preset("default"))
-        return Tracker([model] * count, [source.camera] * count, config, stream_index=range(count), weigher=self.watched)
+        return Tracker([model] * count, [source.camera] * count, config, stream_index=range(count), weighting_network=self.watched)
 
 
 def tracker_config(config: TrackerConfig) -> TrackerConfig:

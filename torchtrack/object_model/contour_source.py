@@ -22,7 +22,7 @@ _VIEWS, _MORE_FACING = 512, 1.1
 class ContourKind(IntEnum):
     """What a contour point comes from: the limb of a smooth surface, a sharp edge (occluding or not), and so on."""
 
-    LIMB = 0
+    SMOOTH = 0
     CREASE = 1
     TEXTURE = 2
     SEGMENT = 3
@@ -71,7 +71,7 @@ class ContourModel(nn.Module):
         self.most_texture_facing = _most_facing(self.texture_normals)
         self.register_buffer("edges", _edge_table(points, normals, is_segment))
         # Edges that may be the limb of what is smooth in reality.
-        self.register_buffer("is_bent", self.edges[-1] == int(ContourKind.LIMB))
+        self.register_buffer("is_bent", self.edges[-1] == int(ContourKind.SMOOTH))
         self.register_buffer("surface_points", _in_rows(model.surface_points))
         exact = len(model.triangles) <= config.exact_faces
         triangles = model.triangles if exact else model.triangles[:0]
@@ -102,7 +102,7 @@ def _edge_table(points: Float[Tensor, "e 2 3"], face_normals: Float[Tensor, "e 2
     """Of every edge: start, vector, direction, the way that turns its tangent (see :func:`_edge_points`), and kind."""
     start, vector = points[:, 0], points[:, 1] - points[:, 0]
     sharp = (face_normals[:, 0] * face_normals[:, 1]).sum(-1) < _SHARP_COSINE
-    kind = torch.where(is_segment, int(ContourKind.SEGMENT), torch.where(sharp, int(ContourKind.CREASE), int(ContourKind.LIMB)))
+    kind = torch.where(is_segment, int(ContourKind.SEGMENT), torch.where(sharp, int(ContourKind.CREASE), int(ContourKind.SMOOTH)))
     turning = torch.linalg.cross(vector, face_normals.sum(1), dim=-1)
     direction = torch.nn.functional.normalize(vector, dim=-1)
     return torch.cat([start, vector, direction, turning, kind[:, None].to(start.dtype)], -1).T.contiguous()

@@ -18,7 +18,7 @@ from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.schedule import is_time
 from torchtrack.tracking.state import StepResult, TrackerState
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import Status
 
 
@@ -62,7 +62,7 @@ class Lesson:
 
 
 def learned_after(
-    state: TrackerState, result: StepResult, prediction: Prediction, found: Found, lesson: Lesson, config: TrackerConfig
+    state: TrackerState, result: StepResult, prediction: Prediction, scored: ScoredFit, lesson: Lesson, config: TrackerConfig
 ) -> TrackerState:
     """The state after a window with what was learned in it.
 
@@ -77,7 +77,7 @@ def learned_after(
     T_cam_obj = state.T_cam_obj.to(lesson.sigma_px.dtype)
     around = Surroundings(prediction.objects, T_cam_obj, state.velocity, lesson.window_s, result.contours, trusted)
     wanted = learned.wanted(lesson.on_surfaces, config.adaptation) if lesson.learns else None
-    learned = learn_after(learned, around, found, lesson.events, wanted, config)
+    learned = learn_after(learned, around, scored, lesson.events, wanted, config)
     return replace(state, appearance=replace(state.appearance, learned=learned))
 
 

@@ -54,7 +54,7 @@ def expect(tracked: TrackedObjects, state: TrackerState, events: EventBatch, t_u
     if tracked.config.motion.speed_from_events and not reads.none_of(never_found):
         state = held_back(state, never_found, tracked.objects, tracked.sensors.seen(pad_streams(events, tracked.streams, t_us)), dt_s)
     if not reads.none_of(lost):
-        state = LastSeen.of(state, tracked.objects, t_us, tracked.config).in_place_of(state, lost)
+        state = LastSeen.from_state(state, tracked.objects, t_us, tracked.config).in_place_of(state, lost)
     return Expected(predicted_after(tracked, state, dt_s), window_s, dt_s, scheduled)
 
 

@@ -12,7 +12,7 @@ from torchtrack.errors import ModelError
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourModel, group_by_model
 from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, stacked, symmetry_planes, turning_axis
-from torchtrack.tracking.association.weighting_network import LimbTrust, TrustNetwork, shipped_weigher
+from torchtrack.tracking.association.weighting_network import SilhouetteTrust, TrustNetwork, shipped_network
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
 from torchtrack.tracking.frontend.tiles import SensorTiles
@@ -49,13 +49,13 @@ class TrackedObjects(nn.Module):
         config: TrackerConfig | None = None,
         stream_index: Sequence[int] | None = None,
         dtype: torch.dtype = torch.float32,
-        weigher: nn.Module | None = None,
+        weighting_network: nn.Module | None = None,
     ) -> None:
         super().__init__()
         cameras = [camera] if isinstance(camera, Camera) else list(camera)
         self.config = config or TrackerConfig()
         self.object_names = tuple(model.name for model in objects)
-        self.object_models, self.cameras, self.has_own_weigher = tuple(objects), tuple(cameras), weigher is not None
+        self.object_models, self.cameras, self.has_own_network = tuple(objects), tuple(cameras), weighting_network is not None
         streams = list(stream_index) if stream_index is not None else [0] * len(objects)
         check_setup(objects, cameras, streams, self.config)
         self._shared = len(set(streams)) < len(streams)
@@ -83,7 +83,7 @@ class TrackedObjects(nn.Module):
         self.register_buffer("has_turning_axis", directions.any(1))
         self.turns = bool(directions.any())
         self.register_buffer("far_pose", far_pose(self.centre_obj))
-        self.weigher = shipped_weigher(self.models, self.config.association) if weigher is None else weigher
+        self.weighting_network = shipped_network(self.models, self.config.association) if weighting_network is None else weighting_network
         # On dense meshes no line of sight is followed.
         with_surface = torch.zeros(len(objects), dtype=torch.bool)
         for model in self.models:
@@ -123,12 +123,12 @@ class TrackedObjects(nn.Module):
     @property
     def shows_all(self) -> bool:
         """Whether a window's events are kept that cannot have to do with the objects: a weigher of one's own may look at any."""
-        return self.weigher is not None and not isinstance(self.weigher, TrustNetwork | LimbTrust)
+        return self.weighting_network is not None and not isinstance(self.weighting_network, TrustNetwork | SilhouetteTrust)
 
     @property
     def looks_back(self) -> bool:
         """Whether anything needs the events of earlier windows: they are not kept for nothing."""
-        return self.config.corners.max_corners > 0 or self.weigher is not None
+        return self.config.corners.max_corners > 0 or self.weighting_network is not None
 
     @property
     def streams(self) -> int:

@@ -35,7 +35,7 @@ def check_in_view(T_cam_obj: Float[Tensor, "b 4 4"], models: Sequence[ObjectMode
     Raises:
         PoseError: if an object is a pixel or two across, wholly outside the image, or around the camera.
     """
-    views = {camera: _View.of(camera) for camera in dict.fromkeys(cameras)}
+    views = {camera: _View.from_camera(camera) for camera in dict.fromkeys(cameras)}
     for T, model, camera in zip(T_cam_obj.detach().cpu().double(), models, cameras, strict=True):
         _check_object(T, model, views[camera])
 
@@ -57,7 +57,7 @@ class _View:
     high: Float[Tensor, "2"]
 
     @classmethod
-    def of(cls, camera: Camera) -> "_View":
+    def from_camera(cls, camera: Camera) -> "_View":
         """By the border of the image."""
         u, v = np.linspace(-0.5, camera.width - 0.5, _BORDER_POINTS), np.linspace(-0.5, camera.height - 0.5, _BORDER_POINTS)
         sides = [(u, np.full_like(u, end)) for end in v[[0, -1]]] + [(np.full_like(v, end), v) for end in u[[0, -1]]]

@@ -100,8 +100,8 @@ def choose_rows(
     What belongs to streams is the same in both, and taken from the second.
     """
 
-    def of_objects(one: Tensor, other: Tensor) -> Tensor:
-        return torch.where(first.view(-1, *[1] * (one.dim() - 1)), one, other)
+    def of_objects(first_rows: Tensor, second_rows: Tensor) -> Tensor:
+        return torch.where(first.view(-1, *[1] * (first_rows.dim() - 1)), first_rows, second_rows)
 
     results = (of_first[1], of_second[1])
     places = max(result.contours.mask.shape[1] for result in results)

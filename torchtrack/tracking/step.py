@@ -11,10 +11,10 @@ from torchtrack.core.events import EventBatch
 from torchtrack.tracking.adapt import Lesson, learned_after, with_late_share
 from torchtrack.tracking.adaptation.pixel_latency import dated
 from torchtrack.tracking.association.observations import Observations, corner_observations, join, select_events
-from torchtrack.tracking.association.weighting_features import Evidence, judged
+from torchtrack.tracking.association.weighting_features import WeightingInputs, judged
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.estimation.rounds import Fit, align, gate_widening, index_for, index_radius, usual_index_radius
+from torchtrack.tracking.estimation.rounds import Fit, align, gate_scale_of, index_for, index_radius, usual_index_radius
 from torchtrack.tracking.expectation import Expected, expect, near_objects
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.tiles import NearbyEvents
@@ -26,12 +26,12 @@ from torchtrack.tracking.relocalization.evidence import gather_evidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_object import OtherPoses, Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
-from torchtrack.tracking.relocalization.tentative import after_probation
+from torchtrack.tracking.relocalization.tentative import confirmed
 from torchtrack.tracking.relocalization.triggers import SEARCHED, has, may_have_rotated, reference_where_known, triggers
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.update import conclude
-from torchtrack.tracking.validation.measures import asked_apart
-from torchtrack.tracking.validation.scored_fit import Found, explained_at_rest, judge_fit
+from torchtrack.tracking.validation.measures import required_spread
+from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, judge_fit
 
 _READS = host_sync.HostReads()
 
@@ -103,7 +103,7 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     events, burst_age_us = sensors.window_events(nearby, maps.burst_age_us, t_us, t_us - state.t_us, config.association.burst_us)
     contours = prediction.contours(expected.dt_s, config.contours)
     sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(tracked.diameter_m)
-    gate_scale = gate_widening(sigma_px, config)
+    gate_scale = gate_scale_of(sigma_px, config)
     # Asked for here: a GPU answers while corners are looked for.
     radius_px = given.reads.ask(index_radius(gate_scale, config), usual_index_radius(config))
     corners = sensors.corners(contours, maps.last_event_us, t_us, expected.window_s, config)
@@ -111,24 +111,24 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     observations, most = corner_observations(corners), config.association.max_events
     if most:
         observations = join(observations, select_events(events, index, prediction.moving(compensated=True), most))
-    if tracked.weigher is not None:
+    if tracked.weighting_network is not None:
         history = sensors.history(maps.last_event_us, t_us)
-        observations = judged(Evidence(observations, events, prediction, contours, index, history), tracked.weigher)
+        observations = judged(WeightingInputs(observations, events, prediction, contours, index, history), tracked.weighting_network)
     return Observed(events, burst_age_us, contours, index, sigma_px, gate_scale, corners, observations)
 
 
-def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, fit: Fit) -> Found:
+def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, fit: Fit) -> ScoredFit:
     """Stage 4, after the alignment: what each pose explains of its contours, and of the events around them."""
     config, health = tracked.config, state.health
     reference = reference_where_known(seen.sigma_px, health.reference_inlier_ratio, config.relocalization)
-    spread = asked_apart(health.reference_normal_spread, health.time_since_validated_s, config.validation)
+    spread = required_spread(health.reference_normal_spread, health.time_since_validated_s, config.validation)
     scored = judge_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference, spread)
     if tracked.turns:
-        return replace(scored, turn_unclear=may_have_rotated(tracked.has_turning_axis, health.time_since_validated_s, config.relocalization))
+        return replace(scored, rotation_unclear=may_have_rotated(tracked.has_turning_axis, health.time_since_validated_s, config.relocalization))
     return scored
 
 
-def relocalized(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, scored: Found, given: StepInput) -> Relocalized:
+def relocalized(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, scored: ScoredFit, given: StepInput) -> Relocalized:
     """Stage 5: other poses for the objects that have a trigger, and for no others."""
     config = tracked.config
     is_starting = torch.zeros_like(tracked.stream_index, dtype=torch.bool) if given.is_starting is None else given.is_starting
@@ -137,7 +137,7 @@ def relocalized(tracked: TrackedObjects, state: TrackerState, expected: Expected
     # A GPU is waited for: a pose that begins to slip is farther off a window later.
     if not given.reads.ask(has(flags, SEARCHED), False).any():
         return window
-    others = OtherPoses(LastSeen.of(state, tracked.objects, given.t_us, config), tracked.ambiguities)
+    others = OtherPoses(LastSeen.from_state(state, tracked.objects, given.t_us, config), tracked.ambiguities)
     return relocalize(window, flags, evidence, seen.events, others, config)
 
 
@@ -153,7 +153,7 @@ def update(
     scored, prediction = located.scored, located.prediction.detached()
     next_state, result = conclude(state, located.prediction, located.gate_scale, scored, seen.corners, expected.dt_s, config)
     if config.relocalization.tentative:
-        next_state, result = after_probation(state, next_state, result, prediction, located.gate_scale, config)
+        next_state, result = confirmed(state, next_state, result, prediction, located.gate_scale, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
     sure = ~scored.elsewhere

@@ -37,7 +37,7 @@ class Tracker(TrackedObjects):
         config: settings; the ``default`` preset when not given.
         stream_index: the stream each object is seen in; the first for all when not given.
         dtype: precision of the pipeline; poses are kept in float64.
-        weigher: judges every window's :class:`tracking.association.weighting_features.Evidence`: how far each observation is to be believed,
+        weigher: judges every window's :class:`tracking.association.weighting_features.WeightingInputs`: how far each observation is to be believed,
             ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
             comes with the package, for what ``matching.weighting_network`` says. Other poses that a search tries are aligned
             without it.
@@ -55,12 +55,12 @@ class Tracker(TrackedObjects):
         config: TrackerConfig | None = None,
         stream_index: Sequence[int] | None = None,
         dtype: torch.dtype = torch.float32,
-        weigher: nn.Module | None = None,
+        weighting_network: nn.Module | None = None,
         *,
         compiled: bool = False,
         kernels: bool = True,
     ) -> None:
-        super().__init__(objects, camera, config, stream_index, dtype, weigher)
+        super().__init__(objects, camera, config, stream_index, dtype, weighting_network)
         self.kernels = kernels
         self.graphs = CompiledStep(self, compiles=compiled)
 
@@ -74,8 +74,10 @@ class Tracker(TrackedObjects):
 
     def alone(self, number: int) -> "Tracker":
         """A tracker of one of the objects alone, in its stream, with the same settings."""
-        weigher, camera = self.weigher if self.has_own_weigher else None, self.cameras[int(self.stream_index[number])]
-        alone = Tracker([self.object_models[number]], camera, self.config, dtype=self.intrinsics.dtype, weigher=weigher, kernels=self.kernels)
+        weighting_network, camera = self.weighting_network if self.has_own_network else None, self.cameras[int(self.stream_index[number])]
+        alone = Tracker(
+            [self.object_models[number]], camera, self.config, dtype=self.intrinsics.dtype, weighting_network=weighting_network, kernels=self.kernels
+        )
         return alone.to(self.intrinsics.device)
 
     def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
@@ -133,12 +135,12 @@ class Tracker(TrackedObjects):
         Returns:
             State, result, and whether any of this was called for: then they do not hold, and :meth:`step` is to take the window.
         """
-        t_us, assumptions = self._window_end(state, events, t_end_us), host_sync.SteadyState()
+        t_us, steady = self._window_end(state, events, t_end_us), host_sync.SteadyState()
         with torch.autocast(t_us.device.type, enabled=False):
-            assumptions.ask(to_be_parted(state, events, t_us, self.objects, self.config), False)
-            given = StepInput(NearbyEvents(events), t_us, reads=assumptions)
+            steady.ask(to_be_parted(state, events, t_us, self.objects, self.config), False)
+            given = StepInput(NearbyEvents(events), t_us, reads=steady)
             done = _counted(advance(self, opened(self, state, events), given))
-        return *done, assumptions.wrong()
+        return *done, steady.wrong()
 
     def prepare(self, state: TrackerState) -> None:
         """Compile what is compiled, before the first window: graphs take a minute or more, kernels half of that, and a live camera does not wait.

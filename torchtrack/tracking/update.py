@@ -21,7 +21,7 @@ from torchtrack.tracking.relocalization.triggers import is_smeared
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.health import TrackHealth
 from torchtrack.tracking.validation.measures import visible_share
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import (
     Status,
     holding_on,
@@ -42,8 +42,8 @@ CERTAIN, CERTAIN_COUNT = 0.9, 0.5
 def conclude(
     state: TrackerState,
     prediction: Prediction,
-    widening: Float[Tensor, "b"],
-    found: Found,
+    gate_scale: Float[Tensor, "b"],
+    scored: ScoredFit,
     corners: Corners,
     dt_s: Float[Tensor, "b"],
     config: TrackerConfig,
@@ -55,11 +55,11 @@ def conclude(
         widening: of each object's first gate.
         dt_s: length of the window.
     """
-    motion, health, covariance, status = judged_objects(state, prediction, widening, found, dt_s, config)
-    contours = _where_they_are(found.fit, motion.T_cam_obj, status >= int(Status.LOST), prediction.objects.intrinsics)
-    result = StepResult(state.t_us, motion.T_cam_obj, covariance, status, found.share, contours, corners, found.count)
-    appearance = replace(state.appearance, darker_outside=_darker_outside(state, found, status, dt_s, config))
-    health = replace(health, score=found.score, reference_normal_spread=_normal_spread(health, found))
+    motion, health, covariance, status = judged_objects(state, prediction, gate_scale, scored, dt_s, config)
+    contours = _where_they_are(scored.fit, motion.T_cam_obj, status >= int(Status.LOST), prediction.objects.intrinsics)
+    result = StepResult(state.t_us, motion.T_cam_obj, covariance, status, scored.explained_ratio, contours, corners, scored.count)
+    appearance = replace(state.appearance, darker_outside=_darker_outside(state, scored, status, dt_s, config))
+    health = replace(health, score=scored.score, reference_normal_spread=_normal_spread(health, scored))
     return replace(state, motion=motion, health=health, appearance=appearance), result
 
 
@@ -77,37 +77,37 @@ Judgement = tuple[MotionState, TrackHealth, Float[Tensor, "b 6 6"], Int[Tensor, 
 
 @accelerable
 def judged_objects(
-    state: TrackerState, prediction: Prediction, widening: Float[Tensor, "b"], found: Found, dt_s: Float[Tensor, "b"], config: TrackerConfig
+    state: TrackerState, prediction: Prediction, gate_scale: Float[Tensor, "b"], scored: ScoredFit, dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> Judgement:
     """What every object's pose is worth, and where it goes on from there: arguments as those of :func:`conclude`."""
-    objects, share, solution, health = prediction.objects, found.share, found.fit.solution, state.health
+    objects, share, solution, health = prediction.objects, scored.explained_ratio, scored.fit.solution, state.health
     reference = health.reference_explained_ratio
-    in_view = visible_share(found.fit.contours, objects.image_size)
+    in_view = visible_share(scored.fit.contours, objects.image_size)
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
-    step = solution.from_prior[:, :6] * ~(found.elsewhere & may_be_anywhere(widening))[:, None]
-    hidden = partly_hidden(found.gathered, found.full_gathered, found.count, found.elsewhere, config.validation)
-    asked_less = torch.where(holding_on(found.count, found.elsewhere, config.validation), 1, hidden)
-    status = judge(share, found.count, in_view, step, objects.diameter_m, config.validation, widening, asked_less)
+    step = solution.from_prior[:, :6] * ~(scored.elsewhere & may_be_anywhere(gate_scale))[:, None]
+    hidden = partly_hidden(scored.inlier_ratio, scored.reference_inlier_ratio, scored.count, scored.elsewhere, config.validation)
+    asked_less = torch.where(holding_on(scored.count, scored.elsewhere, config.validation), 1, hidden)
+    status = judge(share, scored.count, in_view, step, objects.diameter_m, config.validation, gate_scale, asked_less)
     status = torch.where(prediction.usable, status, int(Status.DIVERGED))
     failed = status >= int(Status.LOST)
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
-    trusted = torch.where(failed, 0, torch.maximum(hidden, trust(share, config.validation, reference, widening)))
-    doubted = ~failed & is_smeared(found.score, reference, found.gathered, found.full_gathered, config.relocalization)
-    unsure = doubted | (~failed & found.turn_unclear)
+    trusted = torch.where(failed, 0, torch.maximum(hidden, trust(share, config.validation, reference, gate_scale)))
+    is_drifting_now = ~failed & is_smeared(scored.score, reference, scored.inlier_ratio, scored.reference_inlier_ratio, config.relocalization)
+    unsure = is_drifting_now | (~failed & scored.rotation_unclear)
     status = torch.where(unsure, status.clamp(min=int(Status.UNCERTAIN)), status)
-    velocity, covariance = _updated_motion(prediction, found, failed, trusted, dt_s, config)
+    velocity, covariance = _updated_motion(prediction, scored, failed, trusted, dt_s, config)
     # Of an object that is partly hidden too little is seen to tell.
     seen_well = ~failed & (share >= config.validation.validated_from * reference)
-    acceleration = _acceleration(prediction, found, torch.where(seen_well, trusted, 0), dt_s)
+    acceleration = _acceleration(prediction, scored, torch.where(seen_well, trusted, 0), dt_s)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     certain = (share >= CERTAIN * reference) & (status == int(Status.TRACKING))
-    certain &= (found.count >= CERTAIN_COUNT * health.reference_matches) | (not config.relocalization.by_matches)
+    certain &= (scored.count >= CERTAIN_COUNT * health.reference_matches) | (not config.relocalization.by_matches)
     health = replace(
-        _with_references(health, found, failed),
+        _with_references(health, scored, failed),
         # One good window among bad ones does not end a doubt.
-        drift_s=(health.drift_s + torch.where(failed, 0, torch.where(doubted, dt_s, -dt_s))).clamp(min=0),
+        drift_s=(health.drift_s + torch.where(failed, 0, torch.where(is_drifting_now, dt_s, -dt_s))).clamp(min=0),
         T_last_validated=torch.where(certain[:, None, None], T_cam_obj.detach(), health.T_last_validated),
         time_since_validated_s=torch.where(certain, 0, health.time_since_validated_s + dt_s),
     )
@@ -115,35 +115,35 @@ def judged_objects(
 
 
 def _darker_outside(
-    state: TrackerState, found: Found, status: Int[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
+    state: TrackerState, scored: ScoredFit, status: Int[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> Float[Tensor, "b 8"]:
     """Which side of contours is the darker one, with what the events on those of objects that are seen well say of it."""
     if not config.association.polarity_prior_s:
         return state.appearance.darker_outside
-    matches = found.fit.matches
+    matches = scored.fit.matches
     # What a search found stands on other matches than these.
-    known = (status == int(Status.TRACKING)) & is_seen_well(found.share, state.health.reference_explained_ratio) & ~found.elsewhere
+    known = (status == int(Status.TRACKING)) & is_seen_well(scored.explained_ratio, state.health.reference_explained_ratio) & ~scored.elsewhere
     # Chosen, not multiplied: what is not a number would stay.
     weights = torch.where(known[:, None] & (matches.offsets.abs() < ON_CONTOUR_PX), matches.weights, 0)
     return remembered(state.appearance.darker_outside, matches.directions, matches.dark, weights, dt_s, config.association.polarity_prior_s)
 
 
-def _with_references(health: TrackHealth, found: Found, failed: Bool[Tensor, "b"]) -> TrackHealth:
+def _with_references(health: TrackHealth, scored: ScoredFit, failed: Bool[Tensor, "b"]) -> TrackHealth:
     """Mean score and references with a window more; of objects that failed, as before."""
     ratio, inliers, matches = health.reference_explained_ratio, health.reference_inlier_ratio, health.reference_matches
     return replace(
         health,
-        mean_score=torch.where(failed, health.mean_score, torch.lerp(health.mean_score, found.score, USUAL_GAIN)),
-        reference_explained_ratio=torch.where(failed, ratio, _seen_well(ratio, found.share)),
-        reference_inlier_ratio=torch.where(failed | found.gathered.isnan(), inliers, _seen_well(inliers, found.gathered)),
-        reference_matches=torch.where(failed, matches, _seen_well(matches, found.count.to(matches.dtype))),
+        mean_score=torch.where(failed, health.mean_score, torch.lerp(health.mean_score, scored.score, USUAL_GAIN)),
+        reference_explained_ratio=torch.where(failed, ratio, _seen_well(ratio, scored.explained_ratio)),
+        reference_inlier_ratio=torch.where(failed | scored.inlier_ratio.isnan(), inliers, _seen_well(inliers, scored.inlier_ratio)),
+        reference_matches=torch.where(failed, matches, _seen_well(matches, scored.count.to(matches.dtype))),
     )
 
 
-def _normal_spread(health: TrackHealth, found: Found) -> Float[Tensor, "b"]:
+def _normal_spread(health: TrackHealth, scored: ScoredFit) -> Float[Tensor, "b"]:
     """How far apart the directions of contours are when objects are seen well, with a window more."""
     spread = health.reference_normal_spread
-    return torch.where(health.time_since_validated_s == 0, _seen_well(spread, found.apart), spread)
+    return torch.where(health.time_since_validated_s == 0, _seen_well(spread, scored.apart), spread)
 
 
 def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
@@ -151,9 +151,9 @@ def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Ten
     return torch.maximum(*(torch.lerp(before, now, gain) for gain in (USUAL_GAIN, FALL_GAIN)))
 
 
-def _acceleration(prediction: Prediction, found: Found, trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 6"]:
+def _acceleration(prediction: Prediction, scored: ScoredFit, trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 6"]:
     """Acceleration of a window, as found, as far as the find is to be trusted."""
-    offset = found.fit.solution.from_prior
+    offset = scored.fit.solution.from_prior
     if prediction.acceleration is None:
         return torch.zeros_like(prediction.velocity)
     acceleration = found_acceleration(prediction.acceleration, prediction.information, offset[:, :12], dt_s)
@@ -162,10 +162,10 @@ def _acceleration(prediction: Prediction, found: Found, trusted: Float[Tensor, "
 
 
 def _updated_motion(
-    prediction: Prediction, found: Found, failed: Bool[Tensor, "b"], trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
+    prediction: Prediction, scored: ScoredFit, failed: Bool[Tensor, "b"], trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> tuple[Float[Tensor, "b 6"], Float[Tensor, "b 12 12"]]:
     """Velocity and covariance after a window: as found, as far as the find is to be trusted."""
-    predicted, solution = prediction.covariance, found.fit.solution
+    predicted, solution = prediction.covariance, scored.fit.solution
     if not config.solver.prior:
         return torch.zeros_like(prediction.velocity), predicted
     posterior = config.solver.observation_px**2 * inverse(solution.hessian.double())[:, :12, :12]

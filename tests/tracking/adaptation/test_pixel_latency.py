@@ -10,7 +10,7 @@ from tracked_boxes import in_motion, poses_of, started
 from torchtrack.config.tracker import AssociationConfig, TrackerConfig
 from torchtrack.tracking.adaptation.pixel_latency import dated, late_share_after, slowness, unknown_circuits
 from torchtrack.tracking.association.observations import select_events
-from torchtrack.tracking.estimation.rounds import gate_widening, index_for
+from torchtrack.tracking.estimation.rounds import gate_scale_of, index_for
 
 # Bursts so long that what moves as the boxes of these tests do comes far enough.
 LONG = AssociationConfig(pixel_latency=True, burst_us=30_000)
@@ -20,10 +20,10 @@ OFF = [LONG.model_copy(update=change) for change in ({"pixel_latency": False}, {
 
 def observed(dtype=torch.float32):
     """Prediction, contours and observations of a box in motion, and their matches."""
-    tracker, prediction, seen, found, _ = in_motion(dtype=dtype)
+    tracker, prediction, seen, actual, _ = in_motion(dtype=dtype)
     contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
-    index = index_for(contours, tracker.image_size, tracker.config, gate_widening(torch.zeros(1, dtype=dtype), tracker.config))
-    return prediction, contours, select_events(seen, index, prediction.moving(compensated=True), 1000), found.fit.matches
+    index = index_for(contours, tracker.image_size, tracker.config, gate_scale_of(torch.zeros(1, dtype=dtype), tracker.config))
+    return prediction, contours, select_events(seen, index, prediction.moving(compensated=True), 1000), actual.fit.matches
 
 
 def share_after(into_burst_s, before=0.1, config=LONG, *, known=True, dtype=torch.float32, **changes):
@@ -62,8 +62,8 @@ def test_where_nothing_is_dated_back_so_nothing_is_told(config):
 
 
 def test_from_fast_circuits_to_slow_ones():
-    told = slowness(torch.tensor([0.0, 0.02, 0.08, 0.1, 0.3, 1.0]))
-    assert told[:2].tolist() == [0.0, 0.0] and 0 < told[2] < told[3] < 1 and told[4:].tolist() == [1.0, 1.0]
+    stated = slowness(torch.tensor([0.0, 0.02, 0.08, 0.1, 0.3, 1.0]))
+    assert stated[:2].tolist() == [0.0, 0.0] and 0 < stated[2] < stated[3] < 1 and stated[4:].tolist() == [1.0, 1.0]
     assert slowness(unknown_circuits(torch.zeros(3))).tolist() == pytest.approx([1.0] * 3)
 
 
@@ -82,7 +82,10 @@ def test_of_fast_circuits_no_event_is_late():
 def test_of_what_is_not_seen_well_all_are_late():
     _, _, observations, _ = observed()
     observations = replace(observations, into_burst_s=torch.ones_like(observations.age_s))
-    shares = [float(dated(observations, torch.zeros(1), torch.full((1,), unseen_s), LONG).into_burst_s.mean()) for unseen_s in (0.0, 0.005, 1.0)]
+    shares = [
+        float(dated(observations, torch.zeros(1), torch.full((1,), time_since_validated_s), LONG).into_burst_s.mean())
+        for time_since_validated_s in (0.0, 0.005, 1.0)
+    ]
     assert shares[0] == 0 and 0 < shares[1] < 1 and shares[2] == 1
 
 
@@ -105,7 +108,7 @@ def test_it_is_remembered():
 
 
 def test_with_fast_circuits_poses_are_as_without_bursts():
-    found = []
+    actual = []
     for burst_us in (10_000, 0):
         tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(association=AssociationConfig(pixel_latency=True, burst_us=burst_us)))
         # Each event once more, a little later: bursts of two.
@@ -115,5 +118,5 @@ def test_with_fast_circuits_poses_are_as_without_bursts():
         _, result = tracker.step(
             changed(state, late_share=torch.zeros(1), time_since_validated_s=torch.zeros(1), T_cam_obj=started()[1].T_cam_obj), both, end_us
         )
-        found.append(poses_of([result]))
-    torch.testing.assert_close(*found, atol=2e-5, rtol=0)
+        actual.append(poses_of([result]))
+    torch.testing.assert_close(*actual, atol=2e-5, rtol=0)

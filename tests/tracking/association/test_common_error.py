@@ -13,10 +13,10 @@ from torchtrack.config.tracker import AssociationConfig, SolverConfig, TrackerCo
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.observations import join, select_events
-from torchtrack.tracking.association.weights import SORTED_PX2, mistaken_px2, told_by_each
+from torchtrack.tracking.association.weights import SORTED_PX2, edge_ambiguity_px2, effective_weight
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import joined
-from torchtrack.tracking.estimation.rounds import align, gate_widening, index_for
+from torchtrack.tracking.estimation.rounds import align, gate_scale_of, index_for
 
 WITHOUT = TrackerConfig(solver=SolverConfig(common_px=0.0))
 
@@ -25,14 +25,14 @@ WITHOUT = TrackerConfig(solver=SolverConfig(common_px=0.0))
 def test_the_mean_of_many_has_the_variance_of_what_they_have_in_common(observation_px, common_px, dtype):
     count = torch.tensor([[1.0, 2.0, 10.0, 1e3, 1e6]], dtype=dtype)
     common_px2 = torch.full_like(count, common_px**2)
-    variance = observation_px**2 / (count * told_by_each(count, common_px2, observation_px))
+    variance = observation_px**2 / (count * effective_weight(count, common_px2, observation_px))
     torch.testing.assert_close(variance, common_px**2 + observation_px**2 / count)
 
 
 def test_one_alone_and_those_with_nothing_in_common_tell_all(dtype):
     count = torch.arange(50, dtype=dtype)[None]
-    assert (told_by_each(count, torch.zeros_like(count), 1.5) == 1).all()
-    assert (told_by_each(torch.zeros_like(count), torch.ones_like(count), 1.5) == 1).all()
+    assert (effective_weight(count, torch.zeros_like(count), 1.5) == 1).all()
+    assert (effective_weight(torch.zeros_like(count), torch.ones_like(count), 1.5) == 1).all()
 
 
 def test_observations_are_counted_by_patch_where_they_are_on_a_contour():
@@ -42,15 +42,15 @@ def test_observations_are_counted_by_patch_where_they_are_on_a_contour():
     table = contour_table(contours := upright_line(85.0), index_contours(contours, IMAGE_SIZE, 8, 1))
     observations, still = seen(torch.stack([columns, rows], -1)[None]), moving_objects((0.0, 0.0), 1, torch.float64)
     matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, AssociationConfig(dark_shift_px=0.0))
-    assert matches.beside[0].tolist() == [30] * 30 + [5] * 5 + [30] * 8
+    assert matches.neighbours[0].tolist() == [30] * 30 + [5] * 5 + [30] * 8
 
 
-def solved(times, config, kind=ContourKind.LIMB):
+def solved(times, config, kind=ContourKind.SMOOTH):
     """A window of a box whose edges are taken for those of ``kind``, with each of its events observed so many times."""
     tracker, prediction, events, _, _ = in_motion(config)
     contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
     contours = replace(contours, kind=torch.full_like(contours.kind, int(kind)))
-    tight = gate_widening(torch.zeros(1), tracker.config)
+    tight = gate_scale_of(torch.zeros(1), tracker.config)
     index = index_for(contours, tracker.image_size, tracker.config, tight)
     once = observations = select_events(events, index, prediction.moving(compensated=True), 1000)
     for _ in range(times - 1):
@@ -58,7 +58,7 @@ def solved(times, config, kind=ContourKind.LIMB):
     return prediction, align(prediction, contours, index, tight, observations, tracker.config).solution
 
 
-def told(times, config, kind=ContourKind.LIMB):
+def stated(times, config, kind=ContourKind.SMOOTH):
     """How much these tell of the pose, beside what was predicted: the trace of the information, by the prediction's covariance."""
     prediction, solution = solved(times, config, kind)
     observed = solution.hessian[0, :6, :6].double() / config.solver.observation_px**2 - prediction.information[0, :6, :6]
@@ -66,8 +66,8 @@ def told(times, config, kind=ContourKind.LIMB):
 
 
 def test_events_of_a_limb_seen_many_times_over_tell_little_more():
-    assert told(8, WITHOUT) / told(1, WITHOUT) == pytest.approx(8, rel=0.2)
-    assert 1 < told(8, TrackerConfig()) / told(1, TrackerConfig()) < 5
+    assert stated(8, WITHOUT) / stated(1, WITHOUT) == pytest.approx(8, rel=0.2)
+    assert 1 < stated(8, TrackerConfig()) / stated(1, TrackerConfig()) < 5
 
 
 @pytest.mark.parametrize("kind", [ContourKind.CREASE, ContourKind.TEXTURE, ContourKind.SEGMENT, ContourKind.LEARNED])
@@ -91,7 +91,7 @@ def test_a_displaced_place_with_many_events_pulls_less_with_an_error_in_common()
     matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, AssociationConfig(dark_shift_px=0.0, polarity=False))
     means = []
     for common_px2 in (0.0, 1.0):
-        weights = matches.weights * told_by_each(matches.beside, torch.full_like(matches.beside, common_px2), 1.0)
+        weights = matches.weights * effective_weight(matches.neighbours, torch.full_like(matches.neighbours, common_px2), 1.0)
         means.append(float((weights * matches.offsets.abs()).sum() / weights.sum()))
     assert means[0] == pytest.approx(0.455, abs=0.03)
     # Both stretches tell the same.
@@ -107,49 +107,49 @@ def two_lines(apart_px, dtype=torch.float64, kind=ContourKind.CREASE):
     return contours, index_contours(contours, IMAGE_SIZE, 8, 1)
 
 
-def mistaken(contours, index, close_px=2.0):
-    edges = (contours.kind == int(ContourKind.CREASE)) | (contours.kind == int(ContourKind.LIMB))
-    return mistaken_px2(contours, index, edges, contours.kind == int(ContourKind.CREASE), close_px)[0]
+def edge_ambiguity(contours, index, close_px=2.0):
+    edges = (contours.kind == int(ContourKind.CREASE)) | (contours.kind == int(ContourKind.SMOOTH))
+    return edge_ambiguity_px2(contours, index, edges, contours.kind == int(ContourKind.CREASE), close_px)[0]
 
 
 @pytest.mark.parametrize("apart_px", [1.0, 2.0, 3.0])
 def test_close_edges_are_taken_for_each_other_half_of_the_time_at_most(apart_px, dtype):
-    found = mistaken(*two_lines(apart_px, dtype))
+    actual = edge_ambiguity(*two_lines(apart_px, dtype))
     expected = 0.5 * math.exp(-((apart_px / 2.0) ** 2)) * apart_px**2
-    torch.testing.assert_close(found, torch.full_like(found, expected))
+    torch.testing.assert_close(actual, torch.full_like(actual, expected))
     assert expected <= 0.5 * apart_px**2
 
 
 @pytest.mark.parametrize("apart_px", [0.2, 5.0, 12.0])
 def test_what_is_one_edge_or_far_from_the_next_is_not_mistaken(apart_px):
-    assert (mistaken(*two_lines(apart_px)) == 0).all()
+    assert (edge_ambiguity(*two_lines(apart_px)) == 0).all()
 
 
 @pytest.mark.parametrize("apart_px", [0.2, 0.45, 1.0])
 def test_sharp_edges_at_different_depths_share_what_is_seen_even_where_they_cover_each_other(apart_px):
-    found = mistaken(*two_depths(apart_px))[:-1]
+    actual = edge_ambiguity(*two_depths(apart_px))[:-1]
     expected = 0.5 * math.exp(-((apart_px / 2.0) ** 2)) * (apart_px**2 + SORTED_PX2)
-    torch.testing.assert_close(found, torch.full_like(found, expected), rtol=1e-12, atol=0)
+    torch.testing.assert_close(actual, torch.full_like(actual, expected), rtol=1e-12, atol=0)
 
 
 def test_only_sharp_edges_and_only_where_they_are_far_apart_in_depth_cover_each_other():
-    assert (mistaken(*two_depths(0.2, ContourKind.LIMB)) == 0).all()
-    assert (mistaken(*two_depths(0.2, depth_m=1.01)) == 0).all()
-    assert (mistaken(*two_depths(0.02)) == 0).all()
+    assert (edge_ambiguity(*two_depths(0.2, ContourKind.SMOOTH)) == 0).all()
+    assert (edge_ambiguity(*two_depths(0.2, depth_m=1.01)) == 0).all()
+    assert (edge_ambiguity(*two_depths(0.02)) == 0).all()
 
 
 def test_print_and_edges_that_cross_are_not_mistaken():
-    assert (mistaken(*two_lines(2.0, kind=ContourKind.TEXTURE)) == 0).all()
+    assert (edge_ambiguity(*two_lines(2.0, kind=ContourKind.TEXTURE)) == 0).all()
     level = torch.stack([torch.arange(60.0, 100.0), torch.full((40,), 70.0)], -1)[None].double()
     crossing = contours_at(level, normals=torch.tensor([0.0, 1.0]).expand_as(level), kind=ContourKind.CREASE)
     contours = joined(upright_line(80.0, kind=ContourKind.CREASE), crossing)
-    assert (mistaken(contours, index_contours(contours, IMAGE_SIZE, 8, 1)) == 0).all()
+    assert (edge_ambiguity(contours, index_contours(contours, IMAGE_SIZE, 8, 1)) == 0).all()
 
 
 def test_edges_that_are_hidden_are_not_mistaken_nor_mistake_others():
     contours, _ = two_lines(2.0)
     contours = replace(contours, mask=contours.mask & (contours.pixels[..., 0] < 81))
-    assert (mistaken(contours, index_contours(contours, IMAGE_SIZE, 8, 1)) == 0).all()
+    assert (edge_ambiguity(contours, index_contours(contours, IMAGE_SIZE, 8, 1)) == 0).all()
 
 
 def test_what_is_seen_between_close_edges_tells_less_where_that_counts():
@@ -158,4 +158,4 @@ def test_what_is_seen_between_close_edges_tells_less_where_that_counts():
     for close_px, expected in ((0.0, 0.0), (2.0, 2 * math.exp(-1))):
         table = contour_table(contours, index, close_px=close_px)
         matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, AssociationConfig(dark_shift_px=0.0))
-        torch.testing.assert_close(matches.mistaken_px2, torch.full((1, 2), expected, dtype=torch.float64))
+        torch.testing.assert_close(matches.edge_ambiguity_px2, torch.full((1, 2), expected, dtype=torch.float64))

@@ -40,55 +40,55 @@ def random_contours(batch, count, seed=0, dtype=torch.float64):
 @pytest.mark.parametrize("cell_px", [1, 2, 3])
 @pytest.mark.parametrize("radius_px", [4, 7])
 @pytest.mark.parametrize("finely", [False, True])
-def test_the_index_finds_the_nearest_contour_within_the_radius(cell_px, radius_px, finely, dtype):
+def test_the_index_finds_the_nearest_contour_within_the_radius(cell_px, radius_px, subcell_lookup, dtype):
     contours = random_contours(3, 300, dtype=dtype)
     index = index_contours(contours, IMAGE_SIZE, radius_px, cell_px)
     places = torch.rand((3, 2000, 2), generator=generator(1), dtype=torch.float64).to(dtype) * torch.tensor([200, 150], dtype=dtype)
-    found = index.look_up(places, torch.full((3,), finely))
+    actual = index.look_up(places, torch.full((3,), subcell_lookup))
     # What is found is nearest to the place, or to the centre of its cell; to a sixteenth of a squared pixel.
-    centres = places if finely else ((places + 2**-8) / cell_px).round() * cell_px
-    rounding, reach = 2**-0.5 * cell_px, (2**0.5 if finely else 2**-0.5) * cell_px
+    centres = places if subcell_lookup else ((places + 2**-8) / cell_px).round() * cell_px
+    rounding, reach = 2**-0.5 * cell_px, (2**0.5 if subcell_lookup else 2**-0.5) * cell_px
     for number in range(3):
         distance = brute_force(contours, centres[number], number)
         best = distance.amin(1)
-        there = found[number] >= 0
+        there = actual[number] >= 0
         assert there[best < radius_px - rounding].all()
         assert not there[best > radius_px + reach].any()
-        ours = distance.gather(1, found[number].clamp(min=0)[:, None])[:, 0]
+        ours = distance.gather(1, actual[number].clamp(min=0)[:, None])[:, 0]
         sure = there & (best < radius_px - rounding)
         assert int(sure.sum()) > 100
         exact = (ours.square() - best.square())[sure] <= 1 / 16 + 1e-3
         # What is nearest to none of four centres can be nearest to a place between them, but hardly ever is.
-        assert float(exact.double().mean()) > 0.99 if finely else exact.all()
+        assert float(exact.double().mean()) > 0.99 if subcell_lookup else exact.all()
 
 
 def test_only_some_objects_are_looked_up_finely(dtype):
     index = index_contours(random_contours(3, 300, dtype=dtype), IMAGE_SIZE, 7, 2)
     places = torch.rand((3, 2000, 2), generator=generator(1), dtype=torch.float64).to(dtype) * torch.tensor([200, 150], dtype=dtype)
     mixed = index.look_up(places, torch.tensor([True, False, True]))
-    roughly, finely = index.look_up(places), index.look_up(places, torch.ones(3, dtype=torch.bool))
-    assert torch.equal(mixed, torch.stack([finely[0], roughly[1], finely[2]]))
-    assert not torch.equal(finely[1], roughly[1])
+    roughly, subcell_lookup = index.look_up(places), index.look_up(places, torch.ones(3, dtype=torch.bool))
+    assert torch.equal(mixed, torch.stack([subcell_lookup[0], roughly[1], subcell_lookup[2]]))
+    assert not torch.equal(subcell_lookup[1], roughly[1])
 
 
 @pytest.mark.parametrize("finely", [False, True])
-def test_roundings_do_not_choose_what_is_found_at_whole_pixels(finely, dtype):
+def test_roundings_do_not_choose_what_is_found_at_whole_pixels(subcell_lookup, dtype):
     """Where events lie, which is on the borders of cells or in the middle of four."""
     index = index_contours(random_contours(1, 300, dtype=dtype), IMAGE_SIZE, 7, 2)
     rows, columns = torch.meshgrid(torch.arange(150), torch.arange(200), indexing="ij")
     places = torch.stack([columns, rows], -1).reshape(1, -1, 2).to(dtype)
     rounding = 200 * torch.finfo(dtype).eps * (1 - 2 * torch.rand(places.shape, generator=generator(2), dtype=torch.float64)).to(dtype)
-    fine = torch.tensor([finely])
+    fine = torch.tensor([subcell_lookup])
     assert torch.equal(index.look_up(places + rounding, fine), index.look_up(places, fine))
 
 
 def test_few_places_are_looked_up_as_finely_as_many(dtype):
-    index, finely = index_contours(random_contours(3, 300, dtype=dtype), IMAGE_SIZE, 7, 2), torch.ones(3, dtype=torch.bool)
+    index, subcell_lookup = index_contours(random_contours(3, 300, dtype=dtype), IMAGE_SIZE, 7, 2), torch.ones(3, dtype=torch.bool)
     places = torch.rand((3, 5000, 2), generator=generator(1), dtype=torch.float64).to(dtype) * torch.tensor([200, 150], dtype=dtype)
-    few = torch.cat([index.look_up(some, finely) for some in places.split(500, 1)], 1)
+    few = torch.cat([index.look_up(some, subcell_lookup) for some in places.split(500, 1)], 1)
     # Of many, a table is made of what every cell knows.
     assert 4 * 500 < index.size[0] * index.size[1] < 4 * 5000
-    assert torch.equal(index.look_up(places, finely), few)
+    assert torch.equal(index.look_up(places, subcell_lookup), few)
 
 
 def test_of_edges_that_share_a_cell_the_nearer_one_is_found():
@@ -109,8 +109,8 @@ def test_contours_that_are_masked_are_not_found():
 def test_nothing_is_found_far_away_or_outside_the_region():
     index = index_contours(upright_line(80.0), IMAGE_SIZE, 5, 1)
     places = [[80.0, 60.0], [88.0, 60.0], [80.0, -400.0], [1e9, 60.0], [-1e9, -1e9], [torch.inf, 0.0], [torch.nan, 60.0]]
-    found = index.look_up(torch.tensor([places], dtype=torch.float64))[0].tolist()
-    assert found == [40, -1, -1, -1, -1, -1, -1]
+    actual = index.look_up(torch.tensor([places], dtype=torch.float64))[0].tolist()
+    assert actual == [40, -1, -1, -1, -1, -1, -1]
 
 
 def test_contours_far_outside_the_image_cost_nothing():
@@ -208,7 +208,7 @@ def test_events_are_moved_back_from_the_dark_side(polarity, speed, shift):
     assert matches.targets[0, 0].tolist() == pytest.approx([80.0 + shift, 60.0])
 
 
-@pytest.mark.parametrize(("kind", "shift"), [(ContourKind.LIMB, -0.49), (ContourKind.CREASE, -0.98), (ContourKind.TEXTURE, -0.98)])
+@pytest.mark.parametrize(("kind", "shift"), [(ContourKind.SMOOTH, -0.49), (ContourKind.CREASE, -0.98), (ContourKind.TEXTURE, -0.98)])
 def test_the_limb_of_a_smooth_surface_has_a_shift_of_its_own(kind, shift, dtype):
     contours = upright_line(80.0, kind=kind, dtype=dtype)
     seen_there = seen([[[80.0, 60.0]]], polarity=1.0, dtype=dtype)
@@ -250,8 +250,8 @@ def test_matches_of_an_object_do_not_depend_on_the_others(dtype):
     together, _ = nearest(observations, contours, velocity=(200.0, -100.0), cell_px=2)
     for number in range(3):
         own = Contours(*(getattr(contours, name)[number : number + 1] for name in vars(contours)))
-        one = Observations(*(getattr(observations, name)[number : number + 1] for name in vars(observations) if name != "trust"))
-        alone, _ = nearest(one, own, velocity=(200.0, -100.0), cell_px=2)
+        single = Observations(*(getattr(observations, name)[number : number + 1] for name in vars(observations) if name != "trust"))
+        alone, _ = nearest(single, own, velocity=(200.0, -100.0), cell_px=2)
         for name in vars(alone):
             torch.testing.assert_close(getattr(alone, name)[0], getattr(together, name)[number])
 
@@ -305,9 +305,9 @@ def line_with_offsets(*groups):
 def test_observations_gathered_on_a_contour_are_trusted_and_smeared_ones_are_not():
     places = line_with_offsets((32, 64, 0.6), (80, 112, 2.9))
     matches, _ = nearest(seen(places), upright_line(80.0), gate_px=4.0, concentration=True, smeared_share=0.4)
-    gathered = places[0, :, 1] < 64
-    assert float(matches.weights[0][gathered].min()) == 1
-    assert float(matches.weights[0][~gathered].max()) < 0.2
+    inlier_ratio = places[0, :, 1] < 64
+    assert float(matches.weights[0][inlier_ratio].min()) == 1
+    assert float(matches.weights[0][~inlier_ratio].max()) < 0.2
     assert ((matches.weights >= 0) & (matches.weights <= 1)).all()
 
 
@@ -336,7 +336,7 @@ def test_trust_rises_with_the_share_on_the_contour():
     assert len(set(shares)) >= 5
 
 
-@pytest.mark.parametrize(("offset", "near", "expected"), [(0.0, True, 1.0), (2.0, True, 0.02), (2.0, False, 0.6)], ids=["on", "beside", "none"])
+@pytest.mark.parametrize(("offset", "near", "expected"), [(0.0, True, 1.0), (2.0, True, 0.02), (2.0, False, 0.6)], ids=["on", "neighbours", "none"])
 def test_of_a_single_observation_the_share_is_drawn_towards_a_half(offset, near, expected):
     """One on the contour counts as two of three, one beside it as one of three, and none as one of two."""
     config = AssociationConfig(smeared_share=0.35, gathered_share=0.6, least_trust=0.02)

@@ -128,8 +128,8 @@ def test_values_go_with_their_events(dtype):
     number = ((chosen.pixels[0, :, 1] - 20) / 99 * 399).round().long()[chosen.mask[0]]
     assert len(number) > 40
     pairs = ((chosen.pixels, place), (chosen.age_s, age_s), (chosen.into_burst_s, 2 * age_s), (chosen.polarity, polarity))
-    for found, given in pairs:
-        assert torch.equal(found[0][chosen.mask[0]], given[0][number])
+    for actual, given in pairs:
+        assert torch.equal(actual[0][chosen.mask[0]], given[0][number])
     assert chosen.pixels.dtype == chosen.flow.dtype == dtype
     assert not chosen.has_flow.any()
 
@@ -180,7 +180,7 @@ def test_each_object_can_have_events_of_its_own():
 def test_the_events_of_one_object_can_be_repeated():
     values = [torch.rand((3, 5, *shape), generator=generator(k)) for k, shape in enumerate([(2,), (), (), ()])]
     events = WindowEvents(*values, torch.rand((3, 5), generator=generator(4)) < 0.5)
-    repeated = events.of(1).repeated(4)
+    repeated = events.of_object(1).repeated(4)
     for name in ("pixels", "age_s", "into_burst_s", "polarity", "mask"):
         value = getattr(events, name)
         many = getattr(repeated, name)

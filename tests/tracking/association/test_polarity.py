@@ -54,10 +54,10 @@ def after(dark, *, weights=1.0, window_s=0.005, before=0.0, dtype=torch.float64)
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_what_many_events_say_is_learned_with_the_time_constant(sign, dtype):
-    found = after([sign] * 3000, window_s=0.05, dtype=dtype)
+    actual = after([sign] * 3000, window_s=0.05, dtype=dtype)
     mine = int(octant(turned(10.0)))
-    assert float(found[0, mine]) == pytest.approx(sign * (1 - math.exp(-1)), rel=2e-3)
-    assert (found[0, [other for other in range(8) if other != mine]] == 0).all()
+    assert float(actual[0, mine]) == pytest.approx(sign * (1 - math.exp(-1)), rel=2e-3)
+    assert (actual[0, [other for other in range(8) if other != mine]] == 0).all()
 
 
 def test_few_events_say_little_and_none_nothing():
@@ -76,10 +76,10 @@ def test_objects_learn_each_for_itself_and_are_not_differentiated():
     dark = torch.ones(2, 40, dtype=torch.float64)
     weights = torch.tensor([[1.0], [0.0]], dtype=torch.float64).expand(2, 40).clone().requires_grad_()
     directions = turned(torch.full((2, 40), 10.0))
-    found = remembered(nothing_remembered(dark), directions, dark, weights, torch.full((2,), 0.005, dtype=torch.float64), 0.05)
-    assert not found.requires_grad
-    assert (found[1] == 0).all()
-    torch.testing.assert_close(found[:1], after([1.0] * 40))
+    actual = remembered(nothing_remembered(dark), directions, dark, weights, torch.full((2,), 0.005, dtype=torch.float64), 0.05)
+    assert not actual.requires_grad
+    assert (actual[1] == 0).all()
+    torch.testing.assert_close(actual[:1], after([1.0] * 40))
 
 
 def test_nothing_is_expected_of_what_is_seen_well_and_all_of_what_is_hardly_seen(dtype):
@@ -101,7 +101,7 @@ def test_what_was_never_seen_well_is_measured_against_a_least_share():
 # ---- what events count by it
 
 
-def matched(dark, *, expected=1.0, kind=ContourKind.LIMB):
+def matched(dark, *, expected=1.0, kind=ContourKind.SMOOTH):
     """Matches of events on the line at 80 px, whose normal (1, 0) it moves along: ``dark`` is their polarity."""
     contours = upright_line(80.0, kind=kind)
     v = 32 + 15 * torch.rand(len(dark), generator=generator(), dtype=torch.float64)
@@ -113,7 +113,7 @@ def matched(dark, *, expected=1.0, kind=ContourKind.LIMB):
     return contours, match_nearest(observations, table, places, moving_objects((500.0, 0.0)), 3.0, config)[0]
 
 
-@pytest.mark.parametrize("kind", [ContourKind.LIMB, ContourKind.CREASE])
+@pytest.mark.parametrize("kind", [ContourKind.SMOOTH, ContourKind.CREASE])
 def test_a_few_that_are_as_expected_count_in_full_among_many_that_are_not(kind):
     mixed = [1.0] * 6 + [-1.0] * 60
     _, alone = matched(mixed, expected=None, kind=kind)

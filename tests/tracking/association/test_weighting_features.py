@@ -12,14 +12,14 @@ from torchtrack import Tracker, preset
 from torchtrack.config.tracker import AssociationConfig, TrackerConfig
 from torchtrack.core.dispatch import backend
 from torchtrack.core.events import concatenate
-from torchtrack.tracking.association.weighting_features import limb_features
-from torchtrack.tracking.association.weighting_network import LimbTrust, TrustNetwork
+from torchtrack.tracking.association.weighting_features import silhouette_features
+from torchtrack.tracking.association.weighting_network import SilhouetteTrust, TrustNetwork
 
 BOX, SMOOTH = box_model(), bevelled_model()
 COUNT = 6
 
 
-class Watching(LimbTrust):
+class Watching(SilhouetteTrust):
     """Judges, and keeps what it saw."""
 
     def forward(self, evidence):
@@ -27,13 +27,13 @@ class Watching(LimbTrust):
         return super().forward(evidence)
 
 
-def evidence_of(models=(SMOOTH,), dtype=torch.float32):
+def inputs_of(models=(SMOOTH,), dtype=torch.float32):
     """What a weigher sees of objects in one place, all of the same events."""
-    weigher = Watching(TrustNetwork.shipped())
-    tracker = Tracker(list(models), SMALL_CAMERA, dtype=dtype, weigher=weigher)
+    weighting_network = Watching(TrustNetwork.shipped())
+    tracker = Tracker(list(models), SMALL_CAMERA, dtype=dtype, weighting_network=weighting_network)
     with torch.no_grad():
         follow(tracker, tracker.init(pose().expand(len(models), 4, 4), 0), windows(moving_box(pose(), COUNT)[1], COUNT))
-    return weigher.evidence, weigher
+    return weighting_network.evidence, weighting_network
 
 
 def tracked(models, starts, streams=None, spoilt=None):
@@ -52,19 +52,19 @@ def tracked(models, starts, streams=None, spoilt=None):
 
 
 def test_sharp_edges_are_believed_in_full(dtype):
-    evidence, weigher = evidence_of((BOX, SMOOTH), dtype)
+    evidence, weighting_network = inputs_of((BOX, SMOOTH), dtype)
     for wanted in (False, True):
         with torch.no_grad(), backend(wanted=wanted):
-            trust = weigher(evidence)
+            trust = weighting_network(evidence)
         assert (trust[0] == 1).all()
         of_smooth = trust[1][evidence.observations.mask[1]]
         assert ((of_smooth >= 0) & (of_smooth <= 1)).all() and (of_smooth < 1).float().mean() > 0.9
 
 
 def test_limbs_are_judged_as_the_network_judges_them(dtype):
-    evidence, weigher = evidence_of(dtype=dtype)
-    trust, of_all, (_, is_limb, _) = weigher(evidence), weigher.network(evidence), limb_features(evidence)
-    assert torch.equal(trust[is_limb], of_all[is_limb]) and (trust[~is_limb] == 1).all() and is_limb.any()
+    evidence, weighting_network = inputs_of(dtype=dtype)
+    trust, of_all, (_, is_smooth, _) = weighting_network(evidence), weighting_network.network(evidence), silhouette_features(evidence)
+    assert torch.equal(trust[is_smooth], of_all[is_smooth]) and (trust[~is_smooth] == 1).all() and is_smooth.any()
 
 
 # ---- by a kernel
@@ -72,56 +72,56 @@ def test_limbs_are_judged_as_the_network_judges_them(dtype):
 
 def test_limbs_are_described_the_same_by_a_kernel(dtype):
     pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
-    evidence, _ = evidence_of((SMOOTH, BOX, SMOOTH), dtype)
+    evidence, _ = inputs_of((SMOOTH, BOX, SMOOTH), dtype)
     with torch.no_grad():
-        features, is_limb, objects = limb_features(evidence)
+        features, is_smooth, objects = silhouette_features(evidence)
         with backend(wanted=False):
-            expected, wanted, every = limb_features(evidence)
+            expected, wanted, every = silhouette_features(evidence)
     # Of the box there is nothing to describe.
     assert objects.tolist() == [0, 2] and every.tolist() == [0, 1, 2]
-    assert torch.equal(is_limb, wanted) and not is_limb[1].any()
-    expected, is_limb = expected[objects], is_limb[objects]
-    assert is_limb.sum() > 200 and (features[~is_limb] == 0).all()
+    assert torch.equal(is_smooth, wanted) and not is_smooth[1].any()
+    expected, is_smooth = expected[objects], is_smooth[objects]
+    assert is_smooth.sum() > 200 and (features[~is_smooth] == 0).all()
     # What lies halfway between two pixels is counted at one or the other.
-    assert ((features - expected)[is_limb].abs() < 1e-4).all(-1).double().mean() > 0.99
+    assert ((features - expected)[is_smooth].abs() < 1e-4).all(-1).double().mean() > 0.99
 
 
 def test_where_there_is_no_limb_there_is_nothing_to_describe():
     pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
-    evidence, weigher = evidence_of((BOX,))
+    evidence, weighting_network = inputs_of((BOX,))
     with torch.no_grad():
-        features, is_limb, objects = limb_features(evidence)
-        assert not len(objects) and not features.any() and not is_limb.any() and (weigher(evidence) == 1).all()
+        features, is_smooth, objects = silhouette_features(evidence)
+        assert not len(objects) and not features.any() and not is_smooth.any() and (weighting_network(evidence) == 1).all()
 
 
 # ---- in the tracker
 
 
 def test_it_is_in_the_default_where_an_object_has_limbs():
-    assert isinstance(Tracker([BOX, SMOOTH], SMALL_CAMERA).weigher, LimbTrust)
-    assert Tracker([BOX], SMALL_CAMERA).weigher is None
-    assert Tracker([SMOOTH], SMALL_CAMERA, TrackerConfig(association=AssociationConfig(weighting_network="none"))).weigher is None
-    assert Tracker([SMOOTH], SMALL_CAMERA, preset("paper")).weigher is None
-    own = LimbTrust(TrustNetwork())
-    assert Tracker([BOX], SMALL_CAMERA, weigher=own).weigher is own
+    assert isinstance(Tracker([BOX, SMOOTH], SMALL_CAMERA).weighting_network, SilhouetteTrust)
+    assert Tracker([BOX], SMALL_CAMERA).weighting_network is None
+    assert Tracker([SMOOTH], SMALL_CAMERA, TrackerConfig(association=AssociationConfig(weighting_network="none"))).weighting_network is None
+    assert Tracker([SMOOTH], SMALL_CAMERA, preset("paper")).weighting_network is None
+    own = SilhouetteTrust(TrustNetwork())
+    assert Tracker([BOX], SMALL_CAMERA, weighting_network=own).weighting_network is own
 
 
 def test_it_needs_no_events_from_elsewhere_but_those_before_the_window():
     tracker = Tracker([SMOOTH], SMALL_CAMERA)
     assert tracker.looks_back and not tracker.shows_all
-    assert Tracker([SMOOTH], SMALL_CAMERA, weigher=torch.nn.Identity()).shows_all
+    assert Tracker([SMOOTH], SMALL_CAMERA, weighting_network=torch.nn.Identity()).shows_all
     assert not Tracker([BOX], SMALL_CAMERA).looks_back
 
 
 def test_it_changes_the_poses_of_what_is_smooth_and_of_nothing_else():
     events = windows(moving_box(pose(), COUNT)[1], COUNT)
     for model in (BOX, SMOOTH):
-        found = []
+        actual = []
         for trust in ("limbs", "none"):
             tracker = Tracker([model], SMALL_CAMERA, TrackerConfig(association=AssociationConfig(weighting_network=trust)))
             with torch.no_grad():
-                found.append(follow(tracker, tracker.init(pose()[None], 0), events)[0].T_cam_obj)
-        assert torch.equal(*found) == (model is BOX)
+                actual.append(follow(tracker, tracker.init(pose()[None], 0), events)[0].T_cam_obj)
+        assert torch.equal(*actual) == (model is BOX)
 
 
 def test_smooth_objects_are_followed_among_noise():

@@ -33,11 +33,11 @@ def clutter(count, start_us, duration_us, seed=1):
     return EventBatch.from_numpy(x, y, t_us.numpy(), torch.randint(2, (count,), generator=rng).numpy())
 
 
-def evidence_of(objects=1, dtype=torch.float32, noise=400, polarity=None):
+def inputs_of(objects=1, dtype=torch.float32, noise=400, polarity=None):
     """What a weigher sees of a box in motion among noise; with its tracker and the truth."""
     trajectory, events = moving_box(pose(), 6)
     watching = Watching()
-    tracker = Tracker([box_model()] * objects, SMALL_CAMERA, dtype=dtype, weigher=watching)
+    tracker = Tracker([box_model()] * objects, SMALL_CAMERA, dtype=dtype, weighting_network=watching)
     state = tracker.init(pose().expand(objects, 4, 4), 0)
     for batch, end_us in windows(merged(events, clutter(6 * noise, 0, 30_000)), 6):
         batch = batch if polarity is None else replace(batch, polarity=torch.full_like(batch.polarity, polarity))
@@ -56,11 +56,11 @@ def truth_at(trajectory, tracker, t_us=30_000):
 
 
 def test_events_of_the_contour_lie_on_the_true_one_and_noise_does_not(dtype):
-    evidence, tracker, trajectory = evidence_of(dtype=dtype, noise=0)
+    evidence, tracker, trajectory = inputs_of(dtype=dtype, noise=0)
     distance = true_distance(tracker, evidence, *truth_at(trajectory, tracker))
     mask = evidence.observations.mask
     assert (distance[mask] < 1.0).float().mean() > 0.9 and torch.isinf(distance[~mask]).all()
-    evidence, tracker, trajectory = evidence_of(dtype=dtype, noise=2000)
+    evidence, tracker, trajectory = inputs_of(dtype=dtype, noise=2000)
     distance = true_distance(tracker, evidence, *truth_at(trajectory, tracker))[evidence.observations.mask]
     assert 0.1 < (distance > 2.0).float().mean() < 0.9
 
@@ -74,20 +74,20 @@ def features_of(evidence):
 
 
 def test_features_are_numbers_of_about_unit_size(dtype):
-    evidence, _, _ = evidence_of(dtype=dtype)
+    evidence, _, _ = inputs_of(dtype=dtype)
     features = trust_features(evidence)
     assert features.shape == (*evidence.observations.age_s.shape, FEATURES) and features.dtype == dtype
     assert torch.isfinite(features).all() and features.abs().max() < 8
 
 
 def test_features_do_not_hang_on_other_objects():
-    alone, both = evidence_of()[0], evidence_of(objects=2)[0]
+    alone, both = inputs_of()[0], inputs_of(objects=2)[0]
     torch.testing.assert_close(trust_features(both)[:1], trust_features(alone), atol=3e-4, rtol=0)
     torch.testing.assert_close(trust_features(both)[1:], trust_features(alone), atol=3e-4, rtol=0)
 
 
 def test_events_around_are_counted_by_polarity():
-    ours, others = (features_of(evidence_of(polarity=value)[0]) for value in (True, False))
+    ours, others = (features_of(inputs_of(polarity=value)[0]) for value in (True, False))
     same, opposite = ours[:, :27], ours[:, 27:54]
     # All events are of one polarity: none is found of the other but by corners, which have none.
     assert (same.amax(1) > 0.4).float().mean() > 0.95 and (opposite == 0).all()
@@ -96,7 +96,7 @@ def test_events_around_are_counted_by_polarity():
 
 
 def test_events_of_the_contour_look_otherwise_than_noise():
-    evidence, tracker, trajectory = evidence_of(noise=2000)
+    evidence, tracker, trajectory = inputs_of(noise=2000)
     distance = true_distance(tracker, evidence, *truth_at(trajectory, tracker))
     mask = evidence.observations.mask
     counts = trust_features(evidence)[..., :54].sum(-1)
@@ -104,7 +104,7 @@ def test_events_of_the_contour_look_otherwise_than_noise():
 
 
 def test_observations_without_a_contour_or_on_no_sensor_are_told_as_such():
-    evidence, _, _ = evidence_of()
+    evidence, _, _ = inputs_of()
     far = replace(evidence.observations, pixels=torch.full_like(evidence.observations.pixels, 1e6))
     features = trust_features(replace(evidence, observations=far))
     assert torch.isfinite(features).all() and (features[..., -1] == 0).all()
@@ -122,7 +122,7 @@ def test_the_network_is_small():
 def test_weights_are_kept_and_read_again():
     network = TrustNetwork()
     again = TrustNetwork.from_bytes(network.as_bytes())
-    evidence = evidence_of()[0]
+    evidence = inputs_of()[0]
     trust = network(evidence)
     assert torch.equal(again(evidence), trust) and ((trust >= 0) & (trust <= 1)).all() and trust.requires_grad
 
@@ -134,7 +134,7 @@ def test_other_files_are_refused(content):
 
 
 def test_the_shipped_network_tells_the_contour_from_noise():
-    evidence, tracker, trajectory = evidence_of(noise=2000)
+    evidence, tracker, trajectory = inputs_of(noise=2000)
     distance = true_distance(tracker, evidence, *truth_at(trajectory, tracker))
     trust, mask = TrustNetwork.shipped()(evidence), evidence.observations.mask
     assert trust[mask & (distance < 1)].mean() > 0.3 + trust[mask & (distance > 2)].mean()
@@ -145,10 +145,10 @@ def test_the_shipped_network_tells_the_contour_from_noise():
 
 def test_the_preset_brings_the_network_and_a_weigher_of_ones_own_replaces_it(dtype):
     tracker = Tracker([box_model()], SMALL_CAMERA, preset("learned"), dtype=dtype)
-    assert isinstance(tracker.weigher, TrustNetwork) and {value.dtype for value in tracker.weigher.parameters()} == {dtype}
+    assert isinstance(tracker.weighting_network, TrustNetwork) and {value.dtype for value in tracker.weighting_network.parameters()} == {dtype}
     own = Watching()
-    assert Tracker([box_model()], SMALL_CAMERA, preset("learned"), weigher=own).weigher is own
-    assert Tracker([box_model()], SMALL_CAMERA).weigher is None
+    assert Tracker([box_model()], SMALL_CAMERA, preset("learned"), weighting_network=own).weighting_network is own
+    assert Tracker([box_model()], SMALL_CAMERA).weighting_network is None
 
 
 def test_the_preset_is_the_default_but_for_the_network():

@@ -84,12 +84,12 @@ def weights_on_a_line(polarity, *, speed=500.0, kind=ContourKind.CREASE, polarit
     v = 32 + 15 * torch.rand(len(polarity), generator=generator(), dtype=torch.float64)
     places = torch.stack([torch.full_like(v, 80.0), v], -1)[None]
     observations = seen(places, polarity=torch.tensor(polarity, dtype=torch.float64)[None])
-    table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1), of_print=print_counts)
+    table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1), of_texture=print_counts)
     config = AssociationConfig(concentration=False, dark_shift_px=0.0, silhouette_dark_shift_px=0.0, polarity=polarity_counts)
     return match_nearest(observations, table, places, moving_objects((speed, 0.0)), 3.0, config)[0].weights[0]
 
 
-@pytest.mark.parametrize("kind", [ContourKind.LIMB, ContourKind.CREASE])
+@pytest.mark.parametrize("kind", [ContourKind.SMOOTH, ContourKind.CREASE])
 @pytest.mark.parametrize("speed", [500.0, -500.0])
 def test_events_of_the_wrong_polarity_count_least_on_the_edges_of_a_mesh(kind, speed):
     weights = weights_on_a_line([1.0] * 30 + [-1.0] * 3, kind=kind, speed=speed)

@@ -188,7 +188,7 @@ def test_the_limb_of_a_sphere_lies_on_its_outline(place):
     model = ObjectModel.from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=radius_m), name="ball")
     T = pose((0.3, 0.2, 0.1), place)
     points, pixels, _, kind = visible(contours_of(model, T[None]))
-    assert (kind == int(ContourKind.LIMB)).all()
+    assert (kind == int(ContourKind.SMOOTH)).all()
     centre = torch.tensor(place, dtype=torch.float64)
     outline = torch.asin(radius_m / centre.norm())
     rays = torch.cat([(pixels - INTRINSICS[2:]) / INTRINSICS[:2], torch.ones_like(pixels[:, :1])], -1)
@@ -247,8 +247,8 @@ def test_there_are_places_for_all_texture_that_looks_at_a_camera(monkeypatch):
     bounded = contours_of(model, T)
     assert bounded.mask.shape[1] < CONFIG.max_edge_points + len(model.texture_points)
     for number in range(len(T)):
-        for one, other in zip(visible(counted, number), visible(bounded, number), strict=True):
-            assert torch.equal(one, other)
+        for single, other in zip(visible(counted, number), visible(bounded, number), strict=True):
+            assert torch.equal(single, other)
 
 
 def test_texture_can_be_switched_off_and_thinned():

@@ -259,17 +259,17 @@ def test_only_objects_beside_others_are_drawn_and_nothing_else_changes(monkeypat
     asked, models, T = [], [box_model((0.06, 0.08, 0.05))] * len(positions), places(*positions)
     beside_others = visibility._beside_others
     monkeypatch.setattr(visibility, "_beside_others", lambda *scene: asked.append(beside_others(*scene)) or asked[-1])
-    _, found = extracted(models, T)
+    _, actual = extracted(models, T)
     assert asked[-1].tolist() == drawn
     monkeypatch.setattr(visibility, "_beside_others", lambda scene, *_: torch.ones_like(scene.stream_index, dtype=torch.bool))
-    assert torch.equal(found.mask, extracted(models, T)[1].mask)
+    assert torch.equal(actual.mask, extracted(models, T)[1].mask)
 
 
 def test_objects_of_other_streams_are_not_beside_one_another():
     models, T = [box_model()] * 2, places((0.0, 0.0, 0.3), (0.0, 0.0, 0.7))
     _, alone = extracted(models[:1], T[1:])
-    _, found = extracted([*models, box_model()], torch.cat([T, places((0.01, 0.0, 0.3))]), streams=[0, 1, 0])
-    assert torch.equal(found.mask[1, : alone.mask.shape[1]], alone.mask[0])
+    _, actual = extracted([*models, box_model()], torch.cat([T, places((0.01, 0.0, 0.3))]), streams=[0, 1, 0])
+    assert torch.equal(actual.mask[1, : alone.mask.shape[1]], alone.mask[0])
 
 
 def test_no_input_is_changed():

@@ -52,8 +52,8 @@ def measure(T_cam_obj, further, seed=3):
 @torch.no_grad()
 def measured_optimum(problem, loss):
     """The measure where the cost is least, to rounding."""
-    found = solve_pose(problem, problem.T_prior, settings(loss))
-    T_cam_obj, further = found.T_cam_obj, found.from_prior[:, 6:]
+    actual = solve_pose(problem, problem.T_prior, settings(loss))
+    T_cam_obj, further = actual.T_cam_obj, actual.from_prior[:, 6:]
     for _ in range(4):
         step, good = newton_step(problem, T_cam_obj, further, loss)
         T_cam_obj, further = move_about(T_cam_obj, cayley(step[:, :3]), step[:, 3:6], problem.centre_obj), further + step[:, 6:]
@@ -98,8 +98,8 @@ def test_gradients_are_those_of_the_converged_optimum(name, loss, window):
     problem = noisy(loss, window=window)
     amount = torch.zeros((), dtype=torch.float64, requires_grad=True)
     moved = changed(problem, name, amount)
-    found = with_gradient(moved, solve_pose(moved, problem.T_prior, settings(loss)), settings(loss))
-    (ours,) = torch.autograd.grad(measure(found.T_cam_obj, found.from_prior[:, 6:]), amount)
+    actual = with_gradient(moved, solve_pose(moved, problem.T_prior, settings(loss)), settings(loss))
+    (ours,) = torch.autograd.grad(measure(actual.T_cam_obj, actual.from_prior[:, 6:]), amount)
     small = 3e-5
     theirs = (measured_optimum(changed(problem, name, small), loss) - measured_optimum(changed(problem, name, -small), loss)) / (2 * small)
     assert abs(ours - theirs) <= 1e-3 * abs(theirs)
@@ -110,8 +110,8 @@ def test_gradients_do_not_need_a_solution_that_has_converged():
     gradients = []
     for iterations in (2, 15):
         solution = solve_pose(problem, problem.T_prior.detach(), settings("tukey", iterations))
-        found = with_gradient(problem, solution, SolverConfig(gradient_iterations=6))
-        gradients.append(torch.autograd.grad(found.T_cam_obj[:, :3].sum(), tensors["targets"])[0])
+        actual = with_gradient(problem, solution, SolverConfig(gradient_iterations=6))
+        gradients.append(torch.autograd.grad(actual.T_cam_obj[:, :3].sum(), tensors["targets"])[0])
     assert (gradients[0] - gradients[1]).norm() < 1e-2 * gradients[1].norm()
 
 
@@ -136,10 +136,10 @@ def test_values_stay_to_the_last_bit(dtype):
     window = type(problem.window)(*(value.to(dtype) for value in vars(problem.window).values()))
     problem = PoseProblem(**tensors, window=window)
     solution = solve_pose(problem, problem.T_prior, settings("tukey", 2))
-    found = with_gradient(replace(problem, weights=problem.weights.requires_grad_()), solution, settings("tukey"))
-    assert found.T_cam_obj.requires_grad and not found.hessian.requires_grad
+    actual = with_gradient(replace(problem, weights=problem.weights.requires_grad_()), solution, settings("tukey"))
+    assert actual.T_cam_obj.requires_grad and not actual.hessian.requires_grad
     for name, value in vars(solution).items():
-        assert torch.equal(getattr(found, name), value), name
+        assert torch.equal(getattr(actual, name), value), name
 
 
 @pytest.mark.parametrize("recording", [True, False])
@@ -165,8 +165,8 @@ def test_gradients_are_finite_at_identity_and_for_padding(loss, window):
     weights, targets = problem.weights.clone(), problem.targets.clone()
     weights[:, 20:], targets[:, 30:] = 0, torch.nan
     problem, tensors = leaves(replace(problem, T_prior=eye, weights=weights, targets=targets))
-    found = with_gradient(problem, solve_pose(replace(problem, targets=targets.nan_to_num()), eye, settings(loss, 1)), settings(loss))
-    gradients = torch.autograd.grad(measure(found.T_cam_obj, found.from_prior), list(tensors.values()), allow_unused=True)
+    actual = with_gradient(problem, solve_pose(replace(problem, targets=targets.nan_to_num()), eye, settings(loss, 1)), settings(loss))
+    gradients = torch.autograd.grad(measure(actual.T_cam_obj, actual.from_prior), list(tensors.values()), allow_unused=True)
     for name, gradient in zip(tensors, gradients, strict=True):
         assert gradient is None or torch.isfinite(gradient).all(), name
     by_targets, by_points = (gradients[list(tensors).index(name)] for name in ("targets", "points_obj"))
@@ -190,9 +190,9 @@ def test_a_failed_element_has_no_gradient_and_leaves_its_neighbours_alone(fault)
     for each in (PoseProblem(**broken), alone):
         each, tensors = leaves(each)
         start = each.T_prior.detach()
-        found = with_gradient(each, solve_pose(each, start, settings("tukey")), settings("tukey"))
-        assert torch.isfinite(found.T_cam_obj).all()
-        gradients.append(torch.autograd.grad(found.T_cam_obj.sum(), [tensors[name] for name in ("weights", "targets", "points_obj", "T_prior")]))
+        actual = with_gradient(each, solve_pose(each, start, settings("tukey")), settings("tukey"))
+        assert torch.isfinite(actual.T_cam_obj).all()
+        gradients.append(torch.autograd.grad(actual.T_cam_obj.sum(), [tensors[name] for name in ("weights", "targets", "points_obj", "T_prior")]))
     for ours, theirs in zip(*gradients, strict=True):
         assert torch.isfinite(ours).all() and (ours[1] == 0).all()
         torch.testing.assert_close(ours[::2], theirs, rtol=1e-9, atol=1e-12)

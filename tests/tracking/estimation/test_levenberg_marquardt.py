@@ -134,9 +134,9 @@ def test_the_truth_is_found_from_nearby(batch, count, dtype):
     T_true = random_pose(batch, seed=count)
     problem = problem_at(T_true, count, dtype=dtype)
     start = perturbed(T_true, seed=1, rotation_rad=0.02, translation_m=0.002)
-    found = solve_pose(problem, start.to(dtype), THOROUGH).T_cam_obj
-    degrees, millimetres = pose_errors(found.double(), T_true)
-    assert found.dtype == dtype
+    actual = solve_pose(problem, start.to(dtype), THOROUGH).T_cam_obj
+    degrees, millimetres = pose_errors(actual.double(), T_true)
+    assert actual.dtype == dtype
     assert float(degrees.max()) < EXACT[dtype][0]
     assert float(millimetres.max()) < EXACT[dtype][1]
 
@@ -148,8 +148,8 @@ def test_outliers_do_not_move_the_solution(share, dtype):
     start = perturbed(T_true, seed=1, rotation_rad=0.01, translation_m=0.001).to(dtype)
     errors = {}
     for loss in LOSSES:
-        found = solve_pose(problem, start, replace_config(loss=loss)).T_cam_obj
-        errors[loss] = max(float(error.max()) for error in pose_errors(found.double(), T_true))
+        actual = solve_pose(problem, start, replace_config(loss=loss)).T_cam_obj
+        errors[loss] = max(float(error.max()) for error in pose_errors(actual.double(), T_true))
     assert errors["tukey"] < 0.7
     assert errors["tukey"] < errors["huber"] < errors["none"]
 
@@ -172,8 +172,8 @@ def test_weights_count_as_repetitions():
     doubled = replace(problem, weights=torch.cat([torch.full((3, 20), 2.0), torch.ones(3, 20)], 1).double())
     index = torch.cat([torch.arange(20), torch.arange(40)])
     repeated = replace(problem, **{name: getattr(problem, name)[:, index] for name in ("points_obj", "targets", "directions", "weights")})
-    found = [solve_pose(each, T_true, THOROUGH).T_cam_obj for each in (doubled, repeated)]
-    torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-8)
+    actual = [solve_pose(each, T_true, THOROUGH).T_cam_obj for each in (doubled, repeated)]
+    torch.testing.assert_close(actual[0], actual[1], rtol=0, atol=1e-8)
 
 
 def test_padding_does_not_count(dtype):
@@ -187,8 +187,8 @@ def test_padding_does_not_count(dtype):
         weights=torch.cat([problem.weights, torch.zeros(3, 25, dtype=dtype)], 1),
     )
     start = perturbed(T_true).to(dtype)
-    found = [solve_pose(each, start, THOROUGH).T_cam_obj for each in (problem, padded)]
-    torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-8)
+    actual = [solve_pose(each, start, THOROUGH).T_cam_obj for each in (problem, padded)]
+    torch.testing.assert_close(actual[0], actual[1], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-8)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -237,8 +237,8 @@ def before_the_last_step(problem, start, config):
 @pytest.mark.parametrize("iterations", [2, 3, 9])
 def test_no_step_but_the_last_raises_the_cost(loss, iterations):
     problem, start = far_off()
-    found = before_the_last_step(problem, start, SolverConfig(iterations=iterations, loss=loss, damping=0))
-    before, after = cost_of(problem, start, loss), cost_of(problem, found, loss)
+    actual = before_the_last_step(problem, start, SolverConfig(iterations=iterations, loss=loss, damping=0))
+    before, after = cost_of(problem, start, loss), cost_of(problem, actual, loss)
     assert (after <= before * (1 + 1e-9)).all()
     assert (after < before).any()
 
@@ -268,9 +268,9 @@ def test_the_prior_holds_what_nothing_observes(dtype):
     T_prior[:, 1, 3] += 0.01
     T_prior[:, 0, 3] += 0.002
     problem = replace(problem, T_prior=T_prior.to(dtype))
-    found = solve_pose(problem, T_prior.to(dtype), THOROUGH).T_cam_obj.double()
+    actual = solve_pose(problem, T_prior.to(dtype), THOROUGH).T_cam_obj.double()
     # What is seen goes to the truth, what is not stays with the prior: turning about the line of sight moves y too.
-    centre = transform_points(found, problem.centre_obj.double()[:, None])[:, 0]
+    centre = transform_points(actual, problem.centre_obj.double()[:, None])[:, 0]
     prior_centre = transform_points(T_prior, problem.centre_obj.double()[:, None])[:, 0]
     true_centre = transform_points(T_true, problem.centre_obj.double()[:, None])[:, 0]
     assert float((centre - true_centre)[:, 0].abs().max()) < 2e-4
@@ -282,17 +282,17 @@ def test_without_a_prior_what_nothing_observes_stays_finite(dtype):
     problem = blind(T_true, 0.0, dtype)
     single = replace(problem, points_obj=torch.zeros_like(problem.points_obj))
     for each in (problem, single, replace(problem, weights=torch.zeros_like(problem.weights))):
-        found = solve_pose(each, perturbed(T_true).to(dtype), THOROUGH).T_cam_obj
-        assert torch.isfinite(found).all()
-        assert float((found.double() - T_true).abs().max()) < 0.2
+        actual = solve_pose(each, perturbed(T_true).to(dtype), THOROUGH).T_cam_obj
+        assert torch.isfinite(actual).all()
+        assert float((actual.double() - T_true).abs().max()) < 0.2
 
 
 def test_without_observations_the_pose_goes_to_the_prior(dtype):
     T_true = random_pose(4, seed=9)
     problem = problem_at(T_true, prior=1e4, dtype=dtype)
     problem = replace(problem, weights=torch.zeros_like(problem.weights))
-    found = solve_pose(problem, perturbed(T_true).to(dtype), THOROUGH).T_cam_obj.double()
-    degrees, millimetres = pose_errors(found, T_true)
+    actual = solve_pose(problem, perturbed(T_true).to(dtype), THOROUGH).T_cam_obj.double()
+    degrees, millimetres = pose_errors(actual, T_true)
     assert float(degrees.max()) < 1e-2
     assert float(millimetres.max()) < 1e-2
 

@@ -27,9 +27,9 @@ def without_window(problem):
 def test_a_velocity_that_was_predicted_wrong_is_found_with_the_pose(dtype):
     T_true = random_pose(4, seed=1)
     problem = windowed(T_true, dtype=dtype)
-    found = solve_pose(problem, T_true.to(dtype), THOROUGH)
-    degrees, millimetres = pose_errors(found.T_cam_obj.double(), T_true)
-    error = (found.from_prior[:, 6:12].double() - FASTER).abs()
+    actual = solve_pose(problem, T_true.to(dtype), THOROUGH)
+    degrees, millimetres = pose_errors(actual.T_cam_obj.double(), T_true)
+    error = (actual.from_prior[:, 6:12].double() - FASTER).abs()
     # What is left is the motion's curvature within the window.
     assert float(degrees.max()) < 0.005
     assert float(millimetres.max()) < 0.01
@@ -45,16 +45,16 @@ def test_without_the_ages_the_same_motion_biases_the_pose():
     half_mm, half_deg = 1e3 * 0.5 * WINDOW_S * float(FASTER[3:].norm()), 0.5 * WINDOW_S * float(torch.rad2deg(FASTER[:3].norm()))
     assert float(biased[0].mean()) == pytest.approx(half_deg, rel=0.2)
     assert float(biased[1].mean()) > 0.5 * half_mm
-    found = pose_errors(solve_pose(problem, T_true, THOROUGH).T_cam_obj, T_true)
-    assert float(found[0].max()) < 0.05 * float(biased[0].min())
+    actual = pose_errors(solve_pose(problem, T_true, THOROUGH).T_cam_obj, T_true)
+    assert float(actual[0].max()) < 0.05 * float(biased[0].min())
 
 
 def test_noise_leaves_pose_and_velocity_unbiased():
     """The mean over many windows is far nearer to the truth than one is."""
     T_true = random_pose(1, seed=2).expand(200, 4, 4)
-    found = solve_pose(windowed(T_true, noise_px=0.5), T_true, SolverConfig(iterations=4))
-    velocity = found.from_prior[:, 6:12] - FASTER
-    centre = found.from_prior[:, :6]
+    actual = solve_pose(windowed(T_true, noise_px=0.5), T_true, SolverConfig(iterations=4))
+    velocity = actual.from_prior[:, 6:12] - FASTER
+    centre = actual.from_prior[:, :6]
     for error in (velocity, centre):
         assert (error.mean(0).abs() < 4 * error.std(0) / 200**0.5 + 2e-3 * error.std(0)).all()
 
@@ -63,9 +63,9 @@ def test_noise_leaves_pose_and_velocity_unbiased():
 def test_the_swelling_of_limbs_is_found(silhouette_offset_px, dtype):
     T_true = random_pose(3, seed=3)
     problem = windowed(T_true, faster=torch.zeros(6, dtype=torch.float64), silhouette_offset_px=silhouette_offset_px, dtype=dtype)
-    found = solve_pose(problem, T_true.to(dtype), THOROUGH)
-    torch.testing.assert_close(found.from_prior[:, 12], torch.full((3,), silhouette_offset_px, dtype=dtype), rtol=0, atol=2e-3)
-    degrees, millimetres = pose_errors(found.T_cam_obj.double(), T_true)
+    actual = solve_pose(problem, T_true.to(dtype), THOROUGH)
+    torch.testing.assert_close(actual.from_prior[:, 12], torch.full((3,), silhouette_offset_px, dtype=dtype), rtol=0, atol=2e-3)
+    degrees, millimetres = pose_errors(actual.T_cam_obj.double(), T_true)
     assert float(degrees.max()) < 0.01
     assert float(millimetres.max()) < 0.01
 
@@ -73,9 +73,9 @@ def test_the_swelling_of_limbs_is_found(silhouette_offset_px, dtype):
 def test_observations_of_one_time_say_nothing_of_the_velocity():
     """With age zero the predicted velocity stays, and its prior is all that is known of it."""
     T_true = random_pose(2, seed=4)
-    found = solve_pose(windowed(T_true, age_s=0.0, noise_px=0.3, prior=1.0), T_true, THOROUGH)
-    assert float(found.from_prior[:, 6:12].abs().max()) < 1e-9
-    torch.testing.assert_close(found.hessian[:, 6:12, 6:12], torch.eye(6, dtype=torch.float64).expand(2, 6, 6), rtol=0, atol=1e-9)
+    actual = solve_pose(windowed(T_true, age_s=0.0, noise_px=0.3, prior=1.0), T_true, THOROUGH)
+    assert float(actual.from_prior[:, 6:12].abs().max()) < 1e-9
+    torch.testing.assert_close(actual.hessian[:, 6:12, 6:12], torch.eye(6, dtype=torch.float64).expand(2, 6, 6), rtol=0, atol=1e-9)
 
 
 def test_a_prior_weighs_velocities_against_the_ages():
@@ -86,8 +86,8 @@ def test_a_prior_weighs_velocities_against_the_ages():
         problem = windowed(T_true, noise_px=0.2)
         information = problem.prior_information.clone()
         information[:, 6:12, 6:12] = prior * torch.eye(6, dtype=torch.float64)
-        found = solve_pose(replace(problem, prior_information=information), T_true, THOROUGH)
-        taken.append(float(found.from_prior[:, 6:9].norm(dim=-1).mean() / FASTER[:3].norm()))
+        actual = solve_pose(replace(problem, prior_information=information), T_true, THOROUGH)
+        taken.append(float(actual.from_prior[:, 6:9].norm(dim=-1).mean() / FASTER[:3].norm()))
     assert taken[0] == pytest.approx(1, abs=0.2)
     assert taken[0] > taken[1] > taken[2]
     assert taken[2] < 0.01
@@ -107,7 +107,7 @@ def test_six_and_thirteen_unknowns_agree_where_the_further_ones_are_held(loss, d
     tolerance = 1e-5 if dtype == torch.float32 else 1e-9
     torch.testing.assert_close(thirteen.T_cam_obj, six.T_cam_obj, rtol=0, atol=tolerance)
     torch.testing.assert_close(thirteen.from_prior[:, :6], six.from_prior, rtol=0, atol=tolerance)
-    costs = [robust_cost(part, found.T_cam_obj, found.from_prior, loss) for part, found in ((problem, thirteen), (without_window(problem), six))]
+    costs = [robust_cost(part, actual.T_cam_obj, actual.from_prior, loss) for part, actual in ((problem, thirteen), (without_window(problem), six))]
     torch.testing.assert_close(*costs, rtol=1e-4 if dtype == torch.float32 else 1e-10, atol=tolerance)
     assert (thirteen.from_prior[:, 6:] == 0).all()
 

@@ -20,7 +20,7 @@ from torchtrack.core.lie import affine, move_about, retract_about, transform_poi
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.estimation.implicit_gradient import newton_step, with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import offset_from_prior, robust_cost, solve_pose
-from torchtrack.tracking.estimation.rounds import align, gate_widening, index_for
+from torchtrack.tracking.estimation.rounds import align, gate_scale_of, index_for
 from torchtrack.tracking.estimation.terms import ContourDistance, CostTerm, LinearisedTerm, Place, Prior
 
 THOROUGH = SolverConfig(iterations=20)
@@ -255,7 +255,7 @@ def test_rounds_of_matching_take_a_further_term():
     tracker, prediction, events, alone, T_true = in_motion(dtype=torch.float64)
     T_said = retract_about(T_true, torch.tensor([[0.0, 0, 0, 5e-4, 0, 0]], dtype=torch.float64), prediction.objects.centre_obj)
     contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
-    tight = gate_widening(torch.zeros(1, dtype=torch.float64), tracker.config)
+    tight = gate_scale_of(torch.zeros(1, dtype=torch.float64), tracker.config)
     index = index_for(contours, tracker.image_size, tracker.config, tight)
     observations = select_events(events, index, prediction.moving(compensated=True), 1000)
     pairs = pairs_at(T_said, replace(problem_at(T_said), centre_obj=prediction.objects.centre_obj), 40, weight=1e6)

@@ -57,14 +57,14 @@ def test_bursts_are_those_of_the_events_one_by_one(windows):
         if now - start.get(tuple(pixel), -(10**9)) >= LONGEST_US:
             start[tuple(pixel)] = now
         expected.append(now - start[tuple(pixel)])
-    ages, found = no_bursts(1, 4, 6), []
+    ages, actual = no_bursts(1, 4, 6), []
     step = length_us // windows // 8
     for end in range(step, length_us + step, step):
         inside = (t > end - step) & (t <= end)
         events = batch(*zip(t[inside].tolist(), x[inside].tolist(), y[inside].tolist(), p[inside].tolist(), strict=True))
         ages, into = update(ages, events, step, end)
-        found += into[0].tolist()
-    assert found == expected
+        actual += into[0].tolist()
+    assert actual == expected
 
 
 def test_streams_are_apart_and_padding_is_no_event():
@@ -114,9 +114,9 @@ def test_the_tail_of_a_slow_circuit_is_matched_where_its_edge_has_gone():
     speed_px_s, into_s = 500.0, 6e-3
     # An event now, 3 px behind the edge, of a burst that began when the edge came.
     late = seen([[[80.0 - speed_px_s * into_s, 60.0]]], into_burst_s=into_s)
-    found, _ = nearest(late, line, velocity=(speed_px_s, 0.0))
-    assert abs(float(found.offsets)) == pytest.approx(1.0, abs=0.3)
-    assert float(found.age_s) == pytest.approx(into_s - 1.0 / speed_px_s)
+    actual, _ = nearest(late, line, velocity=(speed_px_s, 0.0))
+    assert abs(float(actual.offsets)) == pytest.approx(1.0, abs=0.3)
+    assert float(actual.age_s) == pytest.approx(into_s - 1.0 / speed_px_s)
 
 
 def test_padded_events_of_nothing():

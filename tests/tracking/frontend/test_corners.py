@@ -41,7 +41,7 @@ def detect(last_event_us, regions, *, config=None, window_s=1.0, surface_config=
     return detect_corners(surface, regions, last_event_us, now, window, table, surface_config, config or CornerConfig(max_corners=32))
 
 
-def found(corners, number=0):
+def actual(corners, number=0):
     """The corners of one object, as a set of sensor pixels."""
     return {tuple(pixel) for pixel in corners.sensor_pixels[number][corners.mask[number]].tolist()}
 
@@ -215,8 +215,8 @@ def test_a_region_beyond_the_border_of_the_sensor_finds_the_same_corners():
     last = square_of_events(14, 14, 44, 44)
     inner = detect(last, region(96, 96), config=CornerConfig(max_corners=32, relative_threshold=0.05))
     beyond = detect(last, region(128, 128, origin=(-24, -24)), config=CornerConfig(max_corners=32, relative_threshold=0.05))
-    assert len(found(inner)) >= 4
-    assert found(inner) <= found(beyond)
+    assert len(actual(inner)) >= 4
+    assert actual(inner) <= actual(beyond)
     assert (beyond.sensor_pixels >= 0).all()
 
 
@@ -236,7 +236,7 @@ def two_objects(dtype, surface_config=SURFACE):
         return detect(last, regions, config=CornerConfig(max_corners=400, snap=False), surface_config=surface_config, dtype=dtype)
 
     together = corners(torch.cat([small, large]))
-    return [found(together, 0), found(together, 1)], [found(corners(small)), found(corners(large))]
+    return [actual(together, 0), actual(together, 1)], [actual(corners(small)), actual(corners(large))]
 
 
 @pytest.mark.parametrize("filters", ["sliced", "kornia"])
@@ -260,5 +260,5 @@ def test_more_regions_than_are_filtered_at_a_time():
     mask = torch.ones(19, 2, dtype=torch.bool)
     many = detect(last, object_regions(pixels, mask, torch.zeros(19, dtype=torch.int64), (120, 160), 16, 256))
     for number in (0, 8, 18):
-        one = detect(last, object_regions(pixels[number : number + 1], mask[:1], torch.tensor([0]), (120, 160), 16, 256))
-        assert found(many, number) == found(one)
+        single = detect(last, object_regions(pixels[number : number + 1], mask[:1], torch.tensor([0]), (120, 160), 16, 256))
+        assert actual(many, number) == actual(single)

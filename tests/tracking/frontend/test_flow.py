@@ -229,10 +229,10 @@ def test_corners_get_their_flow_from_their_own_event_on(dtype):
     """The edge is at 30 px now; what lies 10 px behind fired 25 ms ago, and has the same flow."""
     last = sweeping_edge((1.0, 0.0), 400.0)
     corners = corners_at([(30, 25), (20, 25), (30, 12)], [0, 25_000, 0], [True, True, False], dtype)
-    found = estimate_flow(corners, last, torch.tensor([NOW_US]), torch.tensor([0]), table().to(dtype), FlowConfig())
-    assert found.has_flow.tolist() == [[True, True, False]]
-    assert found.flow.dtype == dtype
-    assert found.flow[0, :2].tolist() == [pytest.approx([400.0, 0.0], abs=1.0)] * 2
-    assert found.flow[0, 2].tolist() == [0, 0]
-    assert torch.equal(found.sensor_pixels, corners.sensor_pixels)
+    actual = estimate_flow(corners, last, torch.tensor([NOW_US]), torch.tensor([0]), table().to(dtype), FlowConfig())
+    assert actual.has_flow.tolist() == [[True, True, False]]
+    assert actual.flow.dtype == dtype
+    assert actual.flow[0, :2].tolist() == [pytest.approx([400.0, 0.0], abs=1.0)] * 2
+    assert actual.flow[0, 2].tolist() == [0, 0]
+    assert torch.equal(actual.sensor_pixels, corners.sensor_pixels)
     assert not corners.has_flow.any()

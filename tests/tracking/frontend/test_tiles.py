@@ -86,23 +86,23 @@ def test_an_object_that_is_not_known_where_to_be_is_near_everywhere():
 def test_kept_events_keep_their_order_and_tell_their_numbers():
     tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
     near = torch.rand((1, len(tiles.middle)), generator=generator(3)) < 0.4
-    found = tiles.keep(events, near)
-    kept = found.events
+    actual = tiles.keep(events, near)
+    kept = actual.events
     assert 0 < len(kept) < 400
-    assert torch.equal(kept.t_us, events.t_us[found.number])
+    assert torch.equal(kept.t_us, events.t_us[actual.number])
     assert near[0, tiles._of(kept.x, kept.y)].all()
     assert int(near[0, tiles._of(events.x, events.y)].sum()) == len(kept)
-    assert found.of_each is None
+    assert actual.of_each is None
 
 
 @pytest.mark.parametrize("share", [0.2, 0.6])
 def test_of_several_objects_it_is_known_which_events_are_near_each(share):
     tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
     near = torch.rand((3, len(tiles.middle)), generator=generator(4)) < share
-    found = tiles.keep(events, near)
-    assert torch.equal(found.number, near.any(0)[tiles._of(events.x, events.y)].nonzero()[:, 0])
-    for chosen, exists, row in zip(*found.of_each, near, strict=True):
-        assert torch.equal(chosen[exists], row[tiles._of(found.events.x, found.events.y)].nonzero()[:, 0])
+    actual = tiles.keep(events, near)
+    assert torch.equal(actual.number, near.any(0)[tiles._of(events.x, events.y)].nonzero()[:, 0])
+    for chosen, exists, row in zip(*actual.of_each, near, strict=True):
+        assert torch.equal(chosen[exists], row[tiles._of(actual.events.x, actual.events.y)].nonzero()[:, 0])
 
 
 def test_where_all_events_are_near_all_are_kept():

@@ -66,8 +66,8 @@ def test_the_acceleration_found_is_the_mean_of_those_that_agree_with_pose_and_ve
     window = window_acceleration(torch.zeros_like(sigma), sigma, torch.ones_like(sigma[:, :1]), covariance, numbers(DT_S))
     information = inverse(covariance)
     for offset in 0.5 * ended[:5]:
-        found = found_acceleration(window, information, offset[None], numbers(DT_S))[0]
-        assert ((found - expected @ offset).abs() < 0.05 * sigma[0]).all()
+        actual = found_acceleration(window, information, offset[None], numbers(DT_S))[0]
+        assert ((actual - expected @ offset).abs() < 0.05 * sigma[0]).all()
 
 
 def test_an_expected_acceleration_is_what_is_found_where_all_came_as_predicted():
@@ -81,10 +81,10 @@ def test_an_expected_acceleration_is_what_is_found_where_all_came_as_predicted()
 def test_a_velocity_that_was_not_known_before_was_not_gained_in_the_window():
     sigma, counts = torch.full((1, 6), 300.0).double(), torch.ones(1, 1).double()
     known = torch.diag_embed((DT_S * sigma[0]).square().repeat(2))[None]
-    found = [window_acceleration(0 * sigma, sigma, counts, scale * known, numbers(DT_S)).rate_hz for scale in (1, 1e4)]
+    actual = [window_acceleration(0 * sigma, sigma, counts, scale * known, numbers(DT_S)).rate_hz for scale in (1, 1e4)]
     # All of it, within the window; and next to nothing of it.
-    torch.testing.assert_close(found[0], torch.full((1, 6), 1 / DT_S).double())
-    torch.testing.assert_close(found[1], torch.full((1, 6), 1e-4 / DT_S).double())
+    torch.testing.assert_close(actual[0], torch.full((1, 6), 1 / DT_S).double())
+    torch.testing.assert_close(actual[1], torch.full((1, 6), 1e-4 / DT_S).double())
 
 
 # ---- how far it counts
@@ -163,8 +163,8 @@ def test_the_velocity_of_what_is_swung_does_not_lag():
 
 
 def test_the_acceleration_of_what_is_swung_is_found():
-    _, _, found, expected = swings(ALWAYS)
-    assert float(torch.corrcoef(torch.stack([found, expected])[:, SWINGING])[0, 1]) > 0.75
+    _, _, actual, expected = swings(ALWAYS)
+    assert float(torch.corrcoef(torch.stack([actual, expected])[:, SWINGING])[0, 1]) > 0.75
 
 
 def test_slow_objects_are_followed_as_without_it():

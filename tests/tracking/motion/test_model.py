@@ -64,9 +64,9 @@ def test_the_predicted_covariance_is_that_of_drawn_motions():
     push = torch.randn((count, 6), generator=generator(2), dtype=torch.float64) * sigma
     later = torch.cat([drawn[:, :6] + dt_s * drawn[:, 6:] + 0.5 * dt_s**2 * push, drawn[:, 6:] + dt_s * push], 1)
     expected = later.T @ later / count
-    found = predict_covariance(start, double(*velocity)[None], double(dt_s), double(DIAMETER_M), config)[0]
+    actual = predict_covariance(start, double(*velocity)[None], double(dt_s), double(DIAMETER_M), config)[0]
     scale = expected.diagonal().sqrt()
-    assert float(((found - expected) / (scale[:, None] * scale)).abs().max()) < 0.02
+    assert float(((actual - expected) / (scale[:, None] * scale)).abs().max()) < 0.02
 
 
 def test_without_time_nothing_changes():
@@ -130,8 +130,8 @@ def test_entries_of_any_magnitude_are_inverted():
     """A pose in radians and metres beside a velocity, and a direction that is known a million times better."""
     scale = torch.logspace(-8, 8, 12, dtype=torch.float64)
     matrices = random_covariance(batch=2)
-    found = inverse(scale[:, None] * matrices * scale)
-    torch.testing.assert_close(found, inverse(matrices) / (scale[:, None] * scale), rtol=1e-9, atol=0)
+    actual = inverse(scale[:, None] * matrices * scale)
+    torch.testing.assert_close(actual, inverse(matrices) / (scale[:, None] * scale), rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("broken", ["zero", "negative", "dependent", "nan"])
@@ -144,10 +144,10 @@ def test_what_cannot_be_inverted_is_infinite_and_harms_no_neighbour(broken):
         "dependent": torch.ones(6, 6, dtype=torch.float64) - torch.diag(double(0, 0, 0, 0, 0, 0.5)),
         "nan": torch.full((6, 6), torch.nan, dtype=torch.float64),
     }[broken]
-    found = inverse(matrices)
-    torch.testing.assert_close(found[[0, 2]], expected[[0, 2]])
-    assert torch.isinf(found[1].diagonal()).all()
-    assert (found[1][~torch.eye(6, dtype=torch.bool)] == 0).all()
+    actual = inverse(matrices)
+    torch.testing.assert_close(actual[[0, 2]], expected[[0, 2]])
+    assert torch.isinf(actual[1].diagonal()).all()
+    assert (actual[1][~torch.eye(6, dtype=torch.bool)] == 0).all()
 
 
 # ---- the left perturbation
@@ -161,10 +161,10 @@ def test_the_covariance_of_the_left_perturbation_is_that_of_drawn_poses():
     poses = retract_about(T.expand(count, 4, 4), drawn, centre_obj.expand(count, 3))
     left = se3_log(poses @ se3_inverse(T))
     expected = left.T @ left / count
-    found = left_covariance(covariance, transform_points(T[None], centre_obj[None, None])[:, 0])[0]
+    actual = left_covariance(covariance, transform_points(T[None], centre_obj[None, None])[:, 0])[0]
     scale = expected.diagonal().sqrt()
-    assert float(((found - expected) / (scale[:, None] * scale)).abs().max()) < 0.02
-    torch.testing.assert_close(found, found.T)
+    assert float(((actual - expected) / (scale[:, None] * scale)).abs().max()) < 0.02
+    torch.testing.assert_close(actual, actual.T)
 
 
 def test_what_is_unknown_stays_unknown_and_harms_no_neighbour():
@@ -172,9 +172,9 @@ def test_what_is_unknown_stays_unknown_and_harms_no_neighbour():
     centre = double(0.1, -0.2, 0.6).expand(3, 3)
     expected = left_covariance(covariance, centre)
     covariance[1] = torch.diag(torch.full((6,), torch.inf, dtype=torch.float64))
-    found = left_covariance(covariance, centre)
-    assert torch.equal(found[1], covariance[1])
-    torch.testing.assert_close(found[[0, 2]], expected[[0, 2]])
+    actual = left_covariance(covariance, centre)
+    assert torch.equal(actual[1], covariance[1])
+    torch.testing.assert_close(actual[[0, 2]], expected[[0, 2]])
 
 
 # ---- velocities that nothing confirms
@@ -183,28 +183,28 @@ def test_what_is_unknown_stays_unknown_and_harms_no_neighbour():
 def test_velocities_die_away_where_nothing_confirms_them(dtype):
     velocity = torch.ones(3, 6, dtype=dtype)
     failed, dt_s = torch.tensor([True, False, True]), torch.tensor([0.1, 0.1, 0.3], dtype=dtype)
-    found = fade(velocity, dt_s, failed, MotionConfig(coast_s=0.2))
-    assert found[:, 0].tolist() == pytest.approx([0.60653, 1.0, 0.22313], rel=1e-4)
-    assert found.dtype == dtype
+    actual = fade(velocity, dt_s, failed, MotionConfig(coast_s=0.2))
+    assert actual[:, 0].tolist() == pytest.approx([0.60653, 1.0, 0.22313], rel=1e-4)
+    assert actual.dtype == dtype
     # Two windows are as good as one that is as long as both.
     twice = fade(fade(velocity, dt_s / 2, failed, MotionConfig()), dt_s / 2, failed, MotionConfig())
-    torch.testing.assert_close(twice, found)
+    torch.testing.assert_close(twice, actual)
 
 
 def test_objects_that_are_held_stand_still():
-    found = fade(torch.ones(2, 6), torch.full((2,), 0.1), torch.tensor([True, False]), MotionConfig(without_events="hold"))
-    assert found[:, 0].tolist() == [0, 1]
+    actual = fade(torch.ones(2, 6), torch.full((2,), 0.1), torch.tensor([True, False]), MotionConfig(without_events="hold"))
+    assert actual[:, 0].tolist() == [0, 1]
 
 
 def test_a_velocity_that_is_set_aside_is_uncertain_by_as_much():
     covariance = random_covariance(batch=2, scale=1e-3)
     dropped = torch.tensor([[1.0, 0, 0, 0, 0.5, 0], [0.0] * 6])
-    found = with_dropped(covariance, dropped)
-    assert torch.equal(found[1], covariance[1])
-    assert torch.equal(found[0, :6], covariance[0, :6])
-    added = (found - covariance)[0, 6:, 6:]
+    actual = with_dropped(covariance, dropped)
+    assert torch.equal(actual[1], covariance[1])
+    assert torch.equal(actual[0, :6], covariance[0, :6])
+    added = (actual - covariance)[0, 6:, 6:]
     torch.testing.assert_close(added, torch.outer(dropped[0], dropped[0]).double())
-    assert (torch.linalg.eigvalsh(found) > 0).all()
+    assert (torch.linalg.eigvalsh(actual) > 0).all()
 
 
 # ---- surfaces of revolution

@@ -13,7 +13,7 @@ from torchtrack.config.tracker import AssociationConfig, ContourConfig, TrackerC
 from torchtrack.core.camera import project
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.lie import retract_about, transform_points
-from torchtrack.tracking.estimation.rounds import gate_widening
+from torchtrack.tracking.estimation.rounds import gate_scale_of
 from torchtrack.tracking.expectation import predicted_after
 
 
@@ -157,8 +157,8 @@ def test_contours_of_a_window_are_the_same_for_each_of_a_batch(dtype):
     velocity, dt_s = torch.randn((3, 6), generator=generator(3)), torch.tensor([0.01, 0.005, 0.02], dtype=dtype)
     together = boxes(poses, velocity=velocity, dtype=dtype).contours(dt_s, CONTOURS)
     for number in range(3):
-        one = slice(number, number + 1)
-        alone = boxes(poses[one], velocity=velocity[one], dtype=dtype).contours(dt_s[one], CONTOURS)
+        single = slice(number, number + 1)
+        alone = boxes(poses[single], velocity=velocity[single], dtype=dtype).contours(dt_s[single], CONTOURS)
         pixels = together.pixels[number][together.mask[number]]
         torch.testing.assert_close(pixels, alone.pixels[0][alone.mask[0]])
 
@@ -169,12 +169,12 @@ def test_contours_of_a_window_are_the_same_for_each_of_a_batch(dtype):
 def test_an_uncertain_prediction_opens_the_first_gate():
     config = TrackerConfig(association=AssociationConfig(gates_px=(5.0, 2.0), max_gate_px=16.0, gate_sigmas=3.0))
     sigma_px = torch.tensor([0.0, 1.0, 5 / 3, 2.5, 5.0, 100.0])
-    assert gate_widening(sigma_px, config).tolist() == pytest.approx([1, 1, 1, 1.5, 3, 3.2])
+    assert gate_scale_of(sigma_px, config).tolist() == pytest.approx([1, 1, 1, 1.5, 3, 3.2])
 
 
 def test_a_first_gate_that_is_wider_than_the_limit_stays():
     config = TrackerConfig(association=AssociationConfig(gates_px=(20.0, 2.0), max_gate_px=16.0))
-    assert gate_widening(torch.tensor([0.0, 100.0]), config).tolist() == [1, 1]
+    assert gate_scale_of(torch.tensor([0.0, 100.0]), config).tolist() == [1, 1]
 
 
 def test_in_motion_the_prediction_is_certain_to_a_pixel_or_two():

@@ -115,8 +115,8 @@ def test_errors_of_turning_objects_are_smoothed_as_those_of_objects_at_rest():
     centres, rests = centre.expand(WINDOWS, 1, 3), torch.zeros(WINDOWS, 1, 3, dtype=torch.float64)
     times = 1e-6 * at_rest.t_us.double()[:, None, None]
     true = retract_about(random_pose(1, seed=3).expand(WINDOWS, 1, 4, 4), rate * times, centres)
-    found = retract_about(true, difference_about(poses(1), at_rest.T_cam_obj, rests), centres)
-    turning = replace(at_rest, T_cam_obj=found, velocity=at_rest.velocity + rate)
+    actual = retract_about(true, difference_about(poses(1), at_rest.T_cam_obj, rests), centres)
+    turning = replace(at_rest, T_cam_obj=actual, velocity=at_rest.velocity + rate)
     diameter = origins(1)[1]
     after, expected = smoothed(turning, centre, diameter, steady), smoothed(at_rest, *origins(1), steady)
     left = difference_about(true, after.T_cam_obj, centres)
@@ -129,11 +129,11 @@ def test_each_object_is_smoothed_as_if_it_were_alone(way):
     windows = filtered(moves(batch=3), 5e-3, poses(3))
     together = smoothed(windows, *origins(3), CONFIG)
     for number in range(3):
-        one = slice(number, number + 1)
-        own = Filtered(windows.t_us, windows.T_cam_obj[:, one], windows.velocity[:, one], windows.covariance[:, one])
+        single = slice(number, number + 1)
+        own = Filtered(windows.t_us, windows.T_cam_obj[:, single], windows.velocity[:, single], windows.covariance[:, single])
         alone = smoothed(own, *origins(1), CONFIG)
-        assert far_from(alone.T_cam_obj, together.T_cam_obj[:, one]) < 1e-12
-        assert far_from(alone.covariance, together.covariance[:, one]) < 1e-12
+        assert far_from(alone.T_cam_obj, together.T_cam_obj[:, single]) < 1e-12
+        assert far_from(alone.covariance, together.covariance[:, single]) < 1e-12
 
 
 @pytest.mark.parametrize("what", ["jump", "not a number", "not positive"])

@@ -25,7 +25,7 @@ def scored_as(score, inlier_ratio, count):
     scored = in_motion()[3]
     rows = len(score)
     values = {"measured": torch.tensor(score), "gathered": torch.tensor(inlier_ratio), "count": torch.tensor(count)}
-    return replace(scored, **values, at_rest=torch.zeros(rows), full_gathered=torch.zeros(rows))
+    return replace(scored, **values, at_rest=torch.zeros(rows), reference_inlier_ratio=torch.zeros(rows))
 
 
 def test_a_pose_passes_that_matches_enough_events_which_gather_enough():
@@ -78,7 +78,7 @@ def test_small_poses_that_few_events_explain_are_worth_less():
 
 def test_what_is_no_better_by_the_margin_is_left():
     tracker, prediction, seen, scored, _ = in_motion()
-    assert float(scored.share) > 0.7
+    assert float(scored.explained_ratio) > 0.7
     assert searched(lost_object(tracker, prediction, seen, scored, 1.0)) is scored
 
 
@@ -91,14 +91,14 @@ def test_what_explains_too_little_for_being_far_away_is_left():
 
 
 @pytest.mark.parametrize("gathered", [0.3, torch.nan])
-def test_what_smears_events_more_than_it_may_is_left(gathered):
+def test_what_smears_events_more_than_it_may_is_left(inlier_ratio):
     """Where it cannot be told how far events gather, nothing speaks against a pose."""
     tracker, prediction, seen, scored, _ = in_motion(displaced=DISPLACED)
     prediction = replace(prediction, covariance=1e2 * prediction.covariance)
     assert searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_inlier_ratio=1.01)) is scored
-    better = searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_inlier_ratio=gathered))
+    better = searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_inlier_ratio=inlier_ratio))
     assert better.elsewhere.tolist() == [True]
-    assert float(better.gathered) > 0.3
+    assert float(better.inlier_ratio) > 0.3
 
 
 def test_what_explains_too_few_events_is_left():
@@ -148,17 +148,17 @@ def test_a_new_object_has_to_be_explained_nearly_all_with_events_that_gather_no_
     given = evidence(is_due=True, reference_explained_ratio=0.5, score=0.8, last_score=0.8, mean_score=0.8)
     assert triggers(given, CONFIG).tolist() == [Trigger.NEW]
     asked, scored = asked_by(acceptance.near_prediction, given)
-    torch.testing.assert_close(asked, torch.tensor([0.1, 0.9, float(scored.gathered) - 0.02, 0.0]))
+    torch.testing.assert_close(asked, torch.tensor([0.1, 0.9, float(scored.inlier_ratio) - 0.02, 0.0]))
 
 
 def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
     """Of any two poses, dense print explains about as much."""
     starting = evidence(is_starting=True)
     asked, scored = asked_by(acceptance.near_prediction, starting)
-    assert 0.5 < float(asked[2]) < float(scored.gathered) < float(asked[2]) + 0.05
+    assert 0.5 < float(asked[2]) < float(scored.inlier_ratio) < float(asked[2]) + 0.05
     assert float(asked[0]) == pytest.approx(0.02)
     assert float(asked_by(acceptance.near_prediction, evidence(sigma_px=5.0))[0][2]) == float(asked_by(acceptance.elsewhere, starting)[0][2]) == 0
-    unknown = replace(scored, gathered=torch.full((1,), torch.nan))
+    unknown = replace(scored, inlier_ratio=torch.full((1,), torch.nan))
     assert float(asked_by(acceptance.near_prediction, starting, unknown)[0][2]) <= 0
 
 

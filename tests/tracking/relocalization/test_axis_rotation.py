@@ -66,7 +66,7 @@ def scene(angle=0.0, seed=0):
     return trajectory, EventBatch.from_numpy(u.numpy(), v.numpy(), t_us.numpy(), polarity.numpy(), 0)
 
 
-def after_a_while(config=None, angle=0.0, wrong=0.0, unseen_s=0.2, kernels=True, first=8):
+def after_a_while(config=None, angle=0.0, wrong=0.0, time_since_validated_s=0.2, kernels=True, first=8):
     """The can tracked for some windows, then turned by ``wrong`` as if unseen, and tracked on: its last state, all results since, the truth."""
     trajectory, events = scene(angle)
     tracker = Tracker([can()], CAMERA, config, dtype=torch.float64, kernels=kernels)
@@ -74,7 +74,9 @@ def after_a_while(config=None, angle=0.0, wrong=0.0, unseen_s=0.2, kernels=True,
     with torch.no_grad():
         state, _ = follow(tracker, tracker.init(trajectory.T_cam_obj[:1], 0), cut[:first])
         state = changed(
-            state, T_cam_obj=turned(state.T_cam_obj, wrong), time_since_validated_s=torch.full_like(state.health.time_since_validated_s, unseen_s)
+            state,
+            T_cam_obj=turned(state.T_cam_obj, wrong),
+            time_since_validated_s=torch.full_like(state.health.time_since_validated_s, time_since_validated_s),
         )
         state, results = follow(tracker, state, cut[first:])
     return state, results, trajectory.at(state.t_us)
@@ -93,7 +95,7 @@ def test_a_can_that_turned_unseen_is_turned_back_once_it_is_seen_again(wrong, ke
 
 def test_it_does_not_turn_farther_than_it_can_have_spun_unseen():
     """Half round within a tenth of a second it cannot; in twice as long nearly."""
-    state, _, T_true = after_a_while(wrong=2.2, unseen_s=0.06, first=18)
+    state, _, T_true = after_a_while(wrong=2.2, time_since_validated_s=0.06, first=18)
     assert float(pose_errors(state.T_cam_obj, T_true)[0]) > 60
     state, _, T_true = after_a_while(wrong=2.2, first=18)
     assert float(pose_errors(state.T_cam_obj, T_true)[0]) < 20
@@ -123,7 +125,7 @@ def test_while_the_handle_is_hidden_nothing_is_told():
 
 def test_what_was_seen_all_the_time_is_not_looked_at(monkeypatch):
     monkeypatch.setattr("torchtrack.tracking.relocalization.axis_rotation._peaks", lambda *args: pytest.fail("looked at"))
-    state, _, _ = after_a_while(unseen_s=0.0)
+    state, _, _ = after_a_while(time_since_validated_s=0.0)
     assert float(state.health.time_since_validated_s) == 0
 
 
@@ -137,8 +139,8 @@ def test_a_neighbour_in_another_stream_is_not_disturbed():
         with torch.no_grad():
             state, _ = follow(tracker, tracker.init(trajectory.T_cam_obj[:1].repeat(2, 1, 1), 0), both[:8])
             poses = torch.stack([state.T_cam_obj[0], turned(state.T_cam_obj[1], wrong)])
-            unseen_s = torch.tensor([0.0, 0.2], dtype=torch.float64)
-            states.append(follow(tracker, changed(state, T_cam_obj=poses, time_since_validated_s=unseen_s), both[8:])[0])
+            time_since_validated_s = torch.tensor([0.0, 0.2], dtype=torch.float64)
+            states.append(follow(tracker, changed(state, T_cam_obj=poses, time_since_validated_s=time_since_validated_s), both[8:])[0])
     torch.testing.assert_close(states[0].T_cam_obj[0], states[1].T_cam_obj[0])
     assert float(pose_errors(states[1].T_cam_obj[1:], trajectory.at(states[1].t_us[1:]))[0]) < 2
 
@@ -195,8 +197,8 @@ def test_turns_out_of_reach_are_left_out():
 
 
 def test_what_was_not_seen_for_a_while_may_have_rotated():
-    has_axis, unseen_s = torch.tensor([True, True, False]), torch.tensor([0.06, 0.04, 0.06])
-    assert may_have_rotated(has_axis, unseen_s, RelocalizationConfig(drift_us=50_000)).tolist() == [True, False, False]
+    has_axis, time_since_validated_s = torch.tensor([True, True, False]), torch.tensor([0.06, 0.04, 0.06])
+    assert may_have_rotated(has_axis, time_since_validated_s, RelocalizationConfig(drift_us=50_000)).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("search", [{"axis_rotation": False}, {"hypotheses": 0}, {"drift_us": 0}])

@@ -155,10 +155,10 @@ def test_a_box_that_slipped_is_found_within_a_window_however_sure_it_is_of_itsel
     slips, never = (
         TrackerConfig(relocalization=RelocalizationConfig(drift_us=0, score_drop_below=to)) for to in (RelocalizationConfig().score_drop_below, 0)
     )
-    found, T_true = displaced_runs(slips, 1.0, displaced=farther * DISPLACED)
+    actual, T_true = displaced_runs(slips, 1.0, displaced=farther * DISPLACED)
     held, _ = displaced_runs(never, 1.0, displaced=farther * DISPLACED)
-    assert int(found[0].status) == int(found[-1].status) == Status.TRACKING
-    degrees, millimetres = pose_errors(found[-1].T_cam_obj, T_true)
+    assert int(actual[0].status) == int(actual[-1].status) == Status.TRACKING
+    degrees, millimetres = pose_errors(actual[-1].T_cam_obj, T_true)
     assert float(degrees) < 0.3 and float(millimetres) < 0.5
     assert [int(result.status) for result in held[:5]] == [Status.TOO_FEW_EVENTS] * 5
 

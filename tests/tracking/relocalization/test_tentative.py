@@ -13,7 +13,7 @@ from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.tracking.expectation import predicted_after
-from torchtrack.tracking.relocalization.tentative import after_probation
+from torchtrack.tracking.relocalization.tentative import confirmed
 from torchtrack.tracking.validation.status import Status
 
 FULL_SHARE = 0.8
@@ -26,17 +26,17 @@ def two_boxes():
     tracker = tracker_of(2)
     before = changed(tracker.init(pose().expand(2, 4, 4), t_us=0), reference_explained_ratio=torch.full((2,), FULL_SHARE))
     after, result = tracker.step(before, EventBatch.empty(), 5_000)
-    found = pose((0.1, -0.2, 0.4), (0.05, 0.02, 0.6)).expand(2, 4, 4)
-    after = changed(after, T_cam_obj=found, covariance=0.1 * after.motion.covariance, velocity=torch.ones_like(after.velocity))
-    return before, predicted_after(tracker, before, torch.full((2,), 5e-3)), after, replace(result, T_cam_obj=found)
+    actual = pose((0.1, -0.2, 0.4), (0.05, 0.02, 0.6)).expand(2, 4, 4)
+    after = changed(after, T_cam_obj=actual, covariance=0.1 * after.motion.covariance, velocity=torch.ones_like(after.velocity))
+    return before, predicted_after(tracker, before, torch.full((2,), 5e-3)), after, replace(result, T_cam_obj=actual)
 
 
-def window(before, shares, widening=TIGHT, status=Status.TRACKING, config=None):
+def window(before, shares, gate_scale=TIGHT, status=Status.TRACKING, config=None):
     """One window in which the boxes are explained by ``shares``."""
     _, prediction, after, result = two_boxes()
     result = replace(result, quality=torch.tensor(shares), status=torch.full((2,), int(status)))
     after = changed(after, tentative=before.tentative)
-    return after_probation(before, after, result, prediction, torch.tensor([widening, TIGHT]), config or TrackerConfig())
+    return confirmed(before, after, result, prediction, torch.tensor([gate_scale, TIGHT]), config or TrackerConfig())
 
 
 def begun(share=FULL_SHARE):
@@ -46,12 +46,12 @@ def begun(share=FULL_SHARE):
 
 def test_a_find_of_an_uncertain_object_is_on_probation():
     _, prediction, after, _ = two_boxes()
-    state, told = begun()
+    state, stated = begun()
     assert state.tentative.is_tentative.tolist() == [True, False]
     torch.testing.assert_close(state.tentative.T_cam_obj[0], prediction.T_cam_obj[0].double())
     assert torch.equal(state.tentative.covariance[0], prediction.covariance[0])
     assert torch.equal(state.T_cam_obj, after.T_cam_obj) and torch.equal(state.motion.covariance, after.motion.covariance)
-    assert told.status.tolist() == [Status.TRACKING] * 2
+    assert stated.status.tolist() == [Status.TRACKING] * 2
     assert not two_boxes()[0].tentative.is_tentative.any()
 
 

@@ -233,8 +233,8 @@ def test_what_explains_much_less_than_when_seen_well_by_smeared_events_is_smeare
 
 def test_what_is_partly_hidden_is_not_smeared():
     """Less is explained, but what is seen gathers as ever; nor does it tell anything where too few events are seen."""
-    gathered = torch.tensor([0.7, 0.9, torch.nan])
-    assert not is_smeared(torch.full((3,), 0.3), torch.full((3,), 0.9), gathered, torch.full((3,), 0.8), RelocalizationConfig()).any()
+    inlier_ratio = torch.tensor([0.7, 0.9, torch.nan])
+    assert not is_smeared(torch.full((3,), 0.3), torch.full((3,), 0.9), inlier_ratio, torch.full((3,), 0.8), RelocalizationConfig()).any()
 
 
 def test_of_those_whose_place_is_not_known_events_need_not_gather():
@@ -263,7 +263,7 @@ def slipped(config, count=10, streams=1, displaced=0):
 
 def test_a_pose_that_slipped_is_in_doubt_and_found_again():
     after, results, T_true = slipped(SEARCHING, count=20)
-    doubted, without, _ = slipped(NEVER_ADRIFT, count=20)
+    is_drifting_now, without, _ = slipped(NEVER_ADRIFT, count=20)
     statuses = [int(result.status) for result in results]
     assert statuses[:3] == [Status.UNCERTAIN] * 3 and statuses[5:] == [Status.TRACKING] * 15
     degrees, millimetres = pose_errors(results[-1].T_cam_obj, T_true)
@@ -271,7 +271,7 @@ def test_a_pose_that_slipped_is_in_doubt_and_found_again():
     assert float(millimetres) < 1.0
     assert float(after.health.drift_s) == 0
     assert float(pose_errors(without[-1].T_cam_obj, T_true)[0]) > 5
-    assert float(doubted.doubted_s) > 0.05
+    assert float(is_drifting_now.doubted_s) > 0.05
 
 
 def test_a_pose_that_strayed_is_found_again_though_it_was_never_in_doubt():
@@ -289,10 +289,10 @@ def test_a_pose_that_strayed_is_found_again_though_it_was_never_in_doubt():
 @pytest.mark.parametrize(("config", "count"), [(SEARCHING, 10), (STRAYING, 20)])
 def test_finding_one_that_slipped_changes_nothing_for_its_neighbour(config, count):
     _, alone, _ = slipped(config, count, streams=2, displaced=-1)
-    _, beside, _ = slipped(config, count, streams=2, displaced=0)
+    _, neighbours, _ = slipped(config, count, streams=2, displaced=0)
     # Sums over as many columns as the fullest of the two has are rounded otherwise.
-    torch.testing.assert_close(poses_of(alone, 1), poses_of(beside, 1), rtol=0, atol=1e-7)
-    assert float((poses_of(alone) - poses_of(beside)).abs().max()) > 1e-3
+    torch.testing.assert_close(poses_of(alone, 1), poses_of(neighbours, 1), rtol=0, atol=1e-7)
+    assert float((poses_of(alone) - poses_of(neighbours)).abs().max()) > 1e-3
 
 
 def test_what_is_tracked_well_is_never_in_doubt():
@@ -311,7 +311,7 @@ def test_how_far_events_gather_can_be_left_out():
 
 
 def test_a_score_is_less_where_events_are_smeared():
-    *_, found, _ = in_motion()
+    *_, actual, _ = in_motion()
     for times, expected in ((2 / 0.9, 0.5), (1 / 0.9, 1.0), (0.5, 1.0), (0.0, 1.0)):
-        score = replace(found, full_gathered=times * found.gathered).score
-        assert float(score) == pytest.approx(expected * float(found.share), rel=1e-6)
+        score = replace(actual, reference_inlier_ratio=times * actual.inlier_ratio).score
+        assert float(score) == pytest.approx(expected * float(actual.explained_ratio), rel=1e-6)

@@ -52,8 +52,8 @@ def test_a_pose_has_its_own_outline_whatever_others_there_are(outlines):
 
 
 def test_thinned_contours_are_some_of_the_visible_ones():
-    _, _, _, found, _ = in_motion()
-    contours, few = found.fit.contours, thinned(found.fit.contours)
+    _, _, _, actual, _ = in_motion()
+    contours, few = actual.fit.contours, thinned(actual.fit.contours)
     assert few.mask.sum() == min(int(contours.mask.sum()), 200)
     visible = {tuple(row) for row in contours.pixels[contours.mask].tolist()}
     assert {tuple(row) for row in few.pixels[few.mask].tolist()} <= visible

@@ -103,10 +103,10 @@ def test_objects_are_judged_each_for_itself():
 
 
 @pytest.mark.parametrize(("widening", "expected"), [(1.0, Status.UNCERTAIN), (1.25, Status.UNCERTAIN), (1.5, Status.LOST), (3.0, Status.LOST)])
-def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(widening, expected):
+def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(gate_scale, expected):
     """Between lost below 0.2 and caught above 0.45: 0.2625 is needed at 1.25 times the gate, 0.325 at 1.5, and no more than 0.45."""
     config = ValidationConfig(lost_below=0.2, refound_above=0.45)
-    status = judge(*(torch.tensor(value) for value in ([0.3], [100], [1.0])), torch.zeros(1, 6), torch.ones(1), config, torch.tensor([widening]))
+    status = judge(*(torch.tensor(value) for value in ([0.3], [100], [1.0])), torch.zeros(1, 6), torch.ones(1), config, torch.tensor([gate_scale]))
     assert Status(int(status)) == expected
 
 
@@ -114,10 +114,10 @@ def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(widening,
 
 
 def test_the_share_that_is_needed_rises_with_the_gate_to_its_limit():
-    widening = torch.tensor([1.0, 1.5, 2.0, 3.2])
-    assert needed_share(widening, ValidationConfig(lost_below=0.2, refound_above=0.4)).tolist() == pytest.approx([0.2, 0.3, 0.4, 0.4])
+    gate_scale = torch.tensor([1.0, 1.5, 2.0, 3.2])
+    assert needed_share(gate_scale, ValidationConfig(lost_below=0.2, refound_above=0.4)).tolist() == pytest.approx([0.2, 0.3, 0.4, 0.4])
     # A share to be caught at that is less than that of a lost one asks for nothing more.
-    assert needed_share(widening, ValidationConfig(lost_below=0.3, refound_above=0.1)).tolist() == pytest.approx([0.3] * 4)
+    assert needed_share(gate_scale, ValidationConfig(lost_below=0.3, refound_above=0.1)).tolist() == pytest.approx([0.3] * 4)
 
 
 def test_trust_rises_from_lost_to_certain():
@@ -129,17 +129,17 @@ def test_trust_rises_from_lost_to_certain():
 
 def test_more_is_asked_of_finds_in_many_places_by_what_is_usual():
     config = ValidationConfig(lost_below=0.1, uncertain_below=0.4, validated_from=0.75)
-    share, usual, widening = torch.tensor([0.4, 0.4, 0.6, 0.4]), torch.tensor([0.8, 0.8, 0.8, 0.2]), torch.tensor([1.0, 2.0, 3.0, 2.0])
-    assert trust(share, config, usual, widening).tolist() == pytest.approx([1.0, 0.6, 1.0, 1.0])
+    share, usual, gate_scale = torch.tensor([0.4, 0.4, 0.6, 0.4]), torch.tensor([0.8, 0.8, 0.8, 0.2]), torch.tensor([1.0, 2.0, 3.0, 2.0])
+    assert trust(share, config, usual, gate_scale).tolist() == pytest.approx([1.0, 0.6, 1.0, 1.0])
 
 
-def hidden(gathered=0.8, usually=0.8, count=200, elsewhere=False, config=CONFIG):
-    return float(partly_hidden(torch.tensor([gathered]), torch.tensor([usually]), torch.tensor([count]), torch.tensor([elsewhere]), config))
+def hidden(inlier_ratio=0.8, usually=0.8, count=200, elsewhere=False, config=CONFIG):
+    return float(partly_hidden(torch.tensor([inlier_ratio]), torch.tensor([usually]), torch.tensor([count]), torch.tensor([elsewhere]), config))
 
 
 @pytest.mark.parametrize(("gathered", "expected"), [(0.0, 0), (0.64, 0), (0.7, 0.5), (0.76, 1), (1.0, 1), (math.nan, 0)])
-def test_what_gathers_as_ever_counts_however_little_is_explained(gathered, expected):
-    assert hidden(gathered) == pytest.approx(expected, abs=1e-6)
+def test_what_gathers_as_ever_counts_however_little_is_explained(inlier_ratio, expected):
+    assert hidden(inlier_ratio) == pytest.approx(expected, abs=1e-6)
 
 
 def test_nothing_counts_as_hidden_that_does_not_tell():
@@ -150,10 +150,10 @@ def test_nothing_counts_as_hidden_that_does_not_tell():
 
 
 def test_of_a_hidden_object_no_more_is_asked_in_more_places():
-    config, widening = ValidationConfig(lost_below=0.2, refound_above=0.4), torch.full((3,), 2.0)
-    assert needed_share(widening, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.4, 0.3, 0.2])
-    told = torch.full((2,), 0.3), torch.full((2,), 100), torch.ones(2), torch.zeros(2, 6), torch.ones(2)
-    assert judge(*told, config, widening[:2], torch.tensor([0.0, 1.0])).tolist() == [Status.LOST, Status.UNCERTAIN]
+    config, gate_scale = ValidationConfig(lost_below=0.2, refound_above=0.4), torch.full((3,), 2.0)
+    assert needed_share(gate_scale, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.4, 0.3, 0.2])
+    stated = torch.full((2,), 0.3), torch.full((2,), 100), torch.ones(2), torch.zeros(2, 6), torch.ones(2)
+    assert judge(*stated, config, gate_scale[:2], torch.tensor([0.0, 1.0])).tolist() == [Status.LOST, Status.UNCERTAIN]
 
 
 def test_what_goes_on_by_many_events_holds_on():
@@ -185,8 +185,8 @@ def test_a_contour_without_matches_is_not():
 @pytest.mark.parametrize(("least", "count", "expected"), [(3, 2, 0), (3, 3, 1), (1, 1, 1), (5, 4, 0)])
 def test_a_patch_needs_a_few_observations_on_its_contours(least, count, expected):
     contours = contours_at(upright_line(count=16, first=32.0))
-    found = share(contours, matches_at(upright_line(count=count, first=36.0)), config=ValidationConfig(min_on_contour=least))
-    assert float(found) == expected
+    actual = share(contours, matches_at(upright_line(count=count, first=36.0)), config=ValidationConfig(min_on_contour=least))
+    assert float(actual) == expected
 
 
 @pytest.mark.parametrize(("on", "expected"), [(20, 0), (39, 0), (41, 1), (80, 1)])
@@ -201,9 +201,9 @@ def test_a_patch_is_explained_where_most_observations_near_its_contours_are_on_t
 
 
 def test_half_a_contour_is_half_explained():
-    found = float(share(contours_at(upright_line()), matches_at(upright_line(count=40))))
-    assert found == pytest.approx(0.5, abs=0.1)
-    assert found >= 0.5
+    actual = float(share(contours_at(upright_line()), matches_at(upright_line(count=40))))
+    assert actual == pytest.approx(0.5, abs=0.1)
+    assert actual >= 0.5
 
 
 def test_what_does_not_move_need_not_be_explained():
@@ -246,9 +246,9 @@ def test_matches_outside_the_image_explain_nothing():
 def test_the_share_of_an_object_does_not_depend_on_the_others():
     contours = contours_at(torch.cat([upright_line(), upright_line(100.0)]))
     matches = matches_at(torch.cat([upright_line(count=80, first=60.0), upright_line(100.0)]))
-    found = share(contours, matches).tolist()
-    assert found[0] == float(share(contours_at(upright_line()), matches_at(upright_line(count=80, first=60.0))))
-    assert found[1] == 1
+    actual = share(contours, matches).tolist()
+    assert actual[0] == float(share(contours_at(upright_line()), matches_at(upright_line(count=80, first=60.0))))
+    assert actual[1] == 1
 
 
 # ---- how far events gather

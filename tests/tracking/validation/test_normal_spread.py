@@ -10,7 +10,7 @@ from tracked_boxes import started
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.config.validation import ValidationConfig
-from torchtrack.tracking.validation.measures import PARALLEL_AFTER_S, asked_apart, directions_apart, held_all_ways
+from torchtrack.tracking.validation.measures import PARALLEL_AFTER_S, constrained_2d, normal_spread_of, required_spread
 from torchtrack.tracking.validation.status import Status
 
 CONFIG = ValidationConfig()
@@ -23,9 +23,9 @@ def matches_of(angles_rad, **changes):
     return replace(matches_at(torch.zeros_like(directions)), directions=directions, **changes)
 
 
-def held(unseen_s=0.1, apart=0.3, full_apart=0.3, config=CONFIG):
-    asked = asked_apart(torch.tensor([full_apart]), torch.tensor([unseen_s]), config)
-    return 1.0 if asked is None else float(held_all_ways(torch.tensor([apart]), asked))
+def held(time_since_validated_s=0.1, apart=0.3, reference_normal_spread=0.3, config=CONFIG):
+    asked = required_spread(torch.tensor([reference_normal_spread]), torch.tensor([time_since_validated_s]), config)
+    return 1.0 if asked is None else float(constrained_2d(torch.tensor([apart]), asked))
 
 
 # ---- how far apart
@@ -42,7 +42,7 @@ def held(unseen_s=0.1, apart=0.3, full_apart=0.3, config=CONFIG):
     ],
 )
 def test_directions_are_apart_as_lines_are(angles_deg, expected):
-    apart = directions_apart(matches_of(torch.tensor([angles_deg]).deg2rad()))
+    apart = normal_spread_of(matches_of(torch.tensor([angles_deg]).deg2rad()))
     torch.testing.assert_close(apart, torch.tensor([expected], dtype=torch.float64), atol=1e-6, rtol=0)
 
 
@@ -50,7 +50,7 @@ def test_they_are_the_smaller_eigenvalue_of_their_scatter():
     angles_rad = torch.rand(3, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     matches = matches_of(angles_rad)
     scatter = torch.einsum("bni,bnj->bij", matches.directions, matches.directions) / 40
-    torch.testing.assert_close(directions_apart(matches), torch.linalg.eigvalsh(scatter)[:, 0])
+    torch.testing.assert_close(normal_spread_of(matches), torch.linalg.eigvalsh(scatter)[:, 0])
 
 
 def test_only_what_lies_on_a_contour_counts():
@@ -58,28 +58,33 @@ def test_only_what_lies_on_a_contour_counts():
     off = matches_of(angles_rad, offsets=torch.tensor([[0.0, 0.5, 0.9, -3.0]], dtype=torch.float64))
     nowhere = matches_of(angles_rad, near=torch.tensor([[True, True, False, False]]))
     for matches in (off, nowhere, matches_of(angles_rad, near=torch.zeros(1, 4, dtype=torch.bool))):
-        assert directions_apart(matches).tolist() == [0.0]
+        assert normal_spread_of(matches).tolist() == [0.0]
 
 
 # ---- when it is asked, and how much
 
 
 def test_what_is_seen_well_or_was_until_now_is_asked_nothing():
-    assert held(unseen_s=0.0, apart=0.0) == held(unseen_s=0.9 * PARALLEL_AFTER_S, apart=0.0) == 1.0
-    assert held(unseen_s=1.1 * PARALLEL_AFTER_S, apart=0.0) == 0.0
+    assert held(time_since_validated_s=0.0, apart=0.0) == held(time_since_validated_s=0.9 * PARALLEL_AFTER_S, apart=0.0) == 1.0
+    assert held(time_since_validated_s=1.1 * PARALLEL_AFTER_S, apart=0.0) == 0.0
     assert held(apart=0.0, config=ValidationConfig(all_directions=False)) == 1.0
 
 
 def test_what_fires_along_parallel_edges_as_a_rule_may_do_so_for_ever():
-    assert held(apart=0.0, full_apart=0.0) == 1.0
-    assert held(apart=0.02, full_apart=0.02) == 1.0
+    assert held(apart=0.0, reference_normal_spread=0.0) == 1.0
+    assert held(apart=0.02, reference_normal_spread=0.02) == 1.0
 
 
 def test_as_much_is_asked_as_there_is_when_seen_well_and_less_the_longer_ago_that_was():
     assert held(apart=0.3) == held(apart=0.15) == 1.0
     assert held(apart=0.01) == 0.0
     assert 0.0 < held(apart=0.05) < 1.0
-    assert held(apart=0.05, unseen_s=0.06) < held(apart=0.05, unseen_s=0.5) < held(apart=0.05, unseen_s=3.0) == 1.0
+    assert (
+        held(apart=0.05, time_since_validated_s=0.06)
+        < held(apart=0.05, time_since_validated_s=0.5)
+        < held(apart=0.05, time_since_validated_s=3.0)
+        == 1.0
+    )
 
 
 # ---- in the tracker
@@ -92,14 +97,19 @@ def of_upright_edges(events, contours):
     return events[contours.normals[0][shown][nearest][:, 0].abs() > 0.99]
 
 
-def last_window(unseen_s, full_apart, *, all_directions=True, upright=False):
+def last_window(time_since_validated_s, reference_normal_spread, *, all_directions=True, upright=False):
     """State and result of the next window of a box that is seen well as a rule, of which only upright edges may be seen."""
     config = TrackerConfig(validation=ValidationConfig(all_directions=all_directions))
     tracker, state, result, (events, end_us), _ = started(config=config)
     if upright:
         events = of_upright_edges(events, result.contours)
     well = dict.fromkeys(("full_share", "usual_score", "score"), torch.full((1,), 0.9))
-    state = changed(state, time_since_validated_s=torch.full((1,), unseen_s), reference_normal_spread=torch.full((1,), full_apart), **well)
+    state = changed(
+        state,
+        time_since_validated_s=torch.full((1,), time_since_validated_s),
+        reference_normal_spread=torch.full((1,), reference_normal_spread),
+        **well,
+    )
     return tracker.step(state, events, end_us)
 
 
@@ -114,22 +124,22 @@ def test_how_far_apart_is_remembered_of_what_is_seen_well():
 
 
 def test_a_pose_that_only_parallel_lines_hold_explains_nothing_while_the_object_may_be_hidden():
-    _, told = last_window(0.1, 0.4, upright=True)
+    _, stated = last_window(0.1, 0.4, upright=True)
     _, not_asked = last_window(0.1, 0.4, upright=True, all_directions=False)
-    assert float(told.quality) < 0.5 * float(not_asked.quality)
-    assert int(told.status) >= int(not_asked.status)
-    assert int(told.observation_count) >= 30
+    assert float(stated.quality) < 0.5 * float(not_asked.quality)
+    assert int(stated.status) >= int(not_asked.status)
+    assert int(stated.observation_count) >= 30
 
 
 @pytest.mark.parametrize(("unseen_s", "full_apart"), [(0.0, 0.4), (0.1, 0.0)])
-def test_it_does_where_the_object_was_just_seen_well_or_never_fires_otherwise(unseen_s, full_apart):
-    _, told = last_window(unseen_s, full_apart, upright=True)
-    _, not_asked = last_window(unseen_s, full_apart, upright=True, all_directions=False)
-    assert float(told.quality) == float(not_asked.quality) > 0
-    assert told.status.tolist() == not_asked.status.tolist()
+def test_it_does_where_the_object_was_just_seen_well_or_never_fires_otherwise(time_since_validated_s, reference_normal_spread):
+    _, stated = last_window(time_since_validated_s, reference_normal_spread, upright=True)
+    _, not_asked = last_window(time_since_validated_s, reference_normal_spread, upright=True, all_directions=False)
+    assert float(stated.quality) == float(not_asked.quality) > 0
+    assert stated.status.tolist() == not_asked.status.tolist()
 
 
 def test_all_of_a_box_holds_it_all_ways():
-    _, told = last_window(0.1, 0.4)
-    assert int(told.status) == Status.TRACKING
-    assert float(told.quality) > 0.7
+    _, stated = last_window(0.1, 0.4)
+    assert int(stated.status) == Status.TRACKING
+    assert float(stated.quality) > 0.7

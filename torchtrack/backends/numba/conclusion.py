@@ -22,15 +22,15 @@ from torchtrack.tracking.relocalization.triggers import SMEARED
 from torchtrack.tracking.state import TrackerState
 from torchtrack.tracking.validation import status
 from torchtrack.tracking.validation.measures import visible_share
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 # As torchtrack.tracking.validation.status.Status.
 TRACKING, UNCERTAIN, LOST, TOO_FEW_EVENTS, OUT_OF_VIEW, DIVERGED = range(6)
 # What is remembered of each object as a number, before a window and after it.
-USUAL_SCORE, FULL_SHARE, FULL_GATHERED, FULL_COUNT, DOUBTED_S, UNSEEN_S = range(6)
+MEAN_SCORE, KNOWN_EXPLAINED_RATIO, KNOWN_INLIER_RATIO, KNOWN_MATCHES, DRIFT_S, TIME_SINCE_VALIDATED_S = range(6)
 REMEMBERED = 6
 # What was found of it.
-SHARE, SCORE, GATHERED, USUALLY_GATHERED, IN_VIEW, WIDENING = range(6)
+SHARE, SCORE, INLIER_RATIO, REFERENCE_INLIER_RATIO, IN_VIEW, GATE_SCALE = range(6)
 FOUND = 6
 _UNKNOWNS = 13
 # As torchtrack.tracking.validation.status.trust has it.
@@ -51,9 +51,9 @@ def conclude(
     offset: Array,
     hessian: Array,
     elsewhere: Array,
-    turn_unclear: Array,
+    rotation_unclear: Array,
     matched: Array,
-    found: Array,
+    measured: Array,
     dt_s: Array,
     centre_obj: Array,
     diameter_m: Array,
@@ -80,26 +80,26 @@ def conclude(
     """
     inverses, centre = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(3)
     for b in range(len(usable)):
-        full_share, share, dt = remembered[FULL_SHARE, b], found[SHARE, b], dt_s[b]
-        hidden = _hidden(b, elsewhere, matched, found, settings)
-        status[b] = _judge(b, usable, offset, elsewhere, matched, found, hidden, diameter_m[b], settings)
+        reference_explained_ratio, share, dt = remembered[KNOWN_EXPLAINED_RATIO, b], measured[SHARE, b], dt_s[b]
+        hidden = _hidden(b, elsewhere, matched, measured, settings)
+        status[b] = _judge(b, usable, offset, elsewhere, matched, measured, hidden, diameter_m[b], settings)
         failed = status[b] >= LOST
         _orthonormalise(T_prior[b] if failed else T_found[b], T_cam_obj[b])
         if failed and (settings.holds or not usable[b]):
             T_cam_obj[b] = T_before[b]
-        trusted = 0.0 if failed else max(hidden, _trust(share, full_share, found[WIDENING, b], settings))
-        doubted = not failed and _in_doubt(b, found, full_share, settings)
-        if doubted or (turn_unclear[b] and not failed):
+        trusted = 0.0 if failed else max(hidden, _trust(share, reference_explained_ratio, measured[GATE_SCALE, b], settings))
+        is_drifting_now = not failed and _is_smeared(b, measured, reference_explained_ratio, settings)
+        if is_drifting_now or (rotation_unclear[b] and not failed):
             status[b] = max(status[b], UNCERTAIN)
         inverse(hessian[b], inverses)
         _update(trusted, failed, dt, velocity[b], covariance[b], offset[b], inverses, settings, new_velocity[b], posterior[b])
-        seen_well = not failed and share >= settings.validated_from * full_share
+        seen_well = not failed and share >= settings.validated_from * reference_explained_ratio
         _accelerate(trusted if seen_well else 0.0, dt, information[b], offset[b], expected[b], variance[b], acceleration[b])
         centre_of(T_cam_obj[b], centre_obj[b], centre)
         _to_left(posterior[b], centre, left[b])
-        certain = share >= settings.certain_share * full_share and status[b] == TRACKING
-        certain = certain and matched[b] >= settings.certain_count * remembered[FULL_COUNT, b]
-        _remember(b, failed, doubted, certain, dt, found, matched[b], settings, remembered)
+        certain = share >= settings.certain_share * reference_explained_ratio and status[b] == TRACKING
+        certain = certain and matched[b] >= settings.certain_count * remembered[KNOWN_MATCHES, b]
+        _remember(b, failed, is_drifting_now, certain, dt, measured, matched[b], settings, remembered)
         if certain:
             T_last_seen[b] = T_cam_obj[b]
 
@@ -117,19 +117,19 @@ def _judge(
     offset: Array,
     elsewhere: Array,
     matched: Array,
-    found: Array,
+    measured: Array,
     hidden: float,
     diameter_m: float,
     settings: ConclusionSettings,
 ) -> int:
     """The status of an object: :func:`torchtrack.tracking.validation.status.judge`."""
-    widening, share, status = found[WIDENING, b], found[SHARE, b], TRACKING
+    gate_scale, share, status = measured[GATE_SCALE, b], measured[SHARE, b], TRACKING
     # As torchtrack.tracking.validation.status.holding_on has it.
     if settings.holds_on and not elsewhere[b] and matched[b] >= settings.hidden_observations:
         hidden = 1.0
-    wider, turned, moved = _clamped(widening - 1.0, 0.0, 1.0) * (1.0 - hidden), 0.0, 0.0
+    wider, turned, moved = _clamped(gate_scale - 1.0, 0.0, 1.0) * (1.0 - hidden), 0.0, 0.0
     # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
-    counts = 0.0 if elsewhere[b] and widening >= settings.anywhere else 1.0
+    counts = 0.0 if elsewhere[b] and gate_scale >= settings.anywhere else 1.0
     for k in range(3):
         turned += (counts * offset[b, k]) ** 2
         moved += (counts * offset[b, 3 + k]) ** 2
@@ -139,37 +139,37 @@ def _judge(
         status = LOST
     if matched[b] < settings.min_observations:
         status = TOO_FEW_EVENTS
-    if found[IN_VIEW, b] < settings.min_visible_ratio:
+    if measured[IN_VIEW, b] < settings.min_visible_ratio:
         status = OUT_OF_VIEW
-    turned_ok = np.sqrt(turned) / widening < settings.max_step_rotation_rad
-    if not (turned_ok and np.sqrt(moved) / widening < settings.max_step_translation * diameter_m) or not usable[b]:
+    turned_ok = np.sqrt(turned) / gate_scale < settings.max_step_rotation_rad
+    if not (turned_ok and np.sqrt(moved) / gate_scale < settings.max_step_translation * diameter_m) or not usable[b]:
         status = DIVERGED
     return status
 
 
 @kernel()
-def _hidden(b: int, elsewhere: Array, matched: Array, found: Array, settings: ConclusionSettings) -> float:
+def _hidden(b: int, elsewhere: Array, matched: Array, measured: Array, settings: ConclusionSettings) -> float:
     """How far a pose counts as that of an object that is partly hidden: :func:`torchtrack.tracking.validation.status.partly_hidden`."""
-    usual = found[USUALLY_GATHERED, b]
+    usual = measured[REFERENCE_INLIER_RATIO, b]
     if not settings.partly_hidden or elsewhere[b] or not usual > settings.hidden_least or matched[b] < settings.hidden_observations:
         return 0.0
-    ramp = (found[GATHERED, b] / usual - settings.hidden_from) / (settings.hidden_fully - settings.hidden_from)
+    ramp = (measured[INLIER_RATIO, b] / usual - settings.hidden_from) / (settings.hidden_fully - settings.hidden_from)
     # Written so that what is not a number counts for nothing.
     return min(ramp, 1.0) if ramp > 0.0 else 0.0
 
 
 @kernel()
-def _trust(share: float, full_share: float, widening: float, settings: ConclusionSettings) -> float:
+def _trust(share: float, reference_explained_ratio: float, gate_scale: float, settings: ConclusionSettings) -> float:
     """How far a pose counts against the prediction: :func:`torchtrack.tracking.validation.status.trust`."""
-    full = max(settings.uncertain_below, settings.validated_from * full_share * _clamped(widening - 1.0, 0.0, 1.0))
+    full = max(settings.uncertain_below, settings.validated_from * reference_explained_ratio * _clamped(gate_scale - 1.0, 0.0, 1.0))
     return _clamped((share - settings.lost_below) / max(full - settings.lost_below, _LEAST_RANGE), 0.0, 1.0)
 
 
 @kernel()
-def _in_doubt(b: int, found: Array, full_share: float, settings: ConclusionSettings) -> bool:
+def _is_smeared(b: int, measured: Array, reference_explained_ratio: float, settings: ConclusionSettings) -> bool:
     """Whether an object may be elsewhere: :func:`torchtrack.tracking.relocalization.triggers.in_doubt`."""
-    smeared = found[GATHERED, b] < settings.smeared * found[USUALLY_GATHERED, b]
-    return smeared and found[SCORE, b] < settings.drift_below * full_share
+    smeared = measured[INLIER_RATIO, b] < settings.smeared * measured[REFERENCE_INLIER_RATIO, b]
+    return smeared and measured[SCORE, b] < settings.drift_below * reference_explained_ratio
 
 
 @kernel()
@@ -207,8 +207,8 @@ def _update(
     trusted *= np.isfinite(total)
     for j in range(12):
         for k in range(12):
-            found = variance * inverses[j, k]
-            posterior[j, k] = found + (1.0 - trusted) * (predicted[j, k] - found) if trusted > 0 else predicted[j, k]
+            updated = variance * inverses[j, k]
+            posterior[j, k] = updated + (1.0 - trusted) * (predicted[j, k] - updated) if trusted > 0 else predicted[j, k]
     kept = (0.0 if settings.holds else np.exp(-dt / settings.coast_s)) if failed else 1.0
     dropped = np.empty(6)
     for k in range(6):
@@ -260,10 +260,10 @@ def _to_left(covariance: Array, centre_cam: Array, left: Array) -> None:
 def _remember(
     b: int,
     failed: bool,
-    doubted: bool,
+    is_drifting_now: bool,
     certain: bool,
     dt: float,
-    found: Array,
+    measured: Array,
     matched: int,
     settings: ConclusionSettings,
     remembered: Array,
@@ -271,15 +271,15 @@ def _remember(
     """What is remembered of an object with a window more: running means, and for how long it is in doubt, or was not seen well."""
     known = remembered[:, b]
     if not failed:
-        known[USUAL_SCORE] += settings.usual_gain * (found[SCORE, b] - known[USUAL_SCORE])
-        known[FULL_SHARE] = _seen_well(known[FULL_SHARE], found[SHARE, b], settings)
-        if not np.isnan(found[GATHERED, b]):
-            known[FULL_GATHERED] = _seen_well(known[FULL_GATHERED], found[GATHERED, b], settings)
-        known[FULL_COUNT] = _seen_well(known[FULL_COUNT], float(matched), settings)
+        known[MEAN_SCORE] += settings.usual_gain * (measured[SCORE, b] - known[MEAN_SCORE])
+        known[KNOWN_EXPLAINED_RATIO] = _seen_well(known[KNOWN_EXPLAINED_RATIO], measured[SHARE, b], settings)
+        if not np.isnan(measured[INLIER_RATIO, b]):
+            known[KNOWN_INLIER_RATIO] = _seen_well(known[KNOWN_INLIER_RATIO], measured[INLIER_RATIO, b], settings)
+        known[KNOWN_MATCHES] = _seen_well(known[KNOWN_MATCHES], float(matched), settings)
         # One good window among bad ones does not end a doubt.
-        known[DOUBTED_S] += dt if doubted else -dt
-    known[DOUBTED_S] = _clamped(known[DOUBTED_S], 0.0, np.inf)
-    known[UNSEEN_S] = 0.0 if certain else known[UNSEEN_S] + dt
+        known[DRIFT_S] += dt if is_drifting_now else -dt
+    known[DRIFT_S] = _clamped(known[DRIFT_S], 0.0, np.inf)
+    known[TIME_SINCE_VALIDATED_S] = 0.0 if certain else known[TIME_SINCE_VALIDATED_S] + dt
 
 
 @kernel()
@@ -288,31 +288,31 @@ def _seen_well(before: float, now: float, settings: ConclusionSettings) -> float
     return before + (settings.usual_gain if now > before else settings.fall_gain) * (now - before)
 
 
-def _has_motion(state: TrackerState, prediction: Prediction, widening: Tensor, found: Found, dt_s: Tensor, config: TrackerConfig) -> bool:
+def _has_motion(state: TrackerState, prediction: Prediction, gate_scale: Tensor, scored: ScoredFit, dt_s: Tensor, config: TrackerConfig) -> bool:
     """Whether objects are predicted with their motion."""
     return config.solver.prior and prediction.acceleration is not None
 
 
 @accelerates(update.judged_objects, supports=_has_motion)
 def judged_objects_numba(
-    state: TrackerState, prediction: Prediction, widening: Float[Tensor, "b"], found: Found, dt_s: Float[Tensor, "b"], config: TrackerConfig
+    state: TrackerState, prediction: Prediction, gate_scale: Float[Tensor, "b"], scored: ScoredFit, dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> update.Judgement:
     """Object by object."""
-    objects, solution, batch, expected = prediction.objects, found.fit.solution, len(dt_s), prediction.acceleration
+    objects, solution, batch, expected = prediction.objects, scored.fit.solution, len(dt_s), prediction.acceleration
     if expected is None:
         raise ValueError("a kernel needs the prediction's acceleration.")
-    in_view = visible_share(found.fit.contours, objects.image_size)
-    told = torch.stack([found.share, found.score, found.gathered, found.full_gathered, in_view, widening])
+    in_view = visible_share(scored.fit.contours, objects.image_size)
+    measured_rows = torch.stack([scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, in_view, gate_scale])
     health = state.health
     references = health.reference_explained_ratio, health.reference_inlier_ratio, health.reference_matches
     remembered = torch.stack([health.mean_score, *references, health.drift_s, health.time_since_validated_s])
     T_last_seen = health.T_last_validated.clone(memory_format=torch.contiguous_format)
     T_cam_obj, covariance, left = (T_last_seen.new_empty(batch, size, size) for size in (4, 12, 6))
-    (velocity, acceleration), status_of = dt_s.new_empty(2, batch, 6), found.count.new_empty(batch)
+    (velocity, acceleration), status_of = dt_s.new_empty(2, batch, 6), scored.count.new_empty(batch)
     conclude(
         *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance, prediction.information),
         *as_arrays(expected.expected, expected.variance, solution.T_cam_obj, solution.from_prior, solution.hessian),
-        *as_arrays(found.elsewhere, found.turn_unclear, found.count, told, dt_s, objects.centre_obj, objects.diameter_m),
+        *as_arrays(scored.elsewhere, scored.rotation_unclear, scored.count, measured_rows, dt_s, objects.centre_obj, objects.diameter_m),
         _settings(config),
         *as_arrays(remembered, T_last_seen, T_cam_obj, velocity, acceleration, covariance, left, status_of),
     )

@@ -9,7 +9,7 @@ from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.backends.numba.index import cells_of
 from torchtrack.backends.numba.look_up import nearest
-from torchtrack.backends.numba.matching import COLUMNS, EXPECTED, INDEXED_U, INDEXED_V, LIMB, MISTAKEN, NORMAL_U, NORMAL_V, ORIENTED, X, Y, Z
+from torchtrack.backends.numba.matching import COLUMNS, EDGE_AMBIGUITY, EXPECTED, INDEXED_U, INDEXED_V, NORMAL_U, NORMAL_V, ORIENTED, SMOOTH, X, Y, Z
 from torchtrack.backends.numba.measures import octant
 from torchtrack.backends.numba.parameters import Cells, TableSettings, filled
 from torchtrack.core.dispatch import accelerates
@@ -52,7 +52,7 @@ def fill(
         expected = polarity[b] if polarity.shape[1] else polarity.ravel()
         not_plain[b] = _fill_one(points_obj[b], normals[b], kind[b], mask[b], indexed[b], expected, settings, table[b])
         if settings.close_px:
-            _add_mistaken(depth_m[b], pixels[b], normals[b], kind[b], mask[b], nearest_of_cell[b], first[b], cells, settings, table[b])
+            _add_edge_ambiguity(depth_m[b], pixels[b], normals[b], kind[b], mask[b], nearest_of_cell[b], first[b], cells, settings, table[b])
 
 
 @kernel()
@@ -74,18 +74,18 @@ def _fill_one(
         table[i, X], table[i, Y], table[i, Z] = points_obj[0, i], points_obj[1, i], points_obj[2, i]
         table[i, NORMAL_U], table[i, NORMAL_V] = normals[0, i], normals[1, i]
         table[i, INDEXED_U], table[i, INDEXED_V] = indexed[0, i], indexed[1, i]
-        is_limb = kind[i] == settings.limb
-        is_oriented = is_limb or kind[i] == settings.crease
-        table[i, LIMB], table[i, ORIENTED] = is_limb, is_oriented
-        not_plain = not_plain or is_limb or kind[i] == settings.texture
-        table[i, EXPECTED] = settings.of_print and kind[i] == settings.texture
+        is_smooth = kind[i] == settings.silhouette
+        is_oriented = is_smooth or kind[i] == settings.crease
+        table[i, SMOOTH], table[i, ORIENTED] = is_smooth, is_oriented
+        not_plain = not_plain or is_smooth or kind[i] == settings.texture
+        table[i, EXPECTED] = settings.of_texture and kind[i] == settings.texture
         if is_oriented and len(polarity):
             table[i, EXPECTED] = polarity[octant(normals[0, i], normals[1, i])]
     return not_plain
 
 
 @kernel()
-def _add_mistaken(
+def _add_edge_ambiguity(
     depth_m: Array,
     pixels: Array,
     normals: Array,
@@ -97,7 +97,7 @@ def _add_mistaken(
     settings: TableSettings,
     table: Array,
 ) -> None:
-    """How far off what is seen on points of edges is, should it be of the edge beside: :func:`tracking.association.weights.mistaken_px2`."""
+    """How far off what is seen on points of edges is, should it be of the edge beside: :func:`tracking.association.weights.edge_ambiguity_px2`."""
     least_m = settings.depth_share * _range(depth_m, mask)
     for i in range(len(mask)):
         if not mask[i] or not table[i, ORIENTED]:
@@ -113,8 +113,8 @@ def _add_mistaken(
             least_px = settings.touching_px if is_deep else settings.apart_px
             if is_parallel and apart_px * side_px > least_px * settings.aside_px:
                 squared = apart_px * apart_px
-                mistaken = 0.5 * (squared + settings.sorted_px2 * is_deep) * np.exp(-squared / settings.close_px**2)
-                table[i, MISTAKEN] = max(table[i, MISTAKEN], mistaken)
+                edge_ambiguity = 0.5 * (squared + settings.sorted_px2 * is_deep) * np.exp(-squared / settings.close_px**2)
+                table[i, EDGE_AMBIGUITY] = max(table[i, EDGE_AMBIGUITY], edge_ambiguity)
 
 
 @kernel()
@@ -129,11 +129,11 @@ def _range(values: Array, mask: Array) -> float:
 
 @accelerates(nearest_contours.contour_table)
 def contour_table_numba(
-    contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_print: bool = True, close_px: float = 0.0
+    contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_texture: bool = True, close_px: float = 0.0
 ) -> ContourTable:
     """Point by point."""
-    limb, crease, texture = (int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
-    settings = filled(TableSettings, weights, limb=limb, crease=crease, texture=texture, of_print=of_print, close_px=close_px)
+    silhouette, crease, texture = (int(kind) for kind in (ContourKind.SMOOTH, ContourKind.CREASE, ContourKind.TEXTURE))
+    settings = filled(TableSettings, weights, silhouette=silhouette, crease=crease, texture=texture, of_texture=of_texture, close_px=close_px)
     table, not_plain = contours.points_obj.new_empty(*contours.mask.shape, COLUMNS), torch.empty_like(contours.mask[:, 0])
     points, pixels, normals, indexed = (value.transpose(1, 2) for value in (contours.points_obj, contours.pixels, contours.normals, index.pixels))
     expected = pixels.new_empty(len(table), 0) if polarity is None else polarity

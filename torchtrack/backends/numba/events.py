@@ -350,8 +350,8 @@ def seen_numba(
     # What all see alike is written once.
     own = sensors.stream_index[:1] if len(sensors.ideal_pixels) == 1 else sensors.stream_index
     seen = sensors.ideal_pixels.new_empty(SEEN, len(own), window.mask.shape[1])
-    told = as_arrays(window.x, window.y, window.age_us, into_burst_us, window.polarity, window.mask, sensors.ideal_pixels)
-    see(*told, *as_arrays(own), seen.numpy())
+    arrays = as_arrays(window.x, window.y, window.age_us, into_burst_us, window.polarity, window.mask, sensors.ideal_pixels)
+    see(*arrays, *as_arrays(own), seen.numpy())
     return _of_rows(seen.expand(-1, batch, -1), window.mask[own].expand(batch, -1))
 
 

@@ -19,7 +19,7 @@ from torchtrack.tracking.motion.prediction import MAX_DEPTH_M, Prediction
 
 # What is told of each motion: its velocity, and of its acceleration what is expected, its variance, and its rate.
 VELOCITY, EXPECTED, VARIANCE, RATE = range(4)
-TOLD = 4
+OUTCOMES = 4
 # Ways in the image, and variances of velocities, are taken to be no less.
 _LEAST_WAY_PX, _LEAST_VARIANCE = 1e-6, 1e-12
 
@@ -39,7 +39,7 @@ def forecast(
     settings: ForecastSettings,
     T_prior: Array,
     usable: Array,
-    told: Array,
+    outcome: Array,
     predicted: Array,
 ) -> None:
     """Predict each object's pose, velocity, acceleration and covariance.
@@ -64,11 +64,11 @@ def forecast(
         goes_on = counts * np.exp(-dt / settings.acceleration_s) if settings.acceleration_s > 0 and not settings.holds else 0.0
         for k in range(6):
             variance = (rotation_sigma if k < 3 else move_sigma) ** 2
-            told[EXPECTED, b, k], told[VARIANCE, b, k] = goes_on * acceleration[b, k], variance
-            told[RATE, b, k] = counts * variance * dt / max(predicted[b, 6 + k, 6 + k], _LEAST_VARIANCE)
-        usable[b] = _move(T_cam_obj[b], centre_obj[b], before, told[EXPECTED, b], dt, settings, T_prior[b], told[VELOCITY, b])
+            outcome[EXPECTED, b, k], outcome[VARIANCE, b, k] = goes_on * acceleration[b, k], variance
+            outcome[RATE, b, k] = counts * variance * dt / max(predicted[b, 6 + k, 6 + k], _LEAST_VARIANCE)
+        usable[b] = _move(T_cam_obj[b], centre_obj[b], before, outcome[EXPECTED, b], dt, settings, T_prior[b], outcome[VELOCITY, b])
         if not usable[b]:
-            T_prior[b], told[VELOCITY, b] = far_pose[b], 0.0
+            T_prior[b], outcome[VELOCITY, b] = far_pose[b], 0.0
 
 
 @kernel()
@@ -204,14 +204,14 @@ def forecast_numba(
     """Object by object."""
     batch, axes = len(dt_s), far_pose.new_empty(0, 3) if axes_obj is None else axes_obj
     T_prior, usable = far_pose.new_empty(batch, 4, 4), torch.empty(batch, dtype=torch.bool)
-    told, covariance = far_pose.new_empty(TOLD, batch, 6), state.covariance.new_empty(batch, 12, 12)
+    outcome, covariance = far_pose.new_empty(OUTCOMES, batch, 6), state.covariance.new_empty(batch, 12, 12)
     known = as_arrays(state.T_cam_obj, state.velocity, state.acceleration, state.covariance, dt_s)
     of_objects = as_arrays(objects.centre_obj, objects.diameter_m, objects.intrinsics, axes, far_pose)
     settings = filled(
         ForecastSettings, config.motion, model, holds=config.motion.model == "hold", least_depth_m=MIN_DEPTH_M, most_depth_m=MAX_DEPTH_M
     )
-    forecast(*known, *of_objects, settings, *as_arrays(T_prior, usable, told, covariance))
-    velocity, *of_acceleration = told.unbind()
+    forecast(*known, *of_objects, settings, *as_arrays(T_prior, usable, outcome, covariance))
+    velocity, *of_acceleration = outcome.unbind()
     return Prediction(objects, T_prior, usable, velocity, covariance, Acceleration(*of_acceleration) if config.solver.prior else None)
 
 

@@ -10,11 +10,11 @@ from torchtrack.backends.numba.parameters import Cells, MatchingSettings
 # Rows of what was observed.
 U, V, AGE, INTO_BURST, POLARITY, TRUST = range(6)
 # Columns of a contour point: its place on the object, its normal, where it was indexed, and marks.
-X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, LIMB, ORIENTED, EXPECTED, MISTAKEN = range(11)
+X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, SMOOTH, ORIENTED, EXPECTED, EDGE_AMBIGUITY = range(11)
 COLUMNS = 11
 # Rows of a match.
 WEIGHT, MATCH_AGE, POINT_X, POINT_Y, POINT_Z, TARGET_U, TARGET_V, DIRECTION_U, DIRECTION_V = range(9)
-OFFSET, IS_LIMB, BESIDE, ERROR, DARK, AS_EXPECTED = range(9, 15)
+OFFSET, IS_SMOOTH, NEIGHBOURS, ERROR, DARK, AS_EXPECTED = range(9, 15)
 ROWS = 15
 # Patches of the image: votes of the observations in each.
 _ON, _NEAR, _VOTES = range(3)
@@ -47,7 +47,7 @@ def match(
     intrinsics: Numbers,
     gate_px: float,
     wider: float,
-    finely: bool,
+    subcell_lookup: bool,
     settings: MatchingSettings,
     contour: Array,
     is_near: Array,
@@ -68,18 +68,20 @@ def match(
     votes[:] = 0.0
     indexed = table[:, INDEXED_U : INDEXED_V + 1]
     for i in range(seen.shape[1]):
-        found = -1
+        nearest_index = -1
         if exists[i]:
-            if finely:
-                found = nearest_of_four(nearest_of_cell, first, indexed, place[i, 0], place[i, 1], cells)
+            if subcell_lookup:
+                nearest_index = nearest_of_four(nearest_of_cell, first, indexed, place[i, 0], place[i, 1], cells)
             else:
-                found = nearest(nearest_of_cell, first, place[i, 0], place[i, 1], cells)
-        contour[i], is_near[i], is_matched[i] = max(found, 0), found >= 0, False
-        if found < 0:
+                nearest_index = nearest(nearest_of_cell, first, place[i, 0], place[i, 1], cells)
+        contour[i], is_near[i], is_matched[i] = max(nearest_index, 0), nearest_index >= 0, False
+        if nearest_index < 0:
             for k in range(ROWS):
                 matches[k, i] = 0.0
         else:
-            is_matched[i] = _match_one(i, found, seen, place, table, pose, motion, change, intrinsics, gate_px, wider, settings, matches, votes)
+            is_matched[i] = _match_one(
+                i, nearest_index, seen, place, table, pose, motion, change, intrinsics, gate_px, wider, settings, matches, votes
+            )
     _weigh(is_near, matches, votes, settings)
 
 
@@ -87,7 +89,7 @@ def match(
 @kernel(fastmath=FAST, forceinline=True)
 def _match_one(
     i: int,
-    found: int,
+    nearest_index: int,
     seen: Array,
     place: Array,
     table: Array,
@@ -102,30 +104,30 @@ def _match_one(
     votes: Array,
 ) -> bool:
     """Match one observation with the contour point that was found for it, and count it in its patch; whether they match."""
-    point_x, point_y, point_z = table[found, X], table[found, Y], table[found, Z]
+    point_x, point_y, point_z = table[nearest_index, X], table[nearest_index, Y], table[nearest_index, Z]
     x, y, z = placed(pose, point_x, point_y, point_z)
     inverse = inverse_depth(z)
     u, v = intrinsics[2] + x * inverse * intrinsics[0], intrinsics[3] + y * inverse * intrinsics[1]
     speed_u, speed_v = across(motion, x, y, z, inverse, intrinsics)
     change_u, change_v = across(change, x, y, z, inverse, intrinsics)
-    nu, nv = table[found, NORMAL_U], table[found, NORMAL_V]
+    nu, nv = table[nearest_index, NORMAL_U], table[nearest_index, NORMAL_V]
     crossing = nu * speed_u + nv * speed_v
     dark = seen[POLARITY, i] * crossing / (abs(crossing) + settings.slow_px_s)
     age = seen[AGE, i] + max(seen[INTO_BURST, i] - settings.burst_px / max(abs(crossing), 1e-3), 0.0)
     carried_u = seen[U, i] + age * (speed_u - 0.5 * age * change_u)
     carried_v = seen[V, i] + age * (speed_v - 0.5 * age * change_v)
-    shift = dark * (settings.dark_shift_px + table[found, LIMB] * (settings.silhouette_dark_shift_px - settings.dark_shift_px))
+    shift = dark * (settings.dark_shift_px + table[nearest_index, SMOOTH] * (settings.silhouette_dark_shift_px - settings.dark_shift_px))
     target_u, target_v = carried_u - nu * shift, carried_v - nv * shift
     du, dv = u - target_u, v - target_v
     is_matched, offset = du * du + dv * dv < (gate_px * wider) ** 2, (du * nu + dv * nv) / wider
-    as_expected = _agreeing(dark * table[found, EXPECTED], settings)
-    dark = dark * table[found, ORIENTED]
+    as_expected = _agreeing(dark * table[nearest_index, EXPECTED], settings)
+    dark = dark * table[nearest_index, ORIENTED]
     rows[WEIGHT, i], rows[MATCH_AGE, i], rows[POINT_X, i], rows[POINT_Y, i], rows[POINT_Z, i] = as_expected, age, point_x, point_y, point_z
     rows[TARGET_U, i], rows[TARGET_V, i], rows[DIRECTION_U, i], rows[DIRECTION_V, i] = target_u, target_v, nu, nv
-    rows[OFFSET, i], rows[IS_LIMB, i], rows[ERROR, i] = offset, table[found, LIMB], table[found, MISTAKEN]
+    rows[OFFSET, i], rows[IS_SMOOTH, i], rows[ERROR, i] = offset, table[nearest_index, SMOOTH], table[nearest_index, EDGE_AMBIGUITY]
     rows[DARK, i], rows[AS_EXPECTED, i] = dark, as_expected
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
-    next_u, next_v = carried_u - (u - table[found, INDEXED_U]), carried_v - (v - table[found, INDEXED_V])
+    next_u, next_v = carried_u - (u - table[nearest_index, INDEXED_U]), carried_v - (v - table[nearest_index, INDEXED_V])
     place[i, 0], place[i, 1] = next_u if is_matched else place[i, 0], next_v if is_matched else place[i, 1]
     # Products in the place of branches, of which a processor would guess half wrong.
     cell = patch(target_u, target_v, settings.patch_bits, settings.patches)
@@ -145,7 +147,7 @@ def _weigh(is_near: Array, matches: Array, votes: Array, settings: MatchingSetti
             continue
         cell = patch(matches[TARGET_U, i], matches[TARGET_V, i], settings.patch_bits, settings.patches)
         on = votes[cell, _ON]
-        matches[BESIDE, i] = on
+        matches[NEIGHBOURS, i] = on
         weight = matches[AS_EXPECTED, i]
         if settings.concentration:
             share = (on + 1.0) / (votes[cell, _NEAR] + 2.0)
@@ -165,6 +167,6 @@ def believe(seen: Array, is_matched: Array, matches: Array, settings: MatchingSe
     enough = total >= settings.min_observations
     for i in range(len(is_matched)):
         is_matched[i] = is_matched[i] and enough
-        common_px2 = matches[ERROR, i] + settings.common_px2 * matches[IS_LIMB, i]
-        told = 1.0 / (1.0 + matches[BESIDE, i] * common_px2 / settings.observation_px**2)
-        matches[WEIGHT, i] *= enough * told
+        common_px2 = matches[ERROR, i] + settings.common_px2 * matches[IS_SMOOTH, i]
+        effective = 1.0 / (1.0 + matches[NEIGHBOURS, i] * common_px2 / settings.observation_px**2)
+        matches[WEIGHT, i] *= enough * effective

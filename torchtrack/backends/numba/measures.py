@@ -36,7 +36,7 @@ def shares(
     as_expected: Array,
     settings: QualitySettings,
     measured: Array,
-    gathered: Array,
+    inlier_ratio: Array,
     apart: Array,
 ) -> None:
     """Of the contour that should fire, the share with observations on it; of the observations near it, the share on it, and their directions.
@@ -45,12 +45,12 @@ def shares(
         points_cam, pixels, normals, mask: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``, ``[b, m]``.
         velocity: ``[b, 6]``, about ``centre_cam [b, 3]``.
         targets, directions, offsets, is_near, as_expected: of matches: ``[b, 2, n]`` and ``[b, n]``.
-        measured, gathered: ``[b]``, filled; not a number where too little is there to tell.
-        apart: ``[b]``, filled: :func:`torchtrack.tracking.validation.measures.directions_apart`.
+        measured, inlier_ratio: ``[b]``, filled; not a number where too little is there to tell.
+        apart: ``[b]``, filled: :func:`torchtrack.tracking.validation.measures.normal_spread_of`.
     """
     counts = np.empty((settings.patches**2, 2))
     for b in range(len(mask)):
-        gathered[b] = _count(targets[b], offsets[b], is_near[b], as_expected[b], settings, counts)
+        inlier_ratio[b] = _count(targets[b], offsets[b], is_near[b], as_expected[b], settings, counts)
         apart[b] = _apart(directions[b], offsets[b], is_near[b], settings.on_contour_px)
         motion, of_lens = drift(velocity[b], centre_cam[b]), lens(intrinsics[b])
         total, explained = 0, 0
@@ -113,20 +113,20 @@ def visible(pixels: Array, mask: Array, height: int, width: int, share: Array) -
 
 
 @kernel()
-def remember(darker_outside: Array, directions: Array, dark: Array, weights: Array, window_s: Array, memory_s: float, little: float) -> None:
+def remember(darker_outside: Array, directions: Array, dark: Array, weights: Array, window_s: Array, memory_s: float, least_evidence: float) -> None:
     """What is remembered of sides with a window more: :func:`torchtrack.tracking.association.polarity.remembered`, in place.
 
     Args:
         darker_outside: ``[b, 8]``.
         directions: ``[b, 2, n]``; ``dark`` and ``weights [b, n]``; ``window_s [b]``.
-        little: evidence that counts for half.
+        least_evidence: evidence that counts for half.
     """
     sums = np.empty((2, 8))
     for b in range(len(dark)):
         _sides(directions[b], dark[b], weights[b], sums)
         fresh = 1.0 - np.exp(-window_s[b] / memory_s)
         for k in range(8):
-            gain = fresh * sums[1, k] / (sums[1, k] + little)
+            gain = fresh * sums[1, k] / (sums[1, k] + least_evidence)
             darker_outside[b, k] += gain * (sums[0, k] / max(sums[1, k], 1e-3) - darker_outside[b, k])
 
 
@@ -201,14 +201,14 @@ def shares_numba(
     contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: ValidationConfig
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """Point by point."""
-    measured, gathered, apart = contours.pixels.new_empty(3, len(contours.mask))
+    measured, inlier_ratio, apart = contours.pixels.new_empty(3, len(contours.mask))
     shown = as_arrays(*(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask)
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
     matched = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
     height, width = image_size
     settings = filled(QualitySettings, config, measures, weights, height=height, width=width)
-    shares(*shown, *moving, *matched, settings, measured.numpy(), gathered.numpy(), apart.numpy())
-    return measured, gathered, apart
+    shares(*shown, *moving, *matched, settings, measured.numpy(), inlier_ratio.numpy(), apart.numpy())
+    return measured, inlier_ratio, apart
 
 
 @accelerates(measures.visible_share)

@@ -9,10 +9,10 @@ from torchtrack.backends.numba import (
     forecast,
     hypotheses,
     index,
-    limb_features,
     measures,
     rounds,
     selection,
+    silhouette_features,
     solving,
     visibility,
 )
@@ -26,10 +26,10 @@ __all__ = [
     "forecast",
     "hypotheses",
     "index",
-    "limb_features",
     "measures",
     "rounds",
     "selection",
+    "silhouette_features",
     "solving",
     "visibility",
 ]

@@ -113,10 +113,10 @@ class TableSettings(NamedTuple):
         touching_px, depth_share, sorted_px2: how little apart edges at different depths are, and by how much more they seem so.
     """
 
-    limb: int
+    silhouette: int
     crease: int
     texture: int
-    of_print: bool
+    of_texture: bool
     close_px: float
     aside_px: float
     parallel: float
@@ -266,7 +266,7 @@ class ConclusionSettings(NamedTuple):
 
 
 class PatchSettings(NamedTuple):
-    """What :mod:`torchtrack.backends.numba.limb_features` goes by: constants of :mod:`torchtrack.tracking.association.weighting_features`.
+    """What :mod:`torchtrack.backends.numba.silhouette_features` goes by: constants of :mod:`torchtrack.tracking.association.weighting_features`.
 
     Args:
         across_px, along_px: where the patch is sampled.
@@ -282,7 +282,7 @@ class PatchSettings(NamedTuple):
     along_px: tuple[float, ...]
     side: int
     border_px: int
-    limb: int
+    silhouette: int
     of_kind: int
     slow_px_s: float
     unit_px_s: float

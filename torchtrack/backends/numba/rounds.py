@@ -12,11 +12,11 @@ from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, at_depth, centre_of, drift, entries, lens
 from torchtrack.backends.numba.index import cells_of
-from torchtrack.backends.numba.association import (
+from torchtrack.backends.numba.matching import (
     AGE,
     DIRECTION_U,
     DIRECTION_V,
-    IS_LIMB,
+    IS_SMOOTH,
     MATCH_AGE,
     POINT_X,
     POINT_Y,
@@ -65,7 +65,7 @@ def align(
     centre_obj: Array,
     gates_px: Array,
     wider: Array,
-    finely: Array,
+    subcell_lookup: Array,
     matching: MatchingSettings,
     rounds: RoundSettings,
     damping: DampingSettings,
@@ -103,7 +103,7 @@ def align(
             change = drift(rounds.compensated * (acceleration[b] + rate_hz[b] * offset[b, 6:12]), centre)
             match(
                 seen[b], exists[b], place, table[b], nearest_of_cell[b], first[b], cells, entries(T_cam_obj[b]), moving, change, of_lens,
-                gates_px[r], wider[r, b], finely[b], matching, contour[b], is_near[b], is_matched[b], matches[b], votes,
+                gates_px[r], wider[r, b], subcell_lookup[b], matching, contour[b], is_near[b], is_matched[b], matches[b], votes,
             )  # fmt: skip
             believe(seen[b], is_matched[b], matches[b], matching)
             pose, scale_px = entries(T_cam_obj[b]), gates_px[r] * wider[r, b]
@@ -137,16 +137,16 @@ def _linearise(
     weights: Array,
 ) -> int:
     """Fill rows of the Jacobian, with residuals, and weights of those that count; how many these are."""
-    used, swelling, middle = 0, offset[UNKNOWNS - 1], (centre[0], centre[1], centre[2])
+    used, silhouette_offset, middle = 0, offset[UNKNOWNS - 1], (centre[0], centre[1], centre[2])
     for i in range(matches.shape[1]):
         weight = matches[WEIGHT, i]
         if not weight > 0:
             continue
         px, py, pz = matches[POINT_X, i] - centre_obj[0], matches[POINT_Y, i] - centre_obj[1], matches[POINT_Z, i] - centre_obj[2]
-        nu, nv, outward = matches[DIRECTION_U, i], matches[DIRECTION_V, i], matches[IS_LIMB, i]
+        nu, nv, outward = matches[DIRECTION_U, i], matches[DIRECTION_V, i], matches[IS_SMOOTH, i]
         there = (matches[TARGET_U, i] - intrinsics[2]) * nu + (matches[TARGET_V, i] - intrinsics[3]) * nv
         row, residual = row_of(pose, px, py, pz, middle, intrinsics, nu, nv, there)
-        residual += outward * swelling
+        residual += outward * silhouette_offset
         relative = residual / scale_px
         robust = max(1.0 - relative * relative, 0.0)
         if robust == 0.0:
@@ -187,7 +187,7 @@ def align_rounds_numba(
         *as_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
         cells_of(table.index),
         *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, objects.intrinsics, objects.centre_obj),
-        *as_arrays(constant(config.association.gates_px, offset.dtype, offset.device), gates.wider, gates.finely),
+        *as_arrays(constant(config.association.gates_px, offset.dtype, offset.device), gates.wider, gates.subcell_lookup),
         filled(MatchingSettings, config.association, config.solver, weights, **common),
         RoundSettings(config.association.motion_compensation, config.solver.velocity_in_window),
         damping_settings(config.solver, information),
@@ -212,7 +212,7 @@ def _acceleration(prediction: Prediction, config: TrackerConfig) -> tuple[Tensor
 def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 15 n"]) -> Matches:
     """The matches as the pipeline knows them."""
     weights, age_s, points, targets, directions, *rest = rows.split((1, 1, 3, 2, 2, 1, 1, 1, 1, 1, 1), 1)
-    offsets, limb, beside, mistaken, dark, as_expected = (value[:, 0] for value in rest)
+    offsets, silhouette, neighbours, edge_ambiguity, dark, as_expected = (value[:, 0] for value in rest)
     points_obj, targets, directions = (value.transpose(1, 2) for value in (points, targets, directions))
-    told = weights[:, 0], age_s[:, 0], points_obj, targets, directions, offsets
-    return Matches(contour, is_matched, *told, is_near, limb, beside, mistaken, dark, as_expected)
+    geometry = weights[:, 0], age_s[:, 0], points_obj, targets, directions, offsets
+    return Matches(contour, is_matched, *geometry, is_near, silhouette, neighbours, edge_ambiguity, dark, as_expected)

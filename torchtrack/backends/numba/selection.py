@@ -90,9 +90,9 @@ def _find(
     for j in range(looked_at):
         i = np.uint64(own[j]) if len(own) else np.uint64(j)
         speed_u, speed_v = at_depth(motion, depth_m, u[i], v[i], of_lens)
-        found = nearest(nearest_of_cell, first, u[i] + speed_u * age_s[i], v[i] + speed_v * age_s[i], cells)
+        nearest_index = nearest(nearest_of_cell, first, u[i] + speed_u * age_s[i], v[i] + speed_v * age_s[i], cells)
         near[total] = i
-        total += np.uint64(mask[i] and found >= 0)
+        total += np.uint64(mask[i] and nearest_index >= 0)
     return np.int64(total)
 
 

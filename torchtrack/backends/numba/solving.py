@@ -91,11 +91,11 @@ def _look(
     """Gradient and Hessian at a pose and an offset from the prior, filled, and the cost there."""
     points, targets, directions, weights, age_s, outward, velocity, rate_hz = problem
     intrinsics, centre_obj, scale_px, information = of_object
-    unknowns, centre, cost, used, beside = len(offset), np.empty(3), 0.0, 0, np.zeros(_POSE)
+    unknowns, centre, cost, used, velocity_offset = len(offset), np.empty(3), 0.0, 0, np.zeros(_POSE)
     centre_of(pose, centre_obj, centre)
     numbers, c, middle = entries(pose), (centre_obj[0], centre_obj[1], centre_obj[2]), (centre[0], centre[1], centre[2])
     if unknowns > _POSE:
-        beside[:] = offset[_POSE : 2 * _POSE] - velocity
+        velocity_offset[:] = offset[_POSE : 2 * _POSE] - velocity
     for i in range(len(weights)):
         if not weights[i] > 0:
             continue
@@ -108,7 +108,7 @@ def _look(
             # Linear in all that is unknown beside the pose; the targets have been moved with one velocity already.
             for k in range(_POSE):
                 rows[_POSE + k, used] = row[k] * age_s[i] * (0.5 * age_s[i] * rate_hz[k] - 1.0)
-                residual += rows[_POSE + k, used] * beside[k]
+                residual += rows[_POSE + k, used] * velocity_offset[k]
             rows[2 * _POSE, used] = outward[i]
             residual += outward[i] * offset[2 * _POSE]
         weight, lost = robustly(residual, scale_px, loss)

@@ -19,7 +19,7 @@ from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.contours.objects import LearnedPoints
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.validation.measures import measured_share
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 # The model's share that is assumed at first, how fast it follows, and how much more of it ends the need of learned contours.
 _FIRST_SHARE, _SHARE_GAIN, _MORE_SHARE = 0.7, 0.2, 0.2
@@ -87,7 +87,7 @@ class LearnedContours:
 
 def judge_model(
     learned: LearnedContours,
-    found: Found,
+    scored: ScoredFit,
     velocity: Callable[[Contours], Tensor],
     image_size: tuple[int, int],
     config: TrackerConfig,
@@ -103,9 +103,9 @@ def judge_model(
         velocity: gives the image velocity of contours (px/s).
         any_count: whether any learned contours were among those of the fit.
     """
-    contours = found.fit.contours
-    share = _share_of_own(found, velocity(contours), image_size, config) if any_count else found.measured
-    known = torch.isfinite(share) & (found.count > 0)
+    contours = scored.fit.contours
+    share = _share_of_own(scored, velocity(contours), image_size, config) if any_count else scored.measured
+    known = torch.isfinite(share) & (scored.count > 0)
     share = torch.where(known, torch.lerp(learned.model_share, share, _SHARE_GAIN), learned.model_share)
     enough = share > config.adaptation.below_ratio + _MORE_SHARE
     if learned.windows < _START_WINDOWS:
@@ -113,9 +113,9 @@ def judge_model(
     return replace(learned, model_share=share, needed=(learned.needed & ~enough) | (share < config.adaptation.below_ratio))
 
 
-def _share_of_own(found: Found, velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: TrackerConfig) -> Float[Tensor, "b"]:
+def _share_of_own(scored: ScoredFit, velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: TrackerConfig) -> Float[Tensor, "b"]:
     """Share of the moving contours of the model itself that events explain; not a number where hardly any move."""
-    contours, matches = found.fit.contours, found.fit.matches
+    contours, matches = scored.fit.contours, scored.fit.matches
     own = contours.kind != int(ContourKind.LEARNED)
     matches = replace(matches, near=matches.near & own.gather(1, matches.contour))
     return measured_share(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config.validation)

@@ -26,7 +26,7 @@ _LATE_PX, _FAR_ENOUGH_PX = 2.0, 2.5
 # Shares of events that are late up to which circuits are fast, and from which they are slow: measured, 0.01 to 0.1, and 0.1 to 0.35.
 _FAST, _SLOW = 0.07, 0.12
 # What was not seen well for so long (s) is dated back in full.
-_UNSEEN_S = 0.02
+_NOT_VALIDATED_S = 0.02
 # It changes with the light, and is looked at so often (µs). Events that are remembered: those of some five such windows.
 LOOK_US, _REMEMBERED = 20_000, 5_000.0
 
@@ -41,7 +41,9 @@ def slowness(late_share: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     return ((late_share - _FAST) / (_SLOW - _FAST)).clamp(0, 1)
 
 
-def dated(observations: Observations, late_share: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], config: AssociationConfig) -> Observations:
+def dated(
+    observations: Observations, late_share: Float[Tensor, "b"], time_since_validated_s: Float[Tensor, "b"], config: AssociationConfig
+) -> Observations:
     """The observations as late in their bursts as counts: less so, and then not dated back so far, the faster circuits are.
 
     Of what is not seen well all are dated back: less exact, but events of what moves otherwise gather less.
@@ -51,7 +53,7 @@ def dated(observations: Observations, late_share: Float[Tensor, "b"], unseen_s: 
     """
     if not _tells(config):
         return observations
-    counts = torch.maximum(slowness(late_share), (unseen_s / _UNSEEN_S).clamp(max=1))
+    counts = torch.maximum(slowness(late_share), (time_since_validated_s / _NOT_VALIDATED_S).clamp(max=1))
     return replace(observations, into_burst_s=observations.into_burst_s * counts[:, None])
 
 

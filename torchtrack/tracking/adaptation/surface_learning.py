@@ -26,7 +26,7 @@ from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, assemble, joined
 from torchtrack.tracking.contours.surface_rays import surface_points
 from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 # Older events are left out where the object has since moved by more than this (px).
 _LONGEST_WAY_PX = 4.0
@@ -97,7 +97,7 @@ class _Sample:
 def learn_after(
     learned: LearnedContours,
     around: Surroundings,
-    found: Found,
+    scored: ScoredFit,
     events: ObjectEvents,
     wanted: Bool[Tensor, "b"] | None,
     config: TrackerConfig,
@@ -108,7 +108,7 @@ def learn_after(
         wanted: objects to learn of, from the state before the window; none where the window is not due.
     """
     velocity, image_size, any_count = around.contour_velocity, around.objects.image_size, around.objects.learned is not None
-    learned = judge_model(learned, found, velocity, image_size, config, any_count=any_count)
+    learned = judge_model(learned, scored, velocity, image_size, config, any_count=any_count)
     if wanted is None or host_sync.none_of(wanted):
         return learned
     return learned.but_of(wanted, learn(learned, around, events.rows(), config))
@@ -156,10 +156,10 @@ def _weighed(evidence: Tensor, known: Contours, around: Surroundings, grid: Cell
         y = place[:, None, :, 1] - along * normal_x + side * normal_y
         return events.gather(1, cell_of(x, y).flatten(1)).view(x.shape).sum(1)
 
-    on, beside = count(_ON_CELLS), count(_BESIDE_CELLS)
+    on, around_count = count(_ON_CELLS), count(_BESIDE_CELLS)
     way_px = (known.normals * around.contour_velocity(known)).sum(-1).abs() * around.window_s[:, None]
     silent = torch.where(way_px > _LEAST_WAY_PX, -_SILENT, 0.0)
-    change = torch.where(on + beside == 0, silent, torch.where(on > _ON_TO_BESIDE * beside, 1.0, -1.0))
+    change = torch.where(on + around_count == 0, silent, torch.where(on > _ON_TO_BESIDE * around_count, 1.0, -1.0))
     return torch.where(known.mask & around.learning[:, None], (evidence + change).clamp(0, _MOST_EVIDENCE), evidence)
 
 

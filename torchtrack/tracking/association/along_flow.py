@@ -34,7 +34,7 @@ def match_along_flow(observations: Observations, contours: Contours, objects: Mo
     directions = take_points(contours.normals, contour)
     mask = observations.mask & observations.has_flow & torch.isfinite(distance)
     offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
-    limb = (contours.kind == int(ContourKind.LIMB)).gather(1, contour).to(offsets.dtype)
+    silhouette = (contours.kind == int(ContourKind.SMOOTH)).gather(1, contour).to(offsets.dtype)
     none, all_of_it = torch.zeros_like(offsets), torch.ones_like(offsets)
-    told = observations.age_s, points_obj, targets, directions, offsets, mask
-    return Matches(contour, mask, all_of_it, *told, limb, beside=none, mistaken_px2=none, dark=none, as_expected=all_of_it)
+    geometry = observations.age_s, points_obj, targets, directions, offsets, mask
+    return Matches(contour, mask, all_of_it, *geometry, silhouette, neighbours=none, edge_ambiguity_px2=none, dark=none, as_expected=all_of_it)

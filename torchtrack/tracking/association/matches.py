@@ -37,9 +37,9 @@ class Matches:
     directions: Float[Tensor, "b n 2"]
     offsets: Float[Tensor, "b n"]
     near: Bool[Tensor, "b n"]
-    limb: Float[Tensor, "b n"]
-    beside: Float[Tensor, "b n"]
-    mistaken_px2: Float[Tensor, "b n"]
+    silhouette: Float[Tensor, "b n"]
+    neighbours: Float[Tensor, "b n"]
+    edge_ambiguity_px2: Float[Tensor, "b n"]
     dark: Float[Tensor, "b n"]
     as_expected: Float[Tensor, "b n"]
 

@@ -17,9 +17,9 @@ from torchtrack.tracking.association.polarity import octant
 from torchtrack.tracking.association.weights import (
     agreeing,
     dark_shift_px,
+    edge_ambiguity_px2,
     leading_side,
     match_weights,
-    mistaken_px2,
 )
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
@@ -49,7 +49,7 @@ class ContourTable:
 
 @accelerable
 def contour_table(
-    contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_print: bool = True, close_px: float = 0.0
+    contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_texture: bool = True, close_px: float = 0.0
 ) -> ContourTable:
     """The table of contours and their index.
 
@@ -60,14 +60,14 @@ def contour_table(
         of_print: whether anything is expected of print.
         close_px: distance from which parallel edges are told apart; 0 for always.
     """
-    limb, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.LIMB, ContourKind.CREASE, ContourKind.TEXTURE))
-    oriented, expected = limb | crease, (texture & of_print).to(contours.pixels.dtype)
+    silhouette, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.SMOOTH, ContourKind.CREASE, ContourKind.TEXTURE))
+    oriented, expected = silhouette | crease, (texture & of_texture).to(contours.pixels.dtype)
     if polarity is not None:
         expected = torch.where(oriented, polarity.gather(1, octant(contours.normals)), expected)
-    mistaken = mistaken_px2(contours, index, oriented, crease, close_px) if close_px else torch.zeros_like(expected)
-    marks = torch.stack([limb.to(expected.dtype), oriented.to(expected.dtype), expected, mistaken], -1)
+    edge_ambiguity = edge_ambiguity_px2(contours, index, oriented, crease, close_px) if close_px else torch.zeros_like(expected)
+    marks = torch.stack([silhouette.to(expected.dtype), oriented.to(expected.dtype), expected, edge_ambiguity], -1)
     values = (contours.points_obj, contours.normals, index.pixels, marks)
-    return ContourTable(torch.cat([value.transpose(1, 2) for value in values], 1), index, ((limb | texture) & contours.mask).any(1))
+    return ContourTable(torch.cat([value.transpose(1, 2) for value in values], 1), index, ((silhouette | texture) & contours.mask).any(1))
 
 
 def match_nearest(
@@ -78,7 +78,7 @@ def match_nearest(
     gate_px: float,
     config: AssociationConfig,
     wider: Float[Tensor, "b"] | None = None,
-    finely: Bool[Tensor, "b"] | None = None,
+    subcell_lookup: Bool[Tensor, "b"] | None = None,
 ) -> tuple[Matches, Float[Tensor, "b n 2"]]:
     """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
 
@@ -90,8 +90,8 @@ def match_nearest(
         finely: objects whose contours are looked up finely; none where not given.
     """
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
-    found = table.index.look_up(place, finely)
-    points_obj, normals, indexed, limb, oriented, expected, mistaken = table.take(contour := found.clamp(min=0))
+    nearest_index = table.index.look_up(place, subcell_lookup)
+    points_obj, normals, indexed, silhouette, oriented, expected, edge_ambiguity = table.take(contour := nearest_index.clamp(min=0))
     pixels, velocity, change = objects.show(points_obj)
     crossing_px_s = vecdot(normals, velocity)
     dark = observations.polarity * leading_side(crossing_px_s)
@@ -100,13 +100,15 @@ def match_nearest(
     if change is not None:
         # It had moved less, or more, when it was slower or faster.
         carried = torch.addcmul(carried, change, age_s[..., None].square(), value=-0.5)
-    targets = torch.addcmul(carried, normals, (dark * dark_shift_px(limb, config))[..., None], value=-1)
+    targets = torch.addcmul(carried, normals, (dark * dark_shift_px(silhouette, config))[..., None], value=-1)
     difference = pixels - targets
-    near = observations.mask & (found >= 0)
+    near = observations.mask & (nearest_index >= 0)
     matched = near & (vecdot(difference, difference) < (gate_px * wider)[:, None].square())
     offsets = vecdot(difference, normals) / wider[:, None]
     as_expected, dark = agreeing(dark * expected, config), dark * oriented
-    weights, beside = match_weights(offsets, targets, near, dark, as_expected, config)
-    matches = Matches(contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, limb, beside, mistaken, dark, as_expected)
+    weights, neighbours = match_weights(offsets, targets, near, dark, as_expected, config)
+    matches = Matches(
+        contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, silhouette, neighbours, edge_ambiguity, dark, as_expected
+    )
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)

@@ -34,7 +34,9 @@ def octant(directions: Float[Tensor, "*n 2"]) -> Int[Tensor, "*n"]:
     return (u > 0).long() + 2 * (v > 0) + 4 * (u.abs() > v.abs())
 
 
-def expected_polarity(darker_outside: Float[Tensor, "b 8"], score: Float[Tensor, "b"], full_share: Float[Tensor, "b"]) -> Float[Tensor, "b 8"]:
+def expected_polarity(
+    darker_outside: Float[Tensor, "b 8"], score: Float[Tensor, "b"], reference_explained_ratio: Float[Tensor, "b"]
+) -> Float[Tensor, "b 8"]:
     """What events on contours are expected to say of their darker side: 1 for the outer one, -1 for the inner one, 0 for nothing.
 
     Args:
@@ -42,19 +44,19 @@ def expected_polarity(darker_outside: Float[Tensor, "b 8"], score: Float[Tensor,
         score: of each object, in the window before.
         full_share: explained when the object is seen well.
     """
-    seen = score / full_share.clamp(min=_LEAST_FULL)
+    seen = score / reference_explained_ratio.clamp(min=_LEAST_FULL)
     counts = ((_SEEN - seen) / (_SEEN - _HARDLY_SEEN)).clamp(0, 1)
     return counts[:, None] * darker_outside * darker_outside.abs()
 
 
-def is_asked(score: Float[Tensor, "b"], full_share: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
+def is_asked(score: Float[Tensor, "b"], reference_explained_ratio: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
     """Of which objects anything is expected at all: those that explain less than when they are seen well."""
-    return score < _SEEN * full_share.clamp(min=_LEAST_FULL)
+    return score < _SEEN * reference_explained_ratio.clamp(min=_LEAST_FULL)
 
 
-def is_seen_well(share: Float[Tensor, "b"], full_share: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
+def is_seen_well(share: Float[Tensor, "b"], reference_explained_ratio: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
     """Which objects explain enough for their contours' sides to be remembered."""
-    return share >= _SEEN_WELL * full_share.clamp(min=_LEAST_FULL)
+    return share >= _SEEN_WELL * reference_explained_ratio.clamp(min=_LEAST_FULL)
 
 
 @accelerable

@@ -21,7 +21,7 @@ from torchtrack.tracking.motion.prediction import Prediction
 
 
 @dataclass(frozen=True)
-class Evidence:
+class WeightingInputs:
     """One window of every object, at the predicted pose; all constants, as far as gradients go.
 
     Args:
@@ -50,13 +50,13 @@ class Evidence:
         return self.history.age_s(pixels)
 
 
-def judged(evidence: Evidence, weigher: nn.Module) -> Observations:
+def judged(evidence: WeightingInputs, weighting_network: nn.Module) -> Observations:
     """The observations, with how far a weigher believes each of them.
 
     Raises:
         ValueError: if the weigher gives something else than one number for each observation.
     """
-    trust = weigher(evidence)
+    trust = weighting_network(evidence)
     expected = evidence.observations.age_s.shape
     if trust.shape != expected:
         raise ValueError(f"a weigher must give one number for each observation, shape {list(expected)}; got {list(trust.shape)}.")
@@ -124,7 +124,7 @@ class _Frame:
         return u + across * nu - along * nv, v + across * nv + along * nu
 
 
-def trust_features(evidence: Evidence) -> Float[Tensor, "b n f"]:
+def trust_features(evidence: WeightingInputs) -> Float[Tensor, "b n f"]:
     """What describes each observation: numbers of about unit size."""
     observations, frame = evidence.observations, _frame(evidence)
     polarity = observations.polarity
@@ -144,27 +144,27 @@ def trust_features(evidence: Evidence) -> Float[Tensor, "b n f"]:
 
 
 @accelerable
-def limb_features(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
+def silhouette_features(evidence: WeightingInputs) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
     """:func:`trust_features`, which observations are nearest to the limb of a smooth surface, and of which objects there may be any.
 
     Of other observations and other objects they need not be told.
     """
     features = trust_features(evidence)
-    of_limb = features[..., OF_KIND + int(ContourKind.LIMB)] * features[..., -1] > 0
-    return features, of_limb & evidence.observations.mask, torch.arange(len(features), device=features.device)
+    of_silhouette = features[..., OF_KIND + int(ContourKind.SMOOTH)] * features[..., -1] > 0
+    return features, of_silhouette & evidence.observations.mask, torch.arange(len(features), device=features.device)
 
 
-def _frame(evidence: Evidence) -> _Frame:
+def _frame(evidence: WeightingInputs) -> _Frame:
     """Nearest contours, as the predicted motion says."""
     observations, contours, prediction = evidence.observations, evidence.contours, evidence.prediction
     plane = prediction.plane_velocity(observations.pixels)
-    found = evidence.index.look_up(torch.addcmul(observations.pixels, plane, observations.age_s[..., None]))
+    nearest_index = evidence.index.look_up(torch.addcmul(observations.pixels, plane, observations.age_s[..., None]))
     table = torch.cat([contours.normals, prediction.contour_velocity(contours), contours.kind[..., None].to(plane.dtype)], -1)
-    normals, velocity, kind = take_points(table, found.clamp(min=0)).split([2, 2, 1], -1)
+    normals, velocity, kind = take_points(table, nearest_index.clamp(min=0)).split([2, 2, 1], -1)
     speed = (normals * velocity).sum(-1)
     outward = torch.where(speed < 0, -1.0, 1.0).to(speed.dtype)
     moved = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
-    return _Frame(found >= 0, kind[..., 0].long(), outward[..., None] * normals, outward, speed.abs().clamp(min=SLOW_PX_S), moved)
+    return _Frame(nearest_index >= 0, kind[..., 0].long(), outward[..., None] * normals, outward, speed.abs().clamp(min=SLOW_PX_S), moved)
 
 
 def _age_share(observations: Observations) -> Float[Tensor, "b n"]:
@@ -173,7 +173,7 @@ def _age_share(observations: Observations) -> Float[Tensor, "b n"]:
     return observations.age_s / oldest_s.clamp(min=1e-6)
 
 
-def _ages(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
+def _ages(evidence: WeightingInputs, frame: _Frame) -> Float[Tensor, "b n p"]:
     """How much older than the observation the time surface is across the contour, in px of the edge's motion."""
     observations = evidence.observations
     places = torch.stack(frame.around(observations.pixels, (0.0,)), -1)
@@ -182,7 +182,7 @@ def _ages(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
     return behind_px.clamp(-OLDEST_PX, OLDEST_PX) / OLDEST_PX
 
 
-def _counts(evidence: Evidence, frame: _Frame) -> Float[Tensor, "b n p"]:
+def _counts(evidence: WeightingInputs, frame: _Frame) -> Float[Tensor, "b n p"]:
     """Events of the observation's own polarity and of the other, around it, all moved to the window's end with the object."""
     events = evidence.events
     moved = evidence.prediction.carried(events.pixels, events.age_s)

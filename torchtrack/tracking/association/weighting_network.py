@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchtrack.config.tracker import AssociationConfig
 from torchtrack.errors import UnknownFormatError
 from torchtrack.object_model.contour_source import ContourModel
-from torchtrack.tracking.association.weighting_features import FEATURES, Evidence, limb_features, trust_features
+from torchtrack.tracking.association.weighting_features import FEATURES, WeightingInputs, silhouette_features, trust_features
 
 _SHIPPED = "learned.safetensors"
 
@@ -52,7 +52,7 @@ class TrustNetwork(nn.Module):
         """The network itself: log odds that observations are of their contour."""
         return self.layers(features)[..., 0]
 
-    def forward(self, evidence: Evidence) -> Float[Tensor, "b n"]:
+    def forward(self, evidence: WeightingInputs) -> Float[Tensor, "b n"]:
         """How far each observation is to be believed, 0 to 1."""
         return torch.sigmoid(self.logits(trust_features(evidence)))
 
@@ -61,7 +61,7 @@ class TrustNetwork(nn.Module):
         return save({name: value.contiguous() for name, value in self.state_dict().items()})
 
 
-class LimbTrust(nn.Module):
+class SilhouetteTrust(nn.Module):
     """A weigher: believes observations of the limbs of smooth surfaces as a network does, and all others in full.
 
     What fires beside a sharp edge is nearly always of that edge, and few of them hold a pose: whatever is believed less there
@@ -72,19 +72,19 @@ class LimbTrust(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, evidence: Evidence) -> Float[Tensor, "b n"]:
+    def forward(self, evidence: WeightingInputs) -> Float[Tensor, "b n"]:
         """How far each observation is to be believed, 0 to 1."""
-        features, is_limb, objects = limb_features(evidence)
+        features, is_smooth, objects = silhouette_features(evidence)
         trust = torch.sigmoid(self.network.logits(features))
-        if len(objects) < len(is_limb):
-            trust = trust.new_ones(is_limb.shape).index_copy(0, objects, trust)
-        return torch.where(is_limb, trust, 1.0)
+        if len(objects) < len(is_smooth):
+            trust = trust.new_ones(is_smooth.shape).index_copy(0, objects, trust)
+        return torch.where(is_smooth, trust, 1.0)
 
 
-def shipped_weigher(models: Sequence[ContourModel], config: AssociationConfig) -> nn.Module | None:
+def shipped_network(models: Sequence[ContourModel], config: AssociationConfig) -> nn.Module | None:
     """The weigher that ``weighting_network`` asks for; none where it has nothing to say of these models."""
     if config.weighting_network == "all":
         return TrustNetwork.shipped()
     if config.weighting_network == "limbs" and any(bool(model.is_bent.any()) for model in models):
-        return LimbTrust(TrustNetwork.shipped())
+        return SilhouetteTrust(TrustNetwork.shipped())
     return None

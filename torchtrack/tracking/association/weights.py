@@ -27,7 +27,7 @@ TOUCHING_PX, DEPTH_SHARE = 0.1, 0.2
 SORTED_PX2 = 0.3
 
 
-def told_by_each(beside: Float[Tensor, "b n"], common_px2: Float[Tensor, "b n"], observation_px: float) -> Float[Tensor, "b n"]:
+def effective_weight(neighbours: Float[Tensor, "b n"], common_px2: Float[Tensor, "b n"], observation_px: float) -> Float[Tensor, "b n"]:
     """What each of so many observations in one place of the image tells, of what it would tell alone.
 
     Side by side they err alike, so the mean of n has a variance of ``common_px2 + observation_px² / n``. Otherwise a pose would
@@ -38,10 +38,10 @@ def told_by_each(beside: Float[Tensor, "b n"], common_px2: Float[Tensor, "b n"],
         common_px2: variance of what they have in common (px²).
         observation_px: standard deviation of what each has alone.
     """
-    return torch.addcmul(scalar_one(beside), beside, common_px2, value=observation_px**-2).reciprocal()
+    return torch.addcmul(scalar_one(neighbours), neighbours, common_px2, value=observation_px**-2).reciprocal()
 
 
-def mistaken_px2(
+def edge_ambiguity_px2(
     contours: Contours, index: ContourIndex, of_edges: Bool[Tensor, "b m"], sharp: Bool[Tensor, "b m"], close_px: float
 ) -> Float[Tensor, "b m"]:
     """Mean square of how far off what is seen on each contour point is, should it be of the edge beside (px²).
@@ -61,11 +61,11 @@ def mistaken_px2(
     """
     pixels, normals = contours.pixels[:, None], contours.normals[:, None]
     aside_px = constant((-ASIDE_PX, ASIDE_PX), pixels.dtype, pixels.device)[:, None]
-    found = index.look_up(torch.addcmul(pixels, normals, aside_px[..., None]).flatten(1, 2))
+    nearest_index = index.look_up(torch.addcmul(pixels, normals, aside_px[..., None]).flatten(1, 2))
     counts = contours.mask & of_edges
     depth_m = contours.points_cam[..., 2]
     marks = torch.stack([counts.to(pixels.dtype), sharp.to(pixels.dtype), depth_m], -1)
-    known = take_points(torch.cat([contours.pixels, contours.normals, marks], -1), found.clamp(min=0)).unflatten(1, (2, -1))
+    known = take_points(torch.cat([contours.pixels, contours.normals, marks], -1), nearest_index.clamp(min=0)).unflatten(1, (2, -1))
     other_pixels, other_normals, other_marks = known.split((2, 2, 3), -1)
     is_edge, is_sharp, other_depth_m = other_marks.unbind(-1)
     apart_px = vecdot(other_pixels - pixels, normals)
@@ -75,7 +75,7 @@ def mistaken_px2(
     # To the side that was looked at, and not the same edge.
     beyond_px = apart_px * aside_px / ASIDE_PX
     is_apart = (beyond_px > APART_PX) | (is_deep & (beyond_px > TOUCHING_PX))
-    is_other = is_apart & is_parallel & counts[:, None] & (is_edge > 0) & (found >= 0).unflatten(1, (2, -1))
+    is_other = is_apart & is_parallel & counts[:, None] & (is_edge > 0) & (nearest_index >= 0).unflatten(1, (2, -1))
     squared = apart_px.square()
     seeming = torch.where(is_deep, squared + SORTED_PX2, squared)
     return torch.where(is_other, 0.5 * seeming * torch.exp(squared * -(close_px**-2)), 0).amax(1)
@@ -99,9 +99,13 @@ def leading_side(speed_px_s: Tensor) -> Tensor:
     return speed_px_s / (speed_px_s.abs() + constant((SLOW_PX_S,), speed_px_s.dtype, speed_px_s.device))
 
 
-def dark_shift_px(limb: Tensor, config: AssociationConfig) -> Tensor:
+def dark_shift_px(silhouette: Tensor, config: AssociationConfig) -> Tensor:
     """How far events lie to the dark side of their edge: a step's, or, less, that of a limb, towards which shading fades."""
-    return torch.add(constant((config.dark_shift_px,), limb.dtype, limb.device), limb, alpha=config.silhouette_dark_shift_px - config.dark_shift_px)
+    return torch.add(
+        constant((config.dark_shift_px,), silhouette.dtype, silhouette.device),
+        silhouette,
+        alpha=config.silhouette_dark_shift_px - config.dark_shift_px,
+    )
 
 
 def match_weights(

@@ -51,7 +51,7 @@ class ContourIndex:
     pixels: Float[Tensor, "b m 2"]
     radius_px: host_sync.AsyncValue
 
-    def look_up(self, pixels: Float[Tensor, "b n 2"], finely: Bool[Tensor, "b"] | None = None) -> Int[Tensor, "b n"]:
+    def look_up(self, pixels: Float[Tensor, "b n 2"], subcell_lookup: Bool[Tensor, "b"] | None = None) -> Int[Tensor, "b n"]:
         """The contour point nearest to the centre of each pixel's cell, -1 where none is near.
 
         Args:
@@ -62,9 +62,9 @@ class ContourIndex:
         # Whole cells first: rounded the same way wherever the region begins.
         column, row = pixels.add(0.5 * self.cell_px + OFF_BORDER_PX).div_(self.cell_px).floor_().sub_(self.first[:, None]).unbind(-1)
         nearest = self.nearest.gather(1, self._flat(column.clamp(0, columns - 1), row.clamp(0, rows - 1))).long()
-        if finely is None or host_sync.none_of(finely):
+        if subcell_lookup is None or host_sync.none_of(subcell_lookup):
             return nearest
-        return torch.where(finely[:, None], self._nearest_of_four(pixels), nearest)
+        return torch.where(subcell_lookup[:, None], self._nearest_of_four(pixels), nearest)
 
     def _nearest_of_four(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
         """The nearest to each pixel of the contour points that the four cells around it know."""

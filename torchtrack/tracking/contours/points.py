@@ -39,7 +39,7 @@ class Contours:
     pixels: Float[Tensor, "b m 2"]
     normals: Float[Tensor, "b m 2"]
 
-    def of(self, number: int) -> "Contours":
+    def of_object(self, number: int) -> "Contours":
         """Those of one object."""
         return Contours(*(value[number : number + 1] for value in vars(self).values()))
 

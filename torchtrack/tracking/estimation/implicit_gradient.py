@@ -54,11 +54,11 @@ def with_gradient(problem: PoseProblem, solution: Linearisation, config: SolverC
         return solution
     exact: PoseProblem = _in_double(problem)
     counted = _counted(exact)
-    found = _Place(solution.T_cam_obj.detach().double(), solution.from_prior.detach().double()[:, 6:])
-    optimum = _optimum(counted, found, config)
+    optimum_place = _Place(solution.T_cam_obj.detach().double(), solution.from_prior.detach().double()[:, 6:])
+    optimum = _optimum(counted, optimum_place, config)
     step, _ = newton_step(exact, optimum.T_cam_obj, optimum.further, config.loss, counted)
     step = torch.where(torch.isfinite(solution.gradient), step, 0)
-    T_cam_obj, from_prior = found.moved(step - step.detach(), exact)
+    T_cam_obj, from_prior = optimum_place.moved(step - step.detach(), exact)
     followed = (from_prior - from_prior.detach()).to(solution.from_prior.dtype)
     return replace(solution, T_cam_obj=T_cam_obj.to(solution.T_cam_obj.dtype), from_prior=solution.from_prior.detach() + followed)
 

@@ -154,8 +154,8 @@ def solve_pose(
         new, old = ((*vars(at).values(), *rest) for at, rest in ((next_place, (*next_equations, next_cost)), (place, (gradient, hessian, cost))))
         *where, gradient, hessian, cost = _choose(better, new, old)
         place = Place(*where)
-    found = place.moved(_last_step(gradient, hessian, damping))
-    return Linearisation(found.pose(problem), gradient, hessian, found.from_prior)
+    last_place = place.moved(_last_step(gradient, hessian, damping))
+    return Linearisation(last_place.pose(problem), gradient, hessian, last_place.from_prior)
 
 
 def _look(terms: Sequence[CostTerm], place: Place, loss: str, *, judged: bool) -> tuple[Tensor, Tensor, Tensor]:

@@ -15,7 +15,7 @@ from torchtrack.tracking.association.along_flow import match_along_flow
 from torchtrack.tracking.association.matches import Matches, both_coordinates
 from torchtrack.tracking.association.nearest import ContourTable, contour_table, match_nearest
 from torchtrack.tracking.association.observations import Observations
-from torchtrack.tracking.association.weights import told_by_each
+from torchtrack.tracking.association.weights import effective_weight
 from torchtrack.tracking.contours.index import ContourIndex, index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject
@@ -29,7 +29,7 @@ _INDEX_MARGIN_PX = 2
 # What has to be looked for with a gate this many times wider may be anywhere.
 ANYWHERE = 2.0
 # Standard deviation of a swelling that is switched off (px).
-_NO_SWELLING_PX = 1e-3
+_NO_SILHOUETTE_OFFSET_PX = 1e-3
 
 
 @dataclass(frozen=True)
@@ -47,21 +47,21 @@ class Fit:
     matches: Matches
 
 
-def gate_widening(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[Tensor, "b"]:
+def gate_scale_of(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[Tensor, "b"]:
     """How many times wider than configured the first gate is, for predictions of that standard deviation: at least 1."""
     matching = config.association
     first_px = matching.gates_px[0]
     return (matching.gate_sigmas * sigma_px / first_px).clamp(1, max(matching.max_gate_px / first_px, 1))
 
 
-def may_be_anywhere(widening: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
+def may_be_anywhere(gate_scale: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
     """Objects of whose place hardly anything was known, by the widening of their first gates."""
-    return widening >= ANYWHERE
+    return gate_scale >= ANYWHERE
 
 
-def index_radius(widening: Float[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:
+def index_radius(gate_scale: Float[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:
     """How far contours are to be found for each object's first gate (px)."""
-    return (widening * max(config.association.gates_px)).long() + _INDEX_MARGIN_PX
+    return (gate_scale * max(config.association.gates_px)).long() + _INDEX_MARGIN_PX
 
 
 def usual_index_radius(config: TrackerConfig) -> int:
@@ -70,21 +70,21 @@ def usual_index_radius(config: TrackerConfig) -> int:
 
 
 def index_for(
-    contours: Contours, image_size: tuple[int, int], config: TrackerConfig, widening: Float[Tensor, "b"], radius_px: AsyncValue | None = None
+    contours: Contours, image_size: tuple[int, int], config: TrackerConfig, gate_scale: Float[Tensor, "b"], radius_px: AsyncValue | None = None
 ) -> ContourIndex:
     """The index of contours, wide enough for each object's first gate.
 
     Args:
         radius_px: :func:`index_radius`, where it was asked for ahead.
     """
-    return index_contours(contours, image_size, radius_px or AsyncValue.to(index_radius(widening, config)), config.association.index_cell_px)
+    return index_contours(contours, image_size, radius_px or AsyncValue.to(index_radius(gate_scale, config)), config.association.index_cell_px)
 
 
 def align(
     prediction: Prediction,
     contours: Contours,
     index: ContourIndex,
-    widening: Float[Tensor, "b"],
+    gate_scale: Float[Tensor, "b"],
     observations: Observations,
     config: TrackerConfig,
     offset: Float[Tensor, "b 13"] | None = None,
@@ -106,7 +106,7 @@ def align(
     begin = prediction if offset is None else prediction.moved(offset)
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
     table = _table(contours, index, objects, matching)
-    gates = Gates(widening, _narrowing(widening, len(matching.gates_px)), _looked_up_finely(objects, begin, table, widening, matching))
+    gates = Gates(gate_scale, _narrowing(gate_scale, len(matching.gates_px)), _needs_subcell_lookup(objects, begin, table, gate_scale, matching))
     start = Start(prediction, begin, offset, information, contours, index, extra_terms)
     solution, matches, contours = align_rounds(start, table, observations, gates, config)
     return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
@@ -143,9 +143,9 @@ class Gates:
         finely: objects whose contours are looked up finely.
     """
 
-    widening: Float[Tensor, "b"]
+    gate_scale: Float[Tensor, "b"]
     wider: Float[Tensor, "r b"]
-    finely: Bool[Tensor, "b"]
+    subcell_lookup: Bool[Tensor, "b"]
 
 
 @accelerable
@@ -163,7 +163,7 @@ def align_rounds(
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, gates.wider, strict=True)):
         if number and number in config.contours.refresh_rounds:
             contours = objects.contours(begin.T_cam_obj, config.contours)
-            index = index_for(contours, objects.image_size, config, gates.widening, start.index.radius_px)
+            index = index_for(contours, objects.image_size, config, gates.gate_scale, start.index.radius_px)
             table = _table(contours, index, objects, matching)
             place = _first_place(begin, observations, config)
         moving = begin.moving(compensated=matching.motion_compensation, offset=offset if config.solver.acceleration_in_window else None)
@@ -171,7 +171,7 @@ def align_rounds(
             contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
             matches = match_along_flow(observations, contours, moving, gate_px, matching)
         else:
-            matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider, gates.finely)
+            matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider, gates.subcell_lookup)
         matches = _believed(matches, observations, config)
         problem = _problem(start, matches, offset, gate_px * wider, config)
         solution = solve_pose(problem, begin.T_cam_obj, config.solver, offset)
@@ -179,29 +179,29 @@ def align_rounds(
     return with_gradient(problem, solution, config.solver), matches, contours
 
 
-def _looked_up_finely(
-    objects: ObjectBatch, begin: Prediction, table: ContourTable, widening: Float[Tensor, "b"], config: AssociationConfig
+def _needs_subcell_lookup(
+    objects: ObjectBatch, begin: Prediction, table: ContourTable, gate_scale: Float[Tensor, "b"], config: AssociationConfig
 ) -> Bool[Tensor, "b"]:
     """Of which objects contours are looked up between the cells of the index: of small ones, and those of which print or smooth limbs are seen.
 
     Others of plain faces are not: their models may lack print, whose events then find the nearest edge all the more surely.
     """
-    finely = objects.size_px(begin.T_cam_obj).detach() < config.fine_below_px
+    subcell_lookup = objects.size_px(begin.T_cam_obj).detach() < config.fine_below_px
     if config.fine_unless_plain:
-        finely = finely | table.not_plain
+        subcell_lookup = subcell_lookup | table.not_plain
     # One that may be far off would settle on the first edges that it is nearest to.
-    return finely & (widening <= 1)
+    return subcell_lookup & (gate_scale <= 1)
 
 
 def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config: AssociationConfig) -> ContourTable:
     """What observations take from their contours, with the polarity that is expected of them."""
-    return contour_table(contours, index, objects.polarity, of_print=config.texture_polarity, close_px=config.edge_ambiguity_px)
+    return contour_table(contours, index, objects.polarity, of_texture=config.texture_polarity, close_px=config.edge_ambiguity_px)
 
 
-def _narrowing(widening: Float[Tensor, "b"], rounds: int) -> Float[Tensor, "r b"]:
+def _narrowing(gate_scale: Float[Tensor, "b"], rounds: int) -> Float[Tensor, "r b"]:
     """How many times wider than configured the gate of every round is: as given at first, not at all at last."""
     left = tuple((1 - number / max(rounds - 1, 1),) for number in range(rounds))
-    return widening ** constant(left, widening.dtype, widening.device)
+    return gate_scale ** constant(left, gate_scale.dtype, gate_scale.device)
 
 
 def _first_place(begin: Prediction, observations: Observations, config: TrackerConfig) -> Float[Tensor, "b n 2"]:
@@ -215,7 +215,7 @@ def _information(prediction: Prediction, config: TrackerConfig) -> Tensor:
     """Information of the prediction in the solver's chart, for observations of unit weight: 13 of them, or none for the pose."""
     if not config.solver.prior:
         return prediction.velocity.new_zeros(len(prediction.velocity), 6, 6)
-    silhouette_offset_px = config.solver.silhouette_offset_px or _NO_SWELLING_PX
+    silhouette_offset_px = config.solver.silhouette_offset_px or _NO_SILHOUETTE_OFFSET_PX
     information = pad((config.solver.observation_px**2 * prediction.information).to(prediction.velocity.dtype), (0, 1, 0, 1))
     information[:, 12, 12] = config.solver.observation_px**2 * silhouette_offset_px**-2
     return information
@@ -228,9 +228,9 @@ def _believed(matches: Matches, observations: Observations, config: TrackerConfi
         weights = weights * observations.trust
     enough = weights.sum(-1, keepdim=True) >= config.validation.min_observations
     # The model of a smooth limb, which has facets, and its shading put a whole piece of it off.
-    common_px2 = torch.add(matches.mistaken_px2, matches.limb, alpha=config.solver.common_px**2)
-    told = told_by_each(matches.beside, common_px2, config.solver.observation_px)
-    return replace(matches, mask=matches.mask & enough, weights=weights * enough * told)
+    common_px2 = torch.add(matches.edge_ambiguity_px2, matches.silhouette, alpha=config.solver.common_px**2)
+    effective = effective_weight(matches.neighbours, common_px2, config.solver.observation_px)
+    return replace(matches, mask=matches.mask & enough, weights=weights * enough * effective)
 
 
 def _problem(start: Start, matches: Matches, offset: Float[Tensor, "b k"], gate_px: Float[Tensor, "b"], config: TrackerConfig) -> PoseProblem:
@@ -254,7 +254,7 @@ def _problem(start: Start, matches: Matches, offset: Float[Tensor, "b k"], gate_
 
 def _window_terms(prediction: Prediction, rows: Matches, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
     """What observations tell beside the pose: of the velocity by their ages, and of how far limbs stand out."""
-    age_s, outward = rows.age_s, rows.limb
+    age_s, outward = rows.age_s, rows.silhouette
     if config.association.residual != "normal":
         outward = torch.zeros_like(outward)
     if not config.solver.velocity_in_window:

@@ -41,7 +41,7 @@ class WindowEvents:
         """How many each object has."""
         return self.mask.sum(-1)
 
-    def of(self, number: int) -> "WindowEvents":
+    def of_object(self, number: int) -> "WindowEvents":
         """The events of one object."""
         return self._with(lambda value: value[number : number + 1])
 
@@ -91,7 +91,7 @@ class SharedEvents:
         """How many each object has."""
         return self.count
 
-    def of(self, number: int) -> WindowEvents:
+    def of_object(self, number: int) -> WindowEvents:
         """The events of one object."""
         count = max(int(self.count[number]), 1)
         exists = torch.arange(count)[None] < self.count[number]
@@ -110,5 +110,5 @@ def laid_out(events: ObjectEvents) -> tuple[WindowEvents, Int[Tensor, "b e"], In
     if isinstance(events, SharedEvents):
         return events.shared, events.own, events.count
     # Of what many have in common, one row is enough.
-    rows = events.of(0) if events.pixels.stride(0) == 0 else events
+    rows = events.of_object(0) if events.pixels.stride(0) == 0 else events
     return rows, torch.empty(0, 0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)

@@ -51,5 +51,5 @@ def forecast(
     moved, velocity = torch.add(velocity, gained, alpha=0.5) * dt_s[:, None], velocity + gained
     T_prior = lie.step_about(state.T_cam_obj.to(velocity.dtype), moved, objects.centre_obj)
     T_prior, usable = before_camera(T_prior, objects.centre_obj, far_pose)
-    told = acceleration if config.solver.prior else None
-    return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance, told)
+    expected_acceleration = acceleration if config.solver.prior else None
+    return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance, expected_acceleration)

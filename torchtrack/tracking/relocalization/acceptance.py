@@ -15,7 +15,7 @@ from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.line_ends import running_on
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.triggers import DRIFTS, Trigger, has
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 # Ratios that differ by less are the same: which of them is larger is chance.
 AS_MUCH = 0.02
@@ -47,7 +47,7 @@ class Acceptance(Protocol):
     def row(self, number: int) -> "Acceptance":
         """What is asked of a single object."""
 
-    def choose(self, tried: Found, hypotheses: Hypotheses, lost: LostObject) -> Choice:
+    def choose(self, tried: ScoredFit, hypotheses: Hypotheses, lost: LostObject) -> Choice:
         """The best of the hypotheses, and whether it is accepted."""
 
 
@@ -71,7 +71,7 @@ class AcceptanceTest:
         """What is asked of a single object."""
         return AcceptanceTest(self.margin[number], self.min_score[number], self.min_inlier_ratio[number], self.min_matches[number])
 
-    def choose(self, tried: Found, hypotheses: Hypotheses, lost: LostObject) -> Choice:
+    def choose(self, tried: ScoredFit, hypotheses: Hypotheses, lost: LostObject) -> Choice:
         """The hypothesis with the best score, and of those about as good the one that the prediction expects most."""
         config, prediction, offsets = lost.config, hypotheses.prediction, tried.fit.solution.from_prior
         eligible = self.is_passed(tried, config) & is_likely(offsets, hypotheses.covariance)
@@ -82,13 +82,13 @@ class AcceptanceTest:
         best = likeliest(less_by_few_events(score, tried.count) if by_events else score, offsets, prediction.covariance[0])
         return Choice(best, score.index_select(0, best) > asked)
 
-    def is_passed(self, tried: Found, config: TrackerConfig) -> Bool[Tensor, "n"]:
+    def is_passed(self, tried: ScoredFit, config: TrackerConfig) -> Bool[Tensor, "n"]:
         """Which hypotheses match enough observations that gather enough."""
         # Written so that what does not tell how far it gathers passes.
-        gathers = ~(tried.gathered < self.min_inlier_ratio)
+        gathers = ~(tried.inlier_ratio < self.min_inlier_ratio)
         return (tried.count >= self.min_matches.clamp(min=config.validation.min_observations)) & gathers
 
-    def asked_score(self, scored: Found, number: int, config: TrackerConfig) -> Float[Tensor, ""]:
+    def asked_score(self, scored: ScoredFit, number: int, config: TrackerConfig) -> Float[Tensor, ""]:
         """The score that has to be surpassed."""
         own = torch.where(scored.count[number] >= config.validation.min_observations, scored.score[number], 0.0)
         return torch.maximum(own + self.margin, self.min_score)
@@ -97,7 +97,7 @@ class AcceptanceTest:
 # ---- the tests
 
 
-def near_prediction(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found, config: TrackerConfig) -> AcceptanceTest:
+def near_prediction(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses around the prediction.
 
     While a motion is not known nothing says how far events gather when all is well, and dense print explains as much of many poses:
@@ -115,18 +115,18 @@ def near_prediction(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: 
     # Of a new object, only what explains nearly all is surely better: edges of what hides it explain half.
     new = has(flags, Trigger.NEW)
     min_score = torch.where(new, search.new_below, min_score)
-    min_inlier_ratio = torch.where(starting | new, scored.gathered.nan_to_num(0.0) - AS_MUCH, 0)
+    min_inlier_ratio = torch.where(starting | new, scored.inlier_ratio.nan_to_num(0.0) - AS_MUCH, 0)
     return AcceptanceTest(margin, min_score, min_inlier_ratio, torch.where(slow, _matches(scored), 0))
 
 
-def elsewhere(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found, config: TrackerConfig) -> AcceptanceTest:
+def elsewhere(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses that are not around the prediction, or farther away than it allows."""
     reference = evidence.reference_explained_ratio
     nothing = torch.zeros_like(reference)
     return AcceptanceTest(nothing + config.relocalization.elsewhere_margin, config.relocalization.elsewhere_min_ratio * reference, nothing, nothing)
 
 
-def as_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found, config: TrackerConfig) -> AcceptanceTest:
+def as_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses as the object was last validated: what is explained enough where it is gives way to far more events alone."""
     test = elsewhere(evidence, flags, scored, config)
     matches = _matches(scored)
@@ -135,7 +135,7 @@ def as_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Fou
     return AcceptanceTest(test.margin, test.min_score, test.min_inlier_ratio, min_matches)
 
 
-def around_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found, config: TrackerConfig) -> AcceptanceTest:
+def around_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses all around where the object was last validated.
 
     A small thing that is all explained says nothing against a pose of which far more events are explained. What is partly hidden does.
@@ -147,7 +147,7 @@ def around_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored:
     return AcceptanceTest(margin, min_score, torch.zeros_like(min_score), min_matches)
 
 
-def _matches(scored: Found) -> Float[Tensor, "b"]:
+def _matches(scored: ScoredFit) -> Float[Tensor, "b"]:
     return scored.count.to(scored.score.dtype)
 
 

@@ -25,7 +25,7 @@ from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.sampling import ENOUGH_EVENTS, score_outlines
 from torchtrack.tracking.relocalization.symmetric import RotationAxes
 from torchtrack.tracking.relocalization.view_sphere import thinned
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 # Rotations that are compared, and how many of them are the same: three degrees apart, and twelve.
 _ROTATIONS, _SAME = 120, 4
@@ -95,7 +95,7 @@ class RotationTest:
         """The same of every object."""
         return self
 
-    def choose(self, tried: Found, hypotheses: Hypotheses, lost: LostObject) -> Choice:
+    def choose(self, tried: ScoredFit, hypotheses: Hypotheses, lost: LostObject) -> Choice:
         """The best of the rotations; the first is the pose as it is, which has to be clearly the best to be confirmed."""
         if not isinstance(hypotheses, Rotations):
             raise TypeError(f"a rotation test compares rotations, not {type(hypotheses).__name__}.")
@@ -112,7 +112,7 @@ class RotationTest:
         return Choice(best, accepted, axis_is_clear=clear & (best == 0))
 
 
-def rotation_test(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Found, config: TrackerConfig) -> RotationTest:
+def rotation_test(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> RotationTest:
     """Of rotations about an axis."""
     return RotationTest()
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchtrack.tracking.relocalization.symmetric import Ambiguities
 from torchtrack.tracking.state import TrackerState
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class TriggerEvidence:
 def gather_evidence(
     state: TrackerState,
     window: Schedule,
-    scored: Found,
+    scored: ScoredFit,
     sigma_px: Float[Tensor, "b"],
     is_starting: Bool[Tensor, "b"],
     ambiguities: Ambiguities,

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.estimation.rounds import gate_widening
+from torchtrack.tracking.estimation.rounds import gate_scale_of
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.last_seen import less_certain, where_last_seen
 from torchtrack.tracking.relocalization.lost_object import LostObject
@@ -89,7 +89,7 @@ def around_last_seen(lost: LostObject) -> Hypotheses:
     other = lost.others.last_seen.prediction(lost.number, lost.window.prediction)
     # A look from there is a wide one, however far this one goes.
     hypotheses = _sampled_elsewhere(lost, other, 2 * lost.config.relocalization.wide_sigma_px)
-    return replace(hypotheses, gate_scale=gate_widening(torch.full_like(lost.window.gate_scale[:1], torch.inf), lost.config))
+    return replace(hypotheses, gate_scale=gate_scale_of(torch.full_like(lost.window.gate_scale[:1], torch.inf), lost.config))
 
 
 def sampled_around(lost: LostObject, prediction: Prediction, sigma_px: float, outline: Contours) -> Hypotheses:

@@ -62,7 +62,7 @@ class LastSeen:
     covariance: Float[Tensor, "b 12 12"]
 
     @classmethod
-    def of(cls, state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> "LastSeen":
+    def from_state(cls, state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> "LastSeen":
         """Poses as they were, as uncertain as this window's look asks for.
 
         Args:

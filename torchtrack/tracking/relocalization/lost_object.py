@@ -11,7 +11,7 @@ from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.symmetric import Ambiguities
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Relocalized:
         gate_scale: how many times wider than configured the first gate of each is.
     """
 
-    scored: Found
+    scored: ScoredFit
     prediction: Prediction
     gate_scale: Float[Tensor, "b"]
 
@@ -77,4 +77,4 @@ class LostObject:
 
     def contours(self) -> Contours:
         """Its contours where it is by now."""
-        return self.window.scored.fit.contours.of(self.number)
+        return self.window.scored.fit.contours.of_object(self.number)

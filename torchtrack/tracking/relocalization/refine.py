@@ -15,13 +15,13 @@ from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import Choice
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
-from torchtrack.tracking.validation.scored_fit import Found, judge_fit
+from torchtrack.tracking.validation.scored_fit import ScoredFit, judge_fit
 
 # So many of the poses of a very uncertain object, those that explain most, are aligned again.
 _ALIGNED_AGAIN = 8
 
 
-def refined(hypotheses: Hypotheses, lost: LostObject) -> Found:
+def refined(hypotheses: Hypotheses, lost: LostObject) -> ScoredFit:
     """The hypotheses aligned on the events of their object, and scored; of a very uncertain object, the best of them once more."""
     search = lost.config.relocalization
     tried = align_and_score(hypotheses.rows(len(hypotheses.offsets)), hypotheses.offsets, lost)
@@ -32,7 +32,7 @@ def refined(hypotheses: Hypotheses, lost: LostObject) -> Found:
     return tried
 
 
-def align_and_score(rows: Prediction, offsets: Float[Tensor, "n 13"], lost: LostObject) -> Found:
+def align_and_score(rows: Prediction, offsets: Float[Tensor, "n 13"], lost: LostObject) -> ScoredFit:
     """Align predictions of an object, each from its own offset, on the events of the object, and score them."""
     config, scored, number = lost.config, lost.window.scored, lost.number
     begin = rows.moved(offsets)
@@ -42,21 +42,21 @@ def align_and_score(rows: Prediction, offsets: Float[Tensor, "n 13"], lost: Lost
     events = lost.events.repeated(len(offsets))
     observations = select_events(events, index, begin.moving(compensated=True), config.association.max_events)
     fit = align(rows, contours, index, tight, observations, config, offsets)
-    references = (value[number].expand_as(tight) for value in (scored.full_gathered, scored.asked_apart))
+    references = (value[number].expand_as(tight) for value in (scored.reference_inlier_ratio, scored.required_spread))
     tried = judge_fit(rows, fit, config, torch.zeros_like(tight), *references)
     return replace(tried, elsewhere=torch.ones_like(tried.elsewhere))
 
 
-def exchanged(lost: LostObject, hypotheses: Hypotheses, tried: Found, choice: Choice) -> Relocalized:
+def exchanged(lost: LostObject, hypotheses: Hypotheses, tried: ScoredFit, choice: Choice) -> Relocalized:
     """What the window gave, with the chosen hypothesis in the place of the object's own pose, where that is accepted."""
     window, number, accepted = lost.window, lost.number, choice.is_accepted
     if choice.axis_is_clear is None and host_sync.none_of(accepted):
         return window
     scored, prediction, gate_scale = replaced(window.scored, number, tried, choice), window.prediction, window.gate_scale
     if choice.axis_is_clear is not None:
-        unclear = scored.turn_unclear.clone()
+        unclear = scored.rotation_unclear.clone()
         unclear[number] &= ~choice.axis_is_clear[0]
-        scored = replace(scored, turn_unclear=unclear)
+        scored = replace(scored, rotation_unclear=unclear)
     if hypotheses.released is not None:
         hessian = scored.fit.solution.hessian.clone()
         hessian[number, :12, :12] += (hypotheses.released * accepted).to(hessian.dtype)
@@ -69,7 +69,7 @@ def exchanged(lost: LostObject, hypotheses: Hypotheses, tried: Found, choice: Ch
     return Relocalized(scored, prediction, gate_scale)
 
 
-def replaced(scored: Found, number: int, tried: Found, choice: Choice) -> Found:
+def replaced(scored: ScoredFit, number: int, tried: ScoredFit, choice: Choice) -> ScoredFit:
     """``scored`` with the pose, contours and quality of an object from the chosen row of what was tried, where that is accepted."""
 
     def put(mine: Tensor, theirs: Tensor) -> Tensor:
@@ -83,7 +83,7 @@ def replaced(scored: Found, number: int, tried: Found, choice: Choice) -> Found:
     count = max(mine.contours.mask.shape[1], theirs.contours.mask.shape[1])
     own, others = mine.contours.widened(count), theirs.contours.widened(count)
     contours = Contours(*(put(value, getattr(others, name)) for name, value in vars(own).items()))
-    names = [field.name for field in fields(Found) if field.name not in ("fit", "turn_unclear")]
+    names = [field.name for field in fields(ScoredFit) if field.name not in ("fit", "turn_unclear")]
     measures = {name: put(getattr(scored, name), getattr(tried, name)) for name in names}
     # Another pose says nothing of whether it is the only possible.
-    return Found(fit=Fit(solution, contours, mine.matches), turn_unclear=scored.turn_unclear, **measures)
+    return ScoredFit(fit=Fit(solution, contours, mine.matches), rotation_unclear=scored.rotation_unclear, **measures)

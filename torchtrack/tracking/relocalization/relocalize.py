@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.host_sync import AsyncValue
-from torchtrack.tracking.estimation.rounds import gate_widening
+from torchtrack.tracking.estimation.rounds import gate_scale_of
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import Acceptance
@@ -52,10 +52,10 @@ def relocalize(
             calls = [pair for pair in zip(sources, tests, strict=True) if pair[0].comes_last == comes_last and pair[0].is_called_for(own)]
             if calls:
                 (px, predicted_px), since_s = sigmas_px[number], evidence.time_since_validated_s[number]
-                lost = LostObject(number, window, widened, px, predicted_px, since_s, events.of(number), others, config)
+                lost = LostObject(number, window, widened, px, predicted_px, since_s, events.of_object(number), others, config)
                 window = _tried(lost, calls)
         if not comes_last:
-            window = _settled(window, drifts, widened, gate_widening(sigma_px, config))
+            window = _settled(window, drifts, widened, gate_scale_of(sigma_px, config))
     return window
 
 

@@ -16,7 +16,7 @@ from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.symmetric import MOST_PLANES
 from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger
-from torchtrack.tracking.validation.scored_fit import Found
+from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Source:
 
     triggers: Trigger
     propose: Callable[[LostObject], Hypotheses | None]
-    test: Callable[[TriggerEvidence, Int[Tensor, "b"], Found, TrackerConfig], Acceptance]
+    test: Callable[[TriggerEvidence, Int[Tensor, "b"], ScoredFit, TrackerConfig], Acceptance]
     unless: Trigger = NONE
     comes_last: bool = False
 

@@ -24,8 +24,8 @@ _NEUTRAL = 0.6
 _KEPT_AT, _TAKEN_BACK_AT = 3.0, -1.5
 
 
-def after_probation(
-    before: TrackerState, state: TrackerState, result: StepResult, prediction: Prediction, widening: Float[Tensor, "b"], config: TrackerConfig
+def confirmed(
+    before: TrackerState, state: TrackerState, result: StepResult, prediction: Prediction, gate_scale: Float[Tensor, "b"], config: TrackerConfig
 ) -> tuple[TrackerState, StepResult]:
     """State and result of a window, with finds taken back that did not prove themselves.
 
@@ -34,10 +34,10 @@ def after_probation(
         state, result: after it.
         prediction: of the objects, with ``widening`` of their first gates.
     """
-    concerned = before.tentative.is_tentative | may_be_anywhere(widening)
+    concerned = before.tentative.is_tentative | may_be_anywhere(gate_scale)
     if host_sync.none_of(concerned):
         return state, result
-    probation = _begun(before, result, prediction, widening)
+    probation = _begun(before, result, prediction, gate_scale)
     wanted = config.validation.validated_from * before.health.reference_explained_ratio
     speaks_for = (result.quality / wanted.clamp(min=1e-3)).clamp(max=1) - _NEUTRAL
     evidence = probation.evidence + speaks_for
@@ -50,10 +50,10 @@ def after_probation(
     return state, replace(result, status=lost)
 
 
-def _begun(before: TrackerState, result: StepResult, prediction: Prediction, widening: Float[Tensor, "b"]) -> TentativeTrack:
+def _begun(before: TrackerState, result: StepResult, prediction: Prediction, gate_scale: Float[Tensor, "b"]) -> TentativeTrack:
     """The probation with those objects that were found in this window although hardly anything was known of them."""
     old = before.tentative
-    begins = ~old.is_tentative & may_be_anywhere(widening) & (result.status < int(Status.LOST))
+    begins = ~old.is_tentative & may_be_anywhere(gate_scale) & (result.status < int(Status.LOST))
     first = begins[:, None, None]
     return TentativeTrack(
         is_tentative=old.is_tentative | begins,

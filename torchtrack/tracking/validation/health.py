@@ -14,13 +14,13 @@ class TrackHealth:
     References are running means that rise as fast as what they follow, but fall slowly.
 
     Args:
-        score: of the last window, :attr:`torchtrack.tracking.validation.scored_fit.Found.score`.
+        score: of the last window, :attr:`torchtrack.tracking.validation.scored_fit.ScoredFit.score`.
         mean_score: its running mean; zero of an object that was never found.
         reference_explained_ratio: of the moving contour, what events explain when the object is seen well.
         reference_inlier_ratio: of the events near its contours, how many are on them then.
         reference_matches: matched observations then.
         reference_normal_spread: how far apart the directions of contours with events on them are then
-            (:func:`torchtrack.tracking.validation.measures.directions_apart`).
+            (:func:`torchtrack.tracking.validation.measures.normal_spread_of`).
         drift_s: for how long, less the time it was not, the object has been in doubt of being elsewhere (s).
         T_last_validated: pose of each object when it was last seen well (float64).
         time_since_validated_s: how long ago that was (s).

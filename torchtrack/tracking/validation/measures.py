@@ -64,10 +64,10 @@ def measured_share(
 def shares(
     contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: ValidationConfig
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
-    """:func:`measured_share` of contours that move with their objects, :func:`gathered_share`, and :func:`directions_apart`."""
+    """:func:`measured_share` of contours that move with their objects, :func:`gathered_share`, and :func:`normal_spread_of`."""
     velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
     measured = measured_share(contours, matches, velocity, image_size, config)
-    return measured, gathered_share(matches, config), directions_apart(matches)
+    return measured, gathered_share(matches, config), normal_spread_of(matches)
 
 
 def gathered_share(matches: Matches, config: ValidationConfig) -> Float[Tensor, "b"]:
@@ -82,7 +82,7 @@ def gathered_share(matches: Matches, config: ValidationConfig) -> Float[Tensor, 
     return torch.where(count < config.min_observations, torch.nan, share)
 
 
-def directions_apart(matches: Matches) -> Float[Tensor, "b"]:
+def normal_spread_of(matches: Matches) -> Float[Tensor, "b"]:
     """How far apart the directions are of the contours that observations lie on: 0 where all are parallel, 0.5 where none prevails.
 
     The smaller eigenvalue of the mean of ``n n^T`` over their unit normals n, by the resultant of these at twice their angles
@@ -95,7 +95,9 @@ def directions_apart(matches: Matches) -> Float[Tensor, "b"]:
     return 0.5 * (count - (doubled * on[:, None]).sum(-1).norm(dim=1)) / count.clamp(min=1)
 
 
-def asked_apart(full_apart: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], config: ValidationConfig) -> Float[Tensor, "b"] | None:
+def required_spread(
+    reference_normal_spread: Float[Tensor, "b"], time_since_validated_s: Float[Tensor, "b"], config: ValidationConfig
+) -> Float[Tensor, "b"] | None:
     """How far apart the directions of an object's contours should be, which was not seen well for a while: as far as when it was.
 
     Less and less: an object may go on along its own edges, of which only those across its way fire then. None where it is certain
@@ -105,15 +107,15 @@ def asked_apart(full_apart: Float[Tensor, "b"], unseen_s: Float[Tensor, "b"], co
         full_apart: how far apart they are when it is seen well; zero, for nothing, where that is not known.
         unseen_s: how long ago that was (s).
     """
-    asks = (unseen_s >= PARALLEL_AFTER_S) & config.all_directions
-    return None if none_of(asks) else torch.where(asks, full_apart * torch.exp(unseen_s / -_ASKED_S), 0)
+    asks = (time_since_validated_s >= PARALLEL_AFTER_S) & config.all_directions
+    return None if none_of(asks) else torch.where(asks, reference_normal_spread * torch.exp(time_since_validated_s / -_ASKED_S), 0)
 
 
-def held_all_ways(apart: Float[Tensor, "b"], asked: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
+def constrained_2d(apart: Float[Tensor, "b"], asked: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     """How far a pose is held in all directions of the image, 0 to 1: an object laid along a bar that hides it slides along its edges.
 
     Args:
-        apart: :func:`directions_apart` of what is explained; ``asked`` of it, zero for nothing.
+        apart: :func:`normal_spread_of` of what is explained; ``asked`` of it, zero for nothing.
     """
     share = (apart - _PARALLEL_FROM * asked) / ((_PARALLEL_TO - _PARALLEL_FROM) * asked).clamp(min=1e-6)
     return torch.where(asked > 0, share.clamp(0, 1), 1)

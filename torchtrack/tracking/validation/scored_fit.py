@@ -10,14 +10,14 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import once
 from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.validation.measures import held_all_ways, shares
+from torchtrack.tracking.validation.measures import constrained_2d, shares
 
 # From this share of how far they do when an object is seen well, events gather in full.
 _AS_GATHERED = 0.9
 
 
 @dataclass(frozen=True)
-class Found:
+class ScoredFit:
     """What one window gave for each object.
 
     Args:
@@ -37,23 +37,23 @@ class Found:
     measured: Float[Tensor, "b"]
     at_rest: Float[Tensor, "b"]
     count: Int[Tensor, "b"]
-    gathered: Float[Tensor, "b"]
-    full_gathered: Float[Tensor, "b"]
+    inlier_ratio: Float[Tensor, "b"]
+    reference_inlier_ratio: Float[Tensor, "b"]
     apart: Float[Tensor, "b"]
-    asked_apart: Float[Tensor, "b"]
+    required_spread: Float[Tensor, "b"]
     elsewhere: Bool[Tensor, "b"]
-    turn_unclear: Bool[Tensor, "b"]
+    rotation_unclear: Bool[Tensor, "b"]
 
     @once
-    def share(self) -> Float[Tensor, "b"]:
+    def explained_ratio(self) -> Float[Tensor, "b"]:
         """What events explain of the contour."""
         return torch.where(self.measured.isnan(), self.at_rest, self.measured)
 
     @once
     def score(self) -> Float[Tensor, "b"]:
         """The share, and less where the events around the contour are smeared: what poses are compared by."""
-        gathered = self.gathered / (_AS_GATHERED * self.full_gathered).clamp(min=1e-3)
-        return self.share * gathered.nan_to_num(1.0).clamp(max=1)
+        inlier_ratio = self.inlier_ratio / (_AS_GATHERED * self.reference_inlier_ratio).clamp(min=1e-3)
+        return self.explained_ratio * inlier_ratio.nan_to_num(1.0).clamp(max=1)
 
 
 def judge_fit(
@@ -61,9 +61,9 @@ def judge_fit(
     fit: Fit,
     config: TrackerConfig,
     at_rest: Float[Tensor, "b"],
-    full_gathered: Float[Tensor, "b"] | None = None,
-    asked_apart: Float[Tensor, "b"] | None = None,
-) -> Found:
+    reference_inlier_ratio: Float[Tensor, "b"] | None = None,
+    required_spread: Float[Tensor, "b"] | None = None,
+) -> ScoredFit:
     """A fit with its quality, by the motion that was found with it; without enough observations it explains nothing.
 
     Args:
@@ -71,20 +71,24 @@ def judge_fit(
         asked_apart: how far apart directions have to be to count in full; zero, or none at all, for nothing asked.
     """
     moving = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).moving(compensated=True)
-    measured, gathered, apart = shares(fit.contours, fit.matches, moving, prediction.objects.image_size, config.validation)
+    measured, inlier_ratio, apart = shares(fit.contours, fit.matches, moving, prediction.objects.image_size, config.validation)
     # Of what does not move, events are noise.
-    gathered = torch.where(measured.isnan(), torch.nan, gathered) if config.relocalization.by_inlier_ratio else torch.full_like(measured, torch.nan)
-    if asked_apart is not None:
-        measured = measured * held_all_ways(apart, asked_apart)
+    inlier_ratio = (
+        torch.where(measured.isnan(), torch.nan, inlier_ratio) if config.relocalization.by_inlier_ratio else torch.full_like(measured, torch.nan)
+    )
+    if required_spread is not None:
+        measured = measured * constrained_2d(apart, required_spread)
     nothing = torch.zeros_like(measured)
-    full_gathered, asked_apart = (nothing if value is None else value for value in (full_gathered, asked_apart))
-    return Found(fit, measured, at_rest, fit.matches.mask.sum(-1), gathered, full_gathered, apart, asked_apart, nothing.bool(), nothing.bool())
+    reference_inlier_ratio, required_spread = (nothing if value is None else value for value in (reference_inlier_ratio, required_spread))
+    return ScoredFit(
+        fit, measured, at_rest, fit.matches.mask.sum(-1), inlier_ratio, reference_inlier_ratio, apart, required_spread, nothing.bool(), nothing.bool()
+    )
 
 
-def explained_at_rest(widening: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
+def explained_at_rest(gate_scale: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     """What an object explains that does not move: all, but nothing where it was looked for in many places.
 
     Args:
         widening: of each object's first gate.
     """
-    return 2 - widening.clamp(1, 2)
+    return 2 - gate_scale.clamp(1, 2)

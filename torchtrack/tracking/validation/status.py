@@ -28,19 +28,23 @@ class Status(IntEnum):
     DIVERGED = 5
 
 
-def needed_share(widening: Float[Tensor, "b"], config: ValidationConfig, hidden: Float[Tensor, "b"] | None = None) -> Float[Tensor, "b"]:
+def needed_share(gate_scale: Float[Tensor, "b"], config: ValidationConfig, hidden: Float[Tensor, "b"] | None = None) -> Float[Tensor, "b"]:
     """The explained share below which an object is lost: the more places it was looked for in, the more is asked of a find.
 
     No more than of any, as far as it is ``hidden``, as :func:`partly_hidden` has it.
     """
-    wider = (widening - 1).clamp(0, 1)
+    wider = (gate_scale - 1).clamp(0, 1)
     if hidden is not None:
         wider = wider * (1 - hidden)
     return config.lost_below + (max(config.refound_above, config.lost_below) - config.lost_below) * wider
 
 
 def partly_hidden(
-    gathered: Float[Tensor, "b"], full_gathered: Float[Tensor, "b"], count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: ValidationConfig
+    inlier_ratio: Float[Tensor, "b"],
+    reference_inlier_ratio: Float[Tensor, "b"],
+    count: Int[Tensor, "b"],
+    elsewhere: Bool[Tensor, "b"],
+    config: ValidationConfig,
 ) -> Float[Tensor, "b"]:
     """How far a pose counts, 0 to 1, by events that gather on its contours as they do when the object is seen well, however few these are.
 
@@ -54,9 +58,9 @@ def partly_hidden(
         count: matched observations.
         elsewhere: objects that a search found.
     """
-    ramp = (gathered / full_gathered.clamp(min=1e-6) - HIDDEN_FROM) / (HIDDEN_FULLY - HIDDEN_FROM)
+    ramp = (inlier_ratio / reference_inlier_ratio.clamp(min=1e-6) - HIDDEN_FROM) / (HIDDEN_FULLY - HIDDEN_FROM)
     # Written so that what is not a number counts for nothing.
-    tells = (ramp > 0) & ~elsewhere & (full_gathered > HIDDEN_LEAST) & are_many(count, config)
+    tells = (ramp > 0) & ~elsewhere & (reference_inlier_ratio > HIDDEN_LEAST) & are_many(count, config)
     return torch.where(tells & config.partly_hidden, ramp.clamp(max=1), 0)
 
 
@@ -75,15 +79,18 @@ def holding_on(count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: Va
 
 
 def trust(
-    share: Float[Tensor, "b"], config: ValidationConfig, full_share: Float[Tensor, "b"] | None = None, widening: Float[Tensor, "b"] | None = None
+    share: Float[Tensor, "b"],
+    config: ValidationConfig,
+    reference_explained_ratio: Float[Tensor, "b"] | None = None,
+    gate_scale: Float[Tensor, "b"] | None = None,
 ) -> Float[Tensor, "b"]:
     """How far a pose that was found counts against the prediction: nothing where it is lost, fully once it is certain.
 
     Of an object that was looked for in many places (``widening``) near to its full share is asked: chance explains some.
     """
     full = torch.full_like(share, config.uncertain_below)
-    if full_share is not None and widening is not None:
-        full = torch.maximum(full, config.validated_from * full_share * (widening - 1).clamp(0, 1))
+    if reference_explained_ratio is not None and gate_scale is not None:
+        full = torch.maximum(full, config.validated_from * reference_explained_ratio * (gate_scale - 1).clamp(0, 1))
     return ((share - config.lost_below) / (full - config.lost_below).clamp(min=1e-6)).clamp(0, 1)
 
 
@@ -94,7 +101,7 @@ def judge(
     step_from_prediction: Float[Tensor, "b 6"],
     diameters_m: Float[Tensor, "b"],
     config: ValidationConfig,
-    widening: Float[Tensor, "b"] | None = None,
+    gate_scale: Float[Tensor, "b"] | None = None,
     hidden: Float[Tensor, "b"] | None = None,
 ) -> Int[Tensor, "b"]:
     """The :class:`Status` of each object, the gravest reason first.
@@ -102,11 +109,11 @@ def judge(
     ``widening`` is of each object's first gate: an uncertain one may be found so much farther away. ``hidden`` is from
     :func:`partly_hidden`.
     """
-    widening = torch.ones_like(quality) if widening is None else widening
-    turned, moved = (step_from_prediction.unflatten(1, (2, 3)).norm(dim=-1) / widening[:, None]).unbind(1)
+    gate_scale = torch.ones_like(quality) if gate_scale is None else gate_scale
+    turned, moved = (step_from_prediction.unflatten(1, (2, 3)).norm(dim=-1) / gate_scale[:, None]).unbind(1)
     reasons: dict[Status, Bool[Tensor, "b"]] = {
         Status.UNCERTAIN: quality < config.uncertain_below,
-        Status.LOST: quality < needed_share(widening, config, hidden),
+        Status.LOST: quality < needed_share(gate_scale, config, hidden),
         Status.TOO_FEW_EVENTS: observation_count < config.min_observations,
         Status.OUT_OF_VIEW: in_view < config.min_visible_ratio,
         # Written so that what is not a number has diverged.

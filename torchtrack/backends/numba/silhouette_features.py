@@ -1,4 +1,4 @@
-"""What describes observations of limbs, one at a time: :func:`torchtrack.tracking.association.weighting_features.limb_features`."""
+"""What describes observations of limbs, one at a time: :func:`torchtrack.tracking.association.weighting_features.silhouette_features`."""
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torchtrack.backends.numba.parameters import Cells, PatchSettings
 from torchtrack.core.dispatch import accelerates
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association import weighting_features
-from torchtrack.tracking.association.weighting_features import Evidence
+from torchtrack.tracking.association.weighting_features import WeightingInputs
 from torchtrack.tracking.frontend.history import BORDER_PX
 from torchtrack.tracking.frontend.window_events import laid_out
 
@@ -55,7 +55,7 @@ def describe(
     t_us: Array,
     settings: PatchSettings,
     features: Array,
-    is_limb: Array,
+    is_smooth: Array,
 ) -> None:
     """Describe the observations of some objects whose nearest contour is a limb.
 
@@ -88,12 +88,12 @@ def describe(
         for i in range(exists.shape[1]):
             x, y, age = pixels[b, 0, i], pixels[b, 1, i], ages_s[b, i]
             speed_u, speed_v = at_depth(motion, depth_m, x, y, of_lens)
-            found = nearest(cells_of_object, first_of_object, x + speed_u * age, y + speed_v * age, cells)
-            is_limb[b, i] = exists[b, i] and found >= 0 and kind[b, max(found, 0)] == settings.limb
-            if not is_limb[b, i]:
+            nearest_index = nearest(cells_of_object, first_of_object, x + speed_u * age, y + speed_v * age, cells)
+            is_smooth[b, i] = exists[b, i] and nearest_index >= 0 and kind[b, max(nearest_index, 0)] == settings.silhouette
+            if not is_smooth[b, i]:
                 described[i] = 0.0
                 continue
-            point = points[0, found], points[1, found], points[2, found], lines[0, found], lines[1, found]
+            point = points[0, nearest_index], points[1, nearest_index], points[2, nearest_index], lines[0, nearest_index], lines[1, nearest_index]
             _describe_one(
                 (x, y, age, polarities[b, i], age / oldest_s), point, motion, of_lens, counted, softened, across_px, along_px, aside_px,
                 places, of_sensor, table_width, newest_us, t_us[s], settings, described[i],
@@ -188,7 +188,7 @@ def _find_pixels(u: float, v: float, nu: float, nv: float, across_px: Array, hei
 # Called for each observation, with so many numbers, it takes a quarter longer.
 @kernel(fastmath=FAST, forceinline=True)
 def _describe_one(
-    told: Numbers,
+    event: Numbers,
     point: Numbers,
     motion: Numbers,
     intrinsics: Numbers,
@@ -206,7 +206,7 @@ def _describe_one(
     row: Array,
 ) -> None:
     """Fill the description of one observation, whose nearest contour point was found."""
-    u, v, age, polarity, age_share = told
+    u, v, age, polarity, age_share = event
     x, y, z, nu, nv = point
     speed_u, speed_v = across(motion, x, y, z, inverse_depth(z), intrinsics)
     outward = -1.0 if nu * speed_u + nv * speed_v < 0 else 1.0
@@ -223,18 +223,18 @@ def _describe_one(
         row[2 * count + k] = min(max(((t_us - newest_us) * 1e-6 - age) * speed / settings.oldest_px, -1.0), 1.0)
     for k in range(settings.of_kind, len(row)):
         row[k] = 0.0
-    row[settings.of_kind + settings.limb] = row[_EXISTS] = 1.0
+    row[settings.of_kind + settings.silhouette] = row[_EXISTS] = 1.0
     row[_SPEED], row[_AGE] = np.log1p(speed / settings.unit_px_s), age_share
     row[_POLARITY], row[_SIDE], row[_KNOWN] = polarity, polarity * outward, abs(polarity)
 
 
-@accelerates(weighting_features.limb_features)
-def limb_features_numba(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
+@accelerates(weighting_features.silhouette_features)
+def silhouette_features_numba(evidence: WeightingInputs) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
     """Observation by observation."""
     observations, contours, index, history = evidence.observations, evidence.contours, evidence.index, evidence.history
     moving, (events, own, counts) = evidence.prediction.moving(compensated=True), laid_out(evidence.seen)
-    has_limb = ((contours.kind == int(ContourKind.LIMB)) & contours.mask).any(1)
-    objects, is_limb = has_limb.nonzero()[:, 0], torch.zeros_like(observations.mask)
+    has_smooth_silhouette = ((contours.kind == int(ContourKind.SMOOTH)) & contours.mask).any(1)
+    objects, is_smooth = has_smooth_silhouette.nonzero()[:, 0], torch.zeros_like(observations.mask)
     # As many for all: how many a neighbour has would show in roundings.
     features = observations.age_s.new_empty(len(objects), observations.mask.shape[1], weighting_features.FEATURES)
     w = weighting_features
@@ -245,7 +245,7 @@ def limb_features_numba(evidence: Evidence) -> tuple[Float[Tensor, "r n f"], Boo
         cells_of(index),
         *as_arrays(moving.velocity, moving.centre_cam, moving.intrinsics),
         *as_arrays(history.sensor_numbers, history.stream_index, history.last_event_us, history.t_us),
-        PatchSettings(w.ACROSS_PX, w.ALONG_PX, w.SIDE, BORDER_PX, int(ContourKind.LIMB), w.OF_KIND, w.SLOW_PX_S, w.SPEED_UNIT_PX_S, w.OLDEST_PX),
-        *as_arrays(features, is_limb),
+        PatchSettings(w.ACROSS_PX, w.ALONG_PX, w.SIDE, BORDER_PX, int(ContourKind.SMOOTH), w.OF_KIND, w.SLOW_PX_S, w.SPEED_UNIT_PX_S, w.OLDEST_PX),
+        *as_arrays(features, is_smooth),
     )
-    return features, is_limb, objects
+    return features, is_smooth, objects
