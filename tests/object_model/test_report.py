@@ -38,7 +38,7 @@ def test_a_mesh_in_millimetres(prism_path):
     assert (report.surface.parts, report.surface.faces, report.surface.vertices, report.surface.open_edges) == (1, 20, 12, 0)
     assert (report.surface.contrary_edges, report.surface.flipped_faces, report.surface.dropped_faces) == (0, 0, 0)
     # Six edges of each end, and six along it; the others lie in a plane.
-    assert (report.creases, report.limbs) == (18, 0)
+    assert (report.creases, report.silhouettes) == (18, 0)
     assert np.abs(report.planes[0]).tolist() == [0, 0, 1]
     assert (report.revolution, report.turning, report.notes) == (None, None, ())
 

@@ -39,7 +39,7 @@ class ByAge(nn.Module):
 
 
 def weighing(weighting_network, config=None, dtype=torch.float64, count=5):
-    """A tracker with a weigher in the middle of a motion, and its next window."""
+    """A tracker with a weighting network in the middle of a motion, and its next window."""
     plain, state, _, window, _ = started(dtype, config, count)
     tracker = Tracker([box_model()], SMALL_CAMERA, config, dtype=dtype, weighting_network=weighting_network)
     tracker.load_state_dict(plain.state_dict(), strict=False)
@@ -229,7 +229,7 @@ def test_autocast_leaves_the_solver_alone():
 
 
 def send_gradient_in_parallel(store, sender):
-    """The gradient of a weigher in distributed data parallel, from a process of its own."""
+    """The gradient of a weighting network in distributed data parallel, from a process of its own."""
     tracker, state, window = weighing(ByAge(slope=-0.5, offset=1.0))
     torch.distributed.init_process_group("gloo", init_method=f"file://{store}", rank=0, world_size=1)
     parallel = nn.parallel.DistributedDataParallel(tracker)

@@ -95,7 +95,7 @@ def _surface_rows(surface: SurfaceReport) -> list[tuple[str, str]]:
 
 
 def _edges(report: ModelReport) -> str:
-    return f"{report.creases:,} creases, which always show; {report.limbs:,} that show where the surface turns away"
+    return f"{report.creases:,} creases, which always show; {report.silhouettes:,} that show where the surface turns away"
 
 
 def _texture(report: ModelReport, surface: SurfaceReport) -> str:

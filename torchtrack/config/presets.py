@@ -33,9 +33,9 @@ def _default() -> TrackerConfig:
 
 
 def _learned() -> TrackerConfig:
-    """The default, with a network's word on how far each observation is to be believed, not on those of limbs alone.
+    """The default, with a network's word on how far each observation is to be believed, not on those of smooth silhouettes alone.
 
-    It believes less where an object is seen badly, and explains less there: that is no sign of having strayed.
+    It believes less where an object is seen badly, and explains less there: that is no sign of a slow drift.
     """
     return TrackerConfig(
         association=AssociationConfig(weighting_network="all"),

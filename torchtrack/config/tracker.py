@@ -99,7 +99,7 @@ class AssociationConfig(Settings):
         120.0, ge=0, description="Of objects smaller than this in the image (px) and not uncertain, contours are looked up finer than by cells."
     )
     fine_unless_plain: bool = Field(
-        True, description="So are those of larger objects of which more is seen than plain faces: print, or smooth limbs."
+        True, description="So are those of larger objects of which more is seen than plain faces: texture, or smooth silhouettes."
     )
     flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
@@ -108,7 +108,7 @@ class AssociationConfig(Settings):
     gathered_share: float = Field(0.6, gt=0, le=1, description="Share of observations on the contour at which a patch counts in full.")
     least_trust: float = Field(0.02, ge=0, le=1, description="What a smeared patch still counts.")
     polarity: bool = Field(True, description="Trust events less whose polarity is not that of most others on the contour around them.")
-    texture_polarity: bool = Field(True, description="Trust events on print less whose polarity is not that of its darker side.")
+    texture_polarity: bool = Field(True, description="Trust events on texture less whose polarity is not that of its darker side.")
     polarity_prior_s: float = Field(
         0.05,
         ge=0,
@@ -124,18 +124,17 @@ class AssociationConfig(Settings):
     dark_shift_px: float = Field(
         0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
     )
-    silhouette_dark_shift_px: float = Field(
-        0.06, ge=0, le=2, description="The same of the limb of a smooth surface, towards which its shading fades (px)."
-    )
+    silhouette_dark_shift_px: float = Field(0.06, ge=0, le=2, description="The same of a smooth silhouette, towards which its shading fades (px).")
     burst_px: float = Field(
-        1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow circuits fire on (px)."
+        1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow pixels fire on (px)."
     )
     pixel_latency: bool = Field(
         True, description="Date them back less far, the fewer are seen to come late: in good light the circuits of a sensor are fast."
     )
     burst_us: int = Field(10_000, ge=0, le=30_000, description="A burst is what a pixel fires of one polarity in this time (µs); 0 for no bursts.")
-    weighting_network: Literal["none", "limbs", "all"] = Field(
-        "limbs", description="Which observations to trust as a small network has learned from the events around them: those of smooth limbs, or all."
+    weighting_network: Literal["none", "silhouettes", "all"] = Field(
+        "silhouettes",
+        description="Which observations to trust as a small network has learned from the events around them: those of smooth silhouettes, or all.",
     )
     max_events: int = Field(1500, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
@@ -156,14 +155,14 @@ class SolverConfig(Settings):
     prior: bool = Field(True, description="Weigh the observations against the prediction by its covariance, and find the velocity with the pose.")
     observation_px: float = Field(1.5, gt=0, description="Standard deviation of one observation (px), with its share of what all have in common.")
     common_px: float = Field(
-        0.25, ge=0, le=10, description="The same of what observations of a smooth limb in one place of the image have in common beside it (px)."
+        0.25, ge=0, le=10, description="The same of what observations of a smooth silhouette in one place of the image have in common beside it (px)."
     )
     velocity_in_window: bool = Field(True, description="Older observations tell of the velocity: pose and velocity are found together.")
     acceleration_in_window: bool = Field(
         True, description="A velocity that is other than predicted became so steadily over the window, as far as it was certain."
     )
     silhouette_offset_px: float = Field(
-        0.2, ge=0, description="Standard deviation of how far smooth limbs stand out, in a window (px); 0 for not at all."
+        0.2, ge=0, description="Standard deviation of how far smooth silhouettes stand out, in a window (px); 0 for not at all."
     )
 
 

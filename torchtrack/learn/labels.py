@@ -1,4 +1,4 @@
-"""Which observations are of the object's contour: what a weigher is to learn, from the true pose."""
+"""Which observations are of the object's contour: what a weighting network is to learn, from the true pose."""
 
 import torch
 from jaxtyping import Float

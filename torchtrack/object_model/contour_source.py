@@ -20,7 +20,7 @@ _VIEWS, _MORE_FACING = 512, 1.1
 
 
 class ContourKind(IntEnum):
-    """What a contour point comes from: the limb of a smooth surface, a sharp edge (occluding or not), and so on."""
+    """What a contour point comes from: the smooth silhouette, a sharp edge (occluding or not), and so on."""
 
     SMOOTH = 0
     CREASE = 1
@@ -70,7 +70,7 @@ class ContourModel(nn.Module):
         self.texture_spacing_m = _spacing(self.texture_points)
         self.most_texture_facing = _most_facing(self.texture_normals)
         self.register_buffer("edges", _edge_table(points, normals, is_segment))
-        # Edges that may be the limb of what is smooth in reality.
+        # Edges that may be the silhouette of what is smooth in reality.
         self.register_buffer("is_bent", self.edges[-1] == int(ContourKind.SMOOTH))
         self.register_buffer("surface_points", _in_rows(model.surface_points))
         exact = len(model.triangles) <= config.exact_faces

@@ -98,7 +98,7 @@ class ModelReport:
         return int(self.model.edge_is_crease.sum())
 
     @property
-    def limbs(self) -> int:
+    def silhouettes(self) -> int:
         """Edges that show where the surface turns away."""
         return len(self.model.edge_is_crease) - self.creases
 

@@ -91,7 +91,7 @@ class CompiledStep:
         return {**vars(self), "_graphs": {}, "_near_tiles": None}
 
     def _are_for(self, t_us: Tensor) -> bool:
-        """Whether there are graphs for windows of that device. A weigher of one's own may do what cannot be recorded: they have to be asked for."""
+        """Whether there are graphs for windows of that device. For a weighting network of one's own they have to be asked for."""
         return self._compiles or (host_sync.on_gpu(t_us) and not self._tracker.shows_all)
 
     def __len__(self) -> int:

@@ -122,7 +122,7 @@ class TrackedObjects(nn.Module):
 
     @property
     def shows_all(self) -> bool:
-        """Whether a window's events are kept that cannot have to do with the objects: a weigher of one's own may look at any."""
+        """Whether a window's events are kept that cannot have to do with the objects: a weighting network of one's own may look at any."""
         return self.weighting_network is not None and not isinstance(self.weighting_network, TrustNetwork | SilhouetteTrust)
 
     @property

@@ -37,7 +37,7 @@ class Tracker(TrackedObjects):
         config: settings; the ``default`` preset when not given.
         stream_index: the stream each object is seen in; the first for all when not given.
         dtype: precision of the pipeline; poses are kept in float64.
-        weigher: judges every window's :class:`tracking.association.weighting_features.WeightingInputs`: how far each observation is to be believed,
+        weighting_network: judges every window's :class:`tracking.association.weighting_features.WeightingInputs`: how far to believe each observation,
             ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
             comes with the package, for what ``matching.weighting_network`` says. Other poses that a search tries are aligned
             without it.
@@ -98,7 +98,7 @@ class Tracker(TrackedObjects):
     def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
         """Advance every object by one window of events.
 
-        Where gradients are recorded, the new poses and velocities are differentiable by the old ones, by the weigher, and by
+        Where gradients are recorded, the new poses and velocities are differentiable by the old ones, by the weighting network, and by
         whatever buffer requires it, such as ``intrinsics``; covariances are constants. Autocast leaves this alone: the
         solver needs the digits.
 

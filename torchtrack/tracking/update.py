@@ -52,7 +52,7 @@ def conclude(
 
     Args:
         state: before the window; its times are those of the state and the result that are returned.
-        widening: of each object's first gate.
+        gate_scale: of each object's first gate.
         dt_s: length of the window.
     """
     motion, health, covariance, status = judged_objects(state, prediction, gate_scale, scored, dt_s, config)

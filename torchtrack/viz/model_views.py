@@ -1,6 +1,6 @@
 """A picture of a model from its six sides, with the contours that the tracker would use there.
 
-In goes an :class:`ObjectModel`, out comes one BGR image of two rows of three views. Limbs are red, creases white, texture
+In goes an :class:`ObjectModel`, out comes one BGR image of two rows of three views. Smooth silhouettes are red, creases white, texture
 edges yellow, and segments of polylines blue; the axes of the object's frame are red, green and blue, at its origin.
 """
 
@@ -26,7 +26,7 @@ _FILLED, _DISTANCE = 1.1, 4.0
 _STROKE_PX, _FRACTION_BITS = 2.0, 4
 _BACKGROUND, _TEXT, _GRID = (40, 36, 32), (230, 230, 230), (70, 66, 62)
 _COLOURS = {
-    ContourKind.LIMB: ("limb", (60, 60, 255)),
+    ContourKind.SMOOTH: ("smooth silhouette", (60, 60, 255)),
     ContourKind.CREASE: ("crease", (255, 255, 255)),
     ContourKind.TEXTURE: ("texture", (0, 220, 255)),
     ContourKind.SEGMENT: ("segment", (255, 160, 60)),
@@ -97,8 +97,8 @@ def _intrinsics() -> Float[Tensor, "4"]:
 def _tile(model: ObjectModel, contours: Contours, number: int, T_cam_obj: Float[Tensor, "4 4"]) -> np.ndarray:
     image = np.full((_SIDE_PX, _SIDE_PX, 3), _BACKGROUND, dtype=np.uint8)
     cv2.rectangle(image, (0, 0), (_SIDE_PX - 1, _SIDE_PX - 1), _GRID, 1)
-    # Creases on top: where a limb is one, too, it is a crease.
-    for kind in (ContourKind.TEXTURE, ContourKind.LIMB, ContourKind.SEGMENT, ContourKind.CREASE):
+    # Creases on top: where a silhouette is one, too, it is a crease.
+    for kind in (ContourKind.TEXTURE, ContourKind.SMOOTH, ContourKind.SEGMENT, ContourKind.CREASE):
         shown = contours.mask[number] & (contours.kind[number] == int(kind))
         _draw_strokes(image, contours.pixels[number][shown].numpy(), contours.normals[number][shown].numpy(), _COLOURS[kind][1])
     _draw_axes(image, model, T_cam_obj)

@@ -1,4 +1,4 @@
-"""The default's trust in observations of smooth limbs: what it judges, both ways that it is computed, and what it needs."""
+"""The default's trust in observations of smooth silhouettes: what it judges, both ways that it is computed, and what it needs."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ class Watching(SilhouetteTrust):
 
 
 def inputs_of(models=(SMOOTH,), dtype=torch.float32):
-    """What a weigher sees of objects in one place, all of the same events."""
+    """What a weighting network sees of objects in one place, all of the same events."""
     weighting_network = Watching(TrustNetwork.shipped())
     tracker = Tracker(list(models), SMALL_CAMERA, dtype=dtype, weighting_network=weighting_network)
     with torch.no_grad():
@@ -117,7 +117,7 @@ def test_it_changes_the_poses_of_what_is_smooth_and_of_nothing_else():
     events = windows(moving_box(pose(), COUNT)[1], COUNT)
     for model in (BOX, SMOOTH):
         actual = []
-        for trust in ("limbs", "none"):
+        for trust in ("silhouettes", "none"):
             tracker = Tracker([model], SMALL_CAMERA, TrackerConfig(association=AssociationConfig(weighting_network=trust)))
             with torch.no_grad():
                 actual.append(follow(tracker, tracker.init(pose()[None], 0), events)[0].T_cam_obj)

@@ -34,7 +34,7 @@ def clutter(count, start_us, duration_us, seed=1):
 
 
 def inputs_of(objects=1, dtype=torch.float32, noise=400, polarity=None):
-    """What a weigher sees of a box in motion among noise; with its tracker and the truth."""
+    """What a weighting network sees of a box in motion among noise; with its tracker and the truth."""
     trajectory, events = moving_box(pose(), 6)
     watching = Watching()
     tracker = Tracker([box_model()] * objects, SMALL_CAMERA, dtype=dtype, weighting_network=watching)

@@ -1,4 +1,4 @@
-"""What the solver finds beside the pose: a velocity from the ages of observations, and how far limbs stand out."""
+"""What the solver finds beside the pose: a velocity from the ages of observations, and how far silhouettes stand out."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Finds on probation: when one begins, and what it takes to be kept or taken back."""
+"""Tentative poses: when one begins, and what it takes to be kept or taken back."""
 
 from dataclasses import replace
 from functools import cache

@@ -268,7 +268,7 @@ def _remember(
     settings: ConclusionSettings,
     remembered: Array,
 ) -> None:
-    """What is remembered of an object with a window more: running means, and for how long it is in doubt, or was not seen well."""
+    """What is remembered of an object with a window more: running means, and for how long it drifts, or was not seen well."""
     known = remembered[:, b]
     if not failed:
         known[MEAN_SCORE] += settings.usual_gain * (measured[SCORE, b] - known[MEAN_SCORE])

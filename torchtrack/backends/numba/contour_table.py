@@ -40,7 +40,7 @@ def fill(
     table: Array,
     not_plain: Array,
 ) -> None:
-    """Fill ``table [b, m, COLUMNS]``, with zeros for points that do not count, and ``not_plain [b]``: which objects show print or limbs.
+    """Fill ``table [b, m, COLUMNS]``, with zeros for points that do not count, and ``not_plain [b]``: which objects show texture or silhouettes.
 
     Args:
         points_obj, depth_m, pixels, normals, kind, mask: of contours; ``pixels`` and ``normals`` as ``[b, 2, m]``, ``points_obj`` as ``[b, 3, m]``.
@@ -66,7 +66,7 @@ def _fill_one(
     settings: TableSettings,
     table: Array,
 ) -> bool:
-    """Fill the table of one object, but for how far off what is seen may be; whether it shows print or limbs."""
+    """Fill the table of one object, but for how far off what is seen may be; whether it shows texture or silhouettes."""
     not_plain = False
     for i in range(len(mask)):
         if not mask[i]:

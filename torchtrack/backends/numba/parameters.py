@@ -105,7 +105,7 @@ class TableSettings(NamedTuple):
     """What :mod:`torchtrack.backends.numba.contour_table` goes by: settings, and constants of :mod:`torchtrack.tracking.association.weights`.
 
     Args:
-        limb, crease, texture: numbers of kinds of contours.
+        silhouette, crease, texture: numbers of kinds of contours.
         of_print: whether anything is expected of print.
         close_px: distance from which parallel edges are told apart; 0 for always.
         aside_px: where an edge is looked for beside another.
@@ -231,7 +231,7 @@ class ConclusionSettings(NamedTuple):
 
     Args:
         holds: whether what failed stays where it was.
-        anywhere: widening of the first gate from which an object may be anywhere.
+        anywhere: scale of the first gate from which an object may be anywhere.
         hidden_from, hidden_fully, hidden_least, hidden_observations: what :func:`torchtrack.tracking.validation.status.partly_hidden` goes by.
         holds_on: whether poses by so many observations that go on from those before are not asked for more.
         smeared: events that gather less than this share of how far they usually do are smeared.
@@ -272,7 +272,7 @@ class PatchSettings(NamedTuple):
         across_px, along_px: where the patch is sampled.
         side: pixels of a side of what events are counted in, a power of two.
         border_px: of the table of sensor pixels.
-        limb: number of the kind of contours whose observations are described.
+        silhouette: number of the kind of contours whose observations are described.
         of_kind: where the kinds begin in a description, after counts and ages.
         slow_px_s: slower, an edge has no direction; ``unit_px_s`` that speeds are told in.
         oldest_px: ages are told up to this, by the way of the edge.

@@ -45,7 +45,7 @@ from torchtrack.tracking.estimation.rounds import Gates, Start
 from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.motion.prediction import Prediction
 
-# Pose, velocity and swelling; and their residual, in the rows of a Jacobian.
+# Pose, velocity and silhouette offset; and their residual, in the rows of a Jacobian.
 UNKNOWNS, _RESIDUAL = 13, 13
 
 

@@ -1,4 +1,5 @@
-"""What describes observations of limbs, one at a time: :func:`torchtrack.tracking.association.weighting_features.silhouette_features`."""
+"""What describes observations of smooth silhouettes, one by one:
+:func:`torchtrack.tracking.association.weighting_features.silhouette_features`."""
 
 import numpy as np
 import torch
@@ -57,7 +58,7 @@ def describe(
     features: Array,
     is_smooth: Array,
 ) -> None:
-    """Describe the observations of some objects whose nearest contour is a limb.
+    """Describe the observations of some objects whose nearest contour is a smooth silhouette.
 
     Args:
         objects: ``[r]``, which these are.
@@ -69,7 +70,7 @@ def describe(
         velocity, centre_cam, intrinsics: of each object.
         sensor_numbers, stream_index, last_event_us, t_us: of a :class:`torchtrack.tracking.frontend.history.History`.
         features: ``[r, n, f]``, filled; with zeros where there is nothing to describe.
-        is_limb: ``[b, n]``, false so far: which these are.
+        is_smooth: ``[b, n]``, false so far: which these are.
     """
     counted, softened = np.zeros(settings.side * settings.side, np.uint16), _softened(features)
     across_px, along_px, aside_px = _patch(settings, features)

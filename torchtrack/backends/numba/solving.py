@@ -18,7 +18,7 @@ from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, Win
 
 # Sums of products run along as many observations at a time: what they need stays in the fastest memory.
 _ALONG = FAST | {"reassoc"}
-# Unknowns of a pose; beside it there may be as many of its velocity, and a swelling.
+# Unknowns of a pose; beside it there may be as many of its velocity, and a silhouette offset.
 _POSE = 6
 
 

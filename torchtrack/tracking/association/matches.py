@@ -19,9 +19,9 @@ class Matches:
         points_obj: the contour point in the object's frame (m).
         targets: ideal pixels of the observations, moved to the window's end.
         directions: unit directions along which the distance counts.
-        offsets: distance of each observation from its contour along the normal, in px over the widening of the gate.
+        offsets: distance of each observation from its contour along the normal, in px over the scale of the gate.
         near: which observations have a contour so near that ``offsets`` says something, matched or not.
-        limb: 1 where the contour is the limb of a smooth surface, 0 where not.
+        silhouette: 1 where the contour is the smooth silhouette, 0 where not.
         beside: how many observations are on the contour in the patch of the image that each lies in.
         mistaken_px2: mean square of how far off each is, should it be of an edge that lies beside its contour (px²).
         dark: 1 where an event says that the outer side of its contour is the darker one, -1 the inner one; 0 where that is not known.

@@ -33,7 +33,7 @@ class ContourTable:
     Args:
         rows: the values of all contour points, laid out so that one selection takes them for all observations.
         index: the contour point nearest to each place in the image.
-        not_plain: objects of which print or smooth limbs are seen.
+        not_plain: objects of which print or smooth silhouettes are seen.
     """
 
     rows: Float[Tensor, "b k m"]
@@ -41,7 +41,7 @@ class ContourTable:
     not_plain: Bool[Tensor, "b"]
 
     def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, ...]:
-        """Of contour points: places on the object, normals, pixels when indexed; limb or not, oriented or not, darker side expected, mistaken."""
+        """Of contour points: places on the object, normals, pixels when indexed; smooth silhouette or not, oriented or not, darker side, ambiguity."""
         taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
         points_obj, normals, indexed, marks = taken.split((3, 2, 2, 4), -1)
         return points_obj, normals, indexed, *marks.unbind(-1)

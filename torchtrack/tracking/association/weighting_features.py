@@ -1,4 +1,4 @@
-"""What a weigher sees of a window before it is aligned: all that tells whether an observation is of the contour near it."""
+"""What a weighting network sees of a window before it is aligned: all that tells whether an observation is of the contour near it."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -26,7 +26,7 @@ class WeightingInputs:
 
     Args:
         observations: what is to be judged.
-        seen: events of the window; all of them, where a weigher of one's own is to judge.
+        seen: events of the window; all of them, where a weighting network of one's own is to judge.
         prediction: pose, motion and uncertainty of each object at the window's end.
         contours: visible contours there.
         index: which of them is nearest to a pixel.
@@ -51,15 +51,15 @@ class WeightingInputs:
 
 
 def judged(evidence: WeightingInputs, weighting_network: nn.Module) -> Observations:
-    """The observations, with how far a weigher believes each of them.
+    """The observations, with how far a weighting network believes each of them.
 
     Raises:
-        ValueError: if the weigher gives something else than one number for each observation.
+        ValueError: if the weighting network gives something else than one number for each observation.
     """
     trust = weighting_network(evidence)
     expected = evidence.observations.age_s.shape
     if trust.shape != expected:
-        raise ValueError(f"a weigher must give one number for each observation, shape {list(expected)}; got {list(trust.shape)}.")
+        raise ValueError(f"a weighting network must give one number for each observation, shape {list(expected)}; got {list(trust.shape)}.")
     return replace(evidence.observations, trust=trust.to(evidence.observations.age_s.dtype))
 
 
@@ -145,7 +145,7 @@ def trust_features(evidence: WeightingInputs) -> Float[Tensor, "b n f"]:
 
 @accelerable
 def silhouette_features(evidence: WeightingInputs) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
-    """:func:`trust_features`, which observations are nearest to the limb of a smooth surface, and of which objects there may be any.
+    """:func:`trust_features`, which observations are nearest to the smooth silhouette, and of which objects there may be any.
 
     Of other observations and other objects they need not be told.
     """

@@ -18,7 +18,7 @@ _SHIPPED = "learned.safetensors"
 
 
 class TrustNetwork(nn.Module):
-    """A weigher: believes an observation by the space-time patch of events around it (:mod:`torchtrack.tracking.association.weighting_features`).
+    """Believes an observation by the space-time patch of events around it (:mod:`torchtrack.tracking.association.weighting_features`).
 
     Args:
         hidden: widths of its two hidden layers.
@@ -62,10 +62,10 @@ class TrustNetwork(nn.Module):
 
 
 class SilhouetteTrust(nn.Module):
-    """A weigher: believes observations of the limbs of smooth surfaces as a network does, and all others in full.
+    """A weighting network: believes observations of the smooth silhouettes as a network does, and all others in full.
 
     What fires beside a sharp edge is nearly always of that edge, and few of them hold a pose: whatever is believed less there
-    is missed. Before a limb lies the shading of the surface, which fires, too, and moves otherwise.
+    is missed. Before a smooth silhouette lies the shading of the surface, which fires, too, and moves otherwise.
     """
 
     def __init__(self, network: TrustNetwork) -> None:
@@ -82,9 +82,9 @@ class SilhouetteTrust(nn.Module):
 
 
 def shipped_network(models: Sequence[ContourModel], config: AssociationConfig) -> nn.Module | None:
-    """The weigher that ``weighting_network`` asks for; none where it has nothing to say of these models."""
+    """The weighting network that ``weighting_network`` asks for; none where it has nothing to say of these models."""
     if config.weighting_network == "all":
         return TrustNetwork.shipped()
-    if config.weighting_network == "limbs" and any(bool(model.is_bent.any()) for model in models):
+    if config.weighting_network == "silhouettes" and any(bool(model.is_bent.any()) for model in models):
         return SilhouetteTrust(TrustNetwork.shipped())
     return None

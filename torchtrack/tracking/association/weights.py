@@ -100,7 +100,7 @@ def leading_side(speed_px_s: Tensor) -> Tensor:
 
 
 def dark_shift_px(silhouette: Tensor, config: AssociationConfig) -> Tensor:
-    """How far events lie to the dark side of their edge: a step's, or, less, that of a limb, towards which shading fades."""
+    """How far events lie to the dark side of their edge: a step's, or, less, that of a smooth silhouette, towards which shading fades."""
     return torch.add(
         constant((config.dark_shift_px,), silhouette.dtype, silhouette.device),
         silhouette,

@@ -207,7 +207,7 @@ def hidden_in_buffer(
 ) -> Bool[Tensor, "b m"]:
     """Points behind another surface in the depth buffer; an object's own counts where it has too many faces for the exact test.
 
-    Beside the limb of a curved surface that surface is nearer, in the same cell even; beyond it, it ends. So a point is
+    Beside the silhouette of a curved surface that surface is nearer, in the same cell even; beyond it, it ends. So a point is
     hidden only where it is also behind what lies a cell to each side of its contour.
 
     Args:

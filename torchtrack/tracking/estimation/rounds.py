@@ -28,7 +28,7 @@ from torchtrack.tracking.motion.prediction import Prediction
 _INDEX_MARGIN_PX = 2
 # What has to be looked for with a gate this many times wider may be anywhere.
 ANYWHERE = 2.0
-# Standard deviation of a swelling that is switched off (px).
+# Standard deviation of a silhouette offset that is switched off (px).
 _NO_SILHOUETTE_OFFSET_PX = 1e-3
 
 
@@ -55,7 +55,7 @@ def gate_scale_of(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[
 
 
 def may_be_anywhere(gate_scale: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
-    """Objects of whose place hardly anything was known, by the widening of their first gates."""
+    """Objects of whose place hardly anything was known, by the scale of their first gates."""
     return gate_scale >= ANYWHERE
 
 
@@ -97,8 +97,8 @@ def align(
     Args:
         prediction: what the prior draws to.
         contours: visible contours where the rounds begin, and ``index`` of them.
-        widening: of each object's first gate; it is taken back by the last.
-        offset: of the beginning from the prediction: pose, velocity and swelling; none when not given.
+        gate_scale: of each object's first gate; it is taken back by the last.
+        offset: of the beginning from the prediction: pose, velocity and silhouette offset; none when not given.
         extra_terms: of the cost, beside contour distances and prior.
     """
     objects, matching = prediction.objects, config.association
@@ -138,7 +138,7 @@ class Gates:
     """How far observations are looked for from contours.
 
     Args:
-        widening: of each object's first gate.
+        gate_scale: of each object's first gate.
         wider: by how much each round's gate is wider, for each object.
         finely: objects whose contours are looked up finely.
     """
@@ -182,7 +182,7 @@ def align_rounds(
 def _needs_subcell_lookup(
     objects: ObjectBatch, begin: Prediction, table: ContourTable, gate_scale: Float[Tensor, "b"], config: AssociationConfig
 ) -> Bool[Tensor, "b"]:
-    """Of which objects contours are looked up between the cells of the index: of small ones, and those of which print or smooth limbs are seen.
+    """Of which objects contours are looked up between the cells of the index: of small ones, and those of which print or smooth silhouettes are seen.
 
     Others of plain faces are not: their models may lack print, whose events then find the nearest edge all the more surely.
     """
@@ -227,7 +227,7 @@ def _believed(matches: Matches, observations: Observations, config: TrackerConfi
     if observations.trust is not None:
         weights = weights * observations.trust
     enough = weights.sum(-1, keepdim=True) >= config.validation.min_observations
-    # The model of a smooth limb, which has facets, and its shading put a whole piece of it off.
+    # The model of a smooth silhouette, which has facets, and its shading put a whole piece of it off.
     common_px2 = torch.add(matches.edge_ambiguity_px2, matches.silhouette, alpha=config.solver.common_px**2)
     effective = effective_weight(matches.neighbours, common_px2, config.solver.observation_px)
     return replace(matches, mask=matches.mask & enough, weights=weights * enough * effective)
@@ -253,7 +253,7 @@ def _problem(start: Start, matches: Matches, offset: Float[Tensor, "b k"], gate_
 
 
 def _window_terms(prediction: Prediction, rows: Matches, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
-    """What observations tell beside the pose: of the velocity by their ages, and of how far limbs stand out."""
+    """What observations tell beside the pose: of the velocity by their ages, and of how far silhouettes stand out."""
     age_s, outward = rows.age_s, rows.silhouette
     if config.association.residual != "normal":
         outward = torch.zeros_like(outward)

@@ -80,14 +80,14 @@ class WindowTerms:
     """What observations tell of beside the pose, which the solver then finds with it.
 
     An observation that is older than the pose tells of the velocity: the two are found together, so that a velocity
-    that was predicted wrong neither biases the pose nor is learned one window late. And all limbs of an object may stand
+    that was predicted wrong neither biases the pose nor is learned one window late. And all silhouettes of an object may stand
     out of its outline, or within it, by one unknown way, as smooth shading makes them: without it, depth would be
     believed to be seen far better than it is.
 
     Args:
         age_s: time from each observation to the pose (s).
         velocity: offset from the predicted velocity that the targets were moved with (rad/s, m/s).
-        outward: 1 where the outline's swelling counts along the direction, 0 where not.
+        outward: 1 where the silhouette's offset counts along the direction, 0 where not.
         rate_hz: acceleration in the window for each unit of velocity beyond the predicted one (1/s); zero where it is the same all along.
     """
 
@@ -111,7 +111,7 @@ class PoseProblem:
         scale_px: scale of the robust loss, per object.
         T_prior: pose the prior draws to.
         prior_information: information of the prior in the solver's chart; zero for no prior.
-        window: further unknowns; then the chart is ``[pose 6, velocity 6, swelling (px) 1]`` instead of the pose alone.
+        window: further unknowns; then the chart is ``[pose 6, velocity 6, silhouette offset (px) 1]`` instead of the pose alone.
         extra_terms: of the cost, beside contour distances and prior.
     """
 

@@ -89,7 +89,7 @@ class Prediction:
         """The contours that show within a window of length ``dt_s``, placed as at its end, where the prediction is.
 
         They are those that show in its middle: an edge that has just come before another has hardly fired, and draws the events
-        of that one; what has turned out of sight has. And the limb of a smooth surface, which moves on over it, is then half a
+        of that one; what has turned out of sight has. And the smooth silhouette, which moves on over it, is then half a
         window's motion off at most.
         """
         if config.source == "splat" or not config.mid_window:

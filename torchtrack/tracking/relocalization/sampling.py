@@ -76,7 +76,7 @@ def _anywhere(
 
 
 def draw_offsets(covariance: Float[Tensor, "12 12"], count: int) -> Float[Tensor, "n 13"]:
-    """Offsets of pose and velocity, drawn evenly from a covariance; the first is none. The swelling, last, is not drawn.
+    """Offsets of pose and velocity, drawn evenly from a covariance; the first is none. The silhouette offset, last, is not drawn.
 
     The sequence is the same every time: a search can be repeated.
     """

@@ -1,4 +1,4 @@
-"""Finds on probation: what was found of an object that was hardly known anything of may be wrong, and then has to be taken back.
+"""Tentative poses: what was found of an object that was hardly known anything of may be wrong, and then has to be taken back.
 
 Of thousands of poses one explains much by chance now and then, above all while the object is still hidden. So where it was
 looked for is kept, until what was found has explained about as much as is usual for some windows, or too little.
@@ -32,26 +32,26 @@ def confirmed(
     Args:
         before: the state before the window.
         state, result: after it.
-        prediction: of the objects, with ``widening`` of their first gates.
+        prediction: of the objects, with ``gate_scale`` of their first gates.
     """
     concerned = before.tentative.is_tentative | may_be_anywhere(gate_scale)
     if host_sync.none_of(concerned):
         return state, result
-    probation = _begun(before, result, prediction, gate_scale)
+    tentative = _begun(before, result, prediction, gate_scale)
     wanted = config.validation.validated_from * before.health.reference_explained_ratio
     speaks_for = (result.quality / wanted.clamp(min=1e-3)).clamp(max=1) - _NEUTRAL
-    evidence = probation.evidence + speaks_for
-    wrong = probation.is_tentative & (evidence <= _TAKEN_BACK_AT)
-    runs = probation.is_tentative & ~wrong & (evidence < _KEPT_AT)
+    evidence = tentative.evidence + speaks_for
+    wrong = tentative.is_tentative & (evidence <= _TAKEN_BACK_AT)
+    runs = tentative.is_tentative & ~wrong & (evidence < _KEPT_AT)
     # The next find of the object begins without any.
-    probation = replace(probation, is_tentative=runs, evidence=torch.where(runs, evidence, 0))
-    state = replace(state, motion=state.motion.at_rest(wrong, probation.T_cam_obj, probation.covariance), tentative=probation)
+    tentative = replace(tentative, is_tentative=runs, evidence=torch.where(runs, evidence, 0))
+    state = replace(state, motion=state.motion.at_rest(wrong, tentative.T_cam_obj, tentative.covariance), tentative=tentative)
     lost = torch.where(wrong & (result.status < int(Status.LOST)), int(Status.LOST), result.status)
     return state, replace(result, status=lost)
 
 
 def _begun(before: TrackerState, result: StepResult, prediction: Prediction, gate_scale: Float[Tensor, "b"]) -> TentativeTrack:
-    """The probation with those objects that were found in this window although hardly anything was known of them."""
+    """The tentative poses of those objects that were found in this window although hardly anything was known of them."""
     old = before.tentative
     begins = ~old.is_tentative & may_be_anywhere(gate_scale) & (result.status < int(Status.LOST))
     first = begins[:, None, None]

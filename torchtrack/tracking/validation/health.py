@@ -21,7 +21,7 @@ class TrackHealth:
         reference_matches: matched observations then.
         reference_normal_spread: how far apart the directions of contours with events on them are then
             (:func:`torchtrack.tracking.validation.measures.normal_spread_of`).
-        drift_s: for how long, less the time it was not, the object has been in doubt of being elsewhere (s).
+        drift_s: for how long, less the time it was not, the object has been drifting, as far as is known (s).
         T_last_validated: pose of each object when it was last seen well (float64).
         time_since_validated_s: how long ago that was (s).
     """

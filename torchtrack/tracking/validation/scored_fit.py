@@ -89,6 +89,6 @@ def explained_at_rest(gate_scale: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     """What an object explains that does not move: all, but nothing where it was looked for in many places.
 
     Args:
-        widening: of each object's first gate.
+        gate_scale: of each object's first gate.
     """
     return 2 - gate_scale.clamp(1, 2)

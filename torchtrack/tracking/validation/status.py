@@ -86,7 +86,7 @@ def trust(
 ) -> Float[Tensor, "b"]:
     """How far a pose that was found counts against the prediction: nothing where it is lost, fully once it is certain.
 
-    Of an object that was looked for in many places (``widening``) near to its full share is asked: chance explains some.
+    Of an object that was looked for in many places (``gate_scale``) near to its full share is asked: chance explains some.
     """
     full = torch.full_like(share, config.uncertain_below)
     if reference_explained_ratio is not None and gate_scale is not None:
@@ -106,7 +106,7 @@ def judge(
 ) -> Int[Tensor, "b"]:
     """The :class:`Status` of each object, the gravest reason first.
 
-    ``widening`` is of each object's first gate: an uncertain one may be found so much farther away. ``hidden`` is from
+    ``gate_scale`` is of each object's first gate: an uncertain one may be found so much farther away. ``hidden`` is from
     :func:`partly_hidden`.
     """
     gate_scale = torch.ones_like(quality) if gate_scale is None else gate_scale
