@@ -37,7 +37,7 @@ class Tracker(TrackedObjects):
         config: settings; the ``default`` preset when not given.
         stream_index: the stream each object is seen in; the first for all when not given.
         dtype: precision of the pipeline; poses are kept in float64.
-        weighting_network: judges every window's :class:`tracking.association.weighting_features.WeightingInputs`: how far to believe each observation,
+        weighting_network: judges every window's :class:`tracking.association.weighting_features.WeightingInputs`: how far to believe each,
             ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
             comes with the package, for what ``matching.weighting_network`` says. Other poses that a search tries are aligned
             without it.

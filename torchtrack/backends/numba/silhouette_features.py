@@ -1,5 +1,6 @@
 """What describes observations of smooth silhouettes, one by one:
-:func:`torchtrack.tracking.association.weighting_features.silhouette_features`."""
+:func:`torchtrack.tracking.association.weighting_features.silhouette_features`.
+"""
 
 import numpy as np
 import torch

@@ -41,7 +41,7 @@ class ContourTable:
     not_plain: Bool[Tensor, "b"]
 
     def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, ...]:
-        """Of contour points: places on the object, normals, pixels when indexed; smooth silhouette or not, oriented or not, darker side, ambiguity."""
+        """Of contour points: places on the object, normals, pixels when indexed; smooth silhouette or not, oriented or not, darker side, error."""
         taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
         points_obj, normals, indexed, marks = taken.split((3, 2, 2, 4), -1)
         return points_obj, normals, indexed, *marks.unbind(-1)
