@@ -39,7 +39,7 @@ def random_contours(batch, count, seed=0, dtype=torch.float64):
 
 @pytest.mark.parametrize("cell_px", [1, 2, 3])
 @pytest.mark.parametrize("radius_px", [4, 7])
-@pytest.mark.parametrize("finely", [False, True])
+@pytest.mark.parametrize("subcell_lookup", [False, True])
 def test_the_index_finds_the_nearest_contour_within_the_radius(cell_px, radius_px, subcell_lookup, dtype):
     contours = random_contours(3, 300, dtype=dtype)
     index = index_contours(contours, IMAGE_SIZE, radius_px, cell_px)
@@ -71,7 +71,7 @@ def test_only_some_objects_are_looked_up_finely(dtype):
     assert not torch.equal(subcell_lookup[1], roughly[1])
 
 
-@pytest.mark.parametrize("finely", [False, True])
+@pytest.mark.parametrize("subcell_lookup", [False, True])
 def test_roundings_do_not_choose_what_is_found_at_whole_pixels(subcell_lookup, dtype):
     """Where events lie, which is on the borders of cells or in the middle of four."""
     index = index_contours(random_contours(1, 300, dtype=dtype), IMAGE_SIZE, 7, 2)

@@ -24,7 +24,7 @@ def scored_as(score, inlier_ratio, count):
     """Fits of some poses, so good."""
     scored = in_motion()[3]
     rows = len(score)
-    values = {"measured": torch.tensor(score), "gathered": torch.tensor(inlier_ratio), "count": torch.tensor(count)}
+    values = {"measured": torch.tensor(score), "inlier_ratio": torch.tensor(inlier_ratio), "count": torch.tensor(count)}
     return replace(scored, **values, at_rest=torch.zeros(rows), reference_inlier_ratio=torch.zeros(rows))
 
 
@@ -90,7 +90,7 @@ def test_what_explains_too_little_for_being_far_away_is_left():
     assert better.elsewhere.tolist() == [True] and scored.elsewhere.tolist() == [False]
 
 
-@pytest.mark.parametrize("gathered", [0.3, torch.nan])
+@pytest.mark.parametrize("inlier_ratio", [0.3, torch.nan])
 def test_what_smears_events_more_than_it_may_is_left(inlier_ratio):
     """Where it cannot be told how far events gather, nothing speaks against a pose."""
     tracker, prediction, seen, scored, _ = in_motion(displaced=DISPLACED)

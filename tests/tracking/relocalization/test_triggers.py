@@ -25,12 +25,12 @@ FORGETFUL = AssociationConfig(polarity_prior_s=0.0, edge_ambiguity_px=0.0)
 TURNING = MotionConfig(turn_s=0)
 SEARCHING = TrackerConfig(
     corners=CornerConfig(max_corners=32),
-    matching=FORGETFUL,
+    association=FORGETFUL,
     motion=TURNING,
     relocalization=RelocalizationConfig(drift_us=10_000, drift_diameters_s=4),
 )
 NEVER_ADRIFT = TrackerConfig(
-    corners=CornerConfig(max_corners=32), matching=FORGETFUL, motion=TURNING, relocalization=RelocalizationConfig(drift_us=0, score_drop_below=0)
+    corners=CornerConfig(max_corners=32), association=FORGETFUL, motion=TURNING, relocalization=RelocalizationConfig(drift_us=0, score_drop_below=0)
 )
 # Nothing is ever in doubt, and looks farther away are for what was not seen well for long, or for nothing.
 UNDOUBTED = {"drift_us": 10_000, "drift_diameters_s": 4, "drift_below": 0, "score_drop_below": 0, "not_validated_below": 0}

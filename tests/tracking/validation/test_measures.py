@@ -102,7 +102,7 @@ def test_objects_are_judged_each_for_itself():
     assert status.tolist() == [Status.TRACKING, Status.UNCERTAIN, Status.LOST, Status.TOO_FEW_EVENTS]
 
 
-@pytest.mark.parametrize(("widening", "expected"), [(1.0, Status.UNCERTAIN), (1.25, Status.UNCERTAIN), (1.5, Status.LOST), (3.0, Status.LOST)])
+@pytest.mark.parametrize(("gate_scale", "expected"), [(1.0, Status.UNCERTAIN), (1.25, Status.UNCERTAIN), (1.5, Status.LOST), (3.0, Status.LOST)])
 def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(gate_scale, expected):
     """Between lost below 0.2 and caught above 0.45: 0.2625 is needed at 1.25 times the gate, 0.325 at 1.5, and no more than 0.45."""
     config = ValidationConfig(lost_below=0.2, refound_above=0.45)
@@ -137,7 +137,7 @@ def hidden(inlier_ratio=0.8, usually=0.8, count=200, elsewhere=False, config=CON
     return float(partly_hidden(torch.tensor([inlier_ratio]), torch.tensor([usually]), torch.tensor([count]), torch.tensor([elsewhere]), config))
 
 
-@pytest.mark.parametrize(("gathered", "expected"), [(0.0, 0), (0.64, 0), (0.7, 0.5), (0.76, 1), (1.0, 1), (math.nan, 0)])
+@pytest.mark.parametrize(("inlier_ratio", "expected"), [(0.0, 0), (0.64, 0), (0.7, 0.5), (0.76, 1), (1.0, 1), (math.nan, 0)])
 def test_what_gathers_as_ever_counts_however_little_is_explained(inlier_ratio, expected):
     assert hidden(inlier_ratio) == pytest.approx(expected, abs=1e-6)
 

@@ -103,7 +103,7 @@ def last_window(time_since_validated_s, reference_normal_spread, *, all_directio
     tracker, state, result, (events, end_us), _ = started(config=config)
     if upright:
         events = of_upright_edges(events, result.contours)
-    well = dict.fromkeys(("full_share", "usual_score", "score"), torch.full((1,), 0.9))
+    well = dict.fromkeys(("reference_explained_ratio", "mean_score", "score"), torch.full((1,), 0.9))
     state = changed(
         state,
         time_since_validated_s=torch.full((1,), time_since_validated_s),
@@ -131,7 +131,7 @@ def test_a_pose_that_only_parallel_lines_hold_explains_nothing_while_the_object_
     assert int(stated.observation_count) >= 30
 
 
-@pytest.mark.parametrize(("unseen_s", "full_apart"), [(0.0, 0.4), (0.1, 0.0)])
+@pytest.mark.parametrize(("time_since_validated_s", "reference_normal_spread"), [(0.0, 0.4), (0.1, 0.0)])
 def test_it_does_where_the_object_was_just_seen_well_or_never_fires_otherwise(time_since_validated_s, reference_normal_spread):
     _, stated = last_window(time_since_validated_s, reference_normal_spread, upright=True)
     _, not_asked = last_window(time_since_validated_s, reference_normal_spread, upright=True, all_directions=False)

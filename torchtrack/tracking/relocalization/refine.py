@@ -83,7 +83,7 @@ def replaced(scored: ScoredFit, number: int, tried: ScoredFit, choice: Choice) -
     count = max(mine.contours.mask.shape[1], theirs.contours.mask.shape[1])
     own, others = mine.contours.widened(count), theirs.contours.widened(count)
     contours = Contours(*(put(value, getattr(others, name)) for name, value in vars(own).items()))
-    names = [field.name for field in fields(ScoredFit) if field.name not in ("fit", "turn_unclear")]
+    names = [field.name for field in fields(ScoredFit) if field.name not in ("fit", "rotation_unclear")]
     measures = {name: put(getattr(scored, name), getattr(tried, name)) for name in names}
     # Another pose says nothing of whether it is the only possible.
     return ScoredFit(fit=Fit(solution, contours, mine.matches), rotation_unclear=scored.rotation_unclear, **measures)
