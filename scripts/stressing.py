@@ -5,9 +5,11 @@ import os
 import time
 import warnings
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import torchtrack
 from torchtrack.bench.scene import Scene, simulated
@@ -23,6 +25,10 @@ PACKET_US, WINDOW_US, HOUR_US = 2_000, 5_000, 3_600_000_000
 # Every so many packets: late, twice, clock back by 0.1 s, by 1000 s, a gap of 50 ms, an hour forward, a burst of noise, a wild time.
 LATE, TWICE, BACK, FAR_BACK, GAP, FORWARD, BURST, WILD = 53, 101, 5_003, 25_013, 2_003, 20_011, 1_009, 499
 HOT_PIXELS, BURST_EVENTS = 5, 5_000
+# How often a step of the first minute is taken again: what it takes is what a step takes on this machine now, whatever else runs on it.
+REFERENCE_EVERY, REFERENCE_AT = 50, 2_000
+# Once in so many windows, a fixed one is taken again: its time is that of a step on this machine now, whatever else runs there.
+REFERENCE_EVERY = 50
 Packet = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -101,6 +107,36 @@ class Faults:
         return EventBatch.from_numpy(*columns, shown, brighter)
 
 
+class ReferenceStep:
+    """The same window taken again and again, from the same state.
+
+    Args:
+        tracker: that takes it.
+        state: before it.
+        packets: of events without end.
+    """
+
+    def __init__(self, tracker: torchtrack.Tracker, state: torchtrack.TrackerState, packets: Iterator[Packet]) -> None:
+        self.seconds: list[float] = []
+        self._tracker = tracker
+        start_us = int(state.t_us[0])
+        for number in range(1, 20):
+            x, y, t_us, polarity = (np.concatenate(column) for column in zip(*islice(packets, 2), strict=True))
+            self._before, self._events = state, EventBatch.from_numpy(x, y, t_us + start_us, polarity)
+            self._end_us = start_us + 2 * PACKET_US * number
+            state = self._step(state, self._end_us)
+
+    def take(self) -> None:
+        """Take it once more."""
+        begun = time.process_time()
+        self._step(self._before, self._end_us)
+        self.seconds.append(time.process_time() - begun)
+
+    def _step(self, state: torchtrack.TrackerState, end_us: int) -> torchtrack.TrackerState:
+        with torch.inference_mode():
+            return self._tracker.step(state, self._events, end_us)[0]
+
+
 def resident_mb() -> float:
     """Memory of this process (MB)."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
@@ -121,17 +157,22 @@ def main() -> int:
     duration_us = round(60e6 * given.minutes)
     per_minute = round(60e6 * given.first) // WINDOW_US
     warnings.simplefilter("ignore", TorchtrackWarning)
+    reference = ReferenceStep(tracker, state, swinging(scene))
     tracked, seconds, table, begun = 0, [], [], time.process_time()
     for count, result in enumerate(torchtrack.track(faults.applied_to(swinging(scene), duration_us), tracker, state, window, problems), 1):
         seconds.append(time.process_time() - begun)
+        if count % REFERENCE_EVERY == 0:
+            reference.take()
         begun = time.process_time()
         tracked += int(result.status[0]) == int(Status.TRACKING)
         if count % per_minute == 0:
-            table.append((count * WINDOW_US / 6e7, 1e3 * float(np.median(seconds)), resident_mb()))
-            print(f"minute {table[-1][0]:5.1f}: step {table[-1][1]:.2f} ms, {table[-1][2]:.0f} MB, tracked {tracked / count:.1%}", flush=True)
-            seconds = []
+            step_s, reference_s = float(np.median(seconds)), float(np.median(reference.seconds))
+            table.append((step_s / reference_s, resident_mb()))
+            line = f"step {1e3 * step_s:.2f} ms, {table[-1][0]:.3f} of the fixed one, {table[-1][1]:.0f} MB, tracked {tracked / count:.1%}"
+            print(f"minute {count * WINDOW_US / 6e7:5.1f}: {line}", flush=True)
+            seconds, reference.seconds = [], []
     expected = duration_us // WINDOW_US + faults.hours * (LONGEST_SILENCE_US // WINDOW_US + 1)
-    slower, larger = (table[-1][column] / table[0][column] - 1 for column in (1, 2)) if len(table) > 1 else (0.0, 0.0)
+    slower, larger = (table[-1][column] / table[0][column] - 1 for column in (0, 1)) if len(table) > 1 else (0.0, 0.0)
     print(f"windows: {count:,} of {expected:,} expected; tracked {tracked / count:.1%}; time per step {slower:+.1%}, memory {larger:+.1%}")
     print(f"the stream: {problems}")
     missed = [name for name, bad in (("windows", abs(count - expected) > 0.01 * expected), ("time", slower > 0.05), ("memory", larger > 0.05)) if bad]
