@@ -32,7 +32,7 @@ from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.sampling import score_outlines
-from torchtrack.tracking.validation.measures import shares
+from torchtrack.tracking.validation.measures import fit_measures
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
@@ -224,7 +224,7 @@ def test_events_near_objects(objects, share):
         assert torch.equal(ours.of_each[0][ours.of_each[1]], theirs.of_each[0][theirs.of_each[1]])
 
 
-# ---- shares and matrices
+# ---- measures and matrices
 
 
 def random_matches(batch=3, count=900):
@@ -240,7 +240,7 @@ def random_matches(batch=3, count=900):
 @pytest.mark.parametrize("settings", [{}, {"min_on_contour": 1, "min_speed_px_s": 100.0}, {"min_observations": 5000}])
 def test_what_events_explain(speed, settings):
     contours, objects = random_contours(), moving_objects((speed, 0.5 * speed), 3)
-    by_kernels, plain = both_ways(lambda: shares(contours, random_matches(), objects, IMAGE_SIZE, ValidationConfig(**settings)))
+    by_kernels, plain = both_ways(lambda: fit_measures(contours, random_matches(), objects, IMAGE_SIZE, ValidationConfig(**settings)))
     assert_as_close(by_kernels, plain, tolerance=1e-6)
 
 
@@ -261,7 +261,7 @@ def test_what_is_not_a_number_stays_with_its_object(what):
     (spoilt.points_cam if what == "points" else spoilt.pixels)[1] = torch.nan
     objects = MovingObjects(torch.eye(4).double().expand(3, 4, 4), random_twist(3), torch.ones(3, 3).double(), torch.ones(3, 4).double())
     with torch.inference_mode():
-        alone, neighbours = (shares(owner, random_matches(), objects, IMAGE_SIZE, ValidationConfig()) for owner in (contours, spoilt))
+        alone, neighbours = (fit_measures(owner, random_matches(), objects, IMAGE_SIZE, ValidationConfig()) for owner in (contours, spoilt))
         index, other = (index_contours(owner, IMAGE_SIZE, 7, 2) for owner in (contours, spoilt))
     for first, second in zip(alone, neighbours, strict=True):
         assert torch.equal(first[[0, 2]], second[[0, 2]])

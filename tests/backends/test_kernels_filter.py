@@ -147,10 +147,10 @@ def random_find(tracker, prediction, dtype):
     solution = Linearisation(T_cam_obj, offset.to(dtype), hessian.to(dtype), offset.to(dtype))
     measured, inlier_ratio = uniform(OBJECTS, low=0.3, seed=23).to(dtype), uniform(OBJECTS, seed=24).to(dtype)
     measured[0], measured[1], measured[5], inlier_ratio[2] = 0.05, 0.3, torch.nan, torch.nan
-    elsewhere, rotation_unclear = torch.arange(OBJECTS) % 3 == 0, torch.arange(OBJECTS) % 4 == 2
+    elsewhere, axis_ambiguous = torch.arange(OBJECTS) % 3 == 0, torch.arange(OBJECTS) % 4 == 2
     reference_inlier_ratio, apart, required_spread = (uniform(OBJECTS, seed=seed).to(dtype) for seed in (26, 30, 31))
     stated = measured, torch.ones_like(measured), count, inlier_ratio, reference_inlier_ratio, apart, required_spread
-    return ScoredFit(Fit(solution, contours, matches), *stated, elsewhere, rotation_unclear)
+    return ScoredFit(Fit(solution, contours, matches), *stated, elsewhere, axis_ambiguous)
 
 
 def conclusions(config, dtype, spoil=lambda scored: None):
@@ -185,7 +185,7 @@ def test_conclusions(settings, dtype):
 @pytest.mark.parametrize(("partly_hidden", "holds_on"), [(True, False), (False, True), (False, False)])
 def test_conclusions_of_what_may_be_partly_hidden(partly_hidden, holds_on, dtype):
     def spoil(scored):
-        scored.measured[:] = 0.2
+        scored.measured_ratio[:] = 0.2
         scored.reference_inlier_ratio[:] = torch.linspace(0.4, 0.9, OBJECTS)
         scored.inlier_ratio[:] = scored.reference_inlier_ratio * torch.tensor([1.0, 0.95, 0.9, 0.85, 1.0, 1.1, torch.nan])
 

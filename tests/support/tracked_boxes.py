@@ -19,7 +19,7 @@ from torchtrack.core.lie import retract_about
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.estimation.rounds import align, gate_scale_of, index_for
 from torchtrack.tracking.expectation import predicted_after
-from torchtrack.tracking.validation.scored_fit import judge_fit
+from torchtrack.tracking.validation.scored_fit import score_fit
 
 WINDOW_US = 5_000
 WIDE_CAMERA = Camera(fx=250.0, fy=250.0, cx=159.5, cy=74.5, width=320, height=150)
@@ -92,7 +92,7 @@ def in_motion(config=None, displaced=None, dtype=torch.float32):
     tight = gate_scale_of(torch.zeros(1, dtype=dtype), tracker.config)
     index = index_for(contours, tracker.image_size, tracker.config, tight)
     observations = select_events(seen, index, prediction.moving(compensated=True), 1000)
-    scored = judge_fit(
+    scored = score_fit(
         prediction, align(prediction, contours, index, tight, observations, tracker.config), tracker.config, torch.ones(1, dtype=dtype)
     )
     return tracker, prediction, seen, scored, trajectory.at(torch.tensor([end_us]))

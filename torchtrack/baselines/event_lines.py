@@ -30,7 +30,7 @@ from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.motion.model import left_covariance
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.tracker import Tracker
-from torchtrack.tracking.validation.measures import explained_share, visible_share
+from torchtrack.tracking.validation.measures import explained_ratio, visible_ratio
 from torchtrack.tracking.validation.status import Status, judge
 
 # Contour points lie so far apart at most that an event on a line is within this of one of its points (px).
@@ -215,9 +215,9 @@ class EventLineTracker(Tracker):
     ) -> tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]]:
         """Status and quality of each object, and which poses are taken."""
         settings = self.config.validation
-        share = explained_share(contours, matches, self._contour_velocity(window, contours), self.image_size, settings)
+        share = explained_ratio(contours, matches, self._contour_velocity(window, contours), self.image_size, settings)
         step = lie.small_difference_about(window.T_start, solution.T_cam_obj, self.centre_obj)
-        in_view = visible_share(contours, self.image_size)
+        in_view = visible_ratio(contours, self.image_size)
         status = judge(share, matches.mask.sum(-1), in_view, step, self.diameter_m, settings)
         return status, share, status < int(Status.TOO_FEW_EVENTS)
 

@@ -68,7 +68,7 @@ def learned_after(
 
     Args:
         prediction: of the objects, before the window.
-        found: what ``state`` and ``result`` stand on.
+        scored: what ``state`` and ``result`` stand on.
     """
     learned = state.appearance.learned
     if learned is None or lesson.on_surfaces is None:

@@ -26,12 +26,12 @@ from torchtrack.tracking.relocalization.evidence import gather_evidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_object import OtherPoses, Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
-from torchtrack.tracking.relocalization.tentative import confirmed
-from torchtrack.tracking.relocalization.triggers import SEARCHED, has, may_have_rotated, reference_where_known, triggers
+from torchtrack.tracking.relocalization.tentative import confirm_or_take_back
+from torchtrack.tracking.relocalization.triggers import SEARCHED, has, may_have_rotated, triggers
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.measures import required_spread
-from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, judge_fit
+from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, reference_where_known, score_fit
 
 _READS = host_sync.HostReads()
 
@@ -122,9 +122,9 @@ def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, s
     config, health = tracked.config, state.health
     reference = reference_where_known(seen.sigma_px, health.reference_inlier_ratio, config.relocalization)
     spread = required_spread(health.reference_normal_spread, health.time_since_validated_s, config.validation)
-    scored = judge_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference, spread)
+    scored = score_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference, spread)
     if tracked.turns:
-        return replace(scored, rotation_unclear=may_have_rotated(tracked.has_turning_axis, health.time_since_validated_s, config.relocalization))
+        return replace(scored, axis_ambiguous=may_have_rotated(tracked.has_turning_axis, health.time_since_validated_s, config.relocalization))
     return scored
 
 
@@ -153,10 +153,10 @@ def update(
     scored, prediction = located.scored, located.prediction.detached()
     next_state, result = conclude(state, located.prediction, located.gate_scale, scored, seen.corners, expected.dt_s, config)
     if config.relocalization.tentative:
-        next_state, result = confirmed(state, next_state, result, prediction, located.gate_scale, config)
+        next_state, result = confirm_or_take_back(state, next_state, result, prediction, located.gate_scale, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
-    sure = ~scored.elsewhere
+    sure = ~scored.is_relocalized
     next_state = with_late_share(next_state, result, (seen.observations, seen.contours, fit.matches, prediction, sure), given.t_us, config)
     maps = replace(next_state.maps, burst_age_us=seen.burst_age_us)
     return replace(next_state, t_us=given.t_us, maps=maps), replace(result, t_us=given.t_us)

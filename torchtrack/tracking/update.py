@@ -17,24 +17,24 @@ from torchtrack.tracking.estimation.rounds import Fit, may_be_anywhere
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import MotionState, fade, found_acceleration, left_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.triggers import is_smeared
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.health import TrackHealth
-from torchtrack.tracking.validation.measures import visible_share
+from torchtrack.tracking.validation.measures import visible_ratio
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import (
     Status,
     holding_on,
+    is_smeared,
     judge,
     partly_hidden,
     trust,
 )
 
-# Share of a new window in the usual quality.
+# Weight of a new window in the mean score.
 USUAL_GAIN = 0.1
-# And in the full one where it is less: what is hidden for a while is not seen well.
+# And in references where it is less: what is hidden for a while is not seen well.
 FALL_GAIN = 0.005
-# A pose that explains this share of what it does when seen well, by this share of the observations, is remembered as one: most that
+# A pose that explains this ratio of what it does when seen well, by this ratio of the observations, is remembered as one: most that
 # slipped explain less, or are far away, where few explain all.
 CERTAIN, CERTAIN_COUNT = 0.9, 0.5
 
@@ -80,34 +80,34 @@ def judged_objects(
     state: TrackerState, prediction: Prediction, gate_scale: Float[Tensor, "b"], scored: ScoredFit, dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> Judgement:
     """What every object's pose is worth, and where it goes on from there: arguments as those of :func:`conclude`."""
-    objects, share, solution, health = prediction.objects, scored.explained_ratio, scored.fit.solution, state.health
+    objects, explained, solution, health = prediction.objects, scored.explained_ratio, scored.fit.solution, state.health
     reference = health.reference_explained_ratio
-    in_view = visible_share(scored.fit.contours, objects.image_size)
-    # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
-    step = solution.from_prior[:, :6] * ~(scored.elsewhere & may_be_anywhere(gate_scale))[:, None]
-    hidden = partly_hidden(scored.inlier_ratio, scored.reference_inlier_ratio, scored.count, scored.elsewhere, config.validation)
-    asked_less = torch.where(holding_on(scored.count, scored.elsewhere, config.validation), 1, hidden)
-    status = judge(share, scored.count, in_view, step, objects.diameter_m, config.validation, gate_scale, asked_less)
+    in_view = visible_ratio(scored.fit.contours, objects.image_size)
+    # A new pose of what may be anywhere is no jump, however far away it is; what is not a number stays that.
+    step = solution.from_prior[:, :6] * ~(scored.is_relocalized & may_be_anywhere(gate_scale))[:, None]
+    hidden = partly_hidden(scored.inlier_ratio, scored.reference_inlier_ratio, scored.count, scored.is_relocalized, config.validation)
+    asked_less = torch.where(holding_on(scored.count, scored.is_relocalized, config.validation), 1, hidden)
+    status = judge(explained, scored.count, in_view, step, objects.diameter_m, config.validation, gate_scale, asked_less)
     status = torch.where(prediction.usable, status, int(Status.DIVERGED))
     failed = status >= int(Status.LOST)
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
-    trusted = torch.where(failed, 0, torch.maximum(hidden, trust(share, config.validation, reference, gate_scale)))
-    is_drifting_now = ~failed & is_smeared(scored.score, reference, scored.inlier_ratio, scored.reference_inlier_ratio, config.relocalization)
-    unsure = is_drifting_now | (~failed & scored.rotation_unclear)
+    trusted = torch.where(failed, 0, torch.maximum(hidden, trust(explained, config.validation, reference, gate_scale)))
+    smeared = ~failed & is_smeared(scored.score, reference, scored.inlier_ratio, scored.reference_inlier_ratio, config.relocalization)
+    unsure = smeared | (~failed & scored.axis_ambiguous)
     status = torch.where(unsure, status.clamp(min=int(Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, scored, failed, trusted, dt_s, config)
     # Of an object that is partly hidden too little is seen to tell.
-    seen_well = ~failed & (share >= config.validation.validated_from * reference)
+    seen_well = ~failed & (explained >= config.validation.validated_from * reference)
     acceleration = _acceleration(prediction, scored, torch.where(seen_well, trusted, 0), dt_s)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
-    certain = (share >= CERTAIN * reference) & (status == int(Status.TRACKING))
+    certain = (explained >= CERTAIN * reference) & (status == int(Status.TRACKING))
     certain &= (scored.count >= CERTAIN_COUNT * health.reference_matches) | (not config.relocalization.by_matches)
     health = replace(
         _with_references(health, scored, failed),
-        # One good window among bad ones does not end a doubt.
-        drift_s=(health.drift_s + torch.where(failed, 0, torch.where(is_drifting_now, dt_s, -dt_s))).clamp(min=0),
+        # One good window among bad ones does not end a drift.
+        drift_s=(health.drift_s + torch.where(failed, 0, torch.where(smeared, dt_s, -dt_s))).clamp(min=0),
         T_last_validated=torch.where(certain[:, None, None], T_cam_obj.detach(), health.T_last_validated),
         time_since_validated_s=torch.where(certain, 0, health.time_since_validated_s + dt_s),
     )
@@ -121,8 +121,8 @@ def _darker_outside(
     if not config.association.polarity_prior_s:
         return state.appearance.darker_outside
     matches = scored.fit.matches
-    # What a search found stands on other matches than these.
-    known = (status == int(Status.TRACKING)) & is_seen_well(scored.explained_ratio, state.health.reference_explained_ratio) & ~scored.elsewhere
+    # What was relocalized stands on other matches than these.
+    known = (status == int(Status.TRACKING)) & is_seen_well(scored.explained_ratio, state.health.reference_explained_ratio) & ~scored.is_relocalized
     # Chosen, not multiplied: what is not a number would stay.
     weights = torch.where(known[:, None] & (matches.offsets.abs() < ON_CONTOUR_PX), matches.weights, 0)
     return remembered(state.appearance.darker_outside, matches.directions, matches.dark, weights, dt_s, config.association.polarity_prior_s)
@@ -143,7 +143,7 @@ def _with_references(health: TrackHealth, scored: ScoredFit, failed: Bool[Tensor
 def _normal_spread(health: TrackHealth, scored: ScoredFit) -> Float[Tensor, "b"]:
     """How far apart the directions of contours are when objects are seen well, with a window more."""
     spread = health.reference_normal_spread
-    return torch.where(health.time_since_validated_s == 0, _seen_well(spread, scored.apart), spread)
+    return torch.where(health.time_since_validated_s == 0, _seen_well(spread, scored.normal_spread), spread)
 
 
 def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
@@ -152,7 +152,7 @@ def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Ten
 
 
 def _acceleration(prediction: Prediction, scored: ScoredFit, trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 6"]:
-    """Acceleration of a window, as found, as far as the find is to be trusted."""
+    """Acceleration of a window, as estimated, as far as that is to be trusted."""
     offset = scored.fit.solution.from_prior
     if prediction.acceleration is None:
         return torch.zeros_like(prediction.velocity)
@@ -164,7 +164,7 @@ def _acceleration(prediction: Prediction, scored: ScoredFit, trusted: Float[Tens
 def _updated_motion(
     prediction: Prediction, scored: ScoredFit, failed: Bool[Tensor, "b"], trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> tuple[Float[Tensor, "b 6"], Float[Tensor, "b 12 12"]]:
-    """Velocity and covariance after a window: as found, as far as the find is to be trusted."""
+    """Velocity and covariance after a window: as estimated, as far as that is to be trusted."""
     predicted, solution = prediction.covariance, scored.fit.solution
     if not config.solver.prior:
         return torch.zeros_like(prediction.velocity), predicted

@@ -21,7 +21,7 @@ from torchtrack.tracking.adapt import objects_as_known
 from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.polarity import expected_polarity, is_asked, is_seen_well, nothing_remembered, octant, remembered
 from torchtrack.tracking.contours.index import index_contours
-from torchtrack.tracking.validation.measures import explained_share
+from torchtrack.tracking.validation.measures import explained_ratio
 from torchtrack.tracking.validation.status import Status
 
 OFF = TrackerConfig(association=AssociationConfig(polarity_prior_s=0.0))
@@ -142,12 +142,12 @@ def test_of_unknown_polarity_nothing_is_said():
 
 
 def test_contours_are_not_explained_by_events_that_are_not_as_expected():
-    config = TrackerConfig().quality
+    config = TrackerConfig().validation
     shares = []
     for dark in ([1.0] * 60, [-1.0] * 60):
         contours, matches = matched(dark)
         moving = torch.tensor([500.0, 0.0], dtype=torch.float64).expand_as(contours.pixels)
-        shares.append(float(explained_share(contours, matches, moving, IMAGE_SIZE, config)))
+        shares.append(float(explained_ratio(contours, matches, moving, IMAGE_SIZE, config)))
     assert shares[0] > 0.1
     assert shares[1] == 0
 

@@ -13,7 +13,7 @@ from torchtrack.object_model.contour_source import group_by_model
 from torchtrack.tracking.contours import visibility
 from torchtrack.tracking.contours.sampling import mesh_contours
 from torchtrack.tracking.contours.visibility import DepthGrid, Scene, depth_buffer, hidden_by_faces, remove_hidden
-from torchtrack.tracking.validation.measures import visible_share
+from torchtrack.tracking.validation.measures import visible_ratio
 
 CONFIG = ContourConfig()
 LARGE_CAMERA = Camera(fx=600.0, fy=600.0, cx=319.5, cy=239.5, width=640, height=480)
@@ -197,7 +197,7 @@ def test_contours_outside_the_image_are_not_said_to_be_hidden(x_m):
     model = ObjectModel.from_mesh(ball(0.1, subdivisions=4), name="ball")
     before, after = extracted([model], pose((0.0, 0.0, 0.0), (x_m, 0.0, 0.6))[None], camera=LARGE_CAMERA)
     size = (LARGE_CAMERA.height, LARGE_CAMERA.width)
-    assert float(visible_share(after, size)) == pytest.approx(float(visible_share(before, size)), abs=0.1)
+    assert float(visible_ratio(after, size)) == pytest.approx(float(visible_ratio(before, size)), abs=0.1)
 
 
 def test_a_bad_pose_harms_no_neighbour(dtype):

@@ -24,8 +24,8 @@ def scored_as(score, inlier_ratio, count):
     """Fits of some poses, so good."""
     scored = in_motion()[3]
     rows = len(score)
-    values = {"measured": torch.tensor(score), "inlier_ratio": torch.tensor(inlier_ratio), "count": torch.tensor(count)}
-    return replace(scored, **values, at_rest=torch.zeros(rows), reference_inlier_ratio=torch.zeros(rows))
+    values = {"measured_ratio": torch.tensor(score), "inlier_ratio": torch.tensor(inlier_ratio), "count": torch.tensor(count)}
+    return replace(scored, **values, ratio_at_rest=torch.zeros(rows), reference_inlier_ratio=torch.zeros(rows))
 
 
 def test_a_pose_passes_that_matches_enough_events_which_gather_enough():
@@ -87,7 +87,7 @@ def test_what_explains_too_little_for_being_far_away_is_left():
     prediction = replace(prediction, covariance=1e2 * prediction.covariance)
     assert searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_score=1.1)) is scored
     better = searched(lost_object(tracker, prediction, seen, scored, 8.0))
-    assert better.elsewhere.tolist() == [True] and scored.elsewhere.tolist() == [False]
+    assert better.is_relocalized.tolist() == [True] and scored.is_relocalized.tolist() == [False]
 
 
 @pytest.mark.parametrize("inlier_ratio", [0.3, torch.nan])
@@ -97,7 +97,7 @@ def test_what_smears_events_more_than_it_may_is_left(inlier_ratio):
     prediction = replace(prediction, covariance=1e2 * prediction.covariance)
     assert searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_inlier_ratio=1.01)) is scored
     better = searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_inlier_ratio=inlier_ratio))
-    assert better.elsewhere.tolist() == [True]
+    assert better.is_relocalized.tolist() == [True]
     assert float(better.inlier_ratio) > 0.3
 
 
@@ -106,7 +106,7 @@ def test_what_explains_too_few_events_is_left():
     prediction = replace(prediction, covariance=1e2 * prediction.covariance)
     better = searched(lost_object(tracker, prediction, seen, scored, 8.0))
     many = float(better.count)
-    assert searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_matches=many)).elsewhere.tolist() == [True]
+    assert searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_matches=many)).is_relocalized.tolist() == [True]
     assert searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_matches=2 * many)) is scored
 
 

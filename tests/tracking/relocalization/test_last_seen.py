@@ -1,5 +1,7 @@
 """Where objects are looked for that were not seen well for long: around the pose that they had then."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose
@@ -43,7 +45,7 @@ def test_what_is_lost_rests_where_it_was_seen_well_and_its_neighbour_goes_on():
     tracker = Tracker([box_model()] * 2, SMALL_CAMERA)
     _, state, *_ = started()
     both = joined([unseen(state), state])
-    both = changed(both, t_us=state.t_us, last_event_us=state.maps.last_event_us, burst_age_us=state.maps.burst_age_us)
+    both = replace(both, t_us=state.t_us, maps=state.maps)
     both = changed(both, T_cam_obj=moved_away(tracker, both, 0.4), velocity=both.velocity + 1)
     last_seen = LastSeen.from_state(both, tracker.objects, torch.tensor([30_000]), CONFIG)
     after = last_seen.in_place_of(both, torch.tensor([True, False]))

@@ -49,15 +49,15 @@ def bar():
 
 
 def test_lines_that_end_with_their_contours_do_not_run_on(device, dtype):
-    share = running_on(contours_of(*square(), device=device, dtype=dtype), places_of(*square(), device=device, dtype=dtype), IMAGE_SIZE)
-    assert share.dtype == dtype and share.device.type == device.type
-    assert share.tolist() == [0.0]
+    ratio = running_on(contours_of(*square(), device=device, dtype=dtype), places_of(*square(), device=device, dtype=dtype), IMAGE_SIZE)
+    assert ratio.dtype == dtype and ratio.device.type == device.type
+    assert ratio.tolist() == [0.0]
 
 
 def test_edges_of_a_bar_run_on_beyond_what_is_laid_along_them(device, dtype):
     sides = square()[1::2]
-    share = running_on(contours_of(*sides, device=device, dtype=dtype), places_of(*bar(), device=device, dtype=dtype), IMAGE_SIZE)
-    assert float(share) > 0.8
+    ratio = running_on(contours_of(*sides, device=device, dtype=dtype), places_of(*bar(), device=device, dtype=dtype), IMAGE_SIZE)
+    assert float(ratio) > 0.8
 
 
 def test_a_bar_before_an_object_is_not_held_against_it():
@@ -106,6 +106,6 @@ def test_scores_of_poses_that_are_not_concerned_stay(concerned):
     together = along.rows(torch.tensor([0, 0]))
     score, asked = torch.tensor([0.9, 0.8]), torch.tensor(concerned)
     less = less_where_lines_run_on(score, asked, together, places, IMAGE_SIZE)
-    share = running_on(together, places, IMAGE_SIZE)
-    assert float(share.min()) > 0.5
-    torch.testing.assert_close(less, torch.where(asked, score * (1 - share), score))
+    ratio = running_on(together, places, IMAGE_SIZE)
+    assert float(ratio.min()) > 0.5
+    torch.testing.assert_close(less, torch.where(asked, score * (1 - ratio), score))

@@ -6,7 +6,6 @@ import pytest
 import torch
 from helpers import SMALL_CAMERA, pose_errors
 from lost_objects import acceptance_test, lost_object, searched
-from states import changed
 from tracked_boxes import in_motion, tensors_of
 
 from torchtrack.config.relocalization import RelocalizationConfig
@@ -52,7 +51,7 @@ def test_a_box_is_found_again_where_hardly_anything_is_known_of_it(velocity_know
     sigma = torch.tensor([0.3] * 3 + [0.04] * 3 + [2.0] * 3 + [0.3] * 3, dtype=torch.float64)
     velocity = prediction.velocity if velocity_known else torch.zeros_like(prediction.velocity)
     prediction = replace(prediction, covariance=torch.diag_embed(sigma.square())[None], velocity=velocity)
-    better = searched(lost_object(tracker, prediction, seen, replace(scored, measured=torch.zeros(1)), 30.0))
+    better = searched(lost_object(tracker, prediction, seen, replace(scored, measured_ratio=torch.zeros(1)), 30.0))
     degrees, millimetres = pose_errors(better.fit.solution.T_cam_obj.double(), T_true)
     assert float(degrees) < 2.0
     assert float(millimetres) < 5.0
@@ -77,9 +76,9 @@ def test_the_best_poses_are_aligned_again_where_hardly_anything_is_known_and_now
     tracker, prediction, seen, scored, _ = in_motion(displaced=DISPLACED)
     for sigma_px in (8.0, 30.0):
         searched(lost_object(tracker, prediction, seen, scored, sigma_px))
-    once = replace_settings(tracker.config, realigned=0)
+    once = replace_settings(tracker.config, realignments=0)
     searched(lost_object(tracker, prediction, seen, scored, 30.0, once))
-    few = replace_settings(tracker.config, hypotheses=3, realigned=1)
+    few = replace_settings(tracker.config, hypotheses=3, realignments=1)
     searched(lost_object(tracker, prediction, seen, scored, 30.0, few))
     assert counts == [24, 24, 8, 8, 24, 3, 3]
 
@@ -101,10 +100,10 @@ def test_what_slipped_goes_on_as_certain_as_if_it_had_been_predicted():
     tracker, prediction, seen, scored, _ = in_motion(displaced=DISPLACED)
     lost = lost_object(tracker, prediction, seen, scored, float(prediction.sigma_px(scored.fit.contours)))
     better = searched(lost, propose=around_prediction_released)
-    assert better.elsewhere.tolist() == [True] and scored.elsewhere.tolist() == [False]
+    assert better.is_relocalized.tolist() == [True] and scored.is_relocalized.tolist() == [False]
     predicted = tracker.config.solver.observation_px**2 * prediction.information[0]
     from_events = better.fit.solution.hessian[0, :12, :12].double() - predicted
     scale = predicted.diagonal().rsqrt()
     assert float(torch.linalg.eigvalsh(from_events * scale[:, None] * scale).min()) > -1e-3
-    unmet = changed(lost, sigma_px=1.0)
+    unmet = replace(lost, sigma_px=1.0)
     assert searched(unmet, acceptance_test(min_score=1.1), around_prediction_released) is scored

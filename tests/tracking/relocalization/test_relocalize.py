@@ -78,7 +78,7 @@ def test_a_further_source_needs_no_change_of_the_loop():
     degrees, millimetres = pose_errors(after.scored.fit.solution.T_cam_obj.double(), T_true)
     assert float(degrees) < 0.5 and float(millimetres) < 1.0
     assert torch.equal(after.prediction.T_cam_obj, T_true.float())
-    assert after.scored.elsewhere.tolist() == [True]
+    assert after.scored.is_relocalized.tolist() == [True]
 
 
 def test_a_source_without_hypotheses_changes_nothing():
@@ -98,7 +98,7 @@ def test_sources_are_tried_in_order_and_each_on_what_those_before_gave():
     source = Source(Trigger.UNCERTAIN, noted, lambda *_: acceptance_test())
     after = looped(lost, seen, evidence(sigma_px=8.0), (source, source))
     assert windows_seen[0] is lost.window.scored
-    assert windows_seen[1].elsewhere.tolist() == [True]
+    assert windows_seen[1].is_relocalized.tolist() == [True]
     assert torch.equal(after.scored.fit.solution.T_cam_obj, windows_seen[1].fit.solution.T_cam_obj)
 
 
@@ -106,18 +106,18 @@ def test_what_had_drifted_and_is_relocalized_is_as_uncertain_as_that_made_it():
     lost, seen, _ = displaced_and_lost()
     drifts = evidence(is_drift_due=True, drift_s=0.2, sigma_px=8.0, matches=10, reference_explained_ratio=0.5)
     after = looped(lost, seen, drifts)
-    assert after.scored.elsewhere.tolist() == [True]
+    assert after.scored.is_relocalized.tolist() == [True]
     assert float(after.prediction.covariance[0, 3, 3]) > float(lost.window.prediction.covariance[0, 3, 3])
     assert float(after.gate_scale) > 1
     sure = looped(lost, seen, evidence(sigma_px=8.0))
-    assert sure.scored.elsewhere.tolist() == [True]
+    assert sure.scored.is_relocalized.tolist() == [True]
     assert torch.equal(sure.prediction.covariance, lost.window.prediction.covariance) and float(sure.gate_scale) == 1
 
 
 def test_a_search_leaves_what_it_was_given_as_it_was():
     lost, seen, _ = displaced_and_lost()
     before = [tensor.clone() for tensor in tensors_of(lost.window.scored)]
-    assert looped(lost, seen, evidence(sigma_px=8.0)).scored.elsewhere.tolist() == [True]
+    assert looped(lost, seen, evidence(sigma_px=8.0)).scored.is_relocalized.tolist() == [True]
     assert all(torch.equal(now, then) for now, then in zip(tensors_of(lost.window.scored), before, strict=True))
 
 
@@ -129,11 +129,8 @@ def displaced_runs(config, covariance_scale, count=10, displaced=DISPLACED):
     tracker = Tracker([box_model()], SMALL_CAMERA, config)
     trajectory, events = moving_box(pose(), count + 5)
     state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 5))
-    state = replace(
-        state,
-        T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()),
-        covariance=covariance_scale * state.motion.covariance,
-    )
+    T_cam_obj = retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double())
+    state = changed(state, T_cam_obj=T_cam_obj, covariance=covariance_scale * state.motion.covariance)
     _, results = follow(tracker, state, windows(events, count, 5 * WINDOW_US))
     return results, trajectory.at(results[-1].t_us)
 

@@ -151,7 +151,7 @@ def test_where_the_prediction_is_good_only_what_it_allows_is_sample():
     tracker, prediction, seen, scored, _ = in_motion()
     covariance = 1e-6 * torch.eye(12, dtype=torch.float64)
     offsets = sample(prediction, scored.fit.contours, covariance, 3.0, (seen.pixels, seen.mask), tracker.config)
-    drawn = draw_offsets(covariance, RelocalizationConfig().drawn).float()
+    drawn = draw_offsets(covariance, RelocalizationConfig().samples).float()
     assert ((offsets[:, None] == drawn).all(-1).any(-1)).all()
     assert float(offsets[:, :6].abs().max()) < 5e-3
 

@@ -170,10 +170,10 @@ def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(last_seen_us):
     def run_off(tracker, state):
         away = torch.tensor([[1.3, 0.0, 0.0, 0.0, 0.0, 0.15]], dtype=torch.float64)
         T_cam_obj = retract_about(state.T_cam_obj, away, tracker.centre_obj.double())
-        return replace(
+        return changed(
             state,
             T_cam_obj=T_cam_obj,
-            doubted_s=torch.full((1,), 0.1),
+            drift_s=torch.full((1,), 0.1),
             time_since_validated_s=torch.full((1,), 0.2),
             velocity=torch.zeros_like(state.velocity),
         )
@@ -193,6 +193,6 @@ def test_where_an_object_was_last_seen_well_is_remembered_and_not_where_it_was_n
     assert torch.equal(state.health.T_last_validated, state.T_cam_obj)
     later, results = follow(tracker, state, windows(events[:0], 2, 8 * WINDOW_US))
     assert int(results[-1].status) == Status.TOO_FEW_EVENTS
-    assert float(state.health.time_since_validated_s) == 0 and float(later.time_since_validated_s) == pytest.approx(0.01)
+    assert float(state.health.time_since_validated_s) == 0 and float(later.health.time_since_validated_s) == pytest.approx(0.01)
     assert torch.equal(later.health.T_last_validated, state.health.T_last_validated) and not torch.equal(later.T_cam_obj, state.T_cam_obj)
     assert trajectory.at(state.t_us).shape == state.health.T_last_validated.shape

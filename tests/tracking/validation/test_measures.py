@@ -1,4 +1,4 @@
-"""Statuses one by one, the explained share, what is in view, and how far a pose is trusted."""
+"""Statuses one by one, the explained ratio, what is in view, and how far a pose is trusted."""
 
 import math
 
@@ -9,16 +9,16 @@ from measured_matches import matches_at
 from torchtrack.config.validation import ValidationConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.validation.measures import explained_share, gathered_share, visible_share
-from torchtrack.tracking.validation.status import Status, holding_on, judge, needed_share, partly_hidden, trust
+from torchtrack.tracking.validation.measures import explained_ratio, inlier_ratio, visible_ratio
+from torchtrack.tracking.validation.status import Status, holding_on, judge, needed_ratio, partly_hidden, trust
 
 IMAGE_SIZE = (150, 200)
 CONFIG = ValidationConfig()
 
 
-def verdict(*, quality=1.0, count=100, in_view=1.0, turned=0.0, moved=0.0, config=CONFIG):
-    """Status of one object whose prediction was turned by ``turned`` rad and moved by ``moved`` diameters."""
-    step = torch.tensor([[0.6 * turned, 0.8 * turned, 0.0, 0.0, 0.0, 0.2 * moved]])
+def verdict(*, quality=1.0, count=100, in_view=1.0, rotated=0.0, moved=0.0, config=CONFIG):
+    """Status of one object whose prediction was rotated by ``rotated`` rad and moved by ``moved`` diameters."""
+    step = torch.tensor([[0.6 * rotated, 0.8 * rotated, 0.0, 0.0, 0.0, 0.2 * moved]])
     status = judge(torch.tensor([quality]), torch.tensor([count]), torch.tensor([in_view]), step, torch.tensor([0.2]), config)
     return Status(int(status))
 
@@ -36,9 +36,9 @@ def upright_line(u=80.0, count=80, first=20.0):
     return torch.stack([torch.full_like(v, u), v], -1)[None]
 
 
-def share(contours, matches, velocity=(100.0, 0.0), config=CONFIG):
+def ratio(contours, matches, velocity=(100.0, 0.0), config=CONFIG):
     moving = torch.tensor(velocity, dtype=torch.float64).expand_as(contours.pixels)
-    return explained_share(contours, matches, moving, IMAGE_SIZE, config)
+    return explained_ratio(contours, matches, moving, IMAGE_SIZE, config)
 
 
 # ---- statuses
@@ -61,11 +61,11 @@ def test_a_good_pose_is_tracking():
         ({"count": 0}, Status.TOO_FEW_EVENTS),
         ({"in_view": 0.19}, Status.OUT_OF_VIEW),
         ({"in_view": 0.2}, Status.TRACKING),
-        ({"axis_rotation": 0.51}, Status.DIVERGED),
-        ({"axis_rotation": 0.49}, Status.TRACKING),
+        ({"rotated": 0.51}, Status.DIVERGED),
+        ({"rotated": 0.49}, Status.TRACKING),
         ({"moved": 0.51}, Status.DIVERGED),
         ({"moved": 0.49}, Status.TRACKING),
-        ({"axis_rotation": float("nan")}, Status.DIVERGED),
+        ({"rotated": float("nan")}, Status.DIVERGED),
         ({"moved": float("inf")}, Status.DIVERGED),
     ],
     ids=lambda value: value.name if isinstance(value, Status) else "-".join(f"{k}={v}" for k, v in value.items()),
@@ -79,7 +79,7 @@ def test_each_reason_has_its_status(change, expected):
     [
         ({"quality": 0.0, "count": 0}, Status.TOO_FEW_EVENTS),
         ({"quality": 0.0, "count": 0, "in_view": 0.0}, Status.OUT_OF_VIEW),
-        ({"quality": 0.0, "count": 0, "in_view": 0.0, "axis_rotation": 1.0}, Status.DIVERGED),
+        ({"quality": 0.0, "count": 0, "in_view": 0.0, "rotated": 1.0}, Status.DIVERGED),
     ],
 )
 def test_the_gravest_reason_is_told(change, expected):
@@ -92,7 +92,7 @@ def test_thresholds_are_those_of_the_settings():
     assert verdict(count=250, quality=0.85, config=config) == Status.UNCERTAIN
     assert verdict(count=250, quality=0.75, config=config) == Status.LOST
     assert verdict(count=250, in_view=0.6, config=config) == Status.OUT_OF_VIEW
-    assert verdict(count=250, turned=0.2, config=config) == Status.DIVERGED
+    assert verdict(count=250, rotated=0.2, config=config) == Status.DIVERGED
 
 
 def test_objects_are_judged_each_for_itself():
@@ -113,24 +113,24 @@ def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(gate_scal
 # ---- how far a pose is trusted
 
 
-def test_the_share_that_is_needed_rises_with_the_gate_to_its_limit():
+def test_the_ratio_that_is_needed_rises_with_the_gate_to_its_limit():
     gate_scale = torch.tensor([1.0, 1.5, 2.0, 3.2])
-    assert needed_share(gate_scale, ValidationConfig(lost_below=0.2, refound_above=0.4)).tolist() == pytest.approx([0.2, 0.3, 0.4, 0.4])
-    # A share to be caught at that is less than that of a lost one asks for nothing more.
-    assert needed_share(gate_scale, ValidationConfig(lost_below=0.3, refound_above=0.1)).tolist() == pytest.approx([0.3] * 4)
+    assert needed_ratio(gate_scale, ValidationConfig(lost_below=0.2, refound_above=0.4)).tolist() == pytest.approx([0.2, 0.3, 0.4, 0.4])
+    # A ratio to be caught at that is less than that of a lost one asks for nothing more.
+    assert needed_ratio(gate_scale, ValidationConfig(lost_below=0.3, refound_above=0.1)).tolist() == pytest.approx([0.3] * 4)
 
 
 def test_trust_rises_from_lost_to_certain():
-    share = torch.tensor([0.0, 0.2, 0.3, 0.4, 1.0])
-    assert trust(share, ValidationConfig(lost_below=0.2, uncertain_below=0.4)).tolist() == pytest.approx([0, 0, 0.5, 1, 1])
+    explained = torch.tensor([0.0, 0.2, 0.3, 0.4, 1.0])
+    assert trust(explained, ValidationConfig(lost_below=0.2, uncertain_below=0.4)).tolist() == pytest.approx([0, 0, 0.5, 1, 1])
     step = trust(torch.tensor([0.29, 0.31]), ValidationConfig(lost_below=0.3, uncertain_below=0.3))
     assert step.tolist() == [0, 1]
 
 
 def test_more_is_asked_of_finds_in_many_places_by_what_is_usual():
     config = ValidationConfig(lost_below=0.1, uncertain_below=0.4, validated_from=0.75)
-    share, usual, gate_scale = torch.tensor([0.4, 0.4, 0.6, 0.4]), torch.tensor([0.8, 0.8, 0.8, 0.2]), torch.tensor([1.0, 2.0, 3.0, 2.0])
-    assert trust(share, config, usual, gate_scale).tolist() == pytest.approx([1.0, 0.6, 1.0, 1.0])
+    explained, usual, gate_scale = torch.tensor([0.4, 0.4, 0.6, 0.4]), torch.tensor([0.8, 0.8, 0.8, 0.2]), torch.tensor([1.0, 2.0, 3.0, 2.0])
+    assert trust(explained, config, usual, gate_scale).tolist() == pytest.approx([1.0, 0.6, 1.0, 1.0])
 
 
 def hidden(inlier_ratio=0.8, usually=0.8, count=200, elsewhere=False, config=CONFIG):
@@ -151,7 +151,7 @@ def test_nothing_counts_as_hidden_that_does_not_tell():
 
 def test_of_a_hidden_object_no_more_is_asked_in_more_places():
     config, gate_scale = ValidationConfig(lost_below=0.2, refound_above=0.4), torch.full((3,), 2.0)
-    assert needed_share(gate_scale, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.4, 0.3, 0.2])
+    assert needed_ratio(gate_scale, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.4, 0.3, 0.2])
     stated = torch.full((2,), 0.3), torch.full((2,), 100), torch.ones(2), torch.zeros(2, 6), torch.ones(2)
     assert judge(*stated, config, gate_scale[:2], torch.tensor([0.0, 1.0])).tolist() == [Status.LOST, Status.UNCERTAIN]
 
@@ -170,22 +170,22 @@ def test_an_uncertain_object_may_be_found_farther_away():
     assert status.tolist() == [Status.DIVERGED, Status.TRACKING]
 
 
-# ---- the explained share
+# ---- the explained ratio
 
 
 def test_a_contour_with_matches_all_along_is_explained():
-    assert float(share(contours_at(upright_line()), matches_at(upright_line(u=81.0)))) == 1
+    assert float(ratio(contours_at(upright_line()), matches_at(upright_line(u=81.0)))) == 1
 
 
 def test_a_contour_without_matches_is_not():
-    assert float(share(contours_at(upright_line()), matches_at(upright_line(u=120.0)))) == 0
-    assert float(share(contours_at(upright_line()), matches_at(upright_line(), near=torch.zeros(1, 80, dtype=torch.bool)))) == 0
+    assert float(ratio(contours_at(upright_line()), matches_at(upright_line(u=120.0)))) == 0
+    assert float(ratio(contours_at(upright_line()), matches_at(upright_line(), near=torch.zeros(1, 80, dtype=torch.bool)))) == 0
 
 
 @pytest.mark.parametrize(("least", "count", "expected"), [(3, 2, 0), (3, 3, 1), (1, 1, 1), (5, 4, 0)])
 def test_a_patch_needs_a_few_observations_on_its_contours(least, count, expected):
     contours = contours_at(upright_line(count=16, first=32.0))
-    actual = share(contours, matches_at(upright_line(count=count, first=36.0)), config=ValidationConfig(min_on_contour=least))
+    actual = ratio(contours, matches_at(upright_line(count=count, first=36.0)), config=ValidationConfig(min_on_contour=least))
     assert float(actual) == expected
 
 
@@ -194,14 +194,14 @@ def test_a_patch_is_explained_where_most_observations_near_its_contours_are_on_t
     """Chance scatters observations around a contour: a fourth of those within 3 px are on it."""
     targets = torch.full((1, 80, 2), 40.0)
     offsets = torch.where(torch.arange(80)[None] < on, 0.5, -2.0)
-    assert float(share(contours_at(upright_line(40.0, count=16, first=32.0)), matches_at(targets, offsets=offsets))) == expected
+    assert float(ratio(contours_at(upright_line(40.0, count=16, first=32.0)), matches_at(targets, offsets=offsets))) == expected
     # Those farther off count neither way.
     away = torch.where(torch.arange(80)[None] < on, 0.5, -3.5)
-    assert float(share(contours_at(upright_line(40.0, count=16, first=32.0)), matches_at(targets, offsets=away))) == 1
+    assert float(ratio(contours_at(upright_line(40.0, count=16, first=32.0)), matches_at(targets, offsets=away))) == 1
 
 
 def test_half_a_contour_is_half_explained():
-    actual = float(share(contours_at(upright_line()), matches_at(upright_line(count=40))))
+    actual = float(ratio(contours_at(upright_line()), matches_at(upright_line(count=40))))
     assert actual == pytest.approx(0.5, abs=0.1)
     assert actual >= 0.5
 
@@ -213,41 +213,41 @@ def test_what_does_not_move_need_not_be_explained():
     moving[:, 80:, 0] = 100.0
     moving[:, :80, 0] = 20.0
     matches = matches_at(upright_line(80.0))
-    assert float(explained_share(contours, matches, moving, IMAGE_SIZE, ValidationConfig(min_speed_px_s=30.0))) == 1
-    assert float(explained_share(contours, matches, moving, IMAGE_SIZE, ValidationConfig(min_speed_px_s=10.0))) == 0.5
+    assert float(explained_ratio(contours, matches, moving, IMAGE_SIZE, ValidationConfig(min_speed_px_s=30.0))) == 1
+    assert float(explained_ratio(contours, matches, moving, IMAGE_SIZE, ValidationConfig(min_speed_px_s=10.0))) == 0.5
 
 
 def test_only_motion_across_the_contour_counts():
     """A contour that slides along itself fires no events."""
     nothing = matches_at(upright_line(150.0))
-    assert float(share(contours_at(upright_line()), nothing, velocity=(0.0, 500.0))) == 1
-    assert float(share(contours_at(upright_line()), nothing, velocity=(40.0, 500.0))) == 0
+    assert float(ratio(contours_at(upright_line()), nothing, velocity=(0.0, 500.0))) == 1
+    assert float(ratio(contours_at(upright_line()), nothing, velocity=(40.0, 500.0))) == 0
 
 
 def test_hidden_contours_and_those_outside_the_image_need_no_explanation():
     outside = torch.cat([upright_line(80.0), upright_line(230.0), upright_line(-20.0), upright_line(60.0)], 1)
     mask = torch.ones(1, 320, dtype=torch.bool)
     mask[:, 240:] = False
-    assert float(share(contours_at(outside, mask=mask), matches_at(upright_line(80.0)))) == 1
+    assert float(ratio(contours_at(outside, mask=mask), matches_at(upright_line(80.0)))) == 1
 
 
 def test_hardly_anything_moving_says_nothing():
-    assert float(share(contours_at(upright_line(count=15)), matches_at(upright_line(150.0)))) == 1
-    assert float(share(contours_at(upright_line(count=16)), matches_at(upright_line(150.0)))) == 0
+    assert float(ratio(contours_at(upright_line(count=15)), matches_at(upright_line(150.0)))) == 1
+    assert float(ratio(contours_at(upright_line(count=16)), matches_at(upright_line(150.0)))) == 0
 
 
 def test_matches_outside_the_image_explain_nothing():
     """Neither at the border that they would be moved to, nor on the other side of it."""
     border = torch.cat([upright_line(1.0), upright_line(198.0)], 1)
     for u in (-30.0, 230.0, -1e9):
-        assert float(share(contours_at(border), matches_at(upright_line(u)))) == 0
+        assert float(ratio(contours_at(border), matches_at(upright_line(u)))) == 0
 
 
-def test_the_share_of_an_object_does_not_depend_on_the_others():
+def test_the_ratio_of_an_object_does_not_depend_on_the_others():
     contours = contours_at(torch.cat([upright_line(), upright_line(100.0)]))
     matches = matches_at(torch.cat([upright_line(count=80, first=60.0), upright_line(100.0)]))
-    actual = share(contours, matches).tolist()
-    assert actual[0] == float(share(contours_at(upright_line()), matches_at(upright_line(count=80, first=60.0))))
+    actual = ratio(contours, matches).tolist()
+    assert actual[0] == float(ratio(contours_at(upright_line()), matches_at(upright_line(count=80, first=60.0))))
     assert actual[1] == 1
 
 
@@ -257,24 +257,24 @@ def test_the_share_of_an_object_does_not_depend_on_the_others():
 @pytest.mark.parametrize(("on", "around", "away", "expected"), [(30, 0, 0, 1.0), (30, 30, 0, 0.5), (30, 30, 100, 0.5), (0, 40, 0, 0.0)])
 def test_events_around_contours_gather_on_them_or_not(on, around, away, expected):
     offsets = torch.cat([torch.full((on,), -0.7), torch.full((around,), 0.9), torch.full((away,), 5.5)])[None]
-    assert float(gathered_share(matches_at(torch.zeros(1, on + around + away, 2), offsets=offsets), CONFIG)) == expected
+    assert float(inlier_ratio(matches_at(torch.zeros(1, on + around + away, 2), offsets=offsets), CONFIG)) == expected
 
 
 def test_few_events_do_not_tell_how_far_they_gather():
-    assert gathered_share(matches_at(torch.zeros(1, 29, 2)), CONFIG).isnan().all()
+    assert inlier_ratio(matches_at(torch.zeros(1, 29, 2)), CONFIG).isnan().all()
     far = torch.zeros(1, 60, dtype=torch.bool)
-    assert gathered_share(matches_at(torch.zeros(1, 60, 2), near=far), CONFIG).isnan().all()
+    assert inlier_ratio(matches_at(torch.zeros(1, 60, 2), near=far), CONFIG).isnan().all()
 
 
 # ---- in view
 
 
-def test_the_visible_share_counts_points_in_the_image():
+def test_the_visible_ratio_counts_points_in_the_image():
     pixels = [[[0.0, 0.0], [199.5, 149.5], [200.0, 20.0], [-0.1, 20.0], [20.0, -0.1], [20.0, 150.0], [50.0, 50.0]]]
-    assert float(visible_share(contours_at(pixels), IMAGE_SIZE)) == pytest.approx(3 / 7)
+    assert float(visible_ratio(contours_at(pixels), IMAGE_SIZE)) == pytest.approx(3 / 7)
     mask = [[True, True, False, False, False, False, True]]
-    assert float(visible_share(contours_at(pixels, mask=mask), IMAGE_SIZE)) == 1
+    assert float(visible_ratio(contours_at(pixels, mask=mask), IMAGE_SIZE)) == 1
 
 
 def test_without_contours_nothing_is_in_view():
-    assert float(visible_share(contours_at([[[50.0, 50.0]]], mask=[[False]]), IMAGE_SIZE)) == 0
+    assert float(visible_ratio(contours_at([[[50.0, 50.0]]], mask=[[False]]), IMAGE_SIZE)) == 0

@@ -10,7 +10,7 @@ from tracked_boxes import started
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.config.validation import ValidationConfig
-from torchtrack.tracking.validation.measures import PARALLEL_AFTER_S, constrained_2d, normal_spread_of, required_spread
+from torchtrack.tracking.validation.measures import PARALLEL_AFTER_S, constrained_2d, normal_spread, required_spread
 from torchtrack.tracking.validation.status import Status
 
 CONFIG = ValidationConfig()
@@ -42,7 +42,7 @@ def held(time_since_validated_s=0.1, apart=0.3, reference_normal_spread=0.3, con
     ],
 )
 def test_directions_are_apart_as_lines_are(angles_deg, expected):
-    apart = normal_spread_of(matches_of(torch.tensor([angles_deg]).deg2rad()))
+    apart = normal_spread(matches_of(torch.tensor([angles_deg]).deg2rad()))
     torch.testing.assert_close(apart, torch.tensor([expected], dtype=torch.float64), atol=1e-6, rtol=0)
 
 
@@ -50,7 +50,7 @@ def test_they_are_the_smaller_eigenvalue_of_their_scatter():
     angles_rad = torch.rand(3, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     matches = matches_of(angles_rad)
     scatter = torch.einsum("bni,bnj->bij", matches.directions, matches.directions) / 40
-    torch.testing.assert_close(normal_spread_of(matches), torch.linalg.eigvalsh(scatter)[:, 0])
+    torch.testing.assert_close(normal_spread(matches), torch.linalg.eigvalsh(scatter)[:, 0])
 
 
 def test_only_what_lies_on_a_contour_counts():
@@ -58,7 +58,7 @@ def test_only_what_lies_on_a_contour_counts():
     off = matches_of(angles_rad, offsets=torch.tensor([[0.0, 0.5, 0.9, -3.0]], dtype=torch.float64))
     nowhere = matches_of(angles_rad, near=torch.tensor([[True, True, False, False]]))
     for matches in (off, nowhere, matches_of(angles_rad, near=torch.zeros(1, 4, dtype=torch.bool))):
-        assert normal_spread_of(matches).tolist() == [0.0]
+        assert normal_spread(matches).tolist() == [0.0]
 
 
 # ---- when it is asked, and how much

@@ -18,20 +18,19 @@ from torchtrack.tracking import update
 from torchtrack.tracking.estimation.rounds import ANYWHERE
 from torchtrack.tracking.motion.model import MotionState
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.triggers import SMEARED
 from torchtrack.tracking.state import TrackerState
 from torchtrack.tracking.validation import status
-from torchtrack.tracking.validation.measures import visible_share
+from torchtrack.tracking.validation.measures import visible_ratio
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 # As torchtrack.tracking.validation.status.Status.
 TRACKING, UNCERTAIN, LOST, TOO_FEW_EVENTS, OUT_OF_VIEW, DIVERGED = range(6)
 # What is remembered of each object as a number, before a window and after it.
-MEAN_SCORE, KNOWN_EXPLAINED_RATIO, KNOWN_INLIER_RATIO, KNOWN_MATCHES, DRIFT_S, TIME_SINCE_VALIDATED_S = range(6)
+MEAN_SCORE, REFERENCE_EXPLAINED, REFERENCE_INLIERS, REFERENCE_MATCHES, DRIFT_S, UNVALIDATED_S = range(6)
 REMEMBERED = 6
-# What was found of it.
-SHARE, SCORE, INLIER_RATIO, REFERENCE_INLIER_RATIO, IN_VIEW, GATE_SCALE = range(6)
-FOUND = 6
+# What was measured of it.
+EXPLAINED_RATIO, SCORE, INLIER_RATIO, REFERENCE, IN_VIEW, GATE_SCALE = range(6)
+MEASURED = 6
 _UNKNOWNS = 13
 # As torchtrack.tracking.validation.status.trust has it.
 _LEAST_RANGE = 1e-6
@@ -47,11 +46,11 @@ def conclude(
     information: Array,
     expected: Array,
     variance: Array,
-    T_found: Array,
+    T_estimated: Array,
     offset: Array,
     hessian: Array,
-    elsewhere: Array,
-    rotation_unclear: Array,
+    is_relocalized: Array,
+    axis_ambiguous: Array,
     matched: Array,
     measured: Array,
     dt_s: Array,
@@ -59,7 +58,7 @@ def conclude(
     diameter_m: Array,
     settings: ConclusionSettings,
     remembered: Array,
-    T_last_seen: Array,
+    T_last_validated: Array,
     T_cam_obj: Array,
     new_velocity: Array,
     acceleration: Array,
@@ -72,36 +71,36 @@ def conclude(
     Args:
         T_before: poses before the window, ``[b, 4, 4]``.
         T_prior, usable, velocity, covariance, information, expected, variance: of the prediction, and its acceleration.
-        T_found, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 13]``, ``[b, 13, 13]``.
-        elsewhere, turn_unclear: ``[b]``, of finds; ``matched [b]``, how many observations they have.
-        found: ``[FOUND, b]``, what else is told of them.
-        remembered, T_last_seen: ``[REMEMBERED, b]`` and ``[b, 4, 4]`` before the window; changed to those after it.
+        T_estimated, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 13]``, ``[b, 13, 13]``.
+        is_relocalized, axis_ambiguous: ``[b]``, of the fits; ``matched [b]``, how many observations they have.
+        measured: ``[MEASURED, b]``, what else is known of them.
+        remembered, T_last_validated: ``[REMEMBERED, b]`` and ``[b, 4, 4]`` before the window; changed to those after it.
         T_cam_obj, new_velocity, acceleration, posterior, left, status: after the window, ``left`` being the covariance of poses; filled.
     """
     inverses, centre = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(3)
     for b in range(len(usable)):
-        reference_explained_ratio, share, dt = remembered[KNOWN_EXPLAINED_RATIO, b], measured[SHARE, b], dt_s[b]
-        hidden = _hidden(b, elsewhere, matched, measured, settings)
-        status[b] = _judge(b, usable, offset, elsewhere, matched, measured, hidden, diameter_m[b], settings)
+        reference, explained, dt = remembered[REFERENCE_EXPLAINED, b], measured[EXPLAINED_RATIO, b], dt_s[b]
+        hidden = _hidden(b, is_relocalized, matched, measured, settings)
+        status[b] = _judge(b, usable, offset, is_relocalized, matched, measured, hidden, diameter_m[b], settings)
         failed = status[b] >= LOST
-        _orthonormalise(T_prior[b] if failed else T_found[b], T_cam_obj[b])
+        _orthonormalise(T_prior[b] if failed else T_estimated[b], T_cam_obj[b])
         if failed and (settings.holds or not usable[b]):
             T_cam_obj[b] = T_before[b]
-        trusted = 0.0 if failed else max(hidden, _trust(share, reference_explained_ratio, measured[GATE_SCALE, b], settings))
-        is_drifting_now = not failed and _is_smeared(b, measured, reference_explained_ratio, settings)
-        if is_drifting_now or (rotation_unclear[b] and not failed):
+        trusted = 0.0 if failed else max(hidden, _trust(explained, reference, measured[GATE_SCALE, b], settings))
+        smeared = not failed and _is_smeared(b, measured, reference, settings)
+        if smeared or (axis_ambiguous[b] and not failed):
             status[b] = max(status[b], UNCERTAIN)
         inverse(hessian[b], inverses)
         _update(trusted, failed, dt, velocity[b], covariance[b], offset[b], inverses, settings, new_velocity[b], posterior[b])
-        seen_well = not failed and share >= settings.validated_from * reference_explained_ratio
+        seen_well = not failed and explained >= settings.validated_from * reference
         _accelerate(trusted if seen_well else 0.0, dt, information[b], offset[b], expected[b], variance[b], acceleration[b])
         centre_of(T_cam_obj[b], centre_obj[b], centre)
         _to_left(posterior[b], centre, left[b])
-        certain = share >= settings.certain_share * reference_explained_ratio and status[b] == TRACKING
-        certain = certain and matched[b] >= settings.certain_count * remembered[KNOWN_MATCHES, b]
-        _remember(b, failed, is_drifting_now, certain, dt, measured, matched[b], settings, remembered)
+        certain = explained >= settings.certain_ratio * reference and status[b] == TRACKING
+        certain = certain and matched[b] >= settings.certain_count * remembered[REFERENCE_MATCHES, b]
+        _remember(b, failed, smeared, certain, dt, measured, matched[b], settings, remembered)
         if certain:
-            T_last_seen[b] = T_cam_obj[b]
+            T_last_validated[b] = T_cam_obj[b]
 
 
 @kernel()
@@ -115,7 +114,7 @@ def _judge(
     b: int,
     usable: Array,
     offset: Array,
-    elsewhere: Array,
+    is_relocalized: Array,
     matched: Array,
     measured: Array,
     hidden: float,
@@ -123,53 +122,53 @@ def _judge(
     settings: ConclusionSettings,
 ) -> int:
     """The status of an object: :func:`torchtrack.tracking.validation.status.judge`."""
-    gate_scale, share, status = measured[GATE_SCALE, b], measured[SHARE, b], TRACKING
+    gate_scale, explained, status = measured[GATE_SCALE, b], measured[EXPLAINED_RATIO, b], TRACKING
     # As torchtrack.tracking.validation.status.holding_on has it.
-    if settings.holds_on and not elsewhere[b] and matched[b] >= settings.hidden_observations:
+    if settings.holds_on and not is_relocalized[b] and matched[b] >= settings.hidden_observations:
         hidden = 1.0
-    wider, turned, moved = _clamped(gate_scale - 1.0, 0.0, 1.0) * (1.0 - hidden), 0.0, 0.0
-    # A find of what may be anywhere is no jump, however far away it is; what is not a number stays that.
-    counts = 0.0 if elsewhere[b] and gate_scale >= settings.anywhere else 1.0
+    wider, rotated, moved = _clamped(gate_scale - 1.0, 0.0, 1.0) * (1.0 - hidden), 0.0, 0.0
+    # A new pose of what may be anywhere is no jump, however far away it is; what is not a number stays that.
+    counts = 0.0 if is_relocalized[b] and gate_scale >= settings.anywhere else 1.0
     for k in range(3):
-        turned += (counts * offset[b, k]) ** 2
+        rotated += (counts * offset[b, k]) ** 2
         moved += (counts * offset[b, 3 + k]) ** 2
-    if share < settings.uncertain_below:
+    if explained < settings.uncertain_below:
         status = UNCERTAIN
-    if share < settings.lost_below + (max(settings.refound_above, settings.lost_below) - settings.lost_below) * wider:
+    if explained < settings.lost_below + (max(settings.refound_above, settings.lost_below) - settings.lost_below) * wider:
         status = LOST
     if matched[b] < settings.min_observations:
         status = TOO_FEW_EVENTS
     if measured[IN_VIEW, b] < settings.min_visible_ratio:
         status = OUT_OF_VIEW
-    turned_ok = np.sqrt(turned) / gate_scale < settings.max_step_rotation_rad
-    if not (turned_ok and np.sqrt(moved) / gate_scale < settings.max_step_translation * diameter_m) or not usable[b]:
+    rotation_ok = np.sqrt(rotated) / gate_scale < settings.max_step_rotation_rad
+    if not (rotation_ok and np.sqrt(moved) / gate_scale < settings.max_step_translation * diameter_m) or not usable[b]:
         status = DIVERGED
     return status
 
 
 @kernel()
-def _hidden(b: int, elsewhere: Array, matched: Array, measured: Array, settings: ConclusionSettings) -> float:
+def _hidden(b: int, is_relocalized: Array, matched: Array, measured: Array, settings: ConclusionSettings) -> float:
     """How far a pose counts as that of an object that is partly hidden: :func:`torchtrack.tracking.validation.status.partly_hidden`."""
-    usual = measured[REFERENCE_INLIER_RATIO, b]
-    if not settings.partly_hidden or elsewhere[b] or not usual > settings.hidden_least or matched[b] < settings.hidden_observations:
+    reference = measured[REFERENCE, b]
+    if not settings.partly_hidden or is_relocalized[b] or not reference > settings.hidden_least or matched[b] < settings.hidden_observations:
         return 0.0
-    ramp = (measured[INLIER_RATIO, b] / usual - settings.hidden_from) / (settings.hidden_fully - settings.hidden_from)
+    ramp = (measured[INLIER_RATIO, b] / reference - settings.hidden_from) / (settings.hidden_fully - settings.hidden_from)
     # Written so that what is not a number counts for nothing.
     return min(ramp, 1.0) if ramp > 0.0 else 0.0
 
 
 @kernel()
-def _trust(share: float, reference_explained_ratio: float, gate_scale: float, settings: ConclusionSettings) -> float:
+def _trust(explained: float, reference: float, gate_scale: float, settings: ConclusionSettings) -> float:
     """How far a pose counts against the prediction: :func:`torchtrack.tracking.validation.status.trust`."""
-    full = max(settings.uncertain_below, settings.validated_from * reference_explained_ratio * _clamped(gate_scale - 1.0, 0.0, 1.0))
-    return _clamped((share - settings.lost_below) / max(full - settings.lost_below, _LEAST_RANGE), 0.0, 1.0)
+    full = max(settings.uncertain_below, settings.validated_from * reference * _clamped(gate_scale - 1.0, 0.0, 1.0))
+    return _clamped((explained - settings.lost_below) / max(full - settings.lost_below, _LEAST_RANGE), 0.0, 1.0)
 
 
 @kernel()
-def _is_smeared(b: int, measured: Array, reference_explained_ratio: float, settings: ConclusionSettings) -> bool:
-    """Whether an object may be elsewhere: :func:`torchtrack.tracking.relocalization.triggers.in_doubt`."""
-    smeared = measured[INLIER_RATIO, b] < settings.smeared * measured[REFERENCE_INLIER_RATIO, b]
-    return smeared and measured[SCORE, b] < settings.drift_below * reference_explained_ratio
+def _is_smeared(b: int, measured: Array, reference: float, settings: ConclusionSettings) -> bool:
+    """Whether an object explains too little by smeared events: :func:`torchtrack.tracking.validation.status.is_smeared`."""
+    gathers_less = measured[INLIER_RATIO, b] < settings.smeared * measured[REFERENCE, b]
+    return gathers_less and measured[SCORE, b] < settings.drift_below * reference
 
 
 @kernel()
@@ -199,7 +198,7 @@ def _update(
     new_velocity: Array,
     posterior: Array,
 ) -> None:
-    """Velocity and covariance after a window: as found, as far as the find is to be trusted; and they fade where nothing confirmed them."""
+    """Velocity and covariance after a window: as estimated, as far as that is to be trusted; and they fade where nothing confirmed them."""
     variance, total = settings.observation_px**2, 0.0
     for j in range(12):
         for k in range(12):
@@ -207,8 +206,8 @@ def _update(
     trusted *= np.isfinite(total)
     for j in range(12):
         for k in range(12):
-            updated = variance * inverses[j, k]
-            posterior[j, k] = updated + (1.0 - trusted) * (predicted[j, k] - updated) if trusted > 0 else predicted[j, k]
+            estimated = variance * inverses[j, k]
+            posterior[j, k] = estimated + (1.0 - trusted) * (predicted[j, k] - estimated) if trusted > 0 else predicted[j, k]
     kept = (0.0 if settings.holds else np.exp(-dt / settings.coast_s)) if failed else 1.0
     dropped = np.empty(6)
     for k in range(6):
@@ -260,7 +259,7 @@ def _to_left(covariance: Array, centre_cam: Array, left: Array) -> None:
 def _remember(
     b: int,
     failed: bool,
-    is_drifting_now: bool,
+    smeared: bool,
     certain: bool,
     dt: float,
     measured: Array,
@@ -272,14 +271,14 @@ def _remember(
     known = remembered[:, b]
     if not failed:
         known[MEAN_SCORE] += settings.usual_gain * (measured[SCORE, b] - known[MEAN_SCORE])
-        known[KNOWN_EXPLAINED_RATIO] = _seen_well(known[KNOWN_EXPLAINED_RATIO], measured[SHARE, b], settings)
+        known[REFERENCE_EXPLAINED] = _seen_well(known[REFERENCE_EXPLAINED], measured[EXPLAINED_RATIO, b], settings)
         if not np.isnan(measured[INLIER_RATIO, b]):
-            known[KNOWN_INLIER_RATIO] = _seen_well(known[KNOWN_INLIER_RATIO], measured[INLIER_RATIO, b], settings)
-        known[KNOWN_MATCHES] = _seen_well(known[KNOWN_MATCHES], float(matched), settings)
-        # One good window among bad ones does not end a doubt.
-        known[DRIFT_S] += dt if is_drifting_now else -dt
+            known[REFERENCE_INLIERS] = _seen_well(known[REFERENCE_INLIERS], measured[INLIER_RATIO, b], settings)
+        known[REFERENCE_MATCHES] = _seen_well(known[REFERENCE_MATCHES], float(matched), settings)
+        # One good window among bad ones does not end a drift.
+        known[DRIFT_S] += dt if smeared else -dt
     known[DRIFT_S] = _clamped(known[DRIFT_S], 0.0, np.inf)
-    known[TIME_SINCE_VALIDATED_S] = 0.0 if certain else known[TIME_SINCE_VALIDATED_S] + dt
+    known[UNVALIDATED_S] = 0.0 if certain else known[UNVALIDATED_S] + dt
 
 
 @kernel()
@@ -301,20 +300,20 @@ def judged_objects_numba(
     objects, solution, batch, expected = prediction.objects, scored.fit.solution, len(dt_s), prediction.acceleration
     if expected is None:
         raise ValueError("a kernel needs the prediction's acceleration.")
-    in_view = visible_share(scored.fit.contours, objects.image_size)
-    measured_rows = torch.stack([scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, in_view, gate_scale])
+    in_view = visible_ratio(scored.fit.contours, objects.image_size)
+    packed = torch.stack([scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, in_view, gate_scale])
     health = state.health
     references = health.reference_explained_ratio, health.reference_inlier_ratio, health.reference_matches
     remembered = torch.stack([health.mean_score, *references, health.drift_s, health.time_since_validated_s])
-    T_last_seen = health.T_last_validated.clone(memory_format=torch.contiguous_format)
-    T_cam_obj, covariance, left = (T_last_seen.new_empty(batch, size, size) for size in (4, 12, 6))
+    T_last_validated = health.T_last_validated.clone(memory_format=torch.contiguous_format)
+    T_cam_obj, covariance, left = (T_last_validated.new_empty(batch, size, size) for size in (4, 12, 6))
     (velocity, acceleration), status_of = dt_s.new_empty(2, batch, 6), scored.count.new_empty(batch)
     conclude(
         *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance, prediction.information),
         *as_arrays(expected.expected, expected.variance, solution.T_cam_obj, solution.from_prior, solution.hessian),
-        *as_arrays(scored.elsewhere, scored.rotation_unclear, scored.count, measured_rows, dt_s, objects.centre_obj, objects.diameter_m),
+        *as_arrays(scored.is_relocalized, scored.axis_ambiguous, scored.count, packed, dt_s, objects.centre_obj, objects.diameter_m),
         _settings(config),
-        *as_arrays(remembered, T_last_seen, T_cam_obj, velocity, acceleration, covariance, left, status_of),
+        *as_arrays(remembered, T_last_validated, T_cam_obj, velocity, acceleration, covariance, left, status_of),
     )
     mean_score, explained_ratio, inlier_ratio, matches, drift_s, time_since_validated_s = remembered.unbind()
     health = replace(
@@ -324,7 +323,7 @@ def judged_objects_numba(
         reference_inlier_ratio=inlier_ratio,
         reference_matches=matches,
         drift_s=drift_s,
-        T_last_validated=T_last_seen,
+        T_last_validated=T_last_validated,
         time_since_validated_s=time_since_validated_s,
     )
     return MotionState(T_cam_obj, velocity, acceleration, covariance), health, left, status_of
@@ -342,8 +341,8 @@ def _settings(config: TrackerConfig) -> ConclusionSettings:
         update,
         holds=config.motion.without_events == "hold",
         anywhere=ANYWHERE,
-        smeared=SMEARED,
+        smeared=status.SMEARED,
         hidden_observations=status.HIDDEN_TIMES * config.validation.min_observations,
-        certain_share=update.CERTAIN,
+        certain_ratio=update.CERTAIN,
         certain_count=update.CERTAIN_COUNT if config.relocalization.by_matches else 0.0,
     )

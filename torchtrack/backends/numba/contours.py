@@ -390,5 +390,5 @@ def score_outlines_numba(
     scores = image.new_empty(len(T_cam_obj))
     given = as_arrays(outlines.points_obj.transpose(1, 2), outlines.tangents_obj.transpose(1, 2), outlines.mask)
     seen = as_arrays(T_cam_obj, intrinsics[0])
-    score_outlines(*given, *seen, sampling_settings(), *as_arrays(image), BORDER_PX, sampling.BESIDE_PX, scores.numpy())
+    score_outlines(*given, *seen, sampling_settings(), *as_arrays(image), BORDER_PX, sampling.AROUND_PX, scores.numpy())
     return scores

@@ -1,4 +1,4 @@
-"""What events explain of an object's contours, and how they gather on them: shares of :mod:`tracking.validation.measures`, object by object."""
+"""What events explain of an object's contours, and how they gather on them: :mod:`tracking.validation.measures`, object by object."""
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torchtrack.tracking.validation import measures
 
 
 @kernel(fastmath=FAST)
-def shares(
+def measure(
     points_cam: Array,
     pixels: Array,
     normals: Array,
@@ -35,25 +35,25 @@ def shares(
     is_near: Array,
     as_expected: Array,
     settings: QualitySettings,
-    measured: Array,
-    inlier_ratio: Array,
-    apart: Array,
+    explained: Array,
+    inliers: Array,
+    spread: Array,
 ) -> None:
-    """Of the contour that should fire, the share with observations on it; of the observations near it, the share on it, and their directions.
+    """Of the contour that should fire, the ratio with observations on it; of the observations near it, the ratio on it, and how normals spread.
 
     Args:
         points_cam, pixels, normals, mask: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``, ``[b, m]``.
         velocity: ``[b, 6]``, about ``centre_cam [b, 3]``.
         targets, directions, offsets, is_near, as_expected: of matches: ``[b, 2, n]`` and ``[b, n]``.
-        measured, inlier_ratio: ``[b]``, filled; not a number where too little is there to tell.
-        apart: ``[b]``, filled: :func:`torchtrack.tracking.validation.measures.normal_spread_of`.
+        explained, inliers: ``[b]``, filled; not a number where too little is there to tell.
+        spread: ``[b]``, filled: :func:`torchtrack.tracking.validation.measures.normal_spread`.
     """
     counts = np.empty((settings.patches**2, 2))
     for b in range(len(mask)):
-        inlier_ratio[b] = _count(targets[b], offsets[b], is_near[b], as_expected[b], settings, counts)
-        apart[b] = _apart(directions[b], offsets[b], is_near[b], settings.on_contour_px)
+        inliers[b] = _count(targets[b], offsets[b], is_near[b], as_expected[b], settings, counts)
+        spread[b] = _normal_spread(directions[b], offsets[b], is_near[b], settings.on_contour_px)
         motion, of_lens = drift(velocity[b], centre_cam[b]), lens(intrinsics[b])
-        total, explained = 0, 0
+        total, count = 0, 0
         for i in range(mask.shape[1]):
             u, v = pixels[b, 0, i], pixels[b, 1, i]
             if not mask[b, i] or not (u >= 0 and v >= 0 and u < settings.width and v < settings.height):
@@ -64,13 +64,13 @@ def shares(
                 cell = patch(u, v, settings.patch_bits, settings.patches)
                 on, near = counts[cell, 0], counts[cell, 1]
                 total += 1
-                explained += on >= settings.min_on_contour and on + 1.0 > settings.least_share * (near + 2.0)
-        measured[b] = explained / total if total >= settings.min_moving_points else np.nan
+                count += on >= settings.min_on_contour and on + 1.0 > settings.least_ratio * (near + 2.0)
+        explained[b] = count / total if total >= settings.min_moving_points else np.nan
 
 
 @kernel()
 def _count(targets: Array, offsets: Array, is_near: Array, as_expected: Array, settings: QualitySettings, counts: Array) -> float:
-    """Count observations on and near contours in each patch of the image; the share of all near ones that is on them."""
+    """Count observations on and near contours in each patch of the image; the ratio of all near ones that is on them."""
     counts[:] = 0.0
     near = on = 0
     for i in range(len(offsets)):
@@ -88,8 +88,8 @@ def _count(targets: Array, offsets: Array, is_near: Array, as_expected: Array, s
 
 
 @kernel()
-def _apart(directions: Array, offsets: Array, is_near: Array, on_contour_px: float) -> float:
-    """How far apart the directions are of what lies on one object's contours."""
+def _normal_spread(directions: Array, offsets: Array, is_near: Array, on_contour_px: float) -> float:
+    """How far the normals are spread of the contours of an object that something lies on."""
     count, cosine, sine = 0, 0.0, 0.0
     for i in range(len(offsets)):
         if is_near[i] and abs(offsets[i]) < on_contour_px:
@@ -101,15 +101,15 @@ def _apart(directions: Array, offsets: Array, is_near: Array, on_contour_px: flo
 
 
 @kernel(fastmath=FAST)
-def visible(pixels: Array, mask: Array, height: int, width: int, share: Array) -> None:
-    """Share of contour points in the image: :func:`tracking.validation.measures.visible_share`, of ``pixels [b, 2, m]`` and ``mask [b, m]``."""
+def visible(pixels: Array, mask: Array, height: int, width: int, ratio: Array) -> None:
+    """Ratio of contour points in the image: :func:`tracking.validation.measures.visible_ratio`, of ``pixels [b, 2, m]`` and ``mask [b, m]``."""
     for b in range(len(mask)):
         total = seen = 0
         for i in range(mask.shape[1]):
             u, v = pixels[b, 0, i], pixels[b, 1, i]
             total += mask[b, i]
             seen += mask[b, i] and u >= 0 and v >= 0 and u < width and v < height
-        share[b] = seen / max(total, 1)
+        ratio[b] = seen / max(total, 1)
 
 
 @kernel()
@@ -196,27 +196,27 @@ def sigma_px_numba(prediction: Prediction, contours: Contours) -> Float[Tensor, 
     return variance.sqrt()
 
 
-@accelerates(measures.shares)
-def shares_numba(
+@accelerates(measures.fit_measures)
+def fit_measures_numba(
     contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: ValidationConfig
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """Point by point."""
-    measured, inlier_ratio, apart = contours.pixels.new_empty(3, len(contours.mask))
+    explained, inliers, spread = contours.pixels.new_empty(3, len(contours.mask))
     shown = as_arrays(*(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask)
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
     matched = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
     height, width = image_size
     settings = filled(QualitySettings, config, measures, weights, height=height, width=width)
-    shares(*shown, *moving, *matched, settings, measured.numpy(), inlier_ratio.numpy(), apart.numpy())
-    return measured, inlier_ratio, apart
+    measure(*shown, *moving, *matched, settings, explained.numpy(), inliers.numpy(), spread.numpy())
+    return explained, inliers, spread
 
 
-@accelerates(measures.visible_share)
-def visible_share_numba(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
+@accelerates(measures.visible_ratio)
+def visible_ratio_numba(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
     """Point by point."""
-    share = contours.pixels.new_empty(len(contours.mask))
-    visible(*as_arrays(contours.pixels.transpose(1, 2), contours.mask), *image_size, share.numpy())
-    return share
+    ratio = contours.pixels.new_empty(len(contours.mask))
+    visible(*as_arrays(contours.pixels.transpose(1, 2), contours.mask), *image_size, ratio.numpy())
+    return ratio
 
 
 @accelerates(polarity.remembered)

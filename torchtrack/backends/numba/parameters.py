@@ -194,7 +194,7 @@ class QualitySettings(NamedTuple):
     min_observations: int
     min_on_contour: int
     min_speed_px_s: float
-    least_share: float
+    least_ratio: float
     min_moving_points: int
     around_px: float
     on_contour_px: float
@@ -234,9 +234,9 @@ class ConclusionSettings(NamedTuple):
         anywhere: scale of the first gate from which an object may be anywhere.
         hidden_from, hidden_fully, hidden_least, hidden_observations: what :func:`torchtrack.tracking.validation.status.partly_hidden` goes by.
         holds_on: whether poses by so many observations that go on from those before are not asked for more.
-        smeared: events that gather less than this share of how far they usually do are smeared.
+        smeared: events that gather less than this ratio of how far they usually do are smeared.
         usual_gain, fall_gain: share of a new window in what is usual, and in what is seen well where it is less.
-        certain_share, certain_count: of what it explains when it is seen well, and by how many, from which a pose is remembered as one.
+        certain_ratio, certain_count: of what it explains when it is seen well, and by how many, from which a pose is remembered as one.
     """
 
     holds: bool
@@ -261,7 +261,7 @@ class ConclusionSettings(NamedTuple):
     smeared: float
     usual_gain: float
     fall_gain: float
-    certain_share: float
+    certain_ratio: float
     certain_count: float
 
 

@@ -18,7 +18,7 @@ from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.contours.objects import LearnedPoints
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.validation.measures import measured_share
+from torchtrack.tracking.validation.measures import measured_ratio
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 # The model's share that is assumed at first, how fast it follows, and how much more of it ends the need of learned contours.
@@ -104,7 +104,7 @@ def judge_model(
         any_count: whether any learned contours were among those of the fit.
     """
     contours = scored.fit.contours
-    share = _share_of_own(scored, velocity(contours), image_size, config) if any_count else scored.measured
+    share = _share_of_own(scored, velocity(contours), image_size, config) if any_count else scored.measured_ratio
     known = torch.isfinite(share) & (scored.count > 0)
     share = torch.where(known, torch.lerp(learned.model_share, share, _SHARE_GAIN), learned.model_share)
     enough = share > config.adaptation.below_ratio + _MORE_SHARE
@@ -118,7 +118,7 @@ def _share_of_own(scored: ScoredFit, velocity: Float[Tensor, "b m 2"], image_siz
     contours, matches = scored.fit.contours, scored.fit.matches
     own = contours.kind != int(ContourKind.LEARNED)
     matches = replace(matches, near=matches.near & own.gather(1, matches.contour))
-    return measured_share(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config.validation)
+    return measured_ratio(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config.validation)
 
 
 def _in_motion(contours: Contours, velocity: Float[Tensor, "b m 2"]) -> Bool[Tensor, "b"]:

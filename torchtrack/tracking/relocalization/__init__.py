@@ -1,1 +1,1 @@
-"""Lost, then found: why other poses are tried, which ones, and when one is taken."""
+"""Lost, then relocalized: why other poses are tried, which, and when one is accepted."""

@@ -2,7 +2,7 @@
 
 A pose has six unknowns, and thousands of draws from all of them come near a given pose but rarely. Two of them, the moves across
 the image, need not be drawn: the correlation of an outline with the events tells of every shift what lies on it. What is
-left to draw are turns and depths, of which some hundreds are enough.
+left to draw are rotations and depths, of which some hundreds are enough.
 """
 
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ from torchtrack.tracking.relocalization.view_sphere import outlines_by_view
 _SIDE = 96
 # Shifts are looked for within this many standard deviations, around an object that takes this many diameters.
 _SIGMAS, _DIAMETERS = 2.5, 1.3
-# Cells to each side that events are blurred over, and that what is beside them is taken from.
-_BLUR, _BESIDE = 1, 3
-# Shifts that are kept of each turn, the best within so many cells to each side.
+# Cells to each side that events are blurred over, and that their surroundings are taken from.
+_BLUR, _AROUND = 1, 3
+# Shifts that are kept of each rotation, the best within so many cells to each side.
 SHIFTS, APART = 3, 2
 # Outlines that are correlated together: what they need stays in a processor's nearer memory.
 _TOGETHER = 32
@@ -57,7 +57,7 @@ class _Square:
 def shifted(
     prediction: Prediction, steps: Float[Tensor, "n 6"], sigma_m: Float[Tensor, ""], places: tuple[Tensor, Tensor], config: TrackerConfig
 ) -> tuple[Float[Tensor, "k 6"], Contours]:
-    """Offsets of one object's pose with most events on its contours, ``relocalization.kept_rotations`` of them, best first; and its outlines.
+    """Offsets of an object's pose with most events on its contours, ``relocalization.kept_rotations`` of them, best first; and its outlines.
 
     Args:
         prediction: of the object.
@@ -95,7 +95,7 @@ def _best(
 def _spectrum(events: Float[Tensor, "h w"]) -> Tensor:
     """The spectrum of how much denser events are than around them, of which one for each pixel of a contour through the cell is enough."""
     enough = events.clamp(max=1)
-    denser = _blurred(enough, _BLUR) - _blurred(enough, _BESIDE)
+    denser = _blurred(enough, _BLUR) - _blurred(enough, _AROUND)
     return rfft2(denser.roll((_SIDE // 2, _SIDE // 2), (0, 1)))
 
 

@@ -17,7 +17,7 @@ class Schedule:
 
     Args:
         triggers: those of :class:`Trigger` that hang on the state alone.
-        is_due: objects that it is time for, should they be very uncertain: what is hidden is not found by looking more often.
+        is_due: objects that it is time for, should they be very uncertain: looking more often does not help where an object is hidden.
         is_drift_due: objects that it is time to look for farther away, should there be reason to.
     """
 

@@ -70,12 +70,12 @@ class LastSeen:
         """
         T_cam_obj = state.health.T_last_validated.to(objects.intrinsics.dtype)
         look = (t_us // max(config.relocalization.interval_us, 1) % _LOOKS)[objects.stream_index]
-        share = (look + 1).double() / _LOOKS
+        fraction = (look + 1).double() / _LOOKS
         height, width = objects.image_size
         across_px = (_SPEED_PX_S * state.health.time_since_validated_s.double()).clamp(max=_DIAGONALS * (height**2 + width**2) ** 0.5)
         across_m, depth_m = across_px / objects.px_per_m(T_cam_obj).double(), _DEPTH_SHARE * objects.depth_m(T_cam_obj).double()
         rotation_rad = torch.full_like(depth_m, _ROTATION_RAD)
-        pose = share[:, None] * torch.stack([rotation_rad, rotation_rad, rotation_rad, across_m, across_m, depth_m], 1)
+        pose = fraction[:, None] * torch.stack([rotation_rad, rotation_rad, rotation_rad, across_m, across_m, depth_m], 1)
         diameter_m = objects.diameter_m.double()[:, None]
         rate = rim_and_centre(torch.full_like(diameter_m, config.motion.initial_speed_m_s), diameter_m)
         return cls(state.health.T_last_validated, torch.diag_embed(torch.cat([pose, rate], 1).square()))

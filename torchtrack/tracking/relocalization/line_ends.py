@@ -21,12 +21,12 @@ _BEFORE_PX, _BEYOND_PX = (8.0, 16.0, 24.0), (8.0, 14.0)
 _ON_PX, _OFF_PX = 2.0, 4.0
 # Where there are no points (px).
 _NOWHERE_PX = 1e5
-# So many ends that hold are taken for granted: one or two are found by chance.
+# So many ends that hold are taken for granted: some are there by chance.
 _GRANTED = 3.0
 
 
 def running_on(contours: Contours, places: tuple[Float[Tensor, "1 e 2"], Bool[Tensor, "1 e"]], image_size: tuple[int, int]) -> Float[Tensor, "n"]:
-    """Of the ends of straight contours with events on them, the share beyond which the events go on; little where there are few ends.
+    """Of the ends of straight contours with events on them, the ratio beyond which the events go on; small where there are few ends.
 
     Args:
         contours: of one object at each of some poses.

@@ -15,7 +15,7 @@ from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import Choice
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
-from torchtrack.tracking.validation.scored_fit import ScoredFit, judge_fit
+from torchtrack.tracking.validation.scored_fit import ScoredFit, score_fit
 
 # So many of the poses of a very uncertain object, those that explain most, are aligned again.
 _ALIGNED_AGAIN = 8
@@ -43,8 +43,8 @@ def align_and_score(rows: Prediction, offsets: Float[Tensor, "n 13"], lost: Lost
     observations = select_events(events, index, begin.moving(compensated=True), config.association.max_events)
     fit = align(rows, contours, index, tight, observations, config, offsets)
     references = (value[number].expand_as(tight) for value in (scored.reference_inlier_ratio, scored.required_spread))
-    tried = judge_fit(rows, fit, config, torch.zeros_like(tight), *references)
-    return replace(tried, elsewhere=torch.ones_like(tried.elsewhere))
+    tried = score_fit(rows, fit, config, torch.zeros_like(tight), *references)
+    return replace(tried, is_relocalized=torch.ones_like(tried.is_relocalized))
 
 
 def exchanged(lost: LostObject, hypotheses: Hypotheses, tried: ScoredFit, choice: Choice) -> Relocalized:
@@ -54,9 +54,9 @@ def exchanged(lost: LostObject, hypotheses: Hypotheses, tried: ScoredFit, choice
         return window
     scored, prediction, gate_scale = replaced(window.scored, number, tried, choice), window.prediction, window.gate_scale
     if choice.axis_is_clear is not None:
-        unclear = scored.rotation_unclear.clone()
+        unclear = scored.axis_ambiguous.clone()
         unclear[number] &= ~choice.axis_is_clear[0]
-        scored = replace(scored, rotation_unclear=unclear)
+        scored = replace(scored, axis_ambiguous=unclear)
     if hypotheses.released is not None:
         hessian = scored.fit.solution.hessian.clone()
         hessian[number, :12, :12] += (hypotheses.released * accepted).to(hessian.dtype)
@@ -83,7 +83,7 @@ def replaced(scored: ScoredFit, number: int, tried: ScoredFit, choice: Choice) -
     count = max(mine.contours.mask.shape[1], theirs.contours.mask.shape[1])
     own, others = mine.contours.widened(count), theirs.contours.widened(count)
     contours = Contours(*(put(value, getattr(others, name)) for name, value in vars(own).items()))
-    names = [field.name for field in fields(ScoredFit) if field.name not in ("fit", "rotation_unclear")]
+    names = [field.name for field in fields(ScoredFit) if field.name not in ("fit", "axis_ambiguous")]
     measures = {name: put(getattr(scored, name), getattr(tried, name)) for name in names}
     # Another pose says nothing of whether it is the only possible.
-    return ScoredFit(fit=Fit(solution, contours, mine.matches), rotation_unclear=scored.rotation_unclear, **measures)
+    return ScoredFit(fit=Fit(solution, contours, mine.matches), axis_ambiguous=scored.axis_ambiguous, **measures)

@@ -72,7 +72,7 @@ def _tried(lost: LostObject, calls: Iterable[tuple[Source, Acceptance]]) -> Relo
 
 def _settled(window: Relocalized, drifts: Bool[Tensor, "b"], widened: Prediction, gate_scale: Float[Tensor, "b"]) -> Relocalized:
     """What the window gives with objects that had drifted off, and were relocalized, as uncertain as they turned out to be."""
-    had_drifted = drifts & window.scored.elsewhere
+    had_drifted = drifts & window.scored.is_relocalized
     covariance = torch.where(had_drifted[:, None, None], widened.covariance, window.prediction.covariance)
     prediction = replace(window.prediction, covariance=covariance)
     return Relocalized(window.scored, prediction, torch.where(had_drifted, gate_scale, window.gate_scale))

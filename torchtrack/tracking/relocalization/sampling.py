@@ -23,8 +23,8 @@ from torchtrack.tracking.relocalization.edge_search import FAR_PX, NEAR_PX, pull
 from torchtrack.tracking.relocalization.event_image import event_density, look_up
 from torchtrack.tracking.relocalization.view_sphere import outlines_at, thinned
 
-# Events beside a contour are counted this far from it (px), and more than this many of them in one place say no more.
-BESIDE_PX, ENOUGH_EVENTS = 4.0, 3.0
+# Events around a contour are counted this far from it (px), and more than this many of them in the same place say no more.
+AROUND_PX, ENOUGH_EVENTS = 4.0, 3.0
 
 
 def sample(
@@ -107,10 +107,10 @@ def _normal(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tenso
 def score_outlines(
     outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"], image: Float[Tensor, "h w"]
 ) -> Float[Tensor, "n"]:
-    """How much denser events are on the contours of one object at each of some poses than beside them.
+    """How much denser events are on the contours of an object at each of some poses than around them.
 
     Args:
-        outlines: its contours at each pose; or one for all, which are moved: over a few degrees they stay contours, even on a smooth surface.
+        outlines: its contours at each pose; or a single row for all, which is moved: over a few degrees they stay contours, even of what is smooth.
         T_cam_obj: the poses.
         image: how many events there are at every pixel, as :mod:`torchtrack.tracking.relocalization.event_image` has it.
     """
@@ -120,7 +120,7 @@ def score_outlines(
     )
     moved = assemble(points, tangents, kind, mask, T_cam_obj, intrinsics.expand(count, 4))
     total = image.new_zeros(count)
-    for side_px, weight in ((0.0, 1.0), (BESIDE_PX, -0.5), (-BESIDE_PX, -0.5)):
+    for side_px, weight in ((0.0, 1.0), (AROUND_PX, -0.5), (-AROUND_PX, -0.5)):
         total = total + weight * (look_up(image, moved.pixels + side_px * moved.normals) * moved.mask).sum(-1)
     return total / moved.mask.sum(-1).clamp(min=1)
 

@@ -13,7 +13,7 @@ from torchtrack.tracking.relocalization.evidence import Schedule
 from torchtrack.tracking.relocalization.triggers import Trigger, searches
 from torchtrack.tracking.state import TrackerState
 
-# A prediction that is so uncertain, as a share of the most that predictions become, tells nothing any more.
+# A prediction that is so uncertain, as a ratio of the most that predictions become, tells nothing any more.
 _NOTHING_KNOWN = 0.8
 # Farther away, or nearer, than when it was last seen well by this factor, an object may have been mistaken for others' edges.
 _DEPTH_FACTOR = 1.25
@@ -33,10 +33,10 @@ def is_time(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], *intervals_us: i
 
 
 def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_due: Bool[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:
-    """LOST, DEPTH_CHANGED and FAR_BELOW_REFERENCE, of objects that were found once, and then not seen well for long.
+    """LOST, DEPTH_CHANGED and FAR_BELOW_REFERENCE, of objects that were seen well once, and then not seen well for long.
 
     LOST: nothing is known of them any more but where they were last seen well, and they are expected there. Others are looked for all
-    around that place. Those that explain little are partly hidden, as a rule; but a pose may also have gone along with what hid the
+    around that place. Those that explain too little are partly hidden, as a rule; but a pose may also have gone along with what hid the
     object, and hold on to other edges.
     """
     unseen = _is_unseen_for_long(state, config)

@@ -21,10 +21,8 @@ from torchtrack.core.host_sync import none_of
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.validation.status import are_many
 
-# An object is new while what it explains when seen well, which rises with every window, is below this share of what it explains.
+# An object is new while what it explains when seen well, which rises with every window, is below this ratio of what it explains.
 _NEW = 0.9
-# Events that gather less than this share of how far they do when an object is seen well are smeared.
-SMEARED = 0.8
 
 
 class Trigger(IntFlag):
@@ -230,27 +228,3 @@ def tries_rotated(config: TrackerConfig) -> bool:
 def may_have_rotated(has_axis: Bool[Tensor, "b"], time_since_validated_s: Float[Tensor, "b"], config: RelocalizationConfig) -> Bool[Tensor, "b"]:
     """Which objects with an axis were not seen well for so long that they may have rotated about it unseen."""
     return has_axis & (time_since_validated_s >= 1e-6 * config.drift_us)
-
-
-def is_smeared(
-    score: Float[Tensor, "b"],
-    reference_explained_ratio: Float[Tensor, "b"],
-    inlier_ratio: Float[Tensor, "b"],
-    reference_inlier_ratio: Float[Tensor, "b"],
-    config: RelocalizationConfig,
-) -> Bool[Tensor, "b"]:
-    """Which objects explain so much less than when they are seen well, by smeared events, that they may be elsewhere.
-
-    Where less is explained but events gather as ever, an object is right, and partly hidden.
-    """
-    return (inlier_ratio < SMEARED * reference_inlier_ratio) & (score < config.drift_below * reference_explained_ratio)
-
-
-def reference_where_known(
-    sigma_px: Float[Tensor, "b"], reference_inlier_ratio: Float[Tensor, "b"], config: RelocalizationConfig
-) -> Float[Tensor, "b"]:
-    """How far events gather on contours when objects are seen well; zero, for nothing, of objects whose place is not known.
-
-    They were hidden, as a rule, and the events of what hides them do not gather where they are seen again.
-    """
-    return torch.where(sigma_px > config.from_sigma_px, 0, reference_inlier_ratio)

@@ -17,23 +17,23 @@ from torchtrack.tracking.motion.prediction import Prediction
 _VIEWS = 200
 # Contour points of an outline, at most.
 _POINTS = 200
-# Turns about the line of sight have to begin somewhere: at this axis of the object, or the other one where it points along the line.
+# Rotations about the line of sight have to begin somewhere: at this axis of the object, or the other one where it points along the line.
 _UP, _OTHER_UP, _ALONG = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 0.9
 
 
 def view_directions(count: int, device: torch.device | None = None) -> Float[Tensor, "v 3"]:
     """Unit vectors spread evenly over the sphere: a Fibonacci lattice (González, "Measurement of areas on a sphere", 2010)."""
     number = torch.arange(count, dtype=torch.float64, device=device) + 0.5
-    z, turn = 1 - 2 * number / count, number * math.pi * (3 - 5**0.5)
+    z, angle = 1 - 2 * number / count, number * math.pi * (3 - 5**0.5)
     radius = (1 - z.square()).sqrt()
-    return torch.stack([radius * turn.cos(), radius * turn.sin(), z], -1)
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], -1)
 
 
 def outlines_by_view(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], config: TrackerConfig) -> Contours:
-    """The contours of one object at each of some poses: those of the view from all around that is nearest to how it is seen there.
+    """The contours of an object at each of some poses: those of the view from all around that is nearest to how it is seen there.
 
     Args:
-        prediction: of the one object; views are taken from its depth.
+        prediction: of the object alone; views are taken from its depth.
         T_cam_obj: the poses.
     """
     objects = prediction.objects
@@ -59,7 +59,7 @@ def thinned(contours: Contours) -> Contours:
 
 
 def outlines_at(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], config: TrackerConfig) -> Contours:
-    """The contours of one object as they are seen at each of some poses."""
+    """The contours of an object as they are seen at each of some poses."""
     return thinned(prediction.objects.copies(0, len(T_cam_obj)).contours(T_cam_obj, config.contours))
 
 

@@ -15,13 +15,13 @@ class TrackHealth:
 
     Args:
         score: of the last window, :attr:`torchtrack.tracking.validation.scored_fit.ScoredFit.score`.
-        mean_score: its running mean; zero of an object that was never found.
+        mean_score: its running mean; zero of an object that was never seen.
         reference_explained_ratio: of the moving contour, what events explain when the object is seen well.
         reference_inlier_ratio: of the events near its contours, how many are on them then.
         reference_matches: matched observations then.
-        reference_normal_spread: how far apart the directions of contours with events on them are then
-            (:func:`torchtrack.tracking.validation.measures.normal_spread_of`).
-        drift_s: for how long, less the time it was not, the object has been drifting, as far as is known (s).
+        reference_normal_spread: how far the normals of contours with events on them are spread then
+            (:func:`torchtrack.tracking.validation.measures.normal_spread`).
+        drift_s: for how long, less the time it was not, the object has explained too little by smeared events (s).
         T_last_validated: pose of each object when it was last seen well (float64).
         time_since_validated_s: how long ago that was (s).
     """
@@ -55,12 +55,12 @@ class TrackHealth:
 
 @dataclass(frozen=True)
 class TentativeTrack:
-    """Where to look for objects again, should the pose that they were found in turn out to be wrong.
+    """Where to look for objects again, should the pose that a search gave them turn out to be wrong.
 
     Args:
         is_tentative: objects whose new pose is not confirmed yet.
         evidence: for it, in windows.
-        T_cam_obj, covariance: of the object before it was found.
+        T_cam_obj, covariance: of the object before that.
     """
 
     is_tentative: Bool[Tensor, "b"]

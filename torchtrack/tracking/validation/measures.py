@@ -1,4 +1,4 @@
-"""Whether a pose can be trusted: status, and the share of the moving contour that events explain.
+"""What events say of a pose: how much of the moving contour they explain, how they gather on it, and how its normals are spread.
 
 The residual does not tell: a slip onto a parallel edge has a small one.
 """
@@ -15,19 +15,19 @@ from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.weights import ON_CONTOUR_PX, on_and_around, patch, patch_sums
 from torchtrack.tracking.contours.points import Contours
 
-# A patch explains its contours when this share of the observations near them are on them.
-LEAST_SHARE = 0.5
+# A patch explains its contours when this ratio of the observations near them is on them.
+LEAST_RATIO = 0.5
 
 
 # Fewer moving contour points than this say nothing.
 MIN_MOVING_POINTS = 16
 
 
-# What has not been seen well for so long may not be held by parallel lines alone; after so much more, hardly anything is asked (s).
-PARALLEL_AFTER_S, _ASKED_S = 0.05, 1.0
+# What has not been seen well for so long may not be held by parallel lines alone; after so much more, hardly anything is required (s).
+PARALLEL_AFTER_S, _REQUIRED_S = 0.05, 1.0
 
 
-# Directions that lie no farther apart than this share of what is asked say nothing for a pose; from the other one on, all.
+# Normals that are spread no farther than this ratio of what is required say nothing for a pose; from the other ratio on, all.
 _PARALLEL_FROM, _PARALLEL_TO = 0.1, 0.33
 
 
@@ -35,55 +35,54 @@ _PARALLEL_FROM, _PARALLEL_TO = 0.1, 0.33
 AROUND_PX = 5.0
 
 
-def explained_share(
+def explained_ratio(
     contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: ValidationConfig
 ) -> Float[Tensor, "b"]:
-    """:func:`measured_share`; where hardly anything moves, nothing speaks against the pose: all is explained."""
-    return measured_share(contours, matches, contour_velocity, image_size, config).nan_to_num(1.0)
+    """:func:`measured_ratio`; where hardly anything moves, nothing speaks against the pose: all is explained."""
+    return measured_ratio(contours, matches, contour_velocity, image_size, config).nan_to_num(1.0)
 
 
-def measured_share(
+def measured_ratio(
     contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: ValidationConfig
 ) -> Float[Tensor, "b"]:
-    """Of the visible contour that should fire given its motion, the share with observations on it; not a number where hardly any moves.
+    """Of the visible contour that should fire given its motion, the ratio with observations on it; not a number where hardly any moves.
 
     A patch of the image explains its contours when most of the observations near them are on them: a few of those that
     chance scatters around a contour always are.
     """
     counts = patch_sums(patch(matches.targets), on_and_around(matches.offsets, matches.near) * matches.as_expected[:, None])
     on, near = counts.gather(2, patch(contours.pixels)[:, None].expand(-1, 2, -1)).unbind(1)
-    explained = (on >= config.min_on_contour) & (on + 1 > LEAST_SHARE * (near + 2))
+    explained = (on >= config.min_on_contour) & (on + 1 > LEAST_RATIO * (near + 2))
     speed = (contours.normals * contour_velocity).sum(-1).abs()
     moving = contours.mask & inside(contours.pixels, image_size) & (speed > config.min_speed_px_s)
     total = moving.sum(-1)
-    share = (moving & explained).sum(-1).to(contours.pixels.dtype) / total.clamp(min=1)
-    return torch.where(total < MIN_MOVING_POINTS, torch.nan, share)
+    ratio = (moving & explained).sum(-1).to(contours.pixels.dtype) / total.clamp(min=1)
+    return torch.where(total < MIN_MOVING_POINTS, torch.nan, ratio)
 
 
 @accelerable
-def shares(
+def fit_measures(
     contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: ValidationConfig
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
-    """:func:`measured_share` of contours that move with their objects, :func:`gathered_share`, and :func:`normal_spread_of`."""
+    """:func:`measured_ratio` of contours that move with their objects, :func:`inlier_ratio`, and :func:`normal_spread`."""
     velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
-    measured = measured_share(contours, matches, velocity, image_size, config)
-    return measured, gathered_share(matches, config), normal_spread_of(matches)
+    return measured_ratio(contours, matches, velocity, image_size, config), inlier_ratio(matches, config), normal_spread(matches)
 
 
-def gathered_share(matches: Matches, config: ValidationConfig) -> Float[Tensor, "b"]:
-    """Of the observations near an object's contours, the share that is on them; not a number where they are too few to tell.
+def inlier_ratio(matches: Matches, config: ValidationConfig) -> Float[Tensor, "b"]:
+    """Of the observations near an object's contours, the ratio that is on them; not a number where they are too few to tell.
 
     Contours that slipped onto others are explained by events of those, but what is around them is no longer theirs alone.
     """
     offsets = matches.offsets.abs()
     near = matches.near & (offsets < AROUND_PX)
     count = near.sum(-1)
-    share = (near & (offsets < ON_CONTOUR_PX)).sum(-1).to(offsets.dtype) / count.clamp(min=1)
-    return torch.where(count < config.min_observations, torch.nan, share)
+    ratio = (near & (offsets < ON_CONTOUR_PX)).sum(-1).to(offsets.dtype) / count.clamp(min=1)
+    return torch.where(count < config.min_observations, torch.nan, ratio)
 
 
-def normal_spread_of(matches: Matches) -> Float[Tensor, "b"]:
-    """How far apart the directions are of the contours that observations lie on: 0 where all are parallel, 0.5 where none prevails.
+def normal_spread(matches: Matches) -> Float[Tensor, "b"]:
+    """How far the normals of the contours are spread that observations lie on: 0 where all are parallel, 0.5 where none prevails.
 
     The smaller eigenvalue of the mean of ``n n^T`` over their unit normals n, by the resultant of these at twice their angles
     (Mardia and Jupp, Directional Statistics, 1.3).
@@ -98,27 +97,27 @@ def normal_spread_of(matches: Matches) -> Float[Tensor, "b"]:
 def required_spread(
     reference_normal_spread: Float[Tensor, "b"], time_since_validated_s: Float[Tensor, "b"], config: ValidationConfig
 ) -> Float[Tensor, "b"] | None:
-    """How far apart the directions of an object's contours should be, which was not seen well for a while: as far as when it was.
+    """How far the normals of an object's contours have to be spread, which was not seen well for a while: as far as when it was.
 
     Less and less: an object may go on along its own edges, of which only those across its way fire then. None where it is certain
-    that nothing is asked of any object, as a rule.
+    that nothing is required of any object, as a rule.
 
     Args:
-        full_apart: how far apart they are when it is seen well; zero, for nothing, where that is not known.
-        unseen_s: how long ago that was (s).
+        reference_normal_spread: of when it is seen well; zero, for nothing, where that is not known.
+        time_since_validated_s: how long ago that was (s).
     """
     asks = (time_since_validated_s >= PARALLEL_AFTER_S) & config.all_directions
-    return None if none_of(asks) else torch.where(asks, reference_normal_spread * torch.exp(time_since_validated_s / -_ASKED_S), 0)
+    return None if none_of(asks) else torch.where(asks, reference_normal_spread * torch.exp(time_since_validated_s / -_REQUIRED_S), 0)
 
 
-def constrained_2d(apart: Float[Tensor, "b"], asked: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
-    """How far a pose is held in all directions of the image, 0 to 1: an object laid along a bar that hides it slides along its edges.
+def constrained_2d(spread: Float[Tensor, "b"], required: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
+    """How far a pose is constrained in both directions of the image, 0 to 1: an object laid along a bar that hides it slides along its edges.
 
     Args:
-        apart: :func:`normal_spread_of` of what is explained; ``asked`` of it, zero for nothing.
+        spread: :func:`normal_spread` of what is explained; ``required`` of it, zero for nothing.
     """
-    share = (apart - _PARALLEL_FROM * asked) / ((_PARALLEL_TO - _PARALLEL_FROM) * asked).clamp(min=1e-6)
-    return torch.where(asked > 0, share.clamp(0, 1), 1)
+    ratio = (spread - _PARALLEL_FROM * required) / ((_PARALLEL_TO - _PARALLEL_FROM) * required).clamp(min=1e-6)
+    return torch.where(required > 0, ratio.clamp(0, 1), 1)
 
 
 def inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
@@ -128,7 +127,7 @@ def inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
 
 
 @accelerable
-def visible_share(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
-    """Share of an object's contour points that lie in the image; zero without any."""
+def visible_ratio(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
+    """Ratio of an object's contour points that lie in the image; zero without any."""
     seen = contours.mask & inside(contours.pixels, image_size)
     return seen.sum(-1) / contours.mask.sum(-1).clamp(min=1)

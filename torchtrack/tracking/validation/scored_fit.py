@@ -6,82 +6,89 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import once
 from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.validation.measures import constrained_2d, shares
+from torchtrack.tracking.validation.measures import constrained_2d, fit_measures
 
-# From this share of how far they do when an object is seen well, events gather in full.
-_AS_GATHERED = 0.9
+# From this ratio of how far they do when an object is seen well, events gather in full.
+_GATHERED_FROM = 0.9
 
 
 @dataclass(frozen=True)
 class ScoredFit:
-    """What one window gave for each object.
+    """What a window gave for each object, with its score.
 
     Args:
         fit: poses, and what they stand on.
-        measured: share of the moving contour that events explain; not a number where hardly anything moves.
-        at_rest: what stands for it then.
+        measured_ratio: ratio of the moving contour that events explain; not a number where hardly anything moves.
+        ratio_at_rest: what stands for it then.
         count: matched observations.
-        gathered: share of the events near the contour that are on it; not a number where it does not tell.
-        full_gathered: the same of when the object is seen well.
-        apart: how far apart the directions of the contours are that events lie on.
-        asked_apart: how far apart they have to be to count in full; zero for nothing asked.
-        elsewhere: which objects a search found in another place than the prediction led to.
-        turn_unclear: which may be turned otherwise about their axis (:mod:`torchtrack.tracking.relocalization.axis_rotation`).
+        inlier_ratio: of the events near the contour, how many are on it; not a number where it does not tell.
+        reference_inlier_ratio: the same of when the object is seen well.
+        normal_spread: how far the normals of the contours are spread that events lie on.
+        required_spread: how far they have to be to count in full; zero for nothing required.
+        is_relocalized: objects that a search took to another pose than the prediction led to.
+        axis_ambiguous: which may be rotated otherwise about their axis (:mod:`torchtrack.tracking.relocalization.axis_rotation`).
     """
 
     fit: Fit
-    measured: Float[Tensor, "b"]
-    at_rest: Float[Tensor, "b"]
+    measured_ratio: Float[Tensor, "b"]
+    ratio_at_rest: Float[Tensor, "b"]
     count: Int[Tensor, "b"]
     inlier_ratio: Float[Tensor, "b"]
     reference_inlier_ratio: Float[Tensor, "b"]
-    apart: Float[Tensor, "b"]
+    normal_spread: Float[Tensor, "b"]
     required_spread: Float[Tensor, "b"]
-    elsewhere: Bool[Tensor, "b"]
-    rotation_unclear: Bool[Tensor, "b"]
+    is_relocalized: Bool[Tensor, "b"]
+    axis_ambiguous: Bool[Tensor, "b"]
 
     @once
     def explained_ratio(self) -> Float[Tensor, "b"]:
         """What events explain of the contour."""
-        return torch.where(self.measured.isnan(), self.at_rest, self.measured)
+        return torch.where(self.measured_ratio.isnan(), self.ratio_at_rest, self.measured_ratio)
 
     @once
     def score(self) -> Float[Tensor, "b"]:
-        """The share, and less where the events around the contour are smeared: what poses are compared by."""
-        inlier_ratio = self.inlier_ratio / (_AS_GATHERED * self.reference_inlier_ratio).clamp(min=1e-3)
-        return self.explained_ratio * inlier_ratio.nan_to_num(1.0).clamp(max=1)
+        """The explained ratio, and less where the events around the contour are smeared: what poses are compared by."""
+        gathering = self.inlier_ratio / (_GATHERED_FROM * self.reference_inlier_ratio).clamp(min=1e-3)
+        return self.explained_ratio * gathering.nan_to_num(1.0).clamp(max=1)
 
 
-def judge_fit(
+def score_fit(
     prediction: Prediction,
     fit: Fit,
     config: TrackerConfig,
-    at_rest: Float[Tensor, "b"],
+    ratio_at_rest: Float[Tensor, "b"],
     reference_inlier_ratio: Float[Tensor, "b"] | None = None,
     required_spread: Float[Tensor, "b"] | None = None,
 ) -> ScoredFit:
-    """A fit with its quality, by the motion that was found with it; without enough observations it explains nothing.
+    """A fit with its score, by the motion that was estimated with it; without enough observations it explains nothing.
 
     Args:
-        full_gathered: of when each object is seen well; zero, or none at all, where that is not known.
-        asked_apart: how far apart directions have to be to count in full; zero, or none at all, for nothing asked.
+        reference_inlier_ratio: of when each object is seen well; zero, or none at all, where that is not known.
+        required_spread: how far normals have to be spread to count in full; zero, or none at all, for nothing required.
     """
     moving = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).moving(compensated=True)
-    measured, inlier_ratio, apart = shares(fit.contours, fit.matches, moving, prediction.objects.image_size, config.validation)
+    measured, inliers, spread = fit_measures(fit.contours, fit.matches, moving, prediction.objects.image_size, config.validation)
     # Of what does not move, events are noise.
-    inlier_ratio = (
-        torch.where(measured.isnan(), torch.nan, inlier_ratio) if config.relocalization.by_inlier_ratio else torch.full_like(measured, torch.nan)
-    )
+    inliers = torch.where(measured.isnan(), torch.nan, inliers) if config.relocalization.by_inlier_ratio else torch.full_like(measured, torch.nan)
     if required_spread is not None:
-        measured = measured * constrained_2d(apart, required_spread)
+        measured = measured * constrained_2d(spread, required_spread)
     nothing = torch.zeros_like(measured)
-    reference_inlier_ratio, required_spread = (nothing if value is None else value for value in (reference_inlier_ratio, required_spread))
     return ScoredFit(
-        fit, measured, at_rest, fit.matches.mask.sum(-1), inlier_ratio, reference_inlier_ratio, apart, required_spread, nothing.bool(), nothing.bool()
+        fit=fit,
+        measured_ratio=measured,
+        ratio_at_rest=ratio_at_rest,
+        count=fit.matches.mask.sum(-1),
+        inlier_ratio=inliers,
+        reference_inlier_ratio=nothing if reference_inlier_ratio is None else reference_inlier_ratio,
+        normal_spread=spread,
+        required_spread=nothing if required_spread is None else required_spread,
+        is_relocalized=nothing.bool(),
+        axis_ambiguous=nothing.bool(),
     )
 
 
@@ -92,3 +99,13 @@ def explained_at_rest(gate_scale: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
         gate_scale: of each object's first gate.
     """
     return 2 - gate_scale.clamp(1, 2)
+
+
+def reference_where_known(
+    sigma_px: Float[Tensor, "b"], reference_inlier_ratio: Float[Tensor, "b"], config: RelocalizationConfig
+) -> Float[Tensor, "b"]:
+    """How far events gather on contours when objects are seen well; zero, for nothing, of objects whose place is not known.
+
+    They were hidden, as a rule, and the events of what hides them do not gather where they are seen again.
+    """
+    return torch.where(sigma_px > config.from_sigma_px, 0, reference_inlier_ratio)

@@ -1,4 +1,4 @@
-"""Statuses: what a pose is worth, told from what was measured."""
+"""Statuses: what a pose is worth, by what was measured."""
 
 from enum import IntEnum
 
@@ -6,15 +6,20 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.validation import ValidationConfig
 from torchtrack.core.constants import constant
 
-# What gathers no more than this share of how far it does when an object is seen well says nothing for a pose; from the other one on, all.
+# What gathers no more than this ratio of how far it does when an object is seen well says nothing for a pose; from the other one on, all.
 HIDDEN_FROM, HIDDEN_FULLY = 0.8, 0.95
 
 
 # It says nothing of objects on which less gathers even then, nor by fewer observations than so many times the least.
 HIDDEN_LEAST, HIDDEN_TIMES = 0.5, 4
+
+
+# Events that gather less than this ratio of how far they do when an object is seen well are smeared.
+SMEARED = 0.8
 
 
 class Status(IntEnum):
@@ -28,8 +33,8 @@ class Status(IntEnum):
     DIVERGED = 5
 
 
-def needed_share(gate_scale: Float[Tensor, "b"], config: ValidationConfig, hidden: Float[Tensor, "b"] | None = None) -> Float[Tensor, "b"]:
-    """The explained share below which an object is lost: the more places it was looked for in, the more is asked of a find.
+def needed_ratio(gate_scale: Float[Tensor, "b"], config: ValidationConfig, hidden: Float[Tensor, "b"] | None = None) -> Float[Tensor, "b"]:
+    """The explained ratio below which an object is lost: the more places it was looked for in, the more is asked of a pose.
 
     No more than of any, as far as it is ``hidden``, as :func:`partly_hidden` has it.
     """
@@ -43,24 +48,24 @@ def partly_hidden(
     inlier_ratio: Float[Tensor, "b"],
     reference_inlier_ratio: Float[Tensor, "b"],
     count: Int[Tensor, "b"],
-    elsewhere: Bool[Tensor, "b"],
+    is_relocalized: Bool[Tensor, "b"],
     config: ValidationConfig,
 ) -> Float[Tensor, "b"]:
     """How far a pose counts, 0 to 1, by events that gather on its contours as they do when the object is seen well, however few these are.
 
     Of an object that is partly hidden little is explained, but what is seen of it gathers as ever. Were it believed the less,
-    it would be expected in ever more places, lost, and hidden parts or not, it would be tracked no more. What a search found
+    it would be expected in ever more places, lost, and hidden parts or not, it would be tracked no more. What a search gave
     is the best of many poses: on one of them, events gather by chance.
 
     Args:
-        gathered: share of the events near the contours that are on them; not a number where it does not tell.
-        full_gathered: the same of when the object is seen well; zero where that is not known.
+        inlier_ratio: of the events near the contours, how many are on them; not a number where it does not tell.
+        reference_inlier_ratio: the same of when the object is seen well; zero where that is not known.
         count: matched observations.
-        elsewhere: objects that a search found.
+        is_relocalized: objects that a search took to another pose.
     """
     ramp = (inlier_ratio / reference_inlier_ratio.clamp(min=1e-6) - HIDDEN_FROM) / (HIDDEN_FULLY - HIDDEN_FROM)
     # Written so that what is not a number counts for nothing.
-    tells = (ramp > 0) & ~elsewhere & (reference_inlier_ratio > HIDDEN_LEAST) & are_many(count, config)
+    tells = (ramp > 0) & ~is_relocalized & (reference_inlier_ratio > HIDDEN_LEAST) & are_many(count, config)
     return torch.where(tells & config.partly_hidden, ramp.clamp(max=1), 0)
 
 
@@ -69,29 +74,29 @@ def are_many(count: Int[Tensor, "b"], config: ValidationConfig) -> Bool[Tensor, 
     return count >= HIDDEN_TIMES * config.min_observations
 
 
-def holding_on(count: Int[Tensor, "b"], elsewhere: Bool[Tensor, "b"], config: ValidationConfig) -> Bool[Tensor, "b"]:
+def holding_on(count: Int[Tensor, "b"], is_relocalized: Bool[Tensor, "b"], config: ValidationConfig) -> Bool[Tensor, "b"]:
     """Which poses go on from the one before by many events: what little is explained of an object that is hidden ever more is still it.
 
     Given up, it would coast away from where it is, and be looked for among the edges of what hides it. Arguments are those of
     :func:`partly_hidden`.
     """
-    return ~elsewhere & are_many(count, config) & config.holds_on
+    return ~is_relocalized & are_many(count, config) & config.holds_on
 
 
 def trust(
-    share: Float[Tensor, "b"],
+    explained_ratio: Float[Tensor, "b"],
     config: ValidationConfig,
     reference_explained_ratio: Float[Tensor, "b"] | None = None,
     gate_scale: Float[Tensor, "b"] | None = None,
 ) -> Float[Tensor, "b"]:
-    """How far a pose that was found counts against the prediction: nothing where it is lost, fully once it is certain.
+    """How far a pose counts against the prediction: nothing where it is lost, fully once it is certain.
 
-    Of an object that was looked for in many places (``gate_scale``) near to its full share is asked: chance explains some.
+    Of an object that was looked for in many places (``gate_scale``) near to its reference is asked: chance explains some.
     """
-    full = torch.full_like(share, config.uncertain_below)
+    full = torch.full_like(explained_ratio, config.uncertain_below)
     if reference_explained_ratio is not None and gate_scale is not None:
         full = torch.maximum(full, config.validated_from * reference_explained_ratio * (gate_scale - 1).clamp(0, 1))
-    return ((share - config.lost_below) / (full - config.lost_below).clamp(min=1e-6)).clamp(0, 1)
+    return ((explained_ratio - config.lost_below) / (full - config.lost_below).clamp(min=1e-6)).clamp(0, 1)
 
 
 def judge(
@@ -106,19 +111,33 @@ def judge(
 ) -> Int[Tensor, "b"]:
     """The :class:`Status` of each object, the gravest reason first.
 
-    ``gate_scale`` is of each object's first gate: an uncertain one may be found so much farther away. ``hidden`` is from
+    ``gate_scale`` is of each object's first gate: an uncertain one may be so much farther away. ``hidden`` is from
     :func:`partly_hidden`.
     """
     gate_scale = torch.ones_like(quality) if gate_scale is None else gate_scale
-    turned, moved = (step_from_prediction.unflatten(1, (2, 3)).norm(dim=-1) / gate_scale[:, None]).unbind(1)
+    rotated, moved = (step_from_prediction.unflatten(1, (2, 3)).norm(dim=-1) / gate_scale[:, None]).unbind(1)
     reasons: dict[Status, Bool[Tensor, "b"]] = {
         Status.UNCERTAIN: quality < config.uncertain_below,
-        Status.LOST: quality < needed_share(gate_scale, config, hidden),
+        Status.LOST: quality < needed_ratio(gate_scale, config, hidden),
         Status.TOO_FEW_EVENTS: observation_count < config.min_observations,
         Status.OUT_OF_VIEW: in_view < config.min_visible_ratio,
         # Written so that what is not a number has diverged.
-        Status.DIVERGED: ~((turned < config.max_step_rotation_rad) & (moved < config.max_step_translation * diameters_m)),
+        Status.DIVERGED: ~((rotated < config.max_step_rotation_rad) & (moved < config.max_step_translation * diameters_m)),
     }
     # Statuses are in the order of their gravity.
     numbers = constant(tuple((int(status),) for status in reasons), torch.int64, quality.device)
     return (torch.stack(list(reasons.values())) * numbers).amax(0)
+
+
+def is_smeared(
+    score: Float[Tensor, "b"],
+    reference_explained_ratio: Float[Tensor, "b"],
+    inlier_ratio: Float[Tensor, "b"],
+    reference_inlier_ratio: Float[Tensor, "b"],
+    config: RelocalizationConfig,
+) -> Bool[Tensor, "b"]:
+    """Which objects explain so much less than when they are seen well, by smeared events, that they may be elsewhere.
+
+    Where less is explained but events gather as ever, an object is right, and partly hidden.
+    """
+    return (inlier_ratio < SMEARED * reference_inlier_ratio) & (score < config.drift_below * reference_explained_ratio)
