@@ -1,4 +1,7 @@
-"""Association of observations with the nearest contour point, within a gate: the one of the preset ``default``."""
+"""Association of observations with the nearest contour point, within a gate: the one of the preset ``default``.
+
+On a CPU without gradients, ``torchtrack/backends/numba/rounds.py`` takes its place, with all rounds of matching and solving in one call.
+"""
 
 from dataclasses import dataclass
 
