@@ -136,7 +136,7 @@ def test_settings_named_alone_exist():
 
 def test_files_exist():
     named = set(re.findall(r"[`(\s]((?:configs|scripts|tests|torchtrack|docs|\.github)/[\w./-]*\w|LICENSE)", README))
-    assert {"configs/demo.yaml", "scripts/demo", "torchtrack/tracking/tracker.py", "LICENSE"} <= named
+    assert {"configs/demo.yaml", "scripts/demo", "torchtrack/tracking/step.py", "LICENSE"} <= named
     for path in named:
         assert (REPOSITORY / path).exists(), path
 
