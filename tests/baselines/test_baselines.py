@@ -80,7 +80,7 @@ def test_a_prediction_behind_the_camera_is_not_followed():
     tracker = tracker_for("ls", [box_model()])
     state = tracker.init(pose()[None], 0)
     velocity = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, -1000.0]])
-    state = type(state)(**{**vars(state), "velocity": velocity})
+    state = changed(state, velocity=velocity)
     after, _ = tracker.step(state, random_events(0), WINDOW_US)
     assert torch.allclose(after.T_cam_obj, state.T_cam_obj, atol=1e-6)
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, drifting, edge_events, pose, pose_errors, random_events
-from states import changed
 
 import torchtrack
 from torchtrack import Tracker, preset
@@ -218,7 +217,7 @@ def test_polyline_models_are_followed():
 def with_dtypes_of(state, like):
     """The state with each tensor in the precision that it has in another one."""
     if is_dataclass(state):
-        return changed(state, **{name: with_dtypes_of(value, getattr(like, name)) for name, value in vars(state).items()})
+        return replace(state, **{name: with_dtypes_of(value, getattr(like, name)) for name, value in vars(state).items()})
     return state.to(like.dtype) if torch.is_tensor(state) else state
 
 

@@ -117,7 +117,7 @@ def test_windows_that_are_learned_from_are_taken_without_a_graph(graphs):
     (state, _), (compiled_state, _) = both_ways(LEARNING)
     # One call prepares the graph.
     assert graphs.calls == [1 + sum(window % 3 > 0 for window in range(5, COUNT))]
-    expected, actual = (vars(owner.learned) for owner in (state, compiled_state))
+    expected, actual = (vars(owner.appearance.learned) for owner in (state, compiled_state))
     for name, value in expected.items():
         assert torch.equal(actual[name], value) if torch.is_tensor(value) else actual[name] == value
 

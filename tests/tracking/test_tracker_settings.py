@@ -94,8 +94,8 @@ def test_a_box_is_tracked_with_other_settings(config):
 
 def test_without_events_beside_the_corners_the_corners_are_all_that_is_observed():
     # Few corners share a patch of the image: one has to be enough to explain it.
-    quality = ValidationConfig(min_observations=6, min_on_contour=1)
-    config = TrackerConfig(corners=CornerConfig(max_corners=32), association=AssociationConfig(max_events=0), quality=quality)
+    validation = ValidationConfig(min_observations=6, min_on_contour=1)
+    config = TrackerConfig(corners=CornerConfig(max_corners=32), association=AssociationConfig(max_events=0), validation=validation)
     _, _, result, _, _ = started(config=config)
     assert 6 <= int(result.observation_count) <= int(result.corners.mask.sum())
 
