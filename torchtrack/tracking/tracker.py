@@ -39,7 +39,7 @@ class Tracker(TrackedObjects):
         dtype: precision of the pipeline; poses are kept in float64.
         weighting_network: judges every window's :class:`tracking.association.weighting_features.WeightingInputs`: how far to believe each,
             ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
-            comes with the package, for what ``matching.weighting_network`` says. Other poses that a search tries are aligned
+            comes with the package, for what ``association.weighting_network`` says. Other poses that a search tries are aligned
             without it.
         compiled: whether steady windows are taken by compiled graphs, see :mod:`torchtrack.tracking.graphs`.
         kernels: whether Numba's kernels are used where they apply, see :mod:`torchtrack.backends.numba`.
