@@ -160,8 +160,9 @@ def test_nothing_changes_for_its_neighbour(two, number):
     assert any(ours is not theirs for ours, theirs in zip(after, lost, strict=True))
     other = 1 - number
     for ours, theirs in zip(after, lost, strict=True):
-        for name in ("T_cam_obj", "velocity", "covariance", "score"):
-            assert torch.equal(getattr(ours.state, name)[other], getattr(theirs.state, name)[other])
+        for name in ("T_cam_obj", "velocity", "covariance"):
+            assert torch.equal(getattr(ours.state.motion, name)[other], getattr(theirs.state.motion, name)[other])
+        assert torch.equal(ours.state.health.score[other], theirs.state.health.score[other])
         for name in ("T_cam_obj", "covariance", "status", "quality", "observation_count"):
             assert torch.equal(getattr(ours.result, name)[other], getattr(theirs.result, name)[other])
         mask = theirs.result.contours.mask[other]
