@@ -21,7 +21,7 @@ from torchtrack.errors import TorchtrackWarning
 from torchtrack.io.problems import Problems
 from torchtrack.tracking.validation.status import Status
 
-PACKET_US, HOUR_US = 2_000, 3_600_000_000
+PACKET_US, WINDOW_US, HOUR_US = 2_000, 5_000, 3_600_000_000
 # Every so many packets: late, twice, clock back by 0.1 s, by 1000 s, a gap of 50 ms, an hour forward, a burst of noise, a wild time.
 LATE, TWICE, BACK, FAR_BACK, GAP, FORWARD, BURST, WILD = 53, 101, 5_003, 25_013, 2_003, 20_011, 1_009, 499
 HOT_PIXELS, BURST_EVENTS = 5, 5_000
@@ -147,17 +147,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=30.0, help="event time")
     parser.add_argument("--first", type=float, default=1.0, help="what the end is compared with: memory and time per step after so many minutes")
-    parser.add_argument("--window-us", type=int, default=5_000, help="length of a window")
     given = parser.parse_args()
-    window_us: int = given.window_us
     scene = simulated(("lbracket",), size=(320, 240))
     faults, problems = Faults(scene), Problems("the stream", strict=False)
     tracker = torchtrack.Tracker(scene.models, scene.camera, preset("causal"))
     state = tracker.init(scene.T_cam_obj, faults.shift_us)
     tracker.prepare(state)
-    window = WindowConfig(mode="time", duration_us=window_us)
+    window = WindowConfig(mode="time", duration_us=WINDOW_US)
     duration_us = round(60e6 * given.minutes)
-    per_minute = round(60e6 * given.first) // window_us
+    per_minute = round(60e6 * given.first) // WINDOW_US
     warnings.simplefilter("ignore", TorchtrackWarning)
     reference = ReferenceStep(tracker, state, swinging(scene))
     tracked, seconds, table, begun = 0, [], [], time.process_time()
@@ -171,9 +169,9 @@ def main() -> int:
             step_s, reference_s = float(np.median(seconds)), float(np.median(reference.seconds))
             table.append((step_s / reference_s, resident_mb()))
             line = f"step {1e3 * step_s:.2f} ms, {table[-1][0]:.3f} of the fixed one, {table[-1][1]:.0f} MB, tracked {tracked / count:.1%}"
-            print(f"minute {count * window_us / 6e7:5.1f}: {line}", flush=True)
+            print(f"minute {count * WINDOW_US / 6e7:5.1f}: {line}", flush=True)
             seconds, reference.seconds = [], []
-    expected = duration_us // window_us + faults.hours * (LONGEST_SILENCE_US // window_us + 1)
+    expected = duration_us // WINDOW_US + faults.hours * (LONGEST_SILENCE_US // WINDOW_US + 1)
     slower, larger = (table[-1][column] / table[0][column] - 1 for column in (0, 1)) if len(table) > 1 else (0.0, 0.0)
     print(f"windows: {count:,} of {expected:,} expected; tracked {tracked / count:.1%}; time per step {slower:+.1%}, memory {larger:+.1%}")
     print(f"the stream: {problems}")

@@ -150,7 +150,7 @@ def swings(config):
         results.append(result)
     phase = 30e-6 * torch.stack([state.t_us[0] for state in states]).double()
     errors = torch.stack([pose_errors(result.T_cam_obj, trajectory.at(result.t_us))[0][0] for result in results])
-    velocity, acceleration = (torch.stack([getattr(state, name)[0, 2] for state in states]).double() for name in ("velocity", "acceleration"))
+    velocity, acceleration = (torch.stack([getattr(state.motion, name)[0, 2] for state in states]).double() for name in ("velocity", "acceleration"))
     return errors, velocity - 7.5 * phase.sin(), acceleration, 225 * phase.cos()
 
 
