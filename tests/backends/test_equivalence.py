@@ -146,7 +146,7 @@ def stated(name, value, args):
     if operation == "silhouette_features":
         features, is_smooth, objects = value
         own = is_smooth[objects]
-        # The reference tells of all objects, a kernel of those with limbs.
+        # The reference tells of all objects, a kernel of those with smooth silhouettes.
         return [is_smooth, features[own]]
     return [tensor for part in (value if isinstance(value, tuple) else (value,)) for tensor in _of(part)]
 

@@ -55,7 +55,7 @@ def random_contours(batch=3, count=400, seed=0, dtype=torch.float64):
 
 
 def textured_plate():
-    """A plate with points of print on one side."""
+    """A plate with points of texture on one side."""
     plate = ObjectModel.from_mesh(trimesh.creation.box((0.12, 0.10, 0.01)))
     grid = torch.stack(torch.meshgrid(torch.linspace(-0.05, 0.05, 21), torch.linspace(-0.04, 0.04, 17), indexing="ij"), -1).flatten(0, 1)
     points = torch.cat([grid, torch.full_like(grid[:, :1], -0.005)], 1)

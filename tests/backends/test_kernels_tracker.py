@@ -25,7 +25,7 @@ from torchtrack.backends.numba.rounds import knows
 
 SETTINGS = {
     "default": {},
-    "finely": {"association": {"fine_below_px": 10_000.0}},
+    "subcell lookup": {"association": {"fine_below_px": 10_000.0}},
     "no concentration": {"association": {"concentration": False}},
     "no polarity": {"association": {"polarity": False, "polarity_prior_s": 0.0, "texture_polarity": False}},
     "no compensation": {"association": {"motion_compensation": False}},
@@ -35,7 +35,7 @@ SETTINGS = {
     "learned trust": {"association": {"weighting_network": "all"}},
     "no velocity": {"solver": {"velocity_in_window": False}},
     "no acceleration": {"solver": {"acceleration_in_window": False}, "motion": {"acceleration_s": 0.0}},
-    "no swelling": {"solver": {"silhouette_offset_px": 0.0, "common_px": 0.0}},
+    "no silhouette offset": {"solver": {"silhouette_offset_px": 0.0, "common_px": 0.0}},
     "damped": {"solver": {"damping": 0.1}},
     "no hidden": {"contours": {"remove_hidden": False, "mid_window": False}},
     "no gathering": {"relocalization": {"by_inlier_ratio": False}},

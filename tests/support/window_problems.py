@@ -17,7 +17,7 @@ FASTER = torch.tensor([0.6, -0.4, 0.8, 0.1, -0.08, 0.06], dtype=torch.float64)
 
 
 def windowed(T_true, *, count=300, faster=FASTER, silhouette_offset_px=0.0, noise_px=0.0, prior=1e-6, age_s=None, seed=0, dtype=torch.float64):
-    """A body that moves by ``faster`` more than predicted, seen at random times of a window; every other point is a limb's."""
+    """A body that moves by ``faster`` more than predicted, seen at random times of a window; every other point is of the smooth silhouette."""
     rng = generator(seed)
     batch = len(T_true)
     points = 0.05 * torch.randn((batch, count, 3), generator=rng, dtype=torch.float64)

@@ -34,8 +34,8 @@ class ByAge(nn.Module):
         super().__init__()
         self.slope, self.offset = nn.Parameter(torch.tensor(slope)), nn.Parameter(torch.tensor(offset))
 
-    def forward(self, evidence):
-        return torch.sigmoid(self.offset + self.slope * 1e3 * evidence.observations.age_s)
+    def forward(self, inputs):
+        return torch.sigmoid(self.offset + self.slope * 1e3 * inputs.observations.age_s)
 
 
 def weighing(weighting_network, config=None, dtype=torch.float64, count=5):
@@ -85,7 +85,7 @@ def test_trust_decides_what_is_followed():
 @pytest.mark.parametrize("shape", [(), (1, 3), (2, 1)])
 def test_a_weigher_must_judge_every_observation(shape):
     class Wrong(nn.Module):
-        def forward(self, evidence):
+        def forward(self, inputs):
             return torch.ones(shape)
 
     tracker, state, window = weighing(Wrong())
@@ -97,9 +97,9 @@ def test_a_weigher_sees_the_time_surface():
     actual = []
 
     class Looking(nn.Module):
-        def forward(self, evidence):
-            actual.append((evidence.age_s(evidence.observations.pixels), evidence.observations))
-            return torch.ones_like(evidence.observations.age_s)
+        def forward(self, inputs):
+            actual.append((inputs.age_s(inputs.observations.pixels), inputs.observations))
+            return torch.ones_like(inputs.observations.age_s)
 
     tracker, state, (events, end_us) = weighing(Looking())
     tracker.step(state, events, end_us)

@@ -37,7 +37,7 @@ def test_a_box_shows_the_four_creases_of_each_side():
         assert abs(across / down - size[0] / size[1]) < 0.02
 
 
-def test_the_picture_shows_creases_and_limbs():
+def test_the_picture_shows_creases_and_smooth_silhouettes():
     box, ball = trimesh.creation.box((0.1, 0.2, 0.3)), trimesh.creation.icosphere(subdivisions=4, radius=0.05)
     for mesh, colour in ((box, WHITE), (ball, RED)):
         image = draw_model(ObjectModel.from_mesh(mesh))

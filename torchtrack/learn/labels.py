@@ -12,17 +12,17 @@ from torchtrack.tracking.tracker import Tracker
 
 
 def true_distance(
-    tracker: Tracker, evidence: WeightingInputs, T_cam_obj: Float[Tensor, "b 4 4"], velocity: Float[Tensor, "b 6"]
+    tracker: Tracker, inputs: WeightingInputs, T_cam_obj: Float[Tensor, "b 4 4"], velocity: Float[Tensor, "b 6"]
 ) -> Float[Tensor, "b n"]:
     """How far each observation lies from the true contour once both are at the window's end (px); infinite where none is near.
 
     Args:
-        tracker: that made the evidence.
-        evidence: of a window.
+        tracker: that made the inputs.
+        inputs: of a window.
         T_cam_obj: true poses at its end.
         velocity: true rotation of each object and velocity of its centre there (rad/s, m/s), as in the tracker's state.
     """
-    observations, predicted = evidence.observations, evidence.prediction
+    observations, predicted = inputs.observations, inputs.prediction
     dtype = predicted.velocity.dtype
     truth = Prediction(predicted.objects, T_cam_obj.to(dtype), predicted.usable, velocity.to(dtype), predicted.covariance)
     contours = predicted.objects.contours(truth.T_cam_obj, tracker.config.contours)

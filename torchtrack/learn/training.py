@@ -79,8 +79,8 @@ class _Watched(nn.Module):
         super().__init__()
         self.network, self.believed = network, True
 
-    def forward(self, evidence: WeightingInputs) -> Tensor:
-        self.evidence, self.features = evidence, trust_features(evidence)
+    def forward(self, inputs: WeightingInputs) -> Tensor:
+        self.inputs, self.features = inputs, trust_features(inputs)
         self.logits = self.network.logits(self.features)
         return torch.sigmoid(self.logits) if self.believed else torch.ones_like(self.logits)
 
@@ -184,9 +184,9 @@ class Trainer:
             T_true = batch.T_cam_obj[:, number + 1]
             velocity = state_velocity(batch.velocity[:, number + 1], T_true, centre_obj)
             with torch.no_grad():
-                distance = true_distance(tracker, self.watched.evidence, T_true, velocity)
+                distance = true_distance(tracker, self.watched.inputs, T_true, velocity)
             is_on = distance < self.config.on_px
-            known = (is_on | (distance > self.config.off_px)) & self.watched.evidence.observations.mask
+            known = (is_on | (distance > self.config.off_px)) & self.watched.inputs.observations.mask
             error_px = _error_px(tracker, state.T_cam_obj, T_true)
             yield Seen(self.watched.logits, self.watched.features, is_on, known, error_px.to(self.watched.logits.dtype))
 

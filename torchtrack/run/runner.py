@@ -53,7 +53,7 @@ def track(
 
     Args:
         source: a source of events, or batches of them; events up to the state's time are passed over. What is wrong with the times of batches
-            is mended as for files: what comes late by up to 10 ms is sorted in, what was sent twice or is too late is dropped, and where the
+            is mended as for files; what comes late by up to 10 ms is sorted in, what was sent twice or is too late is dropped, and where the
             clock wraps or jumps back, time goes on.
         tracker: the tracker, of one stream.
         state: where it starts, from :meth:`Tracker.init`.

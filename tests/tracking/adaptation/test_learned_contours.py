@@ -67,7 +67,7 @@ def test_learned_contours_lie_on_the_print():
     assert float(distance_m.median()) < 1.5e-3
     tangents = learned.tangents_obj[0][trusted(learned)[0]]
     torch.testing.assert_close(tangents.norm(dim=-1), torch.ones(len(tangents)))
-    # The sides of the print are parallel to those of the plate.
+    # The sides of the texture are parallel to those of the plate.
     assert float((tangents[:, :2].abs().max(1).values > 0.97).float().mean()) > 0.8
     shown = results[-1].contours
     assert bool((shown.mask & (shown.kind == int(ContourKind.LEARNED))).any())
@@ -99,7 +99,7 @@ def test_an_object_that_its_model_explains_learns_nothing_beside_one_that_lacks_
 
 
 def test_an_occluder_that_passes_teaches_nothing():
-    """Bars that sweep over a plate whose own print is known by then."""
+    """Bars that sweep over a plate whose own texture is known by then."""
     trajectory, events = plate_sequence()
     bars = torch.tensor([[[x_m, -0.1, 0.0], [x_m, 0.1, 0.0]] for x_m in (-0.3, -0.28, -0.26)], dtype=torch.float64)
     T_bars = replace(trajectory, T_cam_obj=torch.eye(4, dtype=torch.float64).repeat(len(trajectory.t_us), 1, 1))

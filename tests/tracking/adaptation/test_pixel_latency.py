@@ -1,4 +1,4 @@
-"""How slow a sensor's circuits are: what of its events tells it, how that is remembered, and what becomes of late events."""
+"""Pixel latency: what of a sensor's events tells it, how that is remembered, and what becomes of late events."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from states import changed
 from tracked_boxes import in_motion, poses_of, started
 
 from torchtrack.config.tracker import AssociationConfig, TrackerConfig
-from torchtrack.tracking.adaptation.pixel_latency import dated, late_share_after, slowness, unknown_circuits
+from torchtrack.tracking.adaptation.pixel_latency import dated, late_share_after, slowness, unknown_latency
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.estimation.rounds import gate_scale_of, index_for
 
@@ -61,16 +61,16 @@ def test_where_nothing_is_dated_back_so_nothing_is_told(config):
     assert share_after(0.029, config=config) == pytest.approx(0.1)
 
 
-def test_from_fast_circuits_to_slow_ones():
+def test_from_fast_pixels_to_slow_ones():
     stated = slowness(torch.tensor([0.0, 0.02, 0.08, 0.1, 0.3, 1.0]))
     assert stated[:2].tolist() == [0.0, 0.0] and 0 < stated[2] < stated[3] < 1 and stated[4:].tolist() == [1.0, 1.0]
-    assert slowness(unknown_circuits(torch.zeros(3))).tolist() == pytest.approx([1.0] * 3)
+    assert slowness(unknown_latency(torch.zeros(3))).tolist() == pytest.approx([1.0] * 3)
 
 
 # ---- what becomes of late events
 
 
-def test_of_fast_circuits_no_event_is_late():
+def test_of_fast_pixels_no_event_is_late():
     _, _, observations, _ = observed()
     observations = replace(observations, into_burst_s=torch.rand(observations.age_s.shape, generator=torch.Generator().manual_seed(0)))
     assert not dated(observations, torch.zeros(1), SEEN, LONG).into_burst_s.any()
@@ -107,7 +107,7 @@ def test_it_is_remembered():
     assert 0.0 < after[0] < 0.02 and 0.98 < after[1] < 1.0
 
 
-def test_with_fast_circuits_poses_are_as_without_bursts():
+def test_with_fast_pixels_poses_are_as_without_bursts():
     actual = []
     for burst_us in (10_000, 0):
         tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(association=AssociationConfig(pixel_latency=True, burst_us=burst_us)))

@@ -65,13 +65,13 @@ def stated(times, config, kind=ContourKind.SMOOTH):
     return float((observed @ prediction.covariance[0, :6, :6]).trace())
 
 
-def test_events_of_a_limb_seen_many_times_over_tell_little_more():
+def test_events_of_a_smooth_silhouette_seen_many_times_over_tell_little_more():
     assert stated(8, WITHOUT) / stated(1, WITHOUT) == pytest.approx(8, rel=0.2)
     assert 1 < stated(8, TrackerConfig()) / stated(1, TrackerConfig()) < 5
 
 
 @pytest.mark.parametrize("kind", [ContourKind.CREASE, ContourKind.TEXTURE, ContourKind.SEGMENT, ContourKind.LEARNED])
-def test_what_is_no_limb_has_nothing_in_common(kind):
+def test_what_is_no_smooth_silhouette_has_nothing_in_common(kind):
     for theirs, ours in zip(*(vars(solved(2, config, kind)[1]).values() for config in (WITHOUT, TrackerConfig())), strict=True):
         assert torch.equal(theirs, ours)
 

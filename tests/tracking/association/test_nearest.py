@@ -209,14 +209,14 @@ def test_events_are_moved_back_from_the_dark_side(polarity, speed, shift):
 
 
 @pytest.mark.parametrize(("kind", "shift"), [(ContourKind.SMOOTH, -0.49), (ContourKind.CREASE, -0.98), (ContourKind.TEXTURE, -0.98)])
-def test_the_limb_of_a_smooth_surface_has_a_shift_of_its_own(kind, shift, dtype):
+def test_a_smooth_silhouette_has_a_shift_of_its_own(kind, shift, dtype):
     contours = upright_line(80.0, kind=kind, dtype=dtype)
     seen_there = seen([[[80.0, 60.0]]], polarity=1.0, dtype=dtype)
     matches, _ = nearest(seen_there, contours, velocity=(490.0, 0.0), dark_shift_px=1.0, silhouette_dark_shift_px=0.5)
     assert matches.targets[0, 0].tolist() == pytest.approx([80.0 + shift, 60.0])
 
 
-def test_a_limb_is_shifted_less_than_a_step_by_default():
+def test_a_smooth_silhouette_is_shifted_less_than_a_step_by_default():
     assert 0 < AssociationConfig().silhouette_dark_shift_px < AssociationConfig().dark_shift_px
 
 
@@ -454,7 +454,7 @@ def test_both_coordinates_count_each_match_in_u_and_in_v(dtype):
     assert torch.equal(both.targets, torch.cat([matches.targets, matches.targets], 1))
 
 
-def test_box_contours_keep_their_kind_so_that_limbs_are_known():
+def test_box_contours_keep_their_kind_so_that_smooth_silhouettes_are_known():
     config = ContourConfig()
     contours = mesh_contours(group_by_model([box_model()], config), pose()[None].float(), SMALL_CAMERA.intrinsics()[None], config)
     assert (contours.kind == int(ContourKind.CREASE)).all()

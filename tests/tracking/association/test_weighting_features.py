@@ -22,9 +22,9 @@ COUNT = 6
 class Watching(SilhouetteTrust):
     """Judges, and keeps what it saw."""
 
-    def forward(self, evidence):
-        self.evidence = evidence
-        return super().forward(evidence)
+    def forward(self, inputs):
+        self.inputs = inputs
+        return super().forward(inputs)
 
 
 def inputs_of(models=(SMOOTH,), dtype=torch.float32):
@@ -33,7 +33,7 @@ def inputs_of(models=(SMOOTH,), dtype=torch.float32):
     tracker = Tracker(list(models), SMALL_CAMERA, dtype=dtype, weighting_network=weighting_network)
     with torch.no_grad():
         follow(tracker, tracker.init(pose().expand(len(models), 4, 4), 0), windows(moving_box(pose(), COUNT)[1], COUNT))
-    return weighting_network.evidence, weighting_network
+    return weighting_network.inputs, weighting_network
 
 
 def tracked(models, starts, streams=None, spoilt=None):
@@ -52,31 +52,31 @@ def tracked(models, starts, streams=None, spoilt=None):
 
 
 def test_sharp_edges_are_believed_in_full(dtype):
-    evidence, weighting_network = inputs_of((BOX, SMOOTH), dtype)
+    inputs, weighting_network = inputs_of((BOX, SMOOTH), dtype)
     for wanted in (False, True):
         with torch.no_grad(), backend(wanted=wanted):
-            trust = weighting_network(evidence)
+            trust = weighting_network(inputs)
         assert (trust[0] == 1).all()
-        of_smooth = trust[1][evidence.observations.mask[1]]
+        of_smooth = trust[1][inputs.observations.mask[1]]
         assert ((of_smooth >= 0) & (of_smooth <= 1)).all() and (of_smooth < 1).float().mean() > 0.9
 
 
-def test_limbs_are_judged_as_the_network_judges_them(dtype):
-    evidence, weighting_network = inputs_of(dtype=dtype)
-    trust, of_all, (_, is_smooth, _) = weighting_network(evidence), weighting_network.network(evidence), silhouette_features(evidence)
+def test_smooth_silhouettes_are_judged_as_the_network_judges_them(dtype):
+    inputs, weighting_network = inputs_of(dtype=dtype)
+    trust, of_all, (_, is_smooth, _) = weighting_network(inputs), weighting_network.network(inputs), silhouette_features(inputs)
     assert torch.equal(trust[is_smooth], of_all[is_smooth]) and (trust[~is_smooth] == 1).all() and is_smooth.any()
 
 
 # ---- by a kernel
 
 
-def test_limbs_are_described_the_same_by_a_kernel(dtype):
+def test_smooth_silhouettes_are_described_the_same_by_a_kernel(dtype):
     pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
-    evidence, _ = inputs_of((SMOOTH, BOX, SMOOTH), dtype)
+    inputs, _ = inputs_of((SMOOTH, BOX, SMOOTH), dtype)
     with torch.no_grad():
-        features, is_smooth, objects = silhouette_features(evidence)
+        features, is_smooth, objects = silhouette_features(inputs)
         with backend(wanted=False):
-            expected, wanted, every = silhouette_features(evidence)
+            expected, wanted, every = silhouette_features(inputs)
     # Of the box there is nothing to describe.
     assert objects.tolist() == [0, 2] and every.tolist() == [0, 1, 2]
     assert torch.equal(is_smooth, wanted) and not is_smooth[1].any()
@@ -86,18 +86,18 @@ def test_limbs_are_described_the_same_by_a_kernel(dtype):
     assert ((features - expected)[is_smooth].abs() < 1e-4).all(-1).double().mean() > 0.99
 
 
-def test_where_there_is_no_limb_there_is_nothing_to_describe():
+def test_where_there_is_no_smooth_silhouette_there_is_nothing_to_describe():
     pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
-    evidence, weighting_network = inputs_of((BOX,))
+    inputs, weighting_network = inputs_of((BOX,))
     with torch.no_grad():
-        features, is_smooth, objects = silhouette_features(evidence)
-        assert not len(objects) and not features.any() and not is_smooth.any() and (weighting_network(evidence) == 1).all()
+        features, is_smooth, objects = silhouette_features(inputs)
+        assert not len(objects) and not features.any() and not is_smooth.any() and (weighting_network(inputs) == 1).all()
 
 
 # ---- in the tracker
 
 
-def test_it_is_in_the_default_where_an_object_has_limbs():
+def test_it_is_in_the_default_where_an_object_has_smooth_silhouettes():
     assert isinstance(Tracker([BOX, SMOOTH], SMALL_CAMERA).weighting_network, SilhouetteTrust)
     assert Tracker([BOX], SMALL_CAMERA).weighting_network is None
     assert Tracker([SMOOTH], SMALL_CAMERA, TrackerConfig(association=AssociationConfig(weighting_network="none"))).weighting_network is None

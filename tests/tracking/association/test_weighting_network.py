@@ -20,9 +20,9 @@ from torchtrack.tracking.association.weighting_network import TrustNetwork
 class Watching(nn.Module):
     """Believes everything, and keeps what it saw."""
 
-    def forward(self, evidence):
-        self.evidence = evidence
-        return torch.ones_like(evidence.observations.age_s)
+    def forward(self, inputs):
+        self.inputs = inputs
+        return torch.ones_like(inputs.observations.age_s)
 
 
 def clutter(count, start_us, duration_us, seed=1):
@@ -42,7 +42,7 @@ def inputs_of(objects=1, dtype=torch.float32, noise=400, polarity=None):
     for batch, end_us in windows(merged(events, clutter(6 * noise, 0, 30_000)), 6):
         batch = batch if polarity is None else replace(batch, polarity=torch.full_like(batch.polarity, polarity))
         state, _ = tracker.step(state, batch, end_us)
-    return watching.evidence, tracker, trajectory
+    return watching.inputs, tracker, trajectory
 
 
 def truth_at(trajectory, tracker, t_us=30_000):
@@ -56,27 +56,27 @@ def truth_at(trajectory, tracker, t_us=30_000):
 
 
 def test_events_of_the_contour_lie_on_the_true_one_and_noise_does_not(dtype):
-    evidence, tracker, trajectory = inputs_of(dtype=dtype, noise=0)
-    distance = true_distance(tracker, evidence, *truth_at(trajectory, tracker))
-    mask = evidence.observations.mask
+    inputs, tracker, trajectory = inputs_of(dtype=dtype, noise=0)
+    distance = true_distance(tracker, inputs, *truth_at(trajectory, tracker))
+    mask = inputs.observations.mask
     assert (distance[mask] < 1.0).float().mean() > 0.9 and torch.isinf(distance[~mask]).all()
-    evidence, tracker, trajectory = inputs_of(dtype=dtype, noise=2000)
-    distance = true_distance(tracker, evidence, *truth_at(trajectory, tracker))[evidence.observations.mask]
+    inputs, tracker, trajectory = inputs_of(dtype=dtype, noise=2000)
+    distance = true_distance(tracker, inputs, *truth_at(trajectory, tracker))[inputs.observations.mask]
     assert 0.1 < (distance > 2.0).float().mean() < 0.9
 
 
 # ---- features
 
 
-def features_of(evidence):
+def features_of(inputs):
     """Features of the observations of one object that there are."""
-    return trust_features(evidence)[0][evidence.observations.mask[0]]
+    return trust_features(inputs)[0][inputs.observations.mask[0]]
 
 
 def test_features_are_numbers_of_about_unit_size(dtype):
-    evidence, _, _ = inputs_of(dtype=dtype)
-    features = trust_features(evidence)
-    assert features.shape == (*evidence.observations.age_s.shape, FEATURES) and features.dtype == dtype
+    inputs, _, _ = inputs_of(dtype=dtype)
+    features = trust_features(inputs)
+    assert features.shape == (*inputs.observations.age_s.shape, FEATURES) and features.dtype == dtype
     assert torch.isfinite(features).all() and features.abs().max() < 8
 
 
@@ -96,17 +96,17 @@ def test_events_around_are_counted_by_polarity():
 
 
 def test_events_of_the_contour_look_otherwise_than_noise():
-    evidence, tracker, trajectory = inputs_of(noise=2000)
-    distance = true_distance(tracker, evidence, *truth_at(trajectory, tracker))
-    mask = evidence.observations.mask
-    counts = trust_features(evidence)[..., :54].sum(-1)
+    inputs, tracker, trajectory = inputs_of(noise=2000)
+    distance = true_distance(tracker, inputs, *truth_at(trajectory, tracker))
+    mask = inputs.observations.mask
+    counts = trust_features(inputs)[..., :54].sum(-1)
     assert counts[mask & (distance < 1)].mean() > 1.2 * counts[mask & (distance > 2)].mean()
 
 
 def test_observations_without_a_contour_or_on_no_sensor_are_told_as_such():
-    evidence, _, _ = inputs_of()
-    far = replace(evidence.observations, pixels=torch.full_like(evidence.observations.pixels, 1e6))
-    features = trust_features(replace(evidence, observations=far))
+    inputs, _, _ = inputs_of()
+    far = replace(inputs.observations, pixels=torch.full_like(inputs.observations.pixels, 1e6))
+    features = trust_features(replace(inputs, observations=far))
     assert torch.isfinite(features).all() and (features[..., -1] == 0).all()
 
 
@@ -122,9 +122,9 @@ def test_the_network_is_small():
 def test_weights_are_kept_and_read_again():
     network = TrustNetwork()
     again = TrustNetwork.from_bytes(network.as_bytes())
-    evidence = inputs_of()[0]
-    trust = network(evidence)
-    assert torch.equal(again(evidence), trust) and ((trust >= 0) & (trust <= 1)).all() and trust.requires_grad
+    inputs = inputs_of()[0]
+    trust = network(inputs)
+    assert torch.equal(again(inputs), trust) and ((trust >= 0) & (trust <= 1)).all() and trust.requires_grad
 
 
 @pytest.mark.parametrize("content", [b"", b"nothing of the kind", TrustNetwork((8, 8)).as_bytes()])
@@ -134,9 +134,9 @@ def test_other_files_are_refused(content):
 
 
 def test_the_shipped_network_tells_the_contour_from_noise():
-    evidence, tracker, trajectory = inputs_of(noise=2000)
-    distance = true_distance(tracker, evidence, *truth_at(trajectory, tracker))
-    trust, mask = TrustNetwork.shipped()(evidence), evidence.observations.mask
+    inputs, tracker, trajectory = inputs_of(noise=2000)
+    distance = true_distance(tracker, inputs, *truth_at(trajectory, tracker))
+    trust, mask = TrustNetwork.shipped()(inputs), inputs.observations.mask
     assert trust[mask & (distance < 1)].mean() > 0.3 + trust[mask & (distance > 2)].mean()
 
 

@@ -99,7 +99,7 @@ def test_events_of_the_wrong_polarity_count_least_on_the_edges_of_a_mesh(kind, s
 
 @pytest.mark.parametrize("speed", [500.0, -500.0])
 def test_the_darker_side_of_print_is_known_whatever_the_majority_says(speed):
-    # Normals point to the darker side: it becomes brighter there where print moves along its normal.
+    # Normals point to the darker side: it becomes brighter there where texture moves along its normal.
     right = 1.0 if speed > 0 else -1.0
     weights = weights_on_a_line([-right] * 30 + [right] * 3 + [0.0], kind=ContourKind.TEXTURE, speed=speed)
     assert float(weights[:30].max()) < 0.1

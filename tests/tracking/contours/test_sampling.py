@@ -1,4 +1,4 @@
-"""Contours at a pose: which edges are drawn, how evenly, with which normals; limbs, texture, segments, batches."""
+"""Contours at a pose: which edges are drawn, how evenly, with which normals; smooth silhouettes, texture, segments, batches."""
 
 import math
 from dataclasses import replace
@@ -183,7 +183,7 @@ def test_points_lie_no_closer_than_a_pixel_and_as_each_object_needs():
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.4), (0.08, -0.05, 0.4)])
-def test_the_limb_of_a_sphere_lies_on_its_outline(place):
+def test_the_smooth_silhouette_of_a_sphere_lies_on_its_outline(place):
     radius_m = 0.05
     model = ObjectModel.from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=radius_m), name="ball")
     T = pose((0.3, 0.2, 0.1), place)
@@ -200,7 +200,7 @@ def test_the_limb_of_a_sphere_lies_on_its_outline(place):
     assert float((points.norm(dim=-1) / radius_m).min()) > 0.995
 
 
-def test_the_limb_of_a_sphere_on_the_axis_is_a_circle():
+def test_the_smooth_silhouette_of_a_sphere_on_the_axis_is_a_circle():
     radius_m, depth_m = 0.05, 0.4
     model = ObjectModel.from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=radius_m), name="ball")
     _, pixels, normals, _ = visible(contours_of(model, pose((0.0, 0.0, 0.0), (0.0, 0.0, depth_m))[None]))
@@ -229,7 +229,7 @@ def test_texture_is_drawn_on_the_faces_that_look_at_the_camera(view):
 
 @pytest.mark.parametrize(("turn_rad", "is_drawn"), [(0.16, True), (0.135, False)])
 def test_texture_is_left_out_only_where_it_is_seen_edge_on(turn_rad, is_drawn):
-    """At two degrees print still fires; at one it is nothing but an edge."""
+    """At two degrees texture still fires; at one it is nothing but an edge."""
     T = pose((0.0, -turn_rad, 0.0), (0.0, 0.0, 0.5))
     _, front = box_edges(T)
     assert (0, 1) in front or (0, -1) in front

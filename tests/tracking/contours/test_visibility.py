@@ -110,7 +110,7 @@ def test_a_part_in_front_hides_the_part_behind(exact_faces):
 
 
 @pytest.mark.parametrize("exact_faces", [0, 5000], ids=["buffer", "exact"])
-def test_the_limb_of_a_ball_is_not_hidden(exact_faces):
+def test_the_smooth_silhouette_of_a_ball_is_not_hidden(exact_faces):
     model = ObjectModel.from_mesh(ball(0.05), name="ball")
     before, after = extracted([model] * 3, random_pose(3), streams=[0, 1, 2], config=ContourConfig(exact_faces=exact_faces))
     assert (after.mask.sum(1) > 0.95 * before.mask.sum(1)).all()

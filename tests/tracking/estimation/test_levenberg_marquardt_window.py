@@ -60,7 +60,7 @@ def test_noise_leaves_pose_and_velocity_unbiased():
 
 
 @pytest.mark.parametrize("silhouette_offset_px", [-0.7, 0.4])
-def test_the_swelling_of_limbs_is_found(silhouette_offset_px, dtype):
+def test_the_silhouette_offset_is_found(silhouette_offset_px, dtype):
     T_true = random_pose(3, seed=3)
     problem = windowed(T_true, faster=torch.zeros(6, dtype=torch.float64), silhouette_offset_px=silhouette_offset_px, dtype=dtype)
     actual = solve_pose(problem, T_true.to(dtype), THOROUGH)
@@ -113,7 +113,7 @@ def test_six_and_thirteen_unknowns_agree_where_the_further_ones_are_held(loss, d
 
 
 def cost_with(problem, T_cam_obj, further):
-    """Cost at a pose, with an offset of velocity and swelling ``[b, 7]``, by the solver itself."""
+    """Cost at a pose, with an offset of velocity and silhouette ``[b, 7]``, by the solver itself."""
     shift = replace(problem.window, velocity=problem.window.velocity - further[:, :6])
     targets = problem.targets - (further[:, 6:] * problem.window.outward)[..., None] * problem.directions
     moved = replace(problem, targets=targets, window=shift, prior_information=torch.zeros_like(problem.prior_information))

@@ -109,7 +109,7 @@ def test_only_late_events_are_dated_back():
     assert torch.equal(without_tail(age, into, torch.zeros(1, 4), 1.0), age)
 
 
-def test_the_tail_of_a_slow_circuit_is_matched_where_its_edge_has_gone():
+def test_the_tail_of_a_slow_pixel_is_matched_where_its_edge_has_gone():
     line = upright_line(80.0)
     speed_px_s, into_s = 500.0, 6e-3
     # An event now, 3 px behind the edge, of a burst that began when the edge came.

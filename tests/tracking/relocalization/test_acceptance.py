@@ -152,7 +152,7 @@ def test_a_new_object_has_to_be_explained_nearly_all_with_events_that_gather_no_
 
 
 def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
-    """Of any two poses, dense print explains about as much."""
+    """Of any two poses, dense texture explains about as much."""
     starting = evidence(is_starting=True)
     asked, scored = asked_by(acceptance.near_prediction, starting)
     assert 0.5 < float(asked[2]) < float(scored.inlier_ratio) < float(asked[2]) + 0.05

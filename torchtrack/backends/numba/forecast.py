@@ -47,8 +47,8 @@ def forecast(
     Args:
         T_cam_obj, velocity, acceleration, covariance: of the state: ``[b, 4, 4]``, ``[b, 6]``, ``[b, 6]``, ``[b, 12, 12]``.
         axes_obj: ``[b, 3]`` of surfaces of revolution, zero of other objects; or none at all, ``[0, 3]``.
-        far_pose: ``[b, 4, 4]``, in the place of what is not ``usable [b]``.
-        T_prior, told, predicted: ``[b, 4, 4]``, ``[TOLD, b, 6]`` and ``[b, 12, 12]``; filled.
+        far_pose: ``[b, 4, 4]``, in the place of a pose that is not usable.
+        T_prior, usable, outcome, predicted: ``[b, 4, 4]``, ``[b]``, ``[OUTCOMES, b, 6]`` and ``[b, 12, 12]``; filled.
     """
     before, start = np.empty(6), np.empty((12, 12))
     for b in range(len(T_cam_obj)):

@@ -106,7 +106,7 @@ class TableSettings(NamedTuple):
 
     Args:
         silhouette, crease, texture: numbers of kinds of contours.
-        of_print: whether anything is expected of print.
+        of_texture: whether anything is expected of texture.
         close_px: distance from which parallel edges are told apart; 0 for always.
         aside_px: where an edge is looked for beside another.
         parallel, apart_px: contours this parallel and this far apart are two edges.

@@ -86,7 +86,7 @@ def align(
         velocity, acceleration, rate_hz: ``[b, 6]`` as predicted.
         information: ``[b, 13, 13]`` of the prior.
         gates_px: ``[r]``, and by how much each is ``wider [r, b]``.
-        finely: ``[b]``, whether contours are looked up finely.
+        subcell_lookup: ``[b]``, whether contours are looked up between the cells of the index.
         T_cam_obj, offset: ``[b, 4, 4]`` and ``[b, 13]`` from the prior, where the rounds begin; changed to where they end.
         gradient, hessian, contour, is_near, is_matched, matches: of the last round; filled.
     """

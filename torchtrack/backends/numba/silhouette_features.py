@@ -231,10 +231,10 @@ def _describe_one(
 
 
 @accelerates(weighting_features.silhouette_features)
-def silhouette_features_numba(evidence: WeightingInputs) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
+def silhouette_features_numba(inputs: WeightingInputs) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
     """Observation by observation."""
-    observations, contours, index, history = evidence.observations, evidence.contours, evidence.index, evidence.history
-    moving, (events, own, counts) = evidence.prediction.moving(compensated=True), laid_out(evidence.seen)
+    observations, contours, index, history = inputs.observations, inputs.contours, inputs.index, inputs.history
+    moving, (events, own, counts) = inputs.prediction.moving(compensated=True), laid_out(inputs.seen)
     has_smooth_silhouette = ((contours.kind == int(ContourKind.SMOOTH)) & contours.mask).any(1)
     objects, is_smooth = has_smooth_silhouette.nonzero()[:, 0], torch.zeros_like(observations.mask)
     # As many for all: how many a neighbour has would show in roundings.

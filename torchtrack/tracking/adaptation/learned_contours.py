@@ -1,7 +1,7 @@
 """Contours that an object's model lacks, learned from its events: what is known of them, and whether they are needed.
 
-A border whose colour equals what lies behind it fires nothing, while print on the surface does. Without a contour for it,
-the events of print pull neighbouring contours onto themselves. :mod:`torchtrack.tracking.adaptation.surface_learning` finds such contours.
+A border whose colour equals what lies behind it fires nothing, while texture on the surface does. Without a contour for it,
+the events of texture pull neighbouring contours onto themselves. :mod:`torchtrack.tracking.adaptation.surface_learning` finds such contours.
 They count only for objects whose own contours turn out to explain little of what should be seen of them: what was learned
 holds the errors of the poses it was learned at, and a good model needs none of it.
 """

@@ -1,9 +1,9 @@
-"""How slow the circuits of a sensor are, told by how late in their bursts the events on contours come.
+"""Pixel latency: how slow the pixels of a sensor are, measured by how late in their bursts the events on contours come.
 
-In good light a pixel fires while an edge passes it, which is over once the edge has moved on by its blur; in poor light circuits
-fire on for several pixels more. To date late events back is right of slow circuits alone: of fast ones they are as much of the edge
-as early ones are, and without them it seems to lie before where it is. How slow they are is the sensor's, and the light's: it is
-remembered.
+In good light a pixel fires while an edge passes it, which is over once the edge has moved on by its blur; in poor light it fires
+on while the edge moves on by several pixels more. To date late events back is right of slow pixels alone: of fast ones they are
+as much of the edge as early ones are, and without them it seems to lie before where it is. The latency depends on the sensor and
+on the light: it is remembered.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ from torchtrack.tracking.motion.prediction import Prediction
 # An event is late once its edge has moved on by this much since the first of its burst (px). Of an edge that hardly comes farther
 # while a burst lasts, nothing is told.
 _LATE_PX, _FAR_ENOUGH_PX = 2.0, 2.5
-# Shares of events that are late up to which circuits are fast, and from which they are slow: measured, 0.01 to 0.1, and 0.1 to 0.35.
+# Shares of events that are late up to which pixels are fast, and from which they are slow: measured, 0.01 to 0.1, and 0.1 to 0.35.
 _FAST, _SLOW = 0.07, 0.12
 # What was not seen well for so long (s) is dated back in full.
 _NOT_VALIDATED_S = 0.02
@@ -31,25 +31,25 @@ _NOT_VALIDATED_S = 0.02
 LOOK_US, _REMEMBERED = 20_000, 5_000.0
 
 
-def unknown_circuits(like: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
-    """Share of late events before any were seen: as of slow circuits, whose late events do more harm."""
+def unknown_latency(like: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
+    """Share of late events before any were seen: as of slow pixels, whose late events do more harm."""
     return torch.full_like(like, _SLOW)
 
 
 def slowness(late_share: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
-    """From 0, of circuits that are fast, to 1, of slow ones."""
+    """From 0, of pixels that are fast, to 1, of slow ones."""
     return ((late_share - _FAST) / (_SLOW - _FAST)).clamp(0, 1)
 
 
 def dated(
     observations: Observations, late_share: Float[Tensor, "b"], time_since_validated_s: Float[Tensor, "b"], config: AssociationConfig
 ) -> Observations:
-    """The observations as late in their bursts as counts: less so, and then not dated back so far, the faster circuits are.
+    """The observations as late in their bursts as counts: less so, and then not dated back so far, the faster pixels are.
 
     Of what is not seen well all are dated back: less exact, but events of what moves otherwise gather less.
 
     Args:
-        unseen_s: how long ago each object was seen well (s).
+        time_since_validated_s: how long ago each object was seen well (s).
     """
     if not _tells(config):
         return observations

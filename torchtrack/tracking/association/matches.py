@@ -22,8 +22,8 @@ class Matches:
         offsets: distance of each observation from its contour along the normal, in px over the scale of the gate.
         near: which observations have a contour so near that ``offsets`` says something, matched or not.
         silhouette: 1 where the contour is the smooth silhouette, 0 where not.
-        beside: how many observations are on the contour in the patch of the image that each lies in.
-        mistaken_px2: mean square of how far off each is, should it be of an edge that lies beside its contour (px²).
+        neighbours: how many observations are on the contour in the patch of the image that each lies in.
+        edge_ambiguity_px2: mean square of how far off each is, should it be of an edge that lies beside its contour (px²).
         dark: 1 where an event says that the outer side of its contour is the darker one, -1 the inner one; 0 where that is not known.
         as_expected: how far that is what it is expected to say, 0 to 1.
     """

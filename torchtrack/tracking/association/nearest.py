@@ -36,7 +36,7 @@ class ContourTable:
     Args:
         rows: the values of all contour points, laid out so that one selection takes them for all observations.
         index: the contour point nearest to each place in the image.
-        not_plain: objects of which print or smooth silhouettes are seen.
+        not_plain: objects of which texture or smooth silhouettes are seen.
     """
 
     rows: Float[Tensor, "b k m"]
@@ -56,11 +56,11 @@ def contour_table(
 ) -> ContourTable:
     """The table of contours and their index.
 
-    The normals of the mesh's own edges are oriented: they point outwards. Those of print point to its darker side.
+    The normals of the mesh's own edges are oriented: they point outwards. Those of texture point to its darker side.
 
     Args:
         polarity: expected of the mesh's own edges, by the octant that they face (:func:`torchtrack.tracking.association.polarity.expected_polarity`).
-        of_print: whether anything is expected of print.
+        of_texture: whether anything is expected of texture.
         close_px: distance from which parallel edges are told apart; 0 for always.
     """
     silhouette, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.SMOOTH, ContourKind.CREASE, ContourKind.TEXTURE))
@@ -90,7 +90,7 @@ def match_nearest(
         place: where to look for each observation among the contours as indexed; returned anew for the next round.
         objects: at the current poses; a velocity of zero switches motion compensation off.
         wider: by how much the gate, and all that is measured against contours, is wider for each object.
-        finely: objects whose contours are looked up finely; none where not given.
+        subcell_lookup: objects whose contours are looked up between the cells of the index; none where not given.
     """
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
     nearest_index = table.index.look_up(place, subcell_lookup)

@@ -42,7 +42,7 @@ def expected_polarity(
     Args:
         darker_outside: from :func:`remembered`; where it was now this and now that, nothing is expected.
         score: of each object, in the window before.
-        full_share: explained when the object is seen well.
+        reference_explained_ratio: explained when the object is seen well.
     """
     seen = score / reference_explained_ratio.clamp(min=_LEAST_FULL)
     counts = ((_SEEN - seen) / (_SEEN - _HARDLY_SEEN)).clamp(0, 1)

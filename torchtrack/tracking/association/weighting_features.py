@@ -50,17 +50,17 @@ class WeightingInputs:
         return self.history.age_s(pixels)
 
 
-def judged(evidence: WeightingInputs, weighting_network: nn.Module) -> Observations:
+def judged(inputs: WeightingInputs, weighting_network: nn.Module) -> Observations:
     """The observations, with how far a weighting network believes each of them.
 
     Raises:
         ValueError: if the weighting network gives something else than one number for each observation.
     """
-    trust = weighting_network(evidence)
-    expected = evidence.observations.age_s.shape
+    trust = weighting_network(inputs)
+    expected = inputs.observations.age_s.shape
     if trust.shape != expected:
         raise ValueError(f"a weighting network must give one number for each observation, shape {list(expected)}; got {list(trust.shape)}.")
-    return replace(evidence.observations, trust=trust.to(evidence.observations.age_s.dtype))
+    return replace(inputs.observations, trust=trust.to(inputs.observations.age_s.dtype))
 
 
 # Where the patch is sampled: across the contour and along it (px). Negative is behind the moving edge.
@@ -124,11 +124,11 @@ class _Frame:
         return u + across * nu - along * nv, v + across * nv + along * nu
 
 
-def trust_features(evidence: WeightingInputs) -> Float[Tensor, "b n f"]:
+def trust_features(inputs: WeightingInputs) -> Float[Tensor, "b n f"]:
     """What describes each observation: numbers of about unit size."""
-    observations, frame = evidence.observations, _frame(evidence)
+    observations, frame = inputs.observations, _frame(inputs)
     polarity = observations.polarity
-    # Contours that were learned are print.
+    # Contours that were learned are texture.
     kind = torch.where(frame.kind == int(ContourKind.LEARNED), int(ContourKind.TEXTURE), frame.kind)
     # Not by one_hot, which reads values back to check them.
     kinds = (kind[..., None] == torch.arange(_KINDS, device=kind.device)).to(polarity.dtype)
@@ -140,25 +140,25 @@ def trust_features(evidence: WeightingInputs) -> Float[Tensor, "b n f"]:
         _age_share(observations),
         frame.exists.to(polarity.dtype),
     ]
-    return torch.cat([_counts(evidence, frame), _ages(evidence, frame), kinds, torch.stack(single, -1)], -1)
+    return torch.cat([_counts(inputs, frame), _ages(inputs, frame), kinds, torch.stack(single, -1)], -1)
 
 
 @accelerable
-def silhouette_features(evidence: WeightingInputs) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
+def silhouette_features(inputs: WeightingInputs) -> tuple[Float[Tensor, "r n f"], Bool[Tensor, "b n"], Int[Tensor, "r"]]:
     """:func:`trust_features`, which observations are nearest to the smooth silhouette, and of which objects there may be any.
 
     Of other observations and other objects they need not be told.
     """
-    features = trust_features(evidence)
+    features = trust_features(inputs)
     of_silhouette = features[..., OF_KIND + int(ContourKind.SMOOTH)] * features[..., -1] > 0
-    return features, of_silhouette & evidence.observations.mask, torch.arange(len(features), device=features.device)
+    return features, of_silhouette & inputs.observations.mask, torch.arange(len(features), device=features.device)
 
 
-def _frame(evidence: WeightingInputs) -> _Frame:
+def _frame(inputs: WeightingInputs) -> _Frame:
     """Nearest contours, as the predicted motion says."""
-    observations, contours, prediction = evidence.observations, evidence.contours, evidence.prediction
+    observations, contours, prediction = inputs.observations, inputs.contours, inputs.prediction
     plane = prediction.plane_velocity(observations.pixels)
-    nearest_index = evidence.index.look_up(torch.addcmul(observations.pixels, plane, observations.age_s[..., None]))
+    nearest_index = inputs.index.look_up(torch.addcmul(observations.pixels, plane, observations.age_s[..., None]))
     table = torch.cat([contours.normals, prediction.contour_velocity(contours), contours.kind[..., None].to(plane.dtype)], -1)
     normals, velocity, kind = take_points(table, nearest_index.clamp(min=0)).split([2, 2, 1], -1)
     speed = (normals * velocity).sum(-1)
@@ -173,24 +173,24 @@ def _age_share(observations: Observations) -> Float[Tensor, "b n"]:
     return observations.age_s / oldest_s.clamp(min=1e-6)
 
 
-def _ages(evidence: WeightingInputs, frame: _Frame) -> Float[Tensor, "b n p"]:
+def _ages(inputs: WeightingInputs, frame: _Frame) -> Float[Tensor, "b n p"]:
     """How much older than the observation the time surface is across the contour, in px of the edge's motion."""
-    observations = evidence.observations
+    observations = inputs.observations
     places = torch.stack(frame.around(observations.pixels, (0.0,)), -1)
-    newest_s = evidence.age_s(places.flatten(1, 2)).view(places.shape[:3])
+    newest_s = inputs.age_s(places.flatten(1, 2)).view(places.shape[:3])
     behind_px = (newest_s - observations.age_s[..., None]) * frame.speed_px_s[..., None]
     return behind_px.clamp(-OLDEST_PX, OLDEST_PX) / OLDEST_PX
 
 
-def _counts(evidence: WeightingInputs, frame: _Frame) -> Float[Tensor, "b n p"]:
+def _counts(inputs: WeightingInputs, frame: _Frame) -> Float[Tensor, "b n p"]:
     """Events of the observation's own polarity and of the other, around it, all moved to the window's end with the object."""
-    events = evidence.events
-    moved = evidence.prediction.carried(events.pixels, events.age_s)
+    events = inputs.events
+    moved = inputs.prediction.carried(events.pixels, events.age_s)
     cell = 2 * _cells(moved[..., 0], moved[..., 1]) + (events.polarity > 0)
     counts = torch.zeros(len(cell), 2 * SIDE**2, dtype=moved.dtype, device=moved.device)
     counts = counts.scatter_add(1, cell, events.mask.to(moved.dtype))
     places = 2 * _cells(*frame.around(frame.moved, ALONG_PX))
-    own = places + (evidence.observations.polarity >= 0)[..., None]
+    own = places + (inputs.observations.polarity >= 0)[..., None]
     of_both = torch.cat([own, 2 * places + 1 - own], -1)
     return softsign(counts.gather(1, of_both.flatten(1)).view(of_both.shape))
 

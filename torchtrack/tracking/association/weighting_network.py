@@ -52,9 +52,9 @@ class TrustNetwork(nn.Module):
         """The network itself: log odds that observations are of their contour."""
         return self.layers(features)[..., 0]
 
-    def forward(self, evidence: WeightingInputs) -> Float[Tensor, "b n"]:
+    def forward(self, inputs: WeightingInputs) -> Float[Tensor, "b n"]:
         """How far each observation is to be believed, 0 to 1."""
-        return torch.sigmoid(self.logits(trust_features(evidence)))
+        return torch.sigmoid(self.logits(trust_features(inputs)))
 
     def as_bytes(self) -> bytes:
         """Its weights as a safetensors file."""
@@ -72,9 +72,9 @@ class SilhouetteTrust(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, evidence: WeightingInputs) -> Float[Tensor, "b n"]:
+    def forward(self, inputs: WeightingInputs) -> Float[Tensor, "b n"]:
         """How far each observation is to be believed, 0 to 1."""
-        features, is_smooth, objects = silhouette_features(evidence)
+        features, is_smooth, objects = silhouette_features(inputs)
         trust = torch.sigmoid(self.network.logits(features))
         if len(objects) < len(is_smooth):
             trust = trust.new_ones(is_smooth.shape).index_copy(0, objects, trust)

@@ -34,7 +34,7 @@ def effective_weight(neighbours: Float[Tensor, "b n"], common_px2: Float[Tensor,
     follow the places with the most events, and what is seen of an object that is half hidden would seem to tell all.
 
     Args:
-        beside: how many observations are on the contour in the place of each.
+        neighbours: how many observations are on the contour in the place of each.
         common_px2: variance of what they have in common (px²).
         observation_px: standard deviation of what each has alone.
     """
@@ -55,7 +55,7 @@ def edge_ambiguity_px2(
 
     Args:
         contours: with the ``index`` of them.
-        of_edges: points that are on edges of the mesh: of print, both sides fire.
+        of_edges: points that are on edges of the mesh: of texture, both sides fire.
         sharp: which of them are creases.
         close_px: distance from which edges are told apart.
     """

@@ -55,7 +55,7 @@ class ContourIndex:
         """The contour point nearest to the centre of each pixel's cell, -1 where none is near.
 
         Args:
-            finely: objects of which the four cells around a pixel are asked, and what is nearest to the pixel itself is taken. Where edges
+            subcell_lookup: objects of which the four cells around a pixel are asked, and what is nearest to the pixel itself is taken. Where edges
                 lie as close as cells, that is often another one.
         """
         rows, columns = self.size

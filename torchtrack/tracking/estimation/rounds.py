@@ -140,7 +140,7 @@ class Gates:
     Args:
         gate_scale: of each object's first gate.
         wider: by how much each round's gate is wider, for each object.
-        finely: objects whose contours are looked up finely.
+        subcell_lookup: objects whose contours are looked up between the cells of the index.
     """
 
     gate_scale: Float[Tensor, "b"]
@@ -182,9 +182,9 @@ def align_rounds(
 def _needs_subcell_lookup(
     objects: ObjectBatch, begin: Prediction, table: ContourTable, gate_scale: Float[Tensor, "b"], config: AssociationConfig
 ) -> Bool[Tensor, "b"]:
-    """Of which objects contours are looked up between the cells of the index: of small ones, and those of which print or smooth silhouettes are seen.
+    """Of which objects contours are looked up between the cells of the index: small ones, and those that show texture or smooth silhouettes.
 
-    Others of plain faces are not: their models may lack print, whose events then find the nearest edge all the more surely.
+    Others of plain faces are not: their models may lack texture, whose events then find the nearest edge all the more surely.
     """
     subcell_lookup = objects.size_px(begin.T_cam_obj).detach() < config.fine_below_px
     if config.fine_unless_plain:

@@ -1,6 +1,6 @@
-"""Bursts: an edge that passes a pixel fires it several times, for the longer the slower the sensor's circuit is.
+"""Bursts: an edge that passes a pixel fires it several times, for the longer the slower the pixel is.
 
-Where the edge is blurred, its events are spread evenly around the moment when it passes. Real circuits go on firing long
+Where the edge is blurred, its events are spread evenly around the moment when it passes. Real pixels go on firing long
 after that, above all where it got dark. How far into its burst an event comes tells the two apart.
 """
 
