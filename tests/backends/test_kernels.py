@@ -18,7 +18,7 @@ from torchtrack.core.events import EventBatch, concatenate, pad_streams
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
-from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.matches import MatchesWithCues
 from torchtrack.tracking.association.nearest import contour_table
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.association.polarity import remembered
@@ -232,8 +232,8 @@ def random_matches(batch=3, count=900):
     offsets, near = uniform(batch, count, low=-6, high=6, seed=1), uniform(batch, count, seed=2) < 0.7
     zeros, points = torch.zeros_like(offsets), torch.zeros(batch, count, 3).double()
     targets, directions = uniform(batch, count, 2, high=180, seed=3), uniform(batch, count, 2, low=-1, seed=4)
-    stated = zeros, zeros, zeros, torch.where(near, 1.0, -1.0).double(), uniform(batch, count, low=0.5, seed=5)
-    return Matches(zeros.long(), near, uniform(batch, count, seed=6), zeros, points, targets, directions, offsets, near, *stated)
+    stated = uniform(batch, count, low=0.5, seed=5), zeros, zeros, zeros, torch.where(near, 1.0, -1.0).double()
+    return MatchesWithCues(zeros.long(), near, uniform(batch, count, seed=6), zeros, points, targets, directions, offsets, near, *stated)
 
 
 @pytest.mark.parametrize("speed", [0.0, 40.0, 900.0])

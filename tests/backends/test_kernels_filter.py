@@ -11,7 +11,7 @@ from torchtrack import Tracker
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.core.linalg import inverse
-from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.matches import MatchesWithCues
 from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.frontend.corners import no_corners
@@ -140,9 +140,9 @@ def random_find(tracker, prediction, dtype):
     pairs, exists = nothing[..., None].expand(-1, -1, 2), torch.ones_like(nothing, dtype=torch.bool)
     sides = uniform(OBJECTS, 50, 2, low=-1, seed=27).to(dtype)
     of_each = [uniform(OBJECTS, 50, low=low, seed=seed).to(dtype) for low, seed in ((0, 28), (-1, 29))]
-    matches = Matches(
+    matches = MatchesWithCues(
         *(exists.long(), exists, of_each[0], nothing, nothing[..., None].expand(-1, -1, 3), pairs, sides, of_each[1]),
-        *(exists, nothing, nothing, nothing, of_each[1].sign(), torch.ones_like(nothing)),
+        *(exists, torch.ones_like(nothing), nothing, nothing, nothing, of_each[1].sign()),
     )
     solution = Linearisation(T_cam_obj, offset.to(dtype), hessian.to(dtype), offset.to(dtype))
     measured, inlier_ratio = uniform(OBJECTS, low=0.3, seed=23).to(dtype), uniform(OBJECTS, seed=24).to(dtype)

@@ -2,7 +2,7 @@
 
 import torch
 
-from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.matches import MatchesWithCues
 
 
 def matches_at(targets, near=None, offsets=0.0):
@@ -14,7 +14,7 @@ def matches_at(targets, near=None, offsets=0.0):
     points = torch.zeros(*near.shape, 3, dtype=torch.float64)
     directions, zeros, ones = torch.zeros_like(targets), torch.zeros_like(offsets), torch.ones_like(offsets)
     place = points, targets, directions, offsets, near
-    return Matches(
+    return MatchesWithCues(
         nothing,
         torch.zeros_like(near),
         ones,

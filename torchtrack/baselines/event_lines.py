@@ -24,7 +24,7 @@ from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
-from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem
+from torchtrack.tracking.estimation.terms import CostTerm, Linearisation, PoseProblem
 from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.motion.model import left_covariance
@@ -153,7 +153,13 @@ class EventLineTracker(Tracker):
         return LineEvents(taken[..., :2], taken[..., 2], exists)
 
     def _solve_rounds(
-        self, window: Window, events: EventBatch, information: Float[Tensor, "b 6 6"], weight: float, apart_px: float
+        self,
+        window: Window,
+        events: EventBatch,
+        information: Float[Tensor, "b 6 6"],
+        weight: float,
+        apart_px: float,
+        extra_terms: tuple[CostTerm, ...] = (),
     ) -> tuple[Linearisation, Contours, Matches]:
         """Associate and solve, one round per gate, with the lines extracted anew for the second.
 
@@ -161,6 +167,7 @@ class EventLineTracker(Tracker):
             information: of the prediction, in the solver's chart.
             weight: information of one event's distance (1/px²).
             apart_px: events with two lines as near as this are left out.
+            extra_terms: of the cost, beside distances and prediction.
         """
         T_cam_obj, contours = window.T_start, self.objects.contours(window.T_start, self.config.contours)
         near = self._events_near(window, events, contours)
@@ -177,25 +184,21 @@ class EventLineTracker(Tracker):
             matches = Matches(
                 contour=point,
                 mask=matched,
-                weights=matched * weight,
+                weights=matched.to(targets.dtype) * weight,
                 age_s=near.age_s,
                 points_obj=take_points(contours.points_obj, point),
                 targets=targets,
                 directions=take_points(contours.normals, point),
                 offsets=((take_points(contours.pixels, point) - targets) * take_points(contours.normals, point)).sum(-1),
                 near=near.mask & belongs,
-                silhouette=torch.zeros_like(near.age_s),
-                neighbours=torch.zeros_like(near.age_s),
-                edge_ambiguity_px2=torch.zeros_like(near.age_s),
-                dark=torch.zeros_like(near.age_s),
                 as_expected=torch.ones_like(near.age_s),
             )
-            solution = solve_pose(self._problem(window, matches, information, gate_px), T_cam_obj, self.config.solver)
+            solution = solve_pose(self._problem(window, matches, information, gate_px, extra_terms), T_cam_obj, self.config.solver)
             T_cam_obj = solution.T_cam_obj
             contours = reproject(contours, T_cam_obj, self.intrinsics)
         return solution, contours, matches
 
-    def _problem(self, window: Window, matches: Matches, information: Tensor, gate_px: float) -> PoseProblem:
+    def _problem(self, window: Window, matches: Matches, information: Tensor, gate_px: float, extra_terms: tuple[CostTerm, ...]) -> PoseProblem:
         """Distances of events from their lines, and the prediction; objects without a match stay where they are."""
         idle = ~matches.mask.any(-1)
         return PoseProblem(
@@ -208,6 +211,7 @@ class EventLineTracker(Tracker):
             scale_px=torch.full_like(self.centre_obj[:, 0], gate_px),
             T_prior=window.T_start,
             prior_information=torch.where(idle[:, None, None], torch.zeros_like(information), information),
+            extra_terms=extra_terms,
         )
 
     def _judge(

@@ -36,7 +36,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.association import weights
-from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.matches import MatchesWithCues
 from torchtrack.tracking.association.nearest import ContourTable
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.points import Contours
@@ -172,7 +172,7 @@ def knows(config: TrackerConfig) -> bool:
 @accelerates(rounds.align_rounds, supports=lambda start, table, observations, gates, config: knows(config) and not start.extra_terms)
 def align_rounds_numba(
     start: Start, table: ContourTable, observations: Observations, gates: Gates, config: TrackerConfig
-) -> tuple[Linearisation, Matches, Contours]:
+) -> tuple[Linearisation, MatchesWithCues, Contours]:
     """Observation by observation, all rounds of an object at once."""
     prediction, information = start.prediction, start.information
     objects, (batch, count) = prediction.objects, observations.mask.shape
@@ -209,10 +209,10 @@ def _acceleration(prediction: Prediction, config: TrackerConfig) -> tuple[Tensor
     return prediction.acceleration.expected, prediction.acceleration.rate_hz
 
 
-def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 15 n"]) -> Matches:
+def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 15 n"]) -> MatchesWithCues:
     """The matches as the pipeline knows them."""
     weights, age_s, points, targets, directions, *rest = rows.split((1, 1, 3, 2, 2, 1, 1, 1, 1, 1, 1), 1)
     offsets, silhouette, neighbours, edge_ambiguity, dark, as_expected = (value[:, 0] for value in rest)
     points_obj, targets, directions = (value.transpose(1, 2) for value in (points, targets, directions))
     geometry = weights[:, 0], age_s[:, 0], points_obj, targets, directions, offsets
-    return Matches(contour, is_matched, *geometry, is_near, silhouette, neighbours, edge_ambiguity, dark, as_expected)
+    return MatchesWithCues(contour, is_matched, *geometry, is_near, as_expected, silhouette, neighbours, edge_ambiguity, dark)

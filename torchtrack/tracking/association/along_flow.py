@@ -6,7 +6,7 @@ from torchtrack.config.tracker import AssociationConfig
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.padded import take_points
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.matches import MatchesWithCues
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.points import Contours
 
@@ -14,7 +14,9 @@ from torchtrack.tracking.contours.points import Contours
 _MIN_CROSSING = 0.3
 
 
-def match_along_flow(observations: Observations, contours: Contours, objects: MovingObjects, gate_px: float, config: AssociationConfig) -> Matches:
+def match_along_flow(
+    observations: Observations, contours: Contours, objects: MovingObjects, gate_px: float, config: AssociationConfig
+) -> MatchesWithCues:
     """Match each corner with the contour point nearest to it along the line of its flow, either way (the paper's 3.3).
 
     The paper moves corners along the flow "to locate the edge points"; seen from a pose that is a window old the edge
@@ -37,4 +39,4 @@ def match_along_flow(observations: Observations, contours: Contours, objects: Mo
     silhouette = (contours.kind == int(ContourKind.SMOOTH)).gather(1, contour).to(offsets.dtype)
     none, all_of_it = torch.zeros_like(offsets), torch.ones_like(offsets)
     geometry = observations.age_s, points_obj, targets, directions, offsets, mask
-    return Matches(contour, mask, all_of_it, *geometry, silhouette, neighbours=none, edge_ambiguity_px2=none, dark=none, as_expected=all_of_it)
+    return MatchesWithCues(contour, mask, all_of_it, *geometry, all_of_it, silhouette, neighbours=none, edge_ambiguity_px2=none, dark=none)

@@ -1,6 +1,6 @@
-"""What an observation is matched with."""
+"""What an observation is matched with: where, and how far that is to be trusted; apart from it, the cues that weights are made of."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,11 +21,7 @@ class Matches:
         directions: unit directions along which the distance counts.
         offsets: distance of each observation from its contour along the normal, in px over the scale of the gate.
         near: which observations have a contour so near that ``offsets`` says something, matched or not.
-        silhouette: 1 where the contour is the smooth silhouette, 0 where not.
-        neighbours: how many observations are on the contour in the patch of the image that each lies in.
-        edge_ambiguity_px2: mean square of how far off each is, should it be of an edge that lies beside its contour (px²).
-        dark: 1 where an event says that the outer side of its contour is the darker one, -1 the inner one; 0 where that is not known.
-        as_expected: how far that is what it is expected to say, 0 to 1.
+        as_expected: how far each says of its contour's darker side what is expected, 0 to 1; 1 where nothing is.
     """
 
     contour: Int[Tensor, "b n"]
@@ -37,16 +33,29 @@ class Matches:
     directions: Float[Tensor, "b n 2"]
     offsets: Float[Tensor, "b n"]
     near: Bool[Tensor, "b n"]
+    as_expected: Float[Tensor, "b n"]
+
+
+@dataclass(frozen=True)
+class MatchesWithCues(Matches):
+    """Matches, and what else their weights in the cost and what is remembered of contours are made of.
+
+    Args:
+        silhouette: 1 where the contour is the smooth silhouette, 0 where not.
+        neighbours: how many observations are on the contour in the patch of the image that each lies in.
+        edge_ambiguity_px2: mean square of how far off each is, should it be of an edge that lies beside its contour (px²).
+        dark: 1 where an event says that the outer side of its contour is the darker one, -1 the inner one; 0 where that is not known.
+    """
+
     silhouette: Float[Tensor, "b n"]
     neighbours: Float[Tensor, "b n"]
     edge_ambiguity_px2: Float[Tensor, "b n"]
     dark: Float[Tensor, "b n"]
-    as_expected: Float[Tensor, "b n"]
 
 
-def both_coordinates(matches: Matches) -> Matches:
+def both_coordinates(matches: MatchesWithCues) -> MatchesWithCues:
     """The same matches with the distance in u and in v, as two observations each."""
     axes = torch.eye(2, dtype=matches.targets.dtype, device=matches.targets.device)
     directions = torch.cat([axes[axis].expand_as(matches.targets) for axis in range(2)], 1)
     twice = {name: torch.cat([value, value], 1) for name, value in vars(matches).items()}
-    return Matches(**(twice | {"directions": directions}))
+    return replace(matches, **(twice | {"directions": directions}))

@@ -14,7 +14,7 @@ from torchtrack.config.tracker import AssociationConfig
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.tracking.association.matches import Matches
+from torchtrack.tracking.association.matches import MatchesWithCues
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.polarity import octant
 from torchtrack.tracking.association.weights import (
@@ -82,7 +82,7 @@ def match_nearest(
     config: AssociationConfig,
     wider: Float[Tensor, "b"] | None = None,
     subcell_lookup: Bool[Tensor, "b"] | None = None,
-) -> tuple[Matches, Float[Tensor, "b n 2"]]:
+) -> tuple[MatchesWithCues, Float[Tensor, "b n 2"]]:
     """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
 
     Args:
@@ -110,8 +110,8 @@ def match_nearest(
     offsets = vecdot(difference, normals) / wider[:, None]
     as_expected, dark = agreeing(dark * expected, config), dark * oriented
     weights, neighbours = match_weights(offsets, targets, near, dark, as_expected, config)
-    matches = Matches(
-        contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, silhouette, neighbours, edge_ambiguity, dark, as_expected
+    matches = MatchesWithCues(
+        contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, as_expected, silhouette, neighbours, edge_ambiguity, dark
     )
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)

@@ -12,7 +12,7 @@ from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.host_sync import AsyncValue
 from torchtrack.tracking.association.along_flow import match_along_flow
-from torchtrack.tracking.association.matches import Matches, both_coordinates
+from torchtrack.tracking.association.matches import MatchesWithCues, both_coordinates
 from torchtrack.tracking.association.nearest import ContourTable, contour_table, match_nearest
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.weights import effective_weight
@@ -44,7 +44,7 @@ class Fit:
 
     solution: Linearisation
     contours: Contours
-    matches: Matches
+    matches: MatchesWithCues
 
 
 def gate_scale_of(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[Tensor, "b"]:
@@ -151,7 +151,7 @@ class Gates:
 @accelerable
 def align_rounds(
     start: Start, table: ContourTable, observations: Observations, gates: Gates, config: TrackerConfig
-) -> tuple[Linearisation, Matches, Contours]:
+) -> tuple[Linearisation, MatchesWithCues, Contours]:
     """Rounds of matching and solving: the solution and the matches of the last one, and the contours that these are of.
 
     Args:
@@ -221,7 +221,7 @@ def _information(prediction: Prediction, config: TrackerConfig) -> Tensor:
     return information
 
 
-def _believed(matches: Matches, observations: Observations, config: TrackerConfig) -> Matches:
+def _believed(matches: MatchesWithCues, observations: Observations, config: TrackerConfig) -> MatchesWithCues:
     """The matches with weights that hold all there is to be said: none for what has no match, or an object with too few of them."""
     weights = matches.weights * matches.mask
     if observations.trust is not None:
@@ -233,7 +233,7 @@ def _believed(matches: Matches, observations: Observations, config: TrackerConfi
     return replace(matches, mask=matches.mask & enough, weights=weights * enough * effective)
 
 
-def _problem(start: Start, matches: Matches, offset: Float[Tensor, "b k"], gate_px: Float[Tensor, "b"], config: TrackerConfig) -> PoseProblem:
+def _problem(start: Start, matches: MatchesWithCues, offset: Float[Tensor, "b k"], gate_px: Float[Tensor, "b"], config: TrackerConfig) -> PoseProblem:
     """The least squares problem of one round; objects without a match stay where they are."""
     prediction = start.prediction
     rows = both_coordinates(matches) if config.association.residual == "point" else matches
@@ -252,7 +252,7 @@ def _problem(start: Start, matches: Matches, offset: Float[Tensor, "b k"], gate_
     )
 
 
-def _window_terms(prediction: Prediction, rows: Matches, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
+def _window_terms(prediction: Prediction, rows: MatchesWithCues, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
     """What observations tell beside the pose: of the velocity by their ages, and of how far silhouettes stand out."""
     age_s, outward = rows.age_s, rows.silhouette
     if config.association.residual != "normal":
