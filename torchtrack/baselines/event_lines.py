@@ -184,7 +184,7 @@ class EventLineTracker(Tracker):
             matches = Matches(
                 contour=point,
                 mask=matched,
-                weights=matched.to(targets.dtype) * weight,
+                weights=matched * weight,
                 age_s=near.age_s,
                 points_obj=take_points(contours.points_obj, point),
                 targets=targets,

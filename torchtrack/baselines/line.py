@@ -20,7 +20,7 @@ from torch import Tensor
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.core.events import EventBatch
 from torchtrack.core.linalg import solve_positive
-from torchtrack.tracking.estimation.terms import Linearisation
+from torchtrack.tracking.estimation.terms import CostTerm, Linearisation
 from torchtrack.tracking.state import StepResult, TrackerState
 
 # Deviation of the distance between an event and its line (px): much is common to the events of a line, so it is not small.
@@ -43,13 +43,19 @@ class LineTracker(EventLineTracker):
         covariance = torch.diag(deviations.square()).repeat(len(state.T_cam_obj), 1, 1)
         return replace(state, motion=replace(state.motion, covariance=covariance))
 
-    def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
+    def step(
+        self,
+        state: TrackerState,
+        events: EventBatch,
+        t_end_us: int | Int[Tensor, "s"] | None = None,
+        extra_terms: tuple[CostTerm, ...] = (),
+    ) -> tuple[TrackerState, StepResult]:
         """Advance every object by one window; see :meth:`torchtrack.tracking.tracker.Tracker.step`."""
         window = self._open(state, events, t_end_us, state.velocity)
         predicted = predicted_covariance(state.motion.covariance, window.duration_s.double())
         eye = torch.eye(6, dtype=predicted.dtype, device=predicted.device).expand(len(predicted), 6, 6)
         information = solve_positive(predicted[:, :6, :6], eye)[0]
-        solved = self._solve_rounds(window, events, information.to(state.velocity.dtype), weight=_EVENT_PX**-2, apart_px=_APART_PX)
+        solved = self._solve_rounds(window, events, information.to(state.velocity.dtype), _EVENT_PX**-2, _APART_PX, extra_terms)
         judged = self._judge(window, *solved)
         taken = judged[2]
         correction, covariance = corrected(predicted, information, solved[0])

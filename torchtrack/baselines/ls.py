@@ -8,6 +8,7 @@ from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.core import lie
 from torchtrack.core.events import EventBatch
 from torchtrack.core.linalg import inverse
+from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.state import StepResult, TrackerState
 
 # Share of a new window in the velocity.
@@ -22,11 +23,17 @@ class LeastSquaresTracker(EventLineTracker):
     window's end with the line's own velocity, and the gate around the lines narrows from round to round.
     """
 
-    def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
+    def step(
+        self,
+        state: TrackerState,
+        events: EventBatch,
+        t_end_us: int | Int[Tensor, "s"] | None = None,
+        extra_terms: tuple[CostTerm, ...] = (),
+    ) -> tuple[TrackerState, StepResult]:
         """Advance every object by one window; see :meth:`torchtrack.tracking.tracker.Tracker.step`."""
         window = self._open(state, events, t_end_us, state.velocity)
         nothing = torch.zeros(len(state.velocity), 6, 6, dtype=state.velocity.dtype, device=state.velocity.device)
-        solved = self._solve_rounds(window, events, nothing, weight=1.0, apart_px=0.0)
+        solved = self._solve_rounds(window, events, nothing, weight=1.0, apart_px=0.0, extra_terms=extra_terms)
         judged = self._judge(window, *solved)
         moved = lie.small_difference_about(state.T_cam_obj, solved[0].T_cam_obj.double(), self.centre_obj.double()).to(state.velocity.dtype)
         mixed = torch.lerp(state.velocity, moved / window.duration_s.clamp(min=1e-6)[:, None], _VELOCITY_GAIN)

@@ -15,6 +15,7 @@ from torchtrack.tracking.association.weighting_features import WeightingInputs, 
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.rounds import Fit, align, gate_scale_of, index_for, index_radius, usual_index_radius
+from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import Expected, expect, near_objects
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.tiles import NearbyEvents
@@ -46,6 +47,7 @@ class StepInput:
         is_starting: objects whose motion is not known yet; none where not given.
         reads: asks for what has to be decided.
         learns: whether anything may be learned from the window.
+        extra_terms: of the cost, beside contours and prediction.
     """
 
     events: NearbyEvents
@@ -53,6 +55,7 @@ class StepInput:
     is_starting: Bool[Tensor, "b"] | None = None
     reads: host_sync.HostReads = _READS
     learns: bool = True
+    extra_terms: tuple[CostTerm, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> t
     expected = expect(tracked, state, given.events.events, given.t_us, given.reads)
     seen = observe(tracked, state, expected, given)
     as_late = dated(seen.observations, state.appearance.late_share, state.health.time_since_validated_s, tracked.config.association)
-    fit = align(expected.prediction, seen.contours, seen.index, seen.gate_scale, as_late, tracked.config)
+    fit = align(expected.prediction, seen.contours, seen.index, seen.gate_scale, as_late, tracked.config, extra_terms=given.extra_terms)
     scored = validate(tracked, state, expected, seen, fit)
     located = relocalized(tracked, state, expected, seen, scored, given)
     return update(tracked, state, (expected, seen, fit, located), given)

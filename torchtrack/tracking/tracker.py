@@ -15,6 +15,7 @@ from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch
 from torchtrack.object_model import ObjectModel
+from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.graphs import CompiledStep
@@ -95,7 +96,13 @@ class Tracker(TrackedObjects):
         """:meth:`step`, as a layer of a network: what comes in first."""
         return self.step(state, events, t_end_us)
 
-    def step(self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
+    def step(
+        self,
+        state: TrackerState,
+        events: EventBatch,
+        t_end_us: int | Int[Tensor, "s"] | None = None,
+        extra_terms: tuple[CostTerm, ...] = (),
+    ) -> tuple[TrackerState, StepResult]:
         """Advance every object by one window of events.
 
         Where gradients are recorded, the new poses and velocities are differentiable by the old ones, by the weighting network, and by
@@ -106,6 +113,8 @@ class Tracker(TrackedObjects):
             state: from :meth:`init` or the last step.
             events: of all streams, after ``state.t_us`` and up to ``t_end_us``.
             t_end_us: end of the window; the newest event of each stream when not given.
+            extra_terms: of the cost of the poses at the window's end, beside contours and prediction; in the tracker's precision. A window
+                with them is not taken by a graph, and other poses that a search tries are aligned without them.
 
         Raises:
             EventDataError: if the events of a stream are not in time order, or not after ``state.t_us`` and up to ``t_end_us``,
@@ -114,15 +123,17 @@ class Tracker(TrackedObjects):
         t_us = self._window_end(state, events, t_end_us)
         check_step(state.t_us, events, t_us)
         with torch.autocast(t_us.device.type, enabled=False), dispatch.backend(wanted=self.kernels):
-            steady = self._steady(state, events, t_us)
+            steady = None if extra_terms else self._steady(state, events, t_us)
             if steady is not None:
                 return _counted(steady)
             in_parts = to_be_parted(state, events, t_us, self.objects, self.config)
             parted = host_sync.AsyncValue.to(in_parts)
             if host_sync.read_at_once(in_parts) and bool(in_parts.all()):
-                return _counted(self._advance_in_parts(state, events, t_us, in_parts))
-            done = self._advance(state, events, t_us)
-            return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us, in_parts), done) if parted.any() else done)
+                return _counted(self._advance_in_parts(state, events, t_us, in_parts, extra_terms))
+            done = self._advance(state, events, t_us, extra_terms=extra_terms)
+            if not parted.any():
+                return _counted(done)
+            return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us, in_parts, extra_terms), done))
 
     def steady_step(
         self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"]
@@ -160,18 +171,22 @@ class Tracker(TrackedObjects):
         """A window by a graph, where there is one and it holds."""
         return None if torch.is_grad_enabled() else self.graphs(state, events, t_us)
 
-    def _advance_in_parts(self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor) -> tuple[TrackerState, StepResult]:
-        """The window as several short ones, with a search for objects that are ``starting``."""
+    def _advance_in_parts(
+        self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor, extra_terms: tuple[CostTerm, ...]
+    ) -> tuple[TrackerState, StepResult]:
+        """The window as several short ones, with a search for objects that are ``starting``; further terms hold at the end of the last."""
         for left in range(self.config.window.parts, 1, -1):
             until_us = state.t_us + (t_us - state.t_us) // left
             early = events.t_us <= until_us[events.stream_index]
             state, _ = self._advance(state, events[early], until_us, starting)
             events = events[~early]
-        return self._advance(state, events, t_us, starting)
+        return self._advance(state, events, t_us, starting, extra_terms)
 
-    def _advance(self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor | None = None) -> tuple[TrackerState, StepResult]:
+    def _advance(
+        self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor | None = None, extra_terms: tuple[CostTerm, ...] = ()
+    ) -> tuple[TrackerState, StepResult]:
         """One window, or one part of it."""
-        return advance(self, opened(self, state, events), StepInput(NearbyEvents(events), t_us, starting))
+        return advance(self, opened(self, state, events), StepInput(NearbyEvents(events), t_us, starting, extra_terms=extra_terms))
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""

@@ -4,24 +4,29 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from helpers import SMALL_CAMERA, generator, perturbed, pose_errors, random_pose
+from helpers import SMALL_CAMERA, box_model, generator, perturbed, pose, pose_errors, random_pose
 from jaxtyping import Float
 from pose_problems import LOSSES, problem_at
 from torch import Tensor
 from torch.autograd import gradcheck
-from tracked_boxes import in_motion
+from tracked_boxes import assert_same, follow, in_motion, moving_box, windows
 from window_problems import windowed
 
-from torchtrack.config.tracker import SolverConfig
+from torchtrack import Tracker, preset
+from torchtrack.baselines import tracker_class
+from torchtrack.config.relocalization import RelocalizationConfig
+from torchtrack.config.tracker import SolverConfig, TrackerConfig, WindowConfig
 from torchtrack.core import dispatch
 from torchtrack.core.camera import project
 from torchtrack.core.image_velocity import pose_jacobian
 from torchtrack.core.lie import affine, move_about, retract_about, transform_points, turned
+from torchtrack.tracking import initialization
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.estimation.implicit_gradient import newton_step, with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import offset_from_prior, robust_cost, solve_pose
 from torchtrack.tracking.estimation.rounds import align, gate_scale_of, index_for
 from torchtrack.tracking.estimation.terms import ContourDistance, CostTerm, LinearisedTerm, Place, Prior
+from torchtrack.tracking.validation.status import Status
 
 THOROUGH = SolverConfig(iterations=20)
 
@@ -267,3 +272,38 @@ def test_rounds_of_matching_take_a_further_term():
     torch.testing.assert_close(poses[0], alone.fit.solution.T_cam_obj, rtol=0, atol=1e-9)
     assert float(pose_errors(poses[0], T_said)[1]) > 0.2
     assert float(pose_errors(poses[1], T_said)[1]) < 0.01
+
+
+# ---- a window of a tracker
+
+
+@pytest.mark.parametrize("name", ["default", "line", "ls"])
+def test_a_step_takes_a_further_term(name):
+    """Pairs that are known far better than events say where the object is at the window's end; without them it is elsewhere."""
+    trajectory, events = moving_box(pose(), 4)
+    *before, (last, end_us) = windows(events, 4)
+    tracker = tracker_class(name)([box_model()], SMALL_CAMERA, preset(name), dtype=torch.float64)
+    with torch.inference_mode():
+        state, _ = follow(tracker, tracker.init(pose()[None], 0), before)
+        T_said = retract_about(trajectory.at(torch.tensor([end_us])), torch.tensor([[0.0, 0, 0, 5e-4, 0, 0]]).double(), tracker.centre_obj)
+        pairs = pairs_at(T_said, replace(problem_at(T_said), centre_obj=tracker.centre_obj), 40, weight=1e6)
+        results = [tracker.step(state, last, end_us, extra_terms=extra_terms)[1] for extra_terms in ((), (pairs,))]
+    assert_same(results[0], tracker.step(state, last, end_us)[1])
+    millimetres = [float(pose_errors(result.T_cam_obj, T_said)[1]) for result in results]
+    assert millimetres[0] > 0.2 and millimetres[1] < 0.01
+    assert int(results[1].status[0]) == Status.TRACKING
+
+
+def test_where_a_window_is_taken_in_parts_a_further_term_is_of_its_end(monkeypatch):
+    monkeypatch.setattr(initialization, "_EVENTS_OF_A_PART", 40)
+    trajectory, events = moving_box(pose(), 1)
+    config = TrackerConfig(window=WindowConfig(parts=3), relocalization=RelocalizationConfig(hypotheses=0))
+    tracker = Tracker([box_model()], SMALL_CAMERA, config, dtype=torch.float64)
+    start, (window,) = tracker.init(pose()[None], 0), windows(events, 1)
+    assert bool(initialization.to_be_parted(start, window[0], torch.tensor([window[1]]), tracker.objects, config).all())
+    T_said = retract_about(trajectory.at(torch.tensor([window[1]])), torch.tensor([[0.0, 0, 0, 5e-4, 0, 0]]).double(), tracker.centre_obj)
+    pairs = pairs_at(T_said, replace(problem_at(T_said), centre_obj=tracker.centre_obj), 40, weight=1e6)
+    with torch.inference_mode():
+        results = [tracker.step(start, *window, extra_terms=extra_terms)[1] for extra_terms in ((), (pairs,))]
+    millimetres = [float(pose_errors(result.T_cam_obj, T_said)[1]) for result in results]
+    assert millimetres[0] > 0.2 and millimetres[1] < 0.01

@@ -2,7 +2,7 @@
 
 Two terms are in every problem: the distances of observations from contours, and the prior. A further one is a frozen dataclass
 with the method :meth:`CostTerm.linearise`, in a file of its own, and is passed as one of ``extra_terms`` to
-:func:`torchtrack.tracking.estimation.rounds.align` or to a :class:`PoseProblem`.
+:meth:`torchtrack.tracking.tracker.Tracker.step`, :func:`torchtrack.tracking.estimation.rounds.align` or a :class:`PoseProblem`.
 """
 
 from dataclasses import dataclass
@@ -162,7 +162,7 @@ class ContourDistance:
         focal, principal = problem.intrinsics[:, :2, None], problem.intrinsics[:, 2:, None]
         offset = ((problem.targets.transpose(1, 2) - principal) * directions).sum(1)
         arms = (problem.points_obj.transpose(1, 2) - problem.centre_obj[..., None]).contiguous()
-        return cls(arms, directions * focal, offset, problem.weights, problem.scale_px, problem.window)
+        return cls(arms, directions * focal, offset, problem.weights.to(offset.dtype), problem.scale_px, problem.window)
 
     def linearise(self, place: Place) -> LinearisedTerm:
         """Project the matched points, and take residuals and gradients ``g = dπᵀ n`` of them."""
