@@ -65,7 +65,7 @@ def main(arguments: Arguments) -> int:
             arguments.keep.mkdir(parents=True)
             console.print(f"{inputs[0].prepare(arguments.keep)}")
             return 0
-        shown = [_told(outcome, console) for outcome in outcomes(inputs, folder, arguments.jobs)]
+        shown = [_reported(outcome, console) for outcome in outcomes(inputs, folder, arguments.jobs)]
     for outcome in sorted(shown, key=lambda outcome: -outcome.seconds)[: arguments.slowest]:
         console.print(f"{outcome.seconds:6.1f} s  {outcome.name}: {outcome.kind}")
     if arguments.each:
@@ -122,7 +122,7 @@ def _show_each(shown: list[Outcome], seeds: list[Seed], console: Console) -> Non
         console.print(f"{name}: {read[name]} of {count} were read")
 
 
-def _told(outcome: Outcome, console: Console) -> Outcome:
+def _reported(outcome: Outcome, console: Console) -> Outcome:
     if outcome.kind in FAULTS:
         console.print(f"\n{outcome.name}: {outcome.kind} ({outcome.seconds:.1f} s)\n{outcome.detail}")
     return outcome

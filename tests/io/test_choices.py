@@ -12,7 +12,7 @@ from torchtrack.config.events import ReadingConfig
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import EventDataError, TorchtrackWarning
 from torchtrack.io import open_events
-from torchtrack.io.polarity_code import told_if_alike
+from torchtrack.io.polarity_code import with_one_polarity_reported
 
 EVENTS = random_events(3000, **SIZE)
 T, X, Y = (values.numpy() for values in (EVENTS.t_us, EVENTS.x, EVENTS.y))
@@ -154,9 +154,9 @@ def test_single_wrong_polarities_are_damage(tmp_path):
 def test_events_of_one_polarity_are_told(tmp_path, code, which):
     source = opened(save_npz(tmp_path / "e.npz", EVENTS, p=np.full(3000, code)))
     with pytest.warns(TorchtrackWarning, match=f"'e': all of its first 3000 events got {which}"):
-        assert sum(map(len, told_if_alike(source.chunks(), "'e'"))) == 3000
+        assert sum(map(len, with_one_polarity_reported(source.chunks(), "'e'"))) == 3000
     with pytest.warns(TorchtrackWarning, match="all of its first 10000 events"):
-        next(told_if_alike(iter([concatenate([next(source.chunks())] * 4)[:10_000]]), "'e'"))
+        next(with_one_polarity_reported(iter([concatenate([next(source.chunks())] * 4)[:10_000]]), "'e'"))
 
 
 def test_one_of_several_streams_is_told_and_chosen(tmp_path):

@@ -11,20 +11,20 @@ from torchtrack.config.renamed import renamed
 
 Location = tuple[int | str, ...]
 # What was got may be a whole file in the wrong place.
-_MOST_TOLD, _LONGEST_TOLD = 50, 200
+_MOST_SHOWN, _LONGEST_SHOWN = 50, 200
 
 
 def explained(error: ValidationError, settings: type[BaseModel], file: str | None, from_command_line: Collection[str] = ()) -> str:
     """All mistakes, one a line: dotted key, what is wrong, what was got, and what was perhaps meant."""
     mistakes = error.errors()
-    shown = [_line(details, settings, from_command_line) for details in mistakes[:_MOST_TOLD]]
+    shown = [_line(details, settings, from_command_line) for details in mistakes[:_MOST_SHOWN]]
     count = "1 setting is wrong" if len(mistakes) == 1 else f"{len(mistakes)} settings are wrong"
     more = [f"and {len(mistakes) - len(shown)} more"] if len(mistakes) > len(shown) else []
     return f"{file or 'command line'}: {count}\n" + "\n".join(f"  {line}" for line in (*shown, *more))
 
 
 def _line(details: ErrorDetails, settings: type[BaseModel], from_command_line: Collection[str]) -> str:
-    key = ".".join(str(part)[:_LONGEST_TOLD] for part in details["loc"])
+    key = ".".join(str(part)[:_LONGEST_SHOWN] for part in details["loc"])
     origin = " (command line)" if any(key == typed or key.startswith(f"{typed}.") for typed in from_command_line) else ""
     return f"{key}{origin}: {_reason(details, settings)}" if key else _reason(details, settings)
 
@@ -46,12 +46,12 @@ def _reason(details: ErrorDetails, settings: type[BaseModel]) -> str:
 def _shortened(value: Any) -> str:
     """A value as a person can read it, without its end where it is long."""
     text = repr(value)
-    return text if len(text) <= _LONGEST_TOLD else f"{text[:_LONGEST_TOLD]}…"
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
 
 
 def _suggestion(location: Location, settings: type[BaseModel]) -> str:
     """The nearest name at the same place, else the same name elsewhere."""
-    name = str(location[-1])[:_LONGEST_TOLD]
+    name = str(location[-1])[:_LONGEST_SHOWN]
     place = _model_at(location[:-1], settings)
     siblings = list(place.model_fields) if place else []
     if near := difflib.get_close_matches(name, siblings, n=1):

@@ -4,7 +4,7 @@ from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 
 # A search that takes about as long as ten windows, where one takes as long as a hundred.
-_HYPOTHESES, _DRAWN, _TURNS, _KEPT, _PULLED = 8, 300, 60, 30, 8
+_HYPOTHESES, _SAMPLES, _ROTATIONS, _KEPT_ROTATIONS, _PULLED = 8, 300, 60, 30, 8
 
 
 def in_haste(config: TrackerConfig, *, searches: bool) -> TrackerConfig:
@@ -26,7 +26,7 @@ def _without(search: RelocalizationConfig) -> RelocalizationConfig:
 
 def _brief(search: RelocalizationConfig) -> RelocalizationConfig:
     """A search for what is very uncertain alone."""
-    fewer = {"hypotheses": _HYPOTHESES, "samples": _DRAWN, "rotations": _TURNS, "kept_rotations": _KEPT, "pulled": _PULLED}
+    fewer = {"hypotheses": _HYPOTHESES, "samples": _SAMPLES, "rotations": _ROTATIONS, "kept_rotations": _KEPT_ROTATIONS, "pulled": _PULLED}
     least: dict[str, object] = {name: min(count, getattr(search, name)) for name, count in fewer.items()}
     none = {"low_score_below": 0.0, "score_drop_below": 0.0, "mirrored_below": 0.0, "slow_drift_below": 0.0, "new_below": 0.0, "at_start": False}
     return search.model_copy(update={**least, **none, "realignments": 0, "from_sigma_px": max(search.from_sigma_px, search.wide_sigma_px)})

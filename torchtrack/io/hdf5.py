@@ -117,7 +117,7 @@ class Hdf5Events(EventFile):
             return self.choices.time_unit or "us"
         said = next((unit_of(str(times.attrs[name])) for name in ("unit", "units") if name in times.attrs), None)
         # Whole µs, by the custom of data sets that have these tables.
-        is_dsec = times.dtype.kind in "iu" and any(_beside(file, stream.group, name) is not None for name in ("ms_to_idx", "t_offset"))
+        is_dsec = times.dtype.kind in "iu" and any(_optional_array(file, stream.group, name) is not None for name in ("ms_to_idx", "t_offset"))
         stated = self.choices.time_unit or said or stream.unit or ("us" if is_dsec else None)
         return settled_unit(times[:ENOUGH_TIMES], "us" if times.dtype.kind in "iu" else "s", stated, f"'{self.path}'")
 
@@ -140,7 +140,7 @@ class Hdf5Events(EventFile):
 
     def _first(self, file: h5py.File, offset_us: int) -> int:
         """Index of an event not after ``start_us``, by the table of milliseconds where there is one."""
-        table = _beside(file, self.stream.group, "ms_to_idx")
+        table = _optional_array(file, self.stream.group, "ms_to_idx")
         if self.start_us is None or table is None or len(table) == 0 or table.dtype.kind not in "iu":
             return 0
         millisecond = min(max((self.start_us - offset_us) // 1000, 0), len(table) - 1)
@@ -152,7 +152,7 @@ def _arrays(file: h5py.File, stream: Hdf5Stream) -> list[h5py.Dataset]:
     return [file[stream.group]] if stream.is_records else [file[stream.group][name] for name in stream.names]
 
 
-def _beside(file: h5py.File, group: str, name: str) -> h5py.Dataset | None:
+def _optional_array(file: h5py.File, group: str, name: str) -> h5py.Dataset | None:
     """An array in the group of the events, or in the file itself."""
     candidates = (file.get(f"{group}/{name}"), file.get(name))
     return next((array for array in candidates if isinstance(array, h5py.Dataset)), None)
@@ -184,7 +184,7 @@ def _check_filters(array: h5py.Dataset, path: Path) -> None:
 
 
 def _time_offset(file: h5py.File, group: str) -> int:
-    offset = _beside(file, group, "t_offset")
+    offset = _optional_array(file, group, "t_offset")
     return int(offset[()].item()) if offset is not None and offset.size == 1 and offset.dtype.kind in "iu" else 0
 
 

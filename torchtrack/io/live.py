@@ -92,7 +92,7 @@ class DvSource(LiveSource):
         self._reader = reader
 
     def _receive(self) -> Columns | None:
-        with _faults_told(self.name):
+        with _as_event_data_errors(self.name):
             store = self._reader.getNextEventBatch()
             if store is None and not self._reader.isRunning():
                 return None
@@ -110,7 +110,7 @@ class StreamSource(LiveSource):
 
     def __init__(self, name: str, descriptor: int, width: int = 0, height: int = 0) -> None:
         self._descriptor = descriptor
-        with _faults_told(name):
+        with _as_event_data_errors(name):
             self._rest = os.read(descriptor, _HEADER_BYTES)
         header = parse_header(self._rest)
         encoding = header.encoding if header is not None and header.encoding in ("evt2", "evt21", "evt3") else "evt3"
@@ -120,7 +120,7 @@ class StreamSource(LiveSource):
         self._decoder = make_decoder(encoding, self.problems)
 
     def _receive(self) -> Columns | None:
-        with _faults_told(self.name):
+        with _as_event_data_errors(self.name):
             if not select.select([self._descriptor], [], [], _WAIT_S)[0]:
                 return Columns.empty()
             data = os.read(self._descriptor, _READ_BYTES)
@@ -142,7 +142,7 @@ class Evk4Source(LiveSource):
         self._device = iter(drivers.open(serial=serial or None))
 
     def _receive(self) -> Columns | None:
-        with _faults_told(self.name):
+        with _as_event_data_errors(self.name):
             received = next(self._device, None)
         if received is None:
             return None
@@ -180,7 +180,7 @@ def open_live(source: str, width: int | None = None, height: int | None = None) 
 
 
 @contextmanager
-def _faults_told(name: str) -> Iterator[None]:
+def _as_event_data_errors(name: str) -> Iterator[None]:
     """What a driver or the system raises within it, as a camera is unplugged, becomes an :class:`EventDataError`."""
     try:
         yield

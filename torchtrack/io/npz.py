@@ -207,11 +207,11 @@ def _sensor_length(archive: zipfile.ZipFile, name: str, given: int, path: Path) 
     return int(stored.item())
 
 
-def _check_event_member(member: _Member, key: str, shape: tuple[int, ...], name: str, unit_told: bool) -> None:
+def _check_event_member(member: _Member, key: str, shape: tuple[int, ...], name: str, is_unit_given: bool) -> None:
     """Raise unless an array can be that of ``name``: t, x, y or p; times may have decimals where their unit is told."""
     if len(member.shape) != 1 or member.shape != shape:
         raise EventDataError(f"'{member.path}': t, x, y and p must be flat and of one length, but '{key}' has shape {member.shape} and t {shape}.")
-    if name == "t" and member.dtype.kind == "f" and not unit_told:
+    if name == "t" and member.dtype.kind == "f" and not is_unit_given:
         got = f"'{member.path}': '{key}' must be integer microseconds, got {member.dtype}."
         raise EventDataError(f"{got} If it has another unit, set {EVENTS.setting} to s, ms, us or ns.")
     if member.dtype.kind not in {"t": "iuf", "p": "iufb"}.get(name, "iu"):

@@ -58,7 +58,7 @@ class PolarityCode:
         return events[known]
 
 
-def told_if_alike(chunks: Iterable[EventBatch], source: str) -> Iterator[EventBatch]:
+def with_one_polarity_reported(chunks: Iterable[EventBatch], source: str) -> Iterator[EventBatch]:
     """The same events, with a warning where all of them have one polarity: it may be coded in another way."""
     count, seen = 0, set[bool]()
     for chunk in chunks:
@@ -66,15 +66,15 @@ def told_if_alike(chunks: Iterable[EventBatch], source: str) -> Iterator[EventBa
             count += len(chunk)
             seen |= {bool(chunk.polarity.any()), bool(chunk.polarity.all())}
             if count >= _MANY and len(seen) == 1:
-                _tell_alike(count, seen.pop(), source)
+                _warn_of_one_polarity(count, seen.pop(), source)
                 # Once is enough.
                 seen = {False, True}
         yield chunk
     if len(seen) == 1 and count >= _FEW:
-        _tell_alike(count, seen.pop(), source)
+        _warn_of_one_polarity(count, seen.pop(), source)
 
 
-def _tell_alike(count: int, are_brighter: bool, source: str) -> None:
+def _warn_of_one_polarity(count: int, are_brighter: bool, source: str) -> None:
     which = "brighter" if are_brighter else "darker"
     message = f"{source}: all of its first {count} events got {which}. If both should be there, polarity is coded in another way. {_CHOOSE}"
     warnings.warn(message, TorchtrackWarning, stacklevel=3)

@@ -124,7 +124,7 @@ def _read_csv(text: str, wanted: _Wanted) -> Trajectory:
             poses.append([scale * float(values[word]) for word in _POSITION] + [float(values[word]) for word in _QUATERNION])
         except ValueError as error:
             raise PoseError(f"line {number} cannot be read: {error}.") from error
-    return trajectory_of(pose_times_us(times, wanted.time_unit or _told_unit(headings[names.index(time)])), poses)
+    return trajectory_of(pose_times_us(times, wanted.time_unit or _unit_in_heading(headings[names.index(time)])), poses)
 
 
 def _column_name(heading: str) -> str:
@@ -133,7 +133,7 @@ def _column_name(heading: str) -> str:
     return _OTHER_NAMES.get(bare, bare) if heading[:2] != "q_" else f"q{bare}"
 
 
-def _told_unit(heading: str) -> TimeUnit | None:
+def _unit_in_heading(heading: str) -> TimeUnit | None:
     """The unit that the name of a column of times says: ``t_us``, or ``timestamp [ns]``."""
     word = heading.replace("[", "_").replace("]", "").replace(" ", "").rpartition("_")[2]
     return _UNITS.get(word)

@@ -18,7 +18,7 @@ from torchtrack.object_model.gltf import read_gltf
 from torchtrack.object_model.notices import tell
 from torchtrack.object_model.obj import check_indices, read_obj
 from torchtrack.object_model.ply import read_ply
-from torchtrack.object_model.side_files import MeshText, find_beside
+from torchtrack.object_model.side_files import MeshText, find_side_file
 from torchtrack.object_model.stl_off import read_off, read_stl
 from torchtrack.object_model.textures import check_textures, tell_lost_textures
 
@@ -164,7 +164,7 @@ def join_parts(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 def _tell_missing(path: Path, named: Iterable[str]) -> frozenset[str]:
     """Warn of files that a mesh file names and that are not there; which they are."""
-    missing = [name for name in dict.fromkeys(named) if find_beside(path, name) is None]
+    missing = [name for name in dict.fromkeys(named) if find_side_file(path, name) is None]
     if missing:
         tell(
             f"'{path}' names {', '.join(repr(name) for name in missing[:5])}, which cannot be found in '{path.parent}': "

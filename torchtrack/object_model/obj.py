@@ -13,7 +13,7 @@ from pathlib import Path
 from torchtrack.core.limits import check_limit
 from torchtrack.errors import ModelError
 from torchtrack.object_model.notices import tell
-from torchtrack.object_model.side_files import MeshText, SideFiles, find_beside
+from torchtrack.object_model.side_files import MeshText, SideFiles, find_side_file
 
 _PLAIN_END = re.compile(rb"\r(?!\n)")
 _UNUSUAL = re.compile(
@@ -154,11 +154,11 @@ def _materials(path: Path, text: str) -> tuple[ObjMaterials, str]:
     missing: list[str] = []
     named = [name.strip() for name in re.findall(r"^[ \t]*mtllib[ \t]+(\S[^\n]*)$", text, re.MULTILINE)]
     # Several libraries may stand in one line; a name may hold blanks, too.
-    names = dict.fromkeys(name for line in dict.fromkeys(named) for name in ([line] if find_beside(path, line) else line.split()))
+    names = dict.fromkeys(name for line in dict.fromkeys(named) for name in ([line] if find_side_file(path, line) else line.split()))
     if len(names) > _MOST_LIBRARIES:
         raise ModelError(f"'{path}' names {len(names)} material libraries, expected at most {_MOST_LIBRARIES}: it is damaged. Export it again.")
     for name in names:
-        material_path = find_beside(path, name)
+        material_path = find_side_file(path, name)
         if material_path is None:
             missing.append(name)
             continue
@@ -171,7 +171,7 @@ def _materials(path: Path, text: str) -> tuple[ObjMaterials, str]:
             elif kind.lower() == "map_kd" and materials:
                 images[materials[-1]] = rest = image_name(rest)
                 # An image's name is meant from the library's folder, and often written from the model's.
-                image = find_beside(material_path, rest) or find_beside(path, rest)
+                image = find_side_file(material_path, rest) or find_side_file(path, rest)
                 missing += [] if image else [rest]
                 rest = str(image or rest)
             lines.append(f"{kind} {rest}")

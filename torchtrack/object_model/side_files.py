@@ -33,7 +33,7 @@ class SideFiles(Resolver):
         name = str(key)
         if name in self.given:
             return self.given[name]
-        side_file = find_beside(self.path, name)
+        side_file = find_side_file(self.path, name)
         if side_file is None:
             raise FileNotFoundError(f"there is no file '{name}' in '{self.path.parent}'")
         check_limit("mesh_bytes", side_file.stat().st_size, side_file)
@@ -52,7 +52,7 @@ class SideFiles(Resolver):
         return list(self.given)
 
 
-def find_beside(path: Path, name: str) -> Path | None:
+def find_side_file(path: Path, name: str) -> Path | None:
     """The regular file that the model ``path`` calls ``name``; None if there is none."""
     for spelling in _spellings(name):
         try:

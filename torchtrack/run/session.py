@@ -23,7 +23,7 @@ from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS
 from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, Region, downscaled_camera, find_hot_pixels, region_camera
 from torchtrack.io.keep_up import KeepUp
 from torchtrack.io.live import LiveSource, open_live
-from torchtrack.io.polarity_code import told_if_alike
+from torchtrack.io.polarity_code import with_one_polarity_reported
 from torchtrack.io.problems import Problems
 from torchtrack.object_model import ObjectModel
 from torchtrack.run.initial_pose import initial_pose
@@ -64,7 +64,7 @@ class Session:
 
     def chunks(self) -> Iterator[EventBatch]:
         """The events after the start and up to the end."""
-        return told_if_alike(clipped(self.events.chunks(), self.start_us, self.end_us), f"'{self.name}'")
+        return with_one_polarity_reported(clipped(self.events.chunks(), self.start_us, self.end_us), f"'{self.name}'")
 
     def with_objects(self, numbers: Sequence[int]) -> "Session":
         """The same stream, with some of the objects."""

@@ -29,7 +29,7 @@ _MOST_TESTS = 2**19
 DEPTH_STEPS_PER_M, _OBJECT_BITS = 1e6, 20
 NOTHING = 2**62
 # Images that are farther apart than this have no cell in common.
-_BESIDE_CELLS = 2
+_OVERLAP_CELLS = 2
 # So many surface samples for each cell of the square around an object leave no holes: its outline fills half of it, seen from both sides.
 SAMPLES_PER_CELL = 8
 
@@ -228,12 +228,12 @@ def hidden_in_buffer(
     return inside & behind.all(1)
 
 
-def _beside_others(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tensor, "b"]:
+def _may_overlap_others(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tensor, "b"]:
     """Which objects may share a cell with another one of their stream: where the boxes around their outlines meet."""
     if not scene.shared:
         return torch.zeros_like(scene.stream_index, dtype=torch.bool)
     low, high = bounds(contours.pixels, contours.mask)
-    low = low - _BESIDE_CELLS * cell_px
+    low = low - _OVERLAP_CELLS * cell_px
     # The outline of what reaches behind the camera is not all in its image; then no point is farther away than the diameter.
     close = torch.where(contours.mask, contours.points_cam[..., 2], torch.inf).amin(1) < scene.diameters_m
     meet = ((low[:, None] <= high) & (low <= high[:, None])).all(-1) | close[:, None] | close
@@ -256,7 +256,7 @@ def remove_hidden(contours: Contours, scene: Scene, config: ContourConfig) -> Co
     needs_buffer = scene.shared or any(len(model.triangles) == 0 for model in scene.models)
     if needs_buffer:
         exact = _tested_exactly(scene)
-        drawn = ~exact[:, 0] | _beside_others(scene, contours, config.depth_cell_px)
+        drawn = ~exact[:, 0] | _may_overlap_others(scene, contours, config.depth_cell_px)
         if not host_sync.none_of(drawn):
             hidden = hidden | hidden_in_buffer(scene, contours, drawn, exact, config)
     return replace(contours, mask=contours.mask & ~hidden)

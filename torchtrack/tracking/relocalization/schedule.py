@@ -39,11 +39,11 @@ def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_
     around that place. Those that explain too little are partly hidden, as a rule; but a pose may also have gone along with what hid the
     object, and hold on to other edges.
     """
-    unseen = _is_unseen_for_long(state, config)
-    if none_of(unseen):
-        return unseen.long()
-    lost = unseen & _is_unknown(state, objects.diameter_m)
-    due = unseen & is_drift_due & ~lost
+    unvalidated = _lacks_validation(state, config)
+    if none_of(unvalidated):
+        return unvalidated.long()
+    lost = unvalidated & _is_unknown(state, objects.diameter_m)
+    due = unvalidated & is_drift_due & ~lost
     now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.health.T_last_validated))
     changed = due & (torch.maximum(now_m / then_m, then_m / now_m) > _DEPTH_FACTOR)
     below = due & (state.health.score < config.relocalization.not_validated_below * state.health.reference_explained_ratio)
@@ -51,7 +51,7 @@ def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_
     return (torch.stack([lost, changed, below]) * constant(tuple((int(bit),) for bit in bits), torch.int64, lost.device)).sum(0)
 
 
-def _is_unseen_for_long(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
+def _lacks_validation(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
     if not (config.relocalization.not_validated_us and searches(config)):
         return torch.zeros_like(state.health.time_since_validated_s, dtype=torch.bool)
     return (state.health.time_since_validated_s >= 1e-6 * config.relocalization.not_validated_us) & (state.health.mean_score > 0)
