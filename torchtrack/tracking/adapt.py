@@ -9,7 +9,6 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.tracking.adaptation.pixel_latency import LOOK_US, late_share_after
 from torchtrack.tracking.adaptation.surface_learning import Surroundings, learn_after
-from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.polarity import expected_polarity, is_asked
 from torchtrack.tracking.contours.objects import ObjectBatch
@@ -51,6 +50,8 @@ class Lesson:
         window_s: its duration, for each object.
         sigma_px: standard deviation of each object's prediction in the image: of an uncertain one nothing is learned.
         on_surfaces: on which objects contours can be learned; None where on none.
+        observations: of the window, and ``contours`` that they were matched with.
+        t_us: its end, of each stream; the state after it does not have that yet.
         learns: whether anything is learned, and not only looked whether there is need to.
     """
 
@@ -58,6 +59,9 @@ class Lesson:
     window_s: Float[Tensor, "b"]
     sigma_px: Float[Tensor, "b"]
     on_surfaces: Bool[Tensor, "b"] | None
+    observations: Observations
+    contours: Contours
+    t_us: Int[Tensor, "s"]
     learns: bool = True
 
 
@@ -91,21 +95,15 @@ def learns_next(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, conf
 
 
 def with_late_share(
-    state: TrackerState,
-    result: StepResult,
-    matched: tuple[Observations, Contours, Matches, Prediction, Bool[Tensor, "b"]],
-    t_us: Int[Tensor, "s"],
-    config: TrackerConfig,
+    state: TrackerState, result: StepResult, prediction: Prediction, scored: ScoredFit, lesson: Lesson, config: TrackerConfig
 ) -> TrackerState:
-    """The state, before the window that ends at ``t_us`` by its clock, with how many events on contours came late in their bursts.
+    """The state after a window with how many events on contours came late in their bursts; arguments as those of :func:`learned_after`.
 
-    Args:
-        matched: observations, the contours they were matched with, the matches, where the objects were expected, and which of them the
-            matches are of.
+    Matches are of the alignment: where an object was relocalized, they tell nothing of its pose.
     """
-    if not config.association.pixel_latency or host_sync.none_of(due := is_time(state.t_us, t_us, LOOK_US)):
+    if not config.association.pixel_latency or host_sync.none_of(due := is_time(state.t_us, lesson.t_us, LOOK_US)):
         return state
-    observations, contours, matches, prediction, known = matched
-    sure = due[0, prediction.objects.stream_index] & (result.status == int(Status.TRACKING)) & known
-    late_share = late_share_after(state.appearance.late_share, observations, contours, matches, prediction, sure, config.association)
+    known = due[0, prediction.objects.stream_index] & (result.status == int(Status.TRACKING)) & ~scored.is_relocalized
+    matched = lesson.observations, lesson.contours, scored.fit.matches
+    late_share = late_share_after(state.appearance.late_share, *matched, prediction, known, config.association)
     return replace(state, appearance=replace(state.appearance, late_share=late_share))

@@ -96,7 +96,7 @@ def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> t
     fit = align(expected.prediction, seen.contours, seen.index, seen.gate_scale, as_late, tracked.config, extra_terms=given.extra_terms)
     scored = validate(tracked, state, expected, seen, fit)
     located = relocalized(tracked, state, expected, seen, scored, given)
-    return update(tracked, state, (expected, seen, fit, located), given)
+    return update(tracked, state, expected, seen, located, given)
 
 
 def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, given: StepInput) -> Observed:
@@ -145,22 +145,17 @@ def relocalized(tracked: TrackedObjects, state: TrackerState, expected: Expected
 
 
 def update(
-    tracked: TrackedObjects, state: TrackerState, made: tuple[Expected, Observed, Fit, Relocalized], given: StepInput
+    tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, located: Relocalized, given: StepInput
 ) -> tuple[TrackerState, StepResult]:
-    """Stage 6: the filter's update, statuses, and what is learned.
-
-    Args:
-        made: what the stages before made.
-    """
-    (expected, seen, fit, located), config = made, tracked.config
+    """Stage 6: the filter's update, statuses, and what is learned."""
+    config = tracked.config
     scored, prediction = located.scored, located.prediction.detached()
     next_state, result = conclude(state, located.prediction, located.gate_scale, scored, seen.corners, expected.dt_s, config)
     if config.relocalization.tentative:
         next_state, result = confirm_or_take_back(state, next_state, result, prediction, located.gate_scale, config)
-    lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, given.learns)
+    lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, seen.observations, seen.contours, given.t_us, learns=given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
-    sure = ~scored.is_relocalized
-    next_state = with_late_share(next_state, result, (seen.observations, seen.contours, fit.matches, prediction, sure), given.t_us, config)
+    next_state = with_late_share(next_state, result, prediction, scored, lesson, config)
     maps = replace(next_state.maps, burst_age_us=seen.burst_age_us)
     return replace(next_state, t_us=given.t_us, maps=maps), replace(result, t_us=given.t_us)
 

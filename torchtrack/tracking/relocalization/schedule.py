@@ -10,7 +10,7 @@ from torchtrack.core.host_sync import none_of
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import MOST_UNCERTAIN
 from torchtrack.tracking.relocalization.evidence import Schedule
-from torchtrack.tracking.relocalization.triggers import Trigger, searches
+from torchtrack.tracking.relocalization.triggers import Trigger, flags_of, searches
 from torchtrack.tracking.state import TrackerState
 
 # A prediction that is so uncertain, as a ratio of the most that predictions become, tells nothing any more.
@@ -47,8 +47,7 @@ def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_
     now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.health.T_last_validated))
     changed = due & (torch.maximum(now_m / then_m, then_m / now_m) > _DEPTH_FACTOR)
     below = due & (state.health.score < config.relocalization.not_validated_below * state.health.reference_explained_ratio)
-    bits = Trigger.LOST, Trigger.DEPTH_CHANGED, Trigger.FAR_BELOW_REFERENCE
-    return (torch.stack([lost, changed, below]) * constant(tuple((int(bit),) for bit in bits), torch.int64, lost.device)).sum(0)
+    return flags_of({int(Trigger.LOST): lost, int(Trigger.DEPTH_CHANGED): changed, int(Trigger.FAR_BELOW_REFERENCE): below})
 
 
 def _lacks_validation(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:

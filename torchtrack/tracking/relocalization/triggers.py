@@ -61,7 +61,8 @@ def triggers(evidence: TriggerEvidence, config: TrackerConfig) -> Int[Tensor, "b
     if not searches(config):
         return torch.zeros_like(evidence.earlier)
     for conditions in _CONDITIONS:
-        evidence = replace(evidence, earlier=evidence.earlier | _bits(conditions, evidence, config))
+        flags = flags_of({bit: condition(evidence, config) for bit, condition in conditions.items()})
+        evidence = replace(evidence, earlier=evidence.earlier | flags)
     return evidence.earlier
 
 
@@ -70,13 +71,13 @@ def has(flags: Int[Tensor, "b"], wanted: Trigger) -> Bool[Tensor, "b"]:
     return (flags & int(wanted)) != 0
 
 
+def flags_of(holds: Mapping[int, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:
+    """The bits that hold of each object, in one number."""
+    each = torch.stack([*holds.values()])
+    return (each * constant(tuple((bit,) for bit in holds), torch.int64, each.device)).sum(0)
+
+
 Condition = Callable[[TriggerEvidence, TrackerConfig], Bool[Tensor, "b"]]
-
-
-def _bits(conditions: Mapping[int, Condition], evidence: TriggerEvidence, config: TrackerConfig) -> Int[Tensor, "b"]:
-    """The bit of each condition that holds, in one number."""
-    numbers = constant(tuple((bit,) for bit in conditions), evidence.earlier.dtype, evidence.earlier.device)
-    return (torch.stack([condition(evidence, config) for condition in conditions.values()]) * numbers).sum(0)
 
 
 # ---- the conditions
