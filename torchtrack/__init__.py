@@ -36,14 +36,20 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from torchtrack import errors as errors
     from torchtrack.config.presets import preset as preset
+    from torchtrack.config.run import RunConfig as RunConfig
     from torchtrack.config.tracker import TrackerConfig as TrackerConfig
     from torchtrack.core.camera import Camera as Camera
     from torchtrack.core.events import EventBatch as EventBatch
     from torchtrack.io import Trajectory as Trajectory
     from torchtrack.io import open_events as open_events
+    from torchtrack.io import open_live as open_live
+    from torchtrack.io import read_calibration as read_calibration
     from torchtrack.io import read_sequence as read_sequence
+    from torchtrack.io import read_trajectory as read_trajectory
+    from torchtrack.io import write_tum as write_tum
     from torchtrack.object_model import ObjectModel as ObjectModel
     from torchtrack.run.runner import track as track
+    from torchtrack.run.stream import Stream as Stream
     from torchtrack.tracking.state import StepResult as StepResult
     from torchtrack.tracking.state import TrackerState as TrackerState
     from torchtrack.tracking.tracker import Tracker as Tracker
@@ -53,16 +59,22 @@ _HOME = {
     "Camera": "core.camera",
     "EventBatch": "core.events",
     "ObjectModel": "object_model",
+    "RunConfig": "config.run",
     "Status": "tracking.validation.status",
     "StepResult": "tracking.state",
+    "Stream": "run.stream",
     "Tracker": "tracking.tracker",
     "TrackerConfig": "config.tracker",
     "TrackerState": "tracking.state",
     "Trajectory": "io",
     "open_events": "io",
+    "open_live": "io",
     "preset": "config.presets",
+    "read_calibration": "io",
     "read_sequence": "io",
+    "read_trajectory": "io",
     "track": "run.runner",
+    "write_tum": "io",
 }
 
 __all__ = [*_HOME, "__version__", "errors"]

@@ -246,3 +246,13 @@ def test_learning_runs(code, tmp_path):
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert re.fullmatch(r"(\d+\.\d+ mm\n){2}", done.stdout) and len(code.splitlines()) < 30
+
+
+@pytest.mark.parametrize("code", blocks("python live"))
+def test_pushing_events_runs(code, tmp_path):
+    (tmp_path / "example.py").write_text(code, encoding="utf-8")
+    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = [line.split(" ", 2) for line in done.stdout.splitlines()]
+    assert [int(t_us) for t_us, *_ in rows] == [5_000, 10_000, 15_000]
+    assert {status for _, status, _ in rows} <= {status.name for status in Status}

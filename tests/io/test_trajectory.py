@@ -4,13 +4,14 @@ import math
 from decimal import Decimal
 from fractions import Fraction
 
+import numpy as np
 import pytest
 import torch
 from helpers import random_pose, random_twist
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchtrack.core.lie import se3_exp
+from torchtrack.core.lie import quaternion_from_rotation, se3_exp
 from torchtrack.errors import MissingFileError, PoseError
 from torchtrack.io import Trajectory, read_tum, write_tum
 from torchtrack.io.seconds import format_seconds, parse_seconds
@@ -206,3 +207,14 @@ def test_nothing_half_written(tmp_path, monkeypatch):
         write_tum(file, trajectory())
     assert [entry.name for entry in tmp_path.iterdir()] == ["poses.tum"]
     assert file.read_text() == "what was there"
+
+
+def test_quaternions_of_tum_do_not_jump(tmp_path):
+    """Through rotations of 180°, where the conversion of each alone changes its sign."""
+    turns = torch.linspace(0, 4 * torch.pi, 81, dtype=torch.float64)[:, None] * torch.tensor([0.48, -0.6, 0.64, 0, 0, 0], dtype=torch.float64)
+    T = se3_exp(turns)
+    write_tum(tmp_path / "poses.tum", Trajectory(1000 * torch.arange(81), T))
+    quaternions = torch.from_numpy(np.loadtxt(tmp_path / "poses.tum")[:, 4:])
+    alone = quaternion_from_rotation(T[:, :3, :3])
+    assert float((quaternions[1:] * quaternions[:-1]).sum(-1).min()) > 0.9 > float((alone[1:] * alone[:-1]).sum(-1).min())
+    torch.testing.assert_close(read_tum(tmp_path / "poses.tum").T_cam_obj, T, atol=1e-9, rtol=0)

@@ -1,8 +1,12 @@
 """Initial poses as configured, or by a trajectory that covers the start."""
 
+import json
+
 import pytest
 import torch
+from kornia.geometry.liegroup import Se3
 from pydantic import ValidationError
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from torchtrack.config.run import ObjectConfig, PoseConfig
 from torchtrack.core.lie import se3_exp
@@ -74,3 +78,43 @@ def test_ground_truth_is_checked_as_a_trajectory_is():
 def test_settings_of_a_trajectory_need_one():
     with pytest.raises(ValidationError, match="name and time_unit are of a trajectory"):
         PoseConfig(translation_m=(0, 0, 1), time_unit="us")
+
+
+T_CAM_WORLD = se3_exp(torch.tensor([0.3, -1.0, 0.2, 0.1, 0.2, 1.5], dtype=torch.float64))
+
+
+def test_a_trajectory_in_a_world_frame(tmp_path):
+    write_tum(tmp_path / "poses.tum", moving())
+    T = initial_pose(configured(trajectory=tmp_path / "poses.tum", T_cam_world=T_CAM_WORLD.tolist()), None, 25_000)
+    torch.testing.assert_close(T, T_CAM_WORLD @ moving().at(torch.tensor([25_000]))[0], atol=1e-9, rtol=0)
+
+
+def test_a_trajectory_of_bop(tmp_path):
+    poses = moving().T_cam_obj
+    scene = {
+        str(image): [{"obj_id": number, "cam_R_m2c": T[:3, :3].flatten().tolist(), "cam_t_m2c": (1e3 * T[:3, 3]).tolist()} for number, T in
+                     ((1, poses[0]), (5, poses[image]))]
+        for image in range(11)
+    }  # fmt: skip
+    (tmp_path / "scene_gt.json").write_text(json.dumps(scene))
+    T = initial_pose(configured(trajectory=tmp_path / "scene_gt.json", name="5", frame_us=10_000), None, 40_000)
+    torch.testing.assert_close(T, poses[4], atol=1e-9, rtol=0)
+    with pytest.raises(PoseError, match="Give frame_us"):
+        initial_pose(configured(trajectory=tmp_path / "scene_gt.json", name="5"), None, 40_000)
+
+
+def test_what_is_of_a_trajectory_needs_one():
+    with pytest.raises(ValidationError, match="frame_us and T_cam_world: of a trajectory; leave it out"):
+        PoseConfig(translation_m=(0, 0, 0.5), frame_us=10, T_cam_world=T_CAM_WORLD.tolist())
+    with pytest.raises(ValidationError, match="T_cam_world: the upper left 3x3 block is not a rotation"):
+        PoseConfig(trajectory="/poses.tum", T_cam_world=(2 * T_CAM_WORLD).tolist())
+
+
+@pytest.mark.parametrize("given", [T_CAM_WORLD, T_CAM_WORLD.numpy(), RigidTransform.from_matrix(T_CAM_WORLD.numpy()), Se3.from_matrix(T_CAM_WORLD)])
+def test_poses_of_other_libraries(given):
+    torch.testing.assert_close(initial_pose(configured(matrix=given), None, 0), T_CAM_WORLD)
+
+
+def test_what_is_no_pose_is_an_error_of_the_setting():
+    with pytest.raises(ValidationError, match="a rotation alone is no pose"):
+        PoseConfig(matrix=Rotation.identity())

@@ -12,13 +12,14 @@ test of each innovation is here the gate, and a robust loss.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.baselines.event_lines import EventLineTracker
-from torchtrack.core.events import EventBatch
+from torchtrack.core.events import EventBatch, ForeignEvents, as_batch
 from torchtrack.core.linalg import solve_positive
 from torchtrack.tracking.estimation.terms import CostTerm, Linearisation
 from torchtrack.tracking.state import StepResult, TrackerState
@@ -36,7 +37,7 @@ _APART_PX = 3.0
 class LineTracker(EventLineTracker):
     """An error-state Kalman filter on pose and velocity, corrected with the distances of events from model lines."""
 
-    def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
+    def init(self, T_cam_obj: Any, t_us: int | Int[Tensor, "s"]) -> TrackerState:
         """The state before the first window; see :meth:`torchtrack.tracking.tracker.Tracker.init`."""
         state = super().init(T_cam_obj, t_us)
         deviations = torch.tensor(_FIRST_DEVIATIONS, dtype=torch.float64, device=state.T_cam_obj.device).repeat_interleave(3)
@@ -46,11 +47,12 @@ class LineTracker(EventLineTracker):
     def step(
         self,
         state: TrackerState,
-        events: EventBatch,
+        events: EventBatch | ForeignEvents,
         t_end_us: int | Int[Tensor, "s"] | None = None,
         extra_terms: tuple[CostTerm, ...] = (),
     ) -> tuple[TrackerState, StepResult]:
         """Advance every object by one window; see :meth:`torchtrack.tracking.tracker.Tracker.step`."""
+        events = as_batch(events)
         window = self._open(state, events, t_end_us, state.velocity)
         predicted = predicted_covariance(state.motion.covariance, window.duration_s.double())
         eye = torch.eye(6, dtype=predicted.dtype, device=predicted.device).expand(len(predicted), 6, 6)

@@ -32,6 +32,27 @@ class OutputConsole(Console):
             raise
 
 
+class OutputLines:
+    """Lines for another program on standard output, each of which is there at once.
+
+    Raises:
+        OutputError: if that cannot be, as where nobody reads them any more.
+    """
+
+    def write(self, lines: str) -> None:
+        """Write lines, each with its end."""
+        try:
+            with writing(_NAME):
+                sys.stdout.write(lines)
+                sys.stdout.flush()
+        except OutputError:
+            _silence()
+            raise
+
+    def close(self) -> None:
+        """Standard output stays open."""
+
+
 def take_any_text() -> None:
     """Have both streams show ``?`` in place of what their encoding does not know, as of ``LANG=C``: an error over a ° would hide a result."""
     for stream in (sys.stdout, sys.stderr):

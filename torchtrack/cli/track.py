@@ -1,13 +1,14 @@
 """``torchtrack track``: settings in, one run or many, tables out."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress
 
-from torchtrack.cli.console import output_console, tell_failure
+from torchtrack.cli.console import OutputLines, output_console, tell_failure
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load
@@ -15,19 +16,25 @@ from torchtrack.config.run import RunConfig
 from torchtrack.config.settings import CommandLineText
 from torchtrack.core.files import naming
 from torchtrack.eval.tables import run_headline, run_table
+from torchtrack.io.line_file import LineFile
 from torchtrack.run.executor import TaskFailure
 from torchtrack.run.runner import run, run_many
 from torchtrack.run.session import open_session
+from torchtrack.run.sinks import Sink
 from torchtrack.run.sinks.folder import check_folder
+from torchtrack.run.sinks.pose_lines import PoseLines
 from torchtrack.run.sinks.progress import ProgressBar
 from torchtrack.run.sinks.resume import check_resumable, is_complete
 from torchtrack.run.sinks.summary import RunSummary
 
 
-def track(config_or_source: str, overrides: Mapping[str, Any], *, resume: bool = False, quiet: bool) -> int:
-    """Track one source, or go on with that, show the summary; returns the exit code."""
+def track(config_or_source: str, overrides: Mapping[str, Any], *, poses: str | None = None, resume: bool = False, quiet: bool) -> int:
+    """Track one source, or go on with that, show the summary; returns the exit code.
+
+    ``poses`` is a file, or ``-`` for standard output, that gets lines of JSON; the summary goes to standard error in the second case.
+    """
     with naming(Path(config_or_source)):
-        return run_and_show(_run_config(config_or_source, overrides), quiet, resume)
+        return run_and_show(_run_config(config_or_source, overrides), quiet, resume, poses)
 
 
 def track_many(
@@ -71,17 +78,22 @@ def _run_config(config_or_source: str, overrides: Mapping[str, Any]) -> RunConfi
     return load(RunConfig, None, {"source": CommandLineText(config_or_source), **overrides})
 
 
-def run_and_show(config: RunConfig, quiet: bool, resume: bool = False) -> int:
+def run_and_show(config: RunConfig, quiet: bool, resume: bool = False, poses: str | None = None) -> int:
     """One run, and its table; returns the exit code."""
-    console = output_console()
+    only_poses = poses == "-"
+    console = Console(stderr=True, highlight=False, soft_wrap=True) if only_poses else output_console()
     if resume:
         check_resumable(config)
     check_folder(config.output)
     session = open_session(config)
     if config.compiled and not quiet:
         Console(stderr=True).print("compiling the tracker, which takes a minute or two for the first time")
-    progress = [] if quiet else [ProgressBar(Console(stderr=True), session.name, session.known_duration_s)]
-    return _show_run(console, run(config, progress, session, resume=resume), config.output)
+    sinks: list[Sink] = [] if quiet or only_poses else [ProgressBar(Console(stderr=True), session.name, session.known_duration_s)]
+    with ExitStack() as stack:
+        if poses is not None:
+            lines = stack.enter_context(closing(OutputLines() if only_poses else LineFile(Path(poses))))
+            sinks.append(PoseLines(lines, session.labels))
+        return _show_run(console, run(config, sinks, session, resume=resume), config.output)
 
 
 def _show_run(console: Console, summary: RunSummary, output: Path) -> ExitCode:

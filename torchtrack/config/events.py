@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from torchtrack.config.settings import Settings, absolute_path
+from torchtrack.core.column_names import TimeUnit as TimeUnit
 
 _LIVE = re.compile(r"(dv|evk4|davis|stdin)://\S*|-")
 
@@ -24,9 +25,6 @@ def _file_or_live(value: Any, info: Any) -> Any:
 
 
 EventSourcePath = Annotated[Path | str, BeforeValidator(_file_or_live)]
-
-
-TimeUnit = Literal["s", "ms", "us", "ns"]
 
 
 class ReadingConfig(Settings):

@@ -1,9 +1,10 @@
 """Settings of one run: what is tracked, where from, how, and where the results go."""
 
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, model_validator
+import torch
+from pydantic import BeforeValidator, Field, model_validator
 
 from torchtrack.config.events import EventsConfig, EventSourcePath, TimeUnit
 from torchtrack.config.merge import merged
@@ -11,21 +12,32 @@ from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import DistortionModel
-from torchtrack.core.lie import quaternion_problem
+from torchtrack.core.lie import check_pose, quaternion_problem
 from torchtrack.core.limits import Limits, current_limits
+from torchtrack.core.pose_types import as_pose_matrices
 
 Models = Literal["textured", "geometry"]
 Row = tuple[float, float, float, float]
 
 
+def _as_rows(pose: Any) -> Any:
+    """Rows of numbers, where it is a pose of another library, an array or a tensor; else as it is."""
+    return pose if pose is None or isinstance(pose, list | tuple) else as_pose_matrices(pose).tolist()
+
+
+Matrix = Annotated[tuple[Row, Row, Row, Row], BeforeValidator(_as_rows)]
+
+
 class PoseConfig(Settings):
     """An initial pose ``T_cam_obj``, in one of three ways."""
 
-    matrix: tuple[Row, Row, Row, Row] | None = Field(None, description="The 4x4 matrix, row by row.")
+    matrix: Matrix | None = Field(None, description="The 4x4 matrix, row by row.")
     translation_m: tuple[float, float, float] | None = Field(None, description="Position of the object's origin in the camera frame (m).")
     quaternion_xyzw: Row = Field((0.0, 0.0, 0.0, 1.0), description="Rotation beside translation_m, as a quaternion x, y, z, w of norm 1.")
-    trajectory: ConfigPath | None = Field(None, description="A file of poses (TUM, CSV, or a CSV of OptiTrack); the pose is taken at the start time.")
-    name: str | None = Field(None, description="Which of several in the file of poses: the rigid body of OptiTrack.")
+    trajectory: ConfigPath | None = Field(None, description="A file of poses (TUM, CSV, BOP, OptiTrack); the pose is taken at the start time.")
+    name: str | None = Field(None, description="Which of several in the file of poses: the rigid body of OptiTrack, the obj_id of BOP.")
+    frame_us: int | None = Field(None, ge=1, description="Time from one image to the next (µs), where the file of poses numbers images, as BOP does.")
+    T_cam_world: Matrix | None = Field(None, description="Where the camera is, row by row, if the file has poses T_world_obj in a frame of its own.")
     time_unit: TimeUnit | None = Field(None, description="Unit of the file's times: s, ms, us or ns; by default s, or as its first line says.")
 
     @model_validator(mode="after")
@@ -33,8 +45,15 @@ class PoseConfig(Settings):
         ways = [name for name in ("matrix", "translation_m", "trajectory") if getattr(self, name) is not None]
         if len(ways) != 1:
             raise ValueError(f"give exactly one of matrix, translation_m (with quaternion_xyzw) or trajectory; got {' and '.join(ways) or 'none'}")
-        if self.trajectory is None and (self.name, self.time_unit) != (None, None):
-            raise ValueError("name and time_unit are of a trajectory; leave them out")
+        of_trajectory = [name for name in ("name", "frame_us", "T_cam_world", "time_unit") if getattr(self, name) is not None]
+        if self.trajectory is None and of_trajectory:
+            raise ValueError(f"{' and '.join(of_trajectory)}: of a trajectory; leave it out, or give the trajectory")
+        return self
+
+    @model_validator(mode="after")
+    def _rigid_camera(self) -> "PoseConfig":
+        if self.T_cam_world is not None:
+            check_pose(torch.tensor(self.T_cam_world, dtype=torch.float64), "T_cam_world")
         return self
 
     @model_validator(mode="after")

@@ -6,6 +6,7 @@ Conventions, stated once: times are integer microseconds (int64) at every bounda
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -15,10 +16,14 @@ from torch import Tensor
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.polarity import brighter
+from torchtrack.core.structured_events import fields_of
 from torchtrack.errors import EventDataError
 
+ForeignEvents: TypeAlias = Any
+"""Events of another library, in one of the forms of :mod:`torchtrack.core.structured_events`."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class EventBatch:
     """Events of one or more streams in flat ragged form, sorted by time within each stream.
 
@@ -57,6 +62,22 @@ class EventBatch:
         )
 
     @classmethod
+    def from_library(cls, events: Any, stream: int = 0) -> "EventBatch":
+        """A batch of one stream from events as faery, dv-processing, evt3, Metavision and others give them.
+
+        Times are whole microseconds, unless the name of their field says another unit, such as ``t_ns``.
+
+        Args:
+            events: a structured array ``[e]`` or another form, see :mod:`torchtrack.core.structured_events`.
+            stream: which stream they are of.
+
+        Raises:
+            EventDataError: if a field is missing, or as :meth:`from_numpy`.
+        """
+        fields = fields_of(events)
+        return cls.from_numpy(fields.x, fields.y, fields.t_us, fields.polarity, stream)
+
+    @classmethod
     def empty(cls) -> "EventBatch":
         """A batch without events."""
         none = np.zeros(0, dtype=np.int64)
@@ -64,6 +85,13 @@ class EventBatch:
 
     def __len__(self) -> int:
         return len(self.t_us)
+
+    def __repr__(self) -> str:
+        if len(self) == 0:
+            return "EventBatch(no events)"
+        streams = len(self.stream_index.unique())
+        of_streams = f" of {streams} streams" if streams > 1 else ""
+        return f"EventBatch({len(self)} events{of_streams}, {int(self.t_us.min())} to {int(self.t_us.max())} µs, {self.t_us.device})"
 
     def __getitem__(self, index: slice | Tensor) -> "EventBatch":
         fields = (self.x, self.y, self.t_us, self.polarity, self.stream_index)
@@ -109,6 +137,15 @@ def _integer_tensor(values: np.ndarray, dtype: type[np.signedinteger], name: str
         raise EventDataError(f"{name} must lie within {limits.min}…{limits.max}, got {values.min()}…{values.max()}. Check the file.")
     # torch wants memory that it may write to; arrays over a file's bytes are read-only.
     return torch.from_numpy(np.require(values, dtype=dtype, requirements=("C", "W")))
+
+
+def as_batch(events: EventBatch | ForeignEvents) -> EventBatch:
+    """Events as a batch: as they are, or of another library (:meth:`EventBatch.from_library`).
+
+    Raises:
+        EventDataError: if they are neither.
+    """
+    return events if isinstance(events, EventBatch) else EventBatch.from_library(events)
 
 
 def concatenate(batches: Iterable[EventBatch]) -> EventBatch:

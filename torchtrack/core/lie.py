@@ -87,6 +87,18 @@ def quaternion_from_rotation(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor,
     return torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
 
 
+def continuous_quaternions(quaternion: Float[Tensor, "p 4"]) -> Float[Tensor, "p 4"]:
+    """The same rotations, one after the other, with signs such that no quaternion jumps to its negative, which means the same."""
+    turned_back = (quaternion[1:] * quaternion[:-1]).sum(-1) < 0
+    signs = torch.where(turned_back, -1.0, 1.0).to(quaternion).cumprod(0)
+    return torch.cat([quaternion[:1], quaternion[1:] * signs[:, None]])
+
+
+def with_signs_of(quaternion: Float[Tensor, "*b 4"], before: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
+    """The same rotations, each with the sign that is nearer to the quaternion before it."""
+    return torch.where((quaternion * before).sum(-1, keepdim=True) < 0, -quaternion, quaternion)
+
+
 def rotation_from_quaternion(quaternion: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
     """Rotation matrix of a quaternion ``[x, y, z, w]``, which is normalised first."""
     quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)

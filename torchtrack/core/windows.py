@@ -30,41 +30,124 @@ class EventWindow:
     after_gap: bool = False
 
 
-def windows_by_time(chunks: Iterable[EventBatch], duration_us: int, t_start_us: int | None = None) -> Iterator[EventWindow]:
-    """Cut a stream into windows of given durations, in constant memory; windows without events are yielded too.
+class TimeWindows:
+    """Cuts a stream into windows of a duration while its events come; windows without events are yielded too.
 
     After :data:`LONGEST_SILENCE_US` without events, time is passed over up to the next one.
 
     Args:
-        chunks: the events of one stream in time order, cut anywhere.
         duration_us: length of a window.
         t_start_us: where the first window starts; just before the first event when not given.
+
+    Raises:
+        EventDataError: if a window would not last.
     """
-    if duration_us < 1:
-        raise EventDataError(f"a window must last at least 1 µs, got {duration_us}.")
-    pending: list[EventBatch] = []
-    end_us, heard_us, after_gap = None, None, False
-    for chunk in chunks:
+
+    def __init__(self, duration_us: int, t_start_us: int | None = None) -> None:
+        if duration_us < 1:
+            raise EventDataError(f"a window must last at least 1 µs, got {duration_us}.")
+        self._duration_us, self._start_us = duration_us, t_start_us
+        self._end_us: int | None = None
+        self._heard_us: int | None = None
+        self._pending: list[EventBatch] = []
+        self._after_gap = False
+
+    def add(self, chunk: EventBatch) -> Iterator[EventWindow]:
+        """The windows that are complete with these events, which come after all before: an event after their end has been seen."""
         if len(chunk) == 0:
-            continue
-        if t_start_us is None:
-            t_start_us = int(chunk.t_us[0]) - 1
-        if end_us is None:
-            heard_us, end_us = t_start_us, t_start_us + duration_us
+            return
+        start_us = int(chunk.t_us[0]) - 1 if self._start_us is None else self._start_us
+        if self._end_us is None:
+            self._heard_us, self._end_us = start_us, start_us + self._duration_us
         newest_us = int(chunk.t_us[-1])
         # Only what is after the start counts; later on, nothing else is left.
-        left = chunk[int(torch.searchsorted(chunk.t_us, t_start_us, right=True)) :]
-        # A window is complete only once an event after its end has been seen.
-        while end_us < newest_us:
-            cut = int(torch.searchsorted(left.t_us, end_us, right=True))
-            heard_us = end_us if cut or pending else heard_us
-            yield EventWindow(concatenate([*pending, left[:cut]]) if pending else left[:cut], t_start_us, end_us, after_gap)
-            pending, left, t_start_us = [], left[cut:], end_us
-            t_start_us, after_gap = _after_silence(left, t_start_us, heard_us)
-            end_us = t_start_us + duration_us
-        pending += [left] if len(left) else []
-    if pending and t_start_us is not None and end_us is not None:
-        yield EventWindow(concatenate(pending) if len(pending) > 1 else pending[0], t_start_us, end_us, after_gap)
+        left = chunk[int(torch.searchsorted(chunk.t_us, start_us, right=True)) :]
+        while self._end_us < newest_us:
+            cut = int(torch.searchsorted(left.t_us, self._end_us, right=True))
+            self._heard_us = self._end_us if cut or self._pending else self._heard_us
+            window = EventWindow(concatenate([*self._pending, left[:cut]]) if self._pending else left[:cut], start_us, self._end_us, self._after_gap)
+            self._pending, left = [], left[cut:]
+            start_us, self._after_gap = _after_silence(left, self._end_us, self._heard_us)
+            self._start_us, self._end_us = start_us, start_us + self._duration_us
+            yield window
+        self._start_us = start_us
+        self._pending += [left] if len(left) else []
+
+    def rest(self) -> Iterator[EventWindow]:
+        """The window that is not complete, once no more events come; none where nothing is in it."""
+        if self._pending and self._start_us is not None and self._end_us is not None:
+            events = concatenate(self._pending) if len(self._pending) > 1 else self._pending[0]
+            yield EventWindow(events, self._start_us, self._end_us, self._after_gap)
+
+
+class CountWindows:
+    """Cuts a stream into windows of ``count`` events while they come, closed early once ``max_age_us`` have passed.
+
+    Events that share the time of a window's last event stay together with it, so windows may hold a few more.
+    Windows in which ``max_age_us`` passed without an event are yielded too, and time without events is passed over as by
+    :class:`TimeWindows`: no window reaches over more than :data:`LONGEST_SILENCE_US` of it.
+
+    Args:
+        count: events of a window.
+        max_age_us: how long a window lasts at most.
+        t_start_us: where the first window starts; just before the first event when not given.
+
+    Raises:
+        EventDataError: if count or age are not positive.
+    """
+
+    def __init__(self, count: int, max_age_us: int | None = None, t_start_us: int | None = None) -> None:
+        if count < 1 or (max_age_us is not None and max_age_us < 1):
+            raise EventDataError(f"a window needs a positive count and maximum age, got {count} and {max_age_us}.")
+        self._count, self._max_age_us, self._start_us = count, max_age_us, t_start_us
+        self._heard_us: int | None = None
+        self._pending, self._after_gap = EventBatch.empty(), False
+
+    def add(self, chunk: EventBatch) -> Iterator[EventWindow]:
+        """The windows that are complete with these events, which come after all before."""
+        if len(chunk) == 0:
+            return
+        start_us = int(chunk.t_us[0]) - 1 if self._start_us is None else self._start_us
+        self._heard_us = start_us if self._heard_us is None else self._heard_us
+        pending = concatenate([self._pending, chunk]) if len(self._pending) else chunk
+        # Only what is after the start counts; later on, nothing else is left.
+        self._pending = pending[int(torch.searchsorted(pending.t_us, start_us, right=True)) :]
+        while True:
+            if not self._after_gap:
+                # Without a maximum age, no windows without events lead into the silence.
+                waited_us = start_us - LONGEST_SILENCE_US if self._max_age_us is None else self._heard_us
+                start_us, self._after_gap = _after_silence(self._pending, start_us, waited_us)
+            self._start_us = start_us
+            if (end_us := _count_window_end(self._pending, self._count, self._max_age_us, start_us)) is None:
+                break
+            cut = int(torch.searchsorted(self._pending.t_us, end_us, right=True))
+            self._heard_us = int(self._pending.t_us[cut - 1]) if cut else self._heard_us
+            window = EventWindow(self._pending[:cut], start_us, end_us, self._after_gap)
+            self._pending, start_us, self._after_gap = self._pending[cut:], end_us, False
+            self._start_us = start_us
+            yield window
+
+    def rest(self) -> Iterator[EventWindow]:
+        """The window that is not complete, once no more events come; none where nothing is in it."""
+        if len(self._pending) and self._start_us is not None:
+            yield EventWindow(self._pending, self._start_us, int(self._pending.t_us[-1]), self._after_gap)
+
+
+def windows_by_time(chunks: Iterable[EventBatch], duration_us: int, t_start_us: int | None = None) -> Iterator[EventWindow]:
+    """The windows of a stream in time order that is cut into chunks anywhere, as :class:`TimeWindows` cuts them, in constant memory."""
+    yield from cut(chunks, TimeWindows(duration_us, t_start_us))
+
+
+def windows_by_count(chunks: Iterable[EventBatch], count: int, max_age_us: int | None = None, t_start_us: int | None = None) -> Iterator[EventWindow]:
+    """The windows of a stream in time order that is cut into chunks anywhere, as :class:`CountWindows` cuts them, in constant memory."""
+    yield from cut(chunks, CountWindows(count, max_age_us, t_start_us))
+
+
+def cut(chunks: Iterable[EventBatch], windows: TimeWindows | CountWindows) -> Iterator[EventWindow]:
+    """All windows of a stream."""
+    for chunk in chunks:
+        yield from windows.add(chunk)
+    yield from windows.rest()
 
 
 def _after_silence(left: EventBatch, t_start_us: int, heard_us: int | None) -> tuple[int, bool]:
@@ -73,41 +156,6 @@ def _after_silence(left: EventBatch, t_start_us: int, heard_us: int | None) -> t
         return t_start_us, False
     next_us = int(left.t_us[0])
     return (next_us - 1, True) if next_us - t_start_us > LONGEST_SILENCE_US else (t_start_us, False)
-
-
-def windows_by_count(chunks: Iterable[EventBatch], count: int, max_age_us: int | None = None, t_start_us: int | None = None) -> Iterator[EventWindow]:
-    """Cut a stream into windows of ``count`` events, closed early once ``max_age_us`` have passed.
-
-    Events that share the time of a window's last event stay together with it, so windows may hold a few more.
-    ``t_start_us`` is where the first window starts; just before the first event when not given. Windows in which
-    ``max_age_us`` passed without an event are yielded too, and time without events is passed over as by
-    :func:`windows_by_time`: no window reaches over more than :data:`LONGEST_SILENCE_US` of it.
-    """
-    if count < 1 or (max_age_us is not None and max_age_us < 1):
-        raise EventDataError(f"a window needs a positive count and maximum age, got {count} and {max_age_us}.")
-    pending, heard_us, after_gap = EventBatch.empty(), None, False
-    for chunk in chunks:
-        if len(chunk) == 0:
-            continue
-        if t_start_us is None:
-            t_start_us = int(chunk.t_us[0]) - 1
-        heard_us = t_start_us if heard_us is None else heard_us
-        pending = concatenate([pending, chunk]) if len(pending) else chunk
-        # Only what is after the start counts; later on, nothing else is left.
-        pending = pending[int(torch.searchsorted(pending.t_us, t_start_us, right=True)) :]
-        while True:
-            if not after_gap:
-                # Without a maximum age, no windows without events lead into the silence.
-                waited_us = t_start_us - LONGEST_SILENCE_US if max_age_us is None else heard_us
-                t_start_us, after_gap = _after_silence(pending, t_start_us, waited_us)
-            if (end_us := _count_window_end(pending, count, max_age_us, t_start_us)) is None:
-                break
-            cut = int(torch.searchsorted(pending.t_us, end_us, right=True))
-            heard_us = int(pending.t_us[cut - 1]) if cut else heard_us
-            yield EventWindow(pending[:cut], t_start_us, end_us, after_gap)
-            pending, t_start_us, after_gap = pending[cut:], end_us, False
-    if len(pending) and t_start_us is not None:
-        yield EventWindow(pending, t_start_us, int(pending.t_us[-1]), after_gap)
 
 
 def _count_window_end(pending: EventBatch, count: int, max_age_us: int | None, t_start_us: int) -> int | None:

@@ -10,6 +10,7 @@ from torchtrack.io.event_source import EventSource
 from torchtrack.io.event_stream import EventStream
 from torchtrack.io.formats import open_events
 from torchtrack.io.info import EventInfo
+from torchtrack.io.live import open_live
 from torchtrack.io.npz import NpzEvents
 from torchtrack.io.pose_files import read_trajectory
 from torchtrack.io.sequence import Sequence, SequenceObject, is_sequence, read_sequence
@@ -30,6 +31,7 @@ __all__ = [
     "Trajectory",
     "is_sequence",
     "open_events",
+    "open_live",
     "read_calibration",
     "read_sequence",
     "read_trajectory",

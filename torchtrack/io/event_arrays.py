@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from torchtrack.config.events import TimeUnit
-from torchtrack.io.column_names import Column, column_of
+from torchtrack.core.column_names import Column, column_of
 
 _SEPARATORS = "/_."
 

@@ -24,9 +24,9 @@ import h5py
 import numpy as np
 
 from torchtrack.config.events import TimeUnit
+from torchtrack.core.column_names import unit_of
 from torchtrack.core.files import check_is_file
 from torchtrack.errors import EventDataError, TorchtrackError, UnknownFormatError
-from torchtrack.io.column_names import unit_of
 from torchtrack.io.columns import Columns, shifted
 from torchtrack.io.event_file import EventFile
 from torchtrack.io.event_source import PART_EVENTS

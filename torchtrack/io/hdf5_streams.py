@@ -6,7 +6,7 @@ from pathlib import Path
 import h5py
 
 from torchtrack.config.events import TimeUnit
-from torchtrack.io.column_names import column_of
+from torchtrack.core.column_names import column_of
 from torchtrack.io.event_arrays import event_sets
 from torchtrack.io.hdf5_storage import check_link
 

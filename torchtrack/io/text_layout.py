@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchtrack.config.events import TimeUnit
+from torchtrack.core.column_names import Column, column_of
 from torchtrack.errors import EventDataError, TorchtrackWarning
-from torchtrack.io.column_names import Column, column_of
 
 _COMMENT = re.compile(r"#|%|//")
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?")

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchtrack.config.events import TimeUnit
 from torchtrack.core.lie import (
     check_pose,
+    continuous_quaternions,
     quaternion_from_rotation,
     quaternion_problem,
     rotation_angle_deg,
@@ -209,9 +210,9 @@ def _parse_tum_line(content: list[str], where: str) -> list[float]:
 
 
 def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
-    """Write a trajectory as TUM text, times exact to the microsecond; the file appears whole or not at all."""
+    """Write a trajectory as TUM text, times exact to the microsecond, quaternions without a jump of sign; the file appears whole or not at all."""
     T = trajectory.T_cam_obj.cpu()
-    values = torch.cat([T[:, :3, 3], quaternion_from_rotation(T[:, :3, :3])], -1).tolist()
+    values = torch.cat([T[:, :3, 3], continuous_quaternions(quaternion_from_rotation(T[:, :3, :3]))], -1).tolist()
     lines = [
         f"{format_seconds(t_us)} {' '.join(f'{value:.12g}' for value in row)}\n" for t_us, row in zip(trajectory.t_us.tolist(), values, strict=True)
     ]

@@ -30,7 +30,7 @@ _COLOUR_PIXELS = 4
 NO_TRIANGLES = np.zeros((0, 3, 3))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ObjectModel:
     """Shape and print of one object: float32 tensors on the CPU, in metres, in the object's frame.
 
@@ -66,6 +66,11 @@ class ObjectModel:
     surface_normals: Float[Tensor, "n 3"]
     triangles: Float[Tensor, "f 3 3"]
     mesh: trimesh.Trimesh | None
+
+    def __repr__(self) -> str:
+        counted = {"edges": self.edge_points, "texture points": self.texture_points, "segments": self.segments, "faces": self.triangles}
+        parts = ", ".join(f"{len(values)} {name}" for name, values in counted.items() if len(values))
+        return f"ObjectModel('{self.name}', diameter {self.diameter_m:.4g} m, {parts})"
 
     @classmethod
     def from_file(

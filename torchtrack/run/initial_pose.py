@@ -33,7 +33,8 @@ def initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) -> 
 
 def _configured_pose(pose: PoseConfig, start_us: int) -> Float[Tensor, "4 4"]:
     if pose.trajectory is not None:
-        read = read_trajectory(pose.trajectory, name=pose.name, time_unit=pose.time_unit)
+        T_cam_world = None if pose.T_cam_world is None else torch.tensor(pose.T_cam_world, dtype=torch.float64)
+        read = read_trajectory(pose.trajectory, name=pose.name, frame_us=pose.frame_us, T_cam_world=T_cam_world, time_unit=pose.time_unit)
         return read.measured_at(start_us, f"'{pose.trajectory}'")
     if pose.matrix is not None:
         return torch.tensor(pose.matrix, dtype=torch.float64)

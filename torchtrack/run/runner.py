@@ -11,7 +11,7 @@ import torch
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.run import RunConfig, TrackingConfig
 from torchtrack.config.tracker import WindowConfig
-from torchtrack.core.events import EventBatch
+from torchtrack.core.events import EventBatch, ForeignEvents, as_batch
 from torchtrack.core.limits import limits
 from torchtrack.core.windows import clipped
 from torchtrack.errors import ConfigError, EventDataError, TorchtrackError
@@ -40,7 +40,7 @@ __all__ = ["run", "run_many", "track"]
 
 
 def track(
-    source: EventSource | Iterable[EventBatch],
+    source: EventSource | Iterable[EventBatch | ForeignEvents],
     tracker: Tracker,
     state: TrackerState,
     window: WindowConfig | None = None,
@@ -48,13 +48,13 @@ def track(
 ) -> Iterator[StepResult]:
     """Track one stream from ``state`` on, one result per window, in constant memory; refined where the tracker's settings say so.
 
-    Refined results come up to 0.6 s late by the preset ``default``: for batches from a camera of your own, take ``causal``.
-    A live source is never held back.
+    Refined results come up to 0.6 s late by the preset ``default``: for batches from a camera of your own, take ``causal``, or
+    :class:`torchtrack.Stream`. A live source is never held back.
 
     Args:
-        source: a source of events, or batches of them; events up to the state's time are passed over. What is wrong with the times of batches
-            is mended as for files; what comes late by up to 10 ms is sorted in, what was sent twice or is too late is dropped, and where the
-            clock wraps or jumps back, time goes on.
+        source: a source of events, or batches of them, also of another library; events up to the state's time are passed over. What is wrong
+            with the times of batches is mended as for files; what comes late by up to 10 ms is sorted in, what was sent twice or is too
+            late is dropped, and where the clock wraps or jumps back, time goes on.
         tracker: the tracker, of one stream.
         state: where it starts, from :meth:`Tracker.init`.
         window: how to cut the stream; as the tracker is configured when not given.
@@ -64,7 +64,7 @@ def track(
         EventDataError: if the stream has no events after the state's time, or they are malformed.
     """
     start_us = int(state.t_us[0])
-    chunks = source.chunks() if isinstance(source, EventSource) else source
+    chunks = source.chunks() if isinstance(source, EventSource) else map(as_batch, source)
     if not isinstance(source, EventStream):
         camera = tracker.cameras[0]
         chunks = mended_batches(chunks, camera.width, camera.height, problems or Problems("the stream", strict=False))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchtrack.config.tracker import WindowConfig
 from torchtrack.core.events import EventBatch
-from torchtrack.core.windows import EventWindow, windows_by_count, windows_by_time
+from torchtrack.core.windows import CountWindows, EventWindow, TimeWindows, cut
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US
 from torchtrack.tracking.motion.model import initial_covariance
 from torchtrack.tracking.state import StepResult, TrackerState
@@ -32,9 +32,14 @@ class Step:
 
 def cut_windows(chunks: Iterable[EventBatch], t_start_us: int, config: WindowConfig) -> Iterator[EventWindow]:
     """The windows of a stream, by count or by time."""
+    return cut(chunks, window_cutter(t_start_us, config))
+
+
+def window_cutter(t_start_us: int, config: WindowConfig) -> TimeWindows | CountWindows:
+    """What cuts a stream into windows from ``t_start_us`` on, by count or by time."""
     if config.mode == "count":
-        return windows_by_count(chunks, config.count, config.max_age_us, t_start_us)
-    return windows_by_time(chunks, config.duration_us, t_start_us)
+        return CountWindows(config.count, config.max_age_us, t_start_us)
+    return TimeWindows(config.duration_us, t_start_us)
 
 
 def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState) -> Iterator[Step]:

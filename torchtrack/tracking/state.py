@@ -14,9 +14,13 @@ from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.motion.model import MotionState
 from torchtrack.tracking.validation.health import TentativeTrack, TrackHealth
+from torchtrack.tracking.validation.status import Status
+
+# Of more objects than this, the others are counted.
+_MOST_SHOWN = 4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class TrackerState:
     """Everything the tracker remembers between windows, in parts that belong to the rooms that use them.
 
@@ -35,6 +39,9 @@ class TrackerState:
     tentative: TentativeTrack
     appearance: Appearance
     maps: SensorMaps
+
+    def __repr__(self) -> str:
+        return f"TrackerState({_times(self.t_us)}, positions {_positions(self.T_cam_obj)}, {self.T_cam_obj.device})"
 
     @property
     def T_cam_obj(self) -> Float[Tensor, "b 4 4"]:  # noqa: N802 - frames have their letters
@@ -61,7 +68,7 @@ class TrackerState:
         return replace(self, maps=empty)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StepResult:
     """What one window gave.
 
@@ -84,6 +91,24 @@ class StepResult:
     contours: Contours
     corners: Corners
     observation_count: Int[Tensor, "b"]
+
+    def __repr__(self) -> str:
+        judged = zip(self.status[:_MOST_SHOWN].tolist(), self.quality[:_MOST_SHOWN].tolist(), strict=True)
+        statuses = ", ".join(f"{Status(status).name} {quality:.2f}" for status, quality in judged)
+        return f"StepResult({_times(self.t_us)}, {statuses}{_more(self.status)}, positions {_positions(self.T_cam_obj)})"
+
+
+def _times(t_us: Int[Tensor, "s"]) -> str:
+    return f"{', '.join(str(time) for time in t_us[:_MOST_SHOWN].tolist())}{_more(t_us)} µs"
+
+
+def _positions(T_cam_obj: Float[Tensor, "b 4 4"]) -> str:
+    rows = T_cam_obj[:_MOST_SHOWN, :3, 3].tolist()
+    return f"{', '.join('(' + ', '.join(f'{value:.3f}' for value in row) + ')' for row in rows)}{_more(T_cam_obj)} m"
+
+
+def _more(values: Tensor) -> str:
+    return f" and {len(values) - _MOST_SHOWN} more" if len(values) > _MOST_SHOWN else ""
 
 
 S = TypeVar("S", TrackerState, StepResult)

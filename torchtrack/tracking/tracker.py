@@ -5,6 +5,7 @@ The only state is an immutable :class:`TrackerState`; ``step`` is pure: the same
 
 import copy
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Int
@@ -13,7 +14,8 @@ from torch import Tensor, nn
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera
-from torchtrack.core.events import EventBatch
+from torchtrack.core.events import EventBatch, ForeignEvents, as_batch
+from torchtrack.core.pose_types import as_pose_matrices
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import predicted_after
@@ -73,6 +75,13 @@ class Tracker(TrackedObjects):
             self.graphs = copy.copy(self.graphs)
         return self
 
+    def __repr__(self) -> str:
+        names, sizes = ", ".join(self.object_names[:4]), ", ".join(sorted({f"{camera.width}x{camera.height}" for camera in self.cameras}))
+        shown = f"{names}, …" if len(self.object_names) > 4 else names
+        objects = f"{len(self.object_names)} object{'s' * (len(self.object_names) > 1)} ({shown})"
+        streams = f"{self.streams} stream{'s' * (self.streams > 1)} of {sizes} pixels"
+        return f"{type(self).__name__}({objects}, {streams}, {self.intrinsics.device}, {str(self.intrinsics.dtype).removeprefix('torch.')})"
+
     def alone(self, number: int) -> "Tracker":
         """A tracker of one of the objects alone, in its stream, with the same settings."""
         weighting_network, camera = self.weighting_network if self.has_own_network else None, self.cameras[int(self.stream_index[number])]
@@ -81,25 +90,34 @@ class Tracker(TrackedObjects):
         )
         return alone.to(self.intrinsics.device)
 
-    def init(self, T_cam_obj: Tensor, t_us: int | Int[Tensor, "s"]) -> TrackerState:
+    def init(self, T_cam_obj: Any, t_us: int | Int[Tensor, "s"]) -> TrackerState:
         """The state before the first window, from each object's pose at ``t_us``.
+
+        Args:
+            T_cam_obj: ``[b, 4, 4]`` poses (m), or poses of another library, see :mod:`torchtrack.core.pose_types`; of one object also
+                without the first axis.
+            t_us: their time (µs), one or one per stream.
 
         Raises:
             PoseError: if a pose is not a rigid motion, or an object is behind or around the camera, outside the image, or no pixel large.
         """
-        T_cam_obj = torch.as_tensor(T_cam_obj, dtype=torch.float64, device=self.intrinsics.device)
+        T_cam_obj = as_pose_matrices(T_cam_obj).to(self.intrinsics.device)
+        if T_cam_obj.dim() == 2 and len(self.object_names) == 1:
+            T_cam_obj = T_cam_obj[None]
         check_poses(T_cam_obj, self.centre_obj, self.object_names)
         check_in_view(T_cam_obj, self.object_models, [self.cameras[stream] for stream in self.stream_index.tolist()])
         return first_state(self, T_cam_obj, torch.as_tensor(t_us, dtype=torch.int64, device=T_cam_obj.device).expand(self.streams).clone())
 
-    def forward(self, events: EventBatch, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None) -> tuple[TrackerState, StepResult]:
+    def forward(
+        self, events: EventBatch | ForeignEvents, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None
+    ) -> tuple[TrackerState, StepResult]:
         """:meth:`step`, as a layer of a network: what comes in first."""
         return self.step(state, events, t_end_us)
 
     def step(
         self,
         state: TrackerState,
-        events: EventBatch,
+        events: EventBatch | ForeignEvents,
         t_end_us: int | Int[Tensor, "s"] | None = None,
         extra_terms: tuple[CostTerm, ...] = (),
     ) -> tuple[TrackerState, StepResult]:
@@ -111,7 +129,7 @@ class Tracker(TrackedObjects):
 
         Args:
             state: from :meth:`init` or the last step.
-            events: of all streams, after ``state.t_us`` and up to ``t_end_us``.
+            events: of all streams, after ``state.t_us`` and up to ``t_end_us``; of one stream also events of another library.
             t_end_us: end of the window; the newest event of each stream when not given.
             extra_terms: of the cost of the poses at the window's end, beside contours and prediction; in the tracker's precision. A window
                 with them is not taken by a graph, and other poses that a search tries are aligned without them.
@@ -120,6 +138,7 @@ class Tracker(TrackedObjects):
             EventDataError: if the events of a stream are not in time order, or not after ``state.t_us`` and up to ``t_end_us``,
                 except on a GPU; if an event is outside the sensor, where kernels are used.
         """
+        events = as_batch(events)
         t_us = self._window_end(state, events, t_end_us)
         check_step(state.t_us, events, t_us)
         with torch.autocast(t_us.device.type, enabled=False), dispatch.backend(wanted=self.kernels):

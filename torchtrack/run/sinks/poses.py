@@ -6,7 +6,11 @@ from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from torchtrack.core.lie import quaternion_from_rotation
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.core.lie import quaternion_from_rotation, with_signs_of
 from torchtrack.io.line_file import LineFile
 from torchtrack.io.seconds import format_seconds
 from torchtrack.run.sinks.folder import POSES
@@ -23,7 +27,7 @@ COLUMNS = (
 class PoseFiles:
     """Writes ``trajectory_LABEL.tum`` and ``poses.csv`` into a folder, row by row; each row is on disk when its step is taken.
 
-    Files that are there already are written on. Errors are left empty where there is no truth.
+    Files that are there already are written on. No quaternion has another sign than the one before it. Errors are left empty where there is no truth.
 
     Raises:
         OutputError: if they cannot be written; the files end with a whole line then.
@@ -42,6 +46,7 @@ class PoseFiles:
 
             self._table = begun(folder / POSES, _rows([COLUMNS]))
             self._tum = [begun(tum_path(folder, label), "# t tx ty tz qx qy qz qw (seconds, metres)\n") for label in labels]
+            self._quaternions = torch.stack([_last_quaternion(tum_path(folder, label)) for label in labels])
             self._files = opening.pop_all()
 
     def add(self, step: Step) -> None:
@@ -49,7 +54,8 @@ class PoseFiles:
         result = step.result
         t_us = int(result.t_us[0])
         T = result.T_cam_obj.cpu()
-        quaternions = quaternion_from_rotation(T[:, :3, :3]).tolist()
+        self._quaternions = with_signs_of(quaternion_from_rotation(T[:, :3, :3]), self._quaternions)
+        quaternions = self._quaternions.tolist()
         judged = zip(result.status.tolist(), result.quality.tolist(), result.observation_count.tolist(), strict=True)
         columns = zip(self._labels, T[:, :3, 3].tolist(), quaternions, judged, strict=True)
         rows: list[Sequence[object]] = []
@@ -68,6 +74,13 @@ class PoseFiles:
 def tum_path(folder: Path, label: str) -> Path:
     """Where the trajectory of an object is."""
     return folder / f"trajectory_{label}.tum"
+
+
+def _last_quaternion(path: Path) -> Float[Tensor, "4"]:
+    """The last one of a trajectory, or zeros where there is none: a zero has either sign."""
+    *_, last = path.read_text(encoding="utf-8").splitlines() or [""]
+    numbers = [] if last.startswith("#") else [float(word) for word in last.split()[4:]]
+    return torch.tensor(numbers or [0.0] * 4, dtype=torch.float64)
 
 
 def _rows(rows: Sequence[Sequence[object]]) -> str:

@@ -3,8 +3,7 @@
 import re
 from typing import Literal
 
-from torchtrack.config.events import TimeUnit
-
+TimeUnit = Literal["s", "ms", "us", "ns"]
 Column = Literal["t", "x", "y", "p"]
 _NAMES: dict[Column, set[str]] = {
     "t": {"t", "ts", "time", "times", "timestamp", "timestamps", "stamp"},
