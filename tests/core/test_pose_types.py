@@ -71,7 +71,6 @@ def test_pypose():
         (torch.zeros(7), r"expected poses of shape \[..., 4, 4\], got \[7\]"),
         ((Rotation.identity(), [0.0, 0.0]), r"translation of shape \[..., 3\], got \[2\]"),
         ("pose.txt", "poses cannot be made a tensor of numbers"),
-        ((torch.zeros(3, 3), Rotation.identity()), "translation cannot be made a tensor of numbers|expected poses"),
         ([[[1.0, 2.0], [3.0]], [1.0]], "poses cannot be made a tensor of numbers"),
         ([[1.0, 2.0], [3.0]], "poses cannot be made a tensor of numbers"),
     ],

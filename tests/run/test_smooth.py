@@ -20,7 +20,7 @@ from torchtrack.core.lie import rotation_angle_deg
 from torchtrack.errors import EventDataError
 from torchtrack.io import read_tum
 from torchtrack.io.columns import Columns
-from torchtrack.io.live import LiveSource
+from torchtrack.io.live_source import LiveSource
 from torchtrack.run.runner import run, track
 from torchtrack.run.session import open_session
 from torchtrack.run.smooth import SmoothedObjects, Smoother

@@ -9,11 +9,11 @@ from pydantic import BeforeValidator, Field
 from torchtrack.config.settings import Settings, absolute_path
 from torchtrack.core.column_names import TimeUnit as TimeUnit
 
-_LIVE = re.compile(r"(dv|evk4|davis|stdin)://\S*|-")
+_LIVE = re.compile(r"(dv|evk4|davis|stdin|ros)://\S*|-")
 
 
 def is_live(source: Path | str) -> bool:
-    """Whether a source is a camera or a stream, not a file: ``dv://HOST:PORT``, ``evk4://``, ``davis://``, ``stdin://`` or ``-``."""
+    """Whether a source is a camera or a stream, not a file: ``dv://HOST:PORT``, ``evk4://``, ``davis://``, ``ros://``, ``stdin://`` or ``-``."""
     return isinstance(source, str) and _LIVE.fullmatch(source) is not None
 
 

@@ -149,7 +149,7 @@ class TrackingConfig(Settings):
 class RunConfig(TrackingConfig):
     """Settings of ``torchtrack track``."""
 
-    source: EventSourcePath = Field(description="Event file or sequence; or live: dv://HOST:PORT, evk4://, davis://, or stdin:// (EVT3).")
+    source: EventSourcePath = Field(description="Event file or sequence; or live: dv://HOST:PORT, evk4://, davis://, ros://TOPIC or stdin:// (EVT3).")
     events: EventsConfig = EventsConfig()
     objects: tuple[ObjectConfig, ...] = Field((), description="Objects to track; none given: all objects of the sequence.")
     camera: CameraConfig | None = Field(None, description="The camera; a sequence brings its own.")
@@ -165,6 +165,7 @@ class RunConfig(TrackingConfig):
     )
     overlay: OverlayConfig = OverlayConfig()
     limits: Limits = Field(default_factory=current_limits, description="How large files may be.")
+    ros_bag: bool = Field(False, description="Also write poses.mcap: poses and transforms as ROS 2 messages, for Foxglove and rosbag2 (extra ros).")
     alignment: bool = Field(False, description="Measure how far events lie from the contours, at the tracked and at the initial pose.")
     reference_angular_velocity: ConfigPath | None = Field(
         None, description="Text file of three numbers, for the summary (a camera turns the other way)."

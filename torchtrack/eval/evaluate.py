@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from torchtrack.baselines import unsuitable
 from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
 from torchtrack.config.run import RunConfig
@@ -18,6 +21,7 @@ from torchtrack.eval.journal import Journal, Measured, identity
 from torchtrack.eval.paper import check_cells, paper_report
 from torchtrack.eval.results import Evaluation, Failure, NotApplicable, ObjectResult, write_results
 from torchtrack.eval.sources import cell_sequences, find_sequences
+from torchtrack.eval.surface_errors import SurfaceErrors, surface_errors
 from torchtrack.io.atomic import check_writable
 from torchtrack.run.executor import TaskFailure, Tell
 from torchtrack.run.executor.groups import run_in_groups
@@ -171,6 +175,9 @@ class _Measurement:
         self._left_out = [NotApplicable(session.name, label, job.method, why) for label, why in zip(session.labels, reasons, strict=True) if why]
         self.session = session.with_objects([number for number, reason in enumerate(reasons) if reason is None])
         self._record, self._job, self._limits = Record(self.session.ground_truth, self.session.models), job, limits
+        # Times of the windows, and the poses of all objects.
+        self._t_us: list[Tensor] = []
+        self._poses: list[Tensor] = []
 
     def windows(self, config: WindowConfig) -> Iterator[EventWindow]:
         """The windows of the sequence."""
@@ -179,18 +186,30 @@ class _Measurement:
     def add(self, step: Step) -> None:
         """Remember one step."""
         self._record.add(step)
+        self._t_us.append(step.result.t_us[:1].cpu())
+        self._poses.append(step.result.T_cam_obj.cpu())
 
     def finish(self) -> list[ObjectResult | NotApplicable]:
         """What was measured of each object."""
-        by_label = zip(self.session.labels, self._record.objects, strict=True)
-        return [*(self._result(label, record, record.errors) for label, record in by_label if record.errors is not None), *self._left_out]
+        records = enumerate(self._record.objects)
+        return [*(self._result(number, record, record.errors) for number, record in records if record.errors is not None), *self._left_out]
 
     def close(self, error: BaseException | None = None) -> None:
         """Nothing is open."""
 
-    def _result(self, label: str, of_object: ObjectRecord, errors: PoseErrors) -> ObjectResult:
+    def _result(self, number: int, of_object: ObjectRecord, errors: PoseErrors) -> ObjectResult:
         status = {Status(number).name: count for number, count in sorted(of_object.statuses.items())}
         seconds = self._record.step_seconds
         median_step_ms = 1e3 * sorted(seconds)[len(seconds) // 2]
         metrics, unseen_turns = summarise(errors, *self._limits), of_object.axis is not None
-        return ObjectResult(self.session.name, label, self._job.method, errors, metrics, status, median_step_ms, unseen_turns)
+        names = self.session.name, self.session.labels[number], self._job.method
+        return ObjectResult(*names, errors, metrics, status, median_step_ms, unseen_turns, self._surface(number))
+
+    def _surface(self, number: int) -> SurfaceErrors | None:
+        """What the surface of an object is off by; None where nothing was tracked."""
+        truth = self.session.ground_truth[number]
+        if truth is None or not self._t_us:
+            return None
+        t_us = torch.cat(self._t_us)
+        covered = truth.covers(t_us)
+        return surface_errors(torch.stack(self._poses)[covered, number], truth.at(t_us[covered]), self.session.models[number])

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import torchtrack
 from torchtrack.config.run import RunConfig
 from torchtrack.errors import UnknownFormatError
 from torchtrack.eval.results import NotApplicable, ObjectResult
+from torchtrack.eval.surface_errors import SurfaceErrors
 from torchtrack.io.atomic import writing
 from torchtrack.io.line_file import LineFile
 from torchtrack.run.metrics import PoseErrors, summarise
@@ -88,10 +90,11 @@ class Journal:
     def _entry(self, values: dict[str, Any]) -> ObjectResult | NotApplicable:
         if "reason" in values:
             return NotApplicable(**values)
-        errors = values.pop("errors")
+        errors, surface = values.pop("errors"), values.pop("surface")
         t_us, *measures = errors["t_us"], errors["rotation_deg"], errors["translation_cm"]
         of_windows = PoseErrors(torch.tensor(t_us, dtype=torch.int64), *(torch.tensor(values, dtype=torch.float64) for values in measures))
-        return ObjectResult(errors=of_windows, metrics=summarise(of_windows, *self._limits), **values)
+        measured = None if surface is None else SurfaceErrors(**surface)
+        return ObjectResult(errors=of_windows, metrics=summarise(of_windows, *self._limits), surface=measured, **values)
 
 
 def _line(name: str, measured: Measured) -> str:
@@ -102,4 +105,5 @@ def _as_json(entry: ObjectResult | NotApplicable) -> dict[str, Any]:
     if isinstance(entry, NotApplicable):
         return dict(vars(entry))
     errors = {name: values.tolist() for name, values in vars(entry.errors).items()}
-    return {name: value for name, value in vars(entry).items() if name != "metrics"} | {"errors": errors}
+    surface = None if entry.surface is None else asdict(entry.surface)
+    return {name: value for name, value in vars(entry).items() if name != "metrics"} | {"errors": errors, "surface": surface}

@@ -2,10 +2,11 @@
 
 import csv
 import json
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from torchtrack.eval.surface_errors import SurfaceErrors
 from torchtrack.io.atomic import atomic_path
 from torchtrack.run.metrics import Metrics, PoseErrors
 from torchtrack.run.sinks.summary import finite
@@ -13,7 +14,7 @@ from torchtrack.run.sinks.summary import finite
 
 @dataclass(frozen=True)
 class ObjectResult:
-    """Errors of one object in one sequence under one method, its windows by status, and how long a step took.
+    """Errors of one object in one sequence under one method, its windows by status, how long a step took, and what its surface is off by.
 
     ``unseen_turns`` tells of surfaces of revolution, whose turns about their axis are no errors.
     """
@@ -26,13 +27,14 @@ class ObjectResult:
     status: dict[str, int]
     median_step_ms: float
     unseen_turns: bool = False
+    surface: SurfaceErrors | None = None
 
     def as_json(self) -> dict[str, Any]:
         """One entry of ``metrics.json``."""
         names = {"sequence": self.sequence, "object": self.object, "method": self.method}
-        return finite(
-            {**names, **self.metrics.as_dict(), "status": self.status, "median_step_ms": self.median_step_ms, "unseen_turns": self.unseen_turns}
-        )
+        surface = {} if self.surface is None else asdict(self.surface)
+        further = {"status": self.status, "median_step_ms": self.median_step_ms, "unseen_turns": self.unseen_turns}
+        return finite({**names, **self.metrics.as_dict(), **surface, **further})
 
 
 @dataclass(frozen=True)

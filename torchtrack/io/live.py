@@ -4,83 +4,31 @@
 - ``stdin://`` or ``-``: RAW words on standard input, with a header or without (EVT3 then).
 - ``evk4://`` or ``evk4://SERIAL``: a Prophesee EVK4 (extra ``live``).
 - ``davis://`` or ``davis://NAME``: a DAVIS or DVXplorer (extra ``aedat``).
+- ``ros:///TOPIC``: packets of a topic of ROS 2; see :mod:`torchtrack.io.ros_live`.
 """
 
 import os
 import select
 import sys
-import threading
 import time
-from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError
 from torchtrack.io.columns import Columns
-from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
-from torchtrack.io.event_stream import EventStream
 from torchtrack.io.extras import optional
-from torchtrack.io.mending import Mender, all_of
-from torchtrack.io.problems import Problems
+from torchtrack.io.live_source import LiveSource
 from torchtrack.io.prophesee_header import parse_header
 from torchtrack.io.raw_file import make_decoder
-from torchtrack.io.soundness import inside
+from torchtrack.io.ros_live import RosSource
 
 _WAIT_S = 0.05
 _POLL_S = 0.0005
 _READ_BYTES = 1 << 18
 _HEADER_BYTES = 1 << 12
-
-
-class LiveSource(EventStream):
-    """Events as they come. :meth:`chunks` goes on where the one before it stopped; it ends when the sender does, or after :meth:`stop`.
-    A camera that is unplugged, or any other fault of what it reads from, is an :class:`EventDataError`.
-
-    Args:
-        name: what the source is called.
-        width, height: sensor size (px).
-    """
-
-    def __init__(self, name: str, width: int, height: int) -> None:
-        check_sensor_size(width, height, name)
-        self.name, self.width, self.height = name, width, height
-        self.problems = Problems(name, strict=False)
-        self._stopped = threading.Event()
-        self._ended = False
-        self._waiting: list[EventBatch] = []
-        self._mender = Mender(self.problems, waits=False)
-
-    def stop(self) -> None:
-        """End the stream soon; may be called from another thread."""
-        self._stopped.set()
-
-    def chunks(self, max_events: int = DEFAULT_CHUNK_EVENTS) -> Iterator[EventBatch]:
-        """The events that come; see :class:`torchtrack.io.event_source.EventSource`."""
-        check_max_events(max_events)
-        while not self._stopped.is_set():
-            if not self._waiting:
-                if self._ended:
-                    return
-                received = self._receive()
-                self._ended = received is None
-                self._waiting = list(all_of(self._mended(received), max_events))
-                continue
-            # It stays in line until the next one is asked for: who looks at the first events only does not lose them.
-            yield self._waiting[0]
-            del self._waiting[0]
-
-    def _mended(self, received: Columns | None) -> list[Columns]:
-        if received is None:
-            return self._mender.rest()
-        return self._mender.add(inside(received, self.width, self.height, self.problems))
-
-    @abstractmethod
-    def _receive(self) -> Columns | None:
-        """What has come, which may be nothing, after a short wait at most; None at the end of the stream."""
 
 
 class DvSource(LiveSource):
@@ -156,11 +104,12 @@ def open_live(source: str, width: int | None = None, height: int | None = None) 
     """Open a live source by its address.
 
     Args:
-        source: ``dv://HOST:PORT``, ``evk4://[SERIAL]``, ``davis://[NAME]``, ``stdin://`` or ``-``.
+        source: ``dv://HOST:PORT``, ``evk4://[SERIAL]``, ``davis://[NAME]``, ``ros:///TOPIC``, ``stdin://`` or ``-``.
         width, height: sensor size (px), where the source does not say it.
 
     Raises:
         MissingExtraError: if a library that it needs is not installed.
+        ConfigError: if it is a topic of ROS, and this Python has no ROS.
         EventDataError: if nobody answers, there is no such camera, or the sensor size is unknown.
     """
     scheme, _, rest = source.partition("://")
@@ -170,13 +119,21 @@ def open_live(source: str, width: int | None = None, height: int | None = None) 
     if scheme == "evk4":
         drivers = optional("neuromorphic_drivers", "neuromorphic-drivers", "live", purpose)
         return _opened(source, lambda: Evk4Source(source, drivers, rest))
+    if scheme == "ros":
+        return RosSource(_ros_topic(source, rest), width or 0, height or 0)
     dv = optional("dv_processing", "dv-processing", "aedat", purpose)
     if scheme == "davis":
         return _opened(source, lambda: DvSource(source, dv.io.camera.open(rest) if rest else dv.io.camera.open()))
     host, _, port = rest.rpartition(":")
     if scheme != "dv" or not host or not port.isdigit():
-        raise EventDataError(f"'{source}' is no live source. Known: dv://HOST:PORT, evk4://, davis://, stdin://.")
+        raise EventDataError(f"'{source}' is no live source. Known: dv://HOST:PORT, evk4://, davis://, ros:///TOPIC, stdin://.")
     return _opened(source, lambda: DvSource(source, dv.io.NetworkReader(host, int(port))))
+
+
+def _ros_topic(source: str, topic: str) -> str:
+    if not topic.strip("/"):
+        raise EventDataError(f"'{source}' names no topic of ROS. Give its name, as in ros:///event_camera/events.")
+    return topic if topic.startswith("/") else f"/{topic}"
 
 
 @contextmanager

@@ -8,6 +8,7 @@ Reference: github.com/ros-event-camera/event_camera_msgs, github.com/uzh-rpg/rpg
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,13 @@ _FIRST_ROS2_BYTES = 14
 _ROS2_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("padding", "V2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1"), ("end", "V1")])
 # Kinds of words of libcaer_cmp (time high, time low, column, event, base, vector of 8), as EVT3 with rows and columns exchanged.
 _AS_EVT3 = np.array([8, 6, 0, 2, 3, 5, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1], np.uint16)
+
+
+class MessageHeader(NamedTuple):
+    """When a message was made (ns, by the clock of ROS), and the frame that it is of."""
+
+    stamp_ns: int
+    frame: str
 
 
 class _Cursor:
@@ -51,11 +59,12 @@ class _Cursor:
     def text(self) -> str:
         return bytes(self.take(self.number(4))).rstrip(b"\0").decode("utf-8", errors="replace")
 
-    def header(self) -> None:
-        """Pass over std_msgs/Header; ROS 1 has a sequence number in it."""
-        for _ in range(2 if self._ros2 else 3):
+    def header(self) -> MessageHeader:
+        """std_msgs/Header; ROS 1 has a sequence number in it."""
+        if not self._ros2:
             self.number(4)
-        self.text()
+        seconds, nanoseconds = self.number(4), self.number(4)
+        return MessageHeader(seconds * 1_000_000_000 + nanoseconds, self.text())
 
 
 @dataclass
@@ -82,6 +91,14 @@ class MessageDecoder:
         cursor.header()
         height, width = cursor.number(4), cursor.number(4)
         return width, height
+
+    def header(self, message: bytes) -> MessageHeader:
+        """Time and frame of a message.
+
+        Raises:
+            EventDataError: if the message ends before them.
+        """
+        return _Cursor(message, self.ros2).header()
 
     def events(self, messages: Iterable[bytes]) -> Columns:
         """The events of messages; a damaged one counts as a fault."""

@@ -14,6 +14,7 @@ from torchtrack.core.windows import EventWindow
 from torchtrack.errors import EventDataError, MissingFileError, OutputError, TorchtrackError, UnknownFormatError
 from torchtrack.io.atomic import writing
 from torchtrack.io.keep_up import KeepUp
+from torchtrack.io.ros_live import RosSource
 from torchtrack.run.interrupt import Interrupt
 from torchtrack.run.session import Session, open_session
 from torchtrack.run.sinks import Sink
@@ -23,6 +24,8 @@ from torchtrack.run.sinks.overlay import Overlay
 from torchtrack.run.sinks.poses import PoseFiles
 from torchtrack.run.sinks.record import Record
 from torchtrack.run.sinks.resume import check_resumable, take_up
+from torchtrack.run.sinks.ros_bag import PoseBag
+from torchtrack.run.sinks.ros_publisher import RosPublisher
 from torchtrack.run.sinks.summary import Ended, Facts, RunSummary, summarise_run, write_summary
 from torchtrack.run.stepping import Step, cut_windows
 
@@ -98,9 +101,13 @@ class RunOutputs:
             (folder / CONFIG).write_bytes(as_yaml(config).encode("utf-8", "backslashreplace"))
         self._open_sink(self._record)
         self._open_sink(PoseFiles(folder, session.labels, self._record))
+        part = "" if self._resumed_us is None else f"_from_{self._resumed_us}us"
         if config.overlay.enabled:
-            name = "overlay.mp4" if self._resumed_us is None else f"overlay_from_{self._resumed_us}us.mp4"
-            self._open_sink(Overlay(folder / name, session, config.overlay, config.tracker))
+            self._open_sink(Overlay(folder / f"overlay{part}.mp4", session, config.overlay, config.tracker))
+        if config.ros_bag:
+            self._open_sink(PoseBag(folder / f"poses{part}.mcap", session.labels))
+        if isinstance(session.live, RosSource):
+            self._open_sink(RosPublisher(session.live, session.labels))
         if config.alignment:
             self._open_sink(AlignmentRecord(session))
         for sink in self._further:

@@ -17,7 +17,7 @@ from torchtrack.core.windows import clipped
 from torchtrack.errors import ConfigError, EventDataError, TorchtrackError
 from torchtrack.io import EventSource
 from torchtrack.io.event_stream import EventStream
-from torchtrack.io.live import LiveSource
+from torchtrack.io.live_source import LiveSource
 from torchtrack.io.mending import mended_batches
 from torchtrack.io.problems import Problems
 from torchtrack.run.executor import TaskFailure, Tell

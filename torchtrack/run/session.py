@@ -22,7 +22,8 @@ from torchtrack.io import EventSource, SequenceObject, Trajectory, is_sequence, 
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS
 from torchtrack.io.filters import BackgroundFilter, Downscaled, HotPixelFilter, Region, downscaled_camera, find_hot_pixels, region_camera
 from torchtrack.io.keep_up import KeepUp
-from torchtrack.io.live import LiveSource, open_live
+from torchtrack.io.live import open_live
+from torchtrack.io.live_source import LiveSource
 from torchtrack.io.polarity_code import with_one_polarity_reported
 from torchtrack.io.problems import Problems
 from torchtrack.object_model import ObjectModel

@@ -12,7 +12,7 @@ from torchtrack.io.atomic import missing_folders, remove_empty, writing
 
 SUMMARY, CONFIG, POSES = "summary.json", "config.yaml", "poses.csv"
 # What a run writes; all else in the folder is the user's own.
-_WRITTEN = (SUMMARY, CONFIG, POSES, "trajectory_*.tum", "overlay*.mp4", "overlay*.png")
+_WRITTEN = (SUMMARY, CONFIG, POSES, "trajectory_*.tum", "poses*.mcap", "overlay*.mp4", "overlay*.png")
 _PREVIOUS = ".previous"
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 

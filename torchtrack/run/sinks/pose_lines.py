@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
@@ -13,6 +13,7 @@ from torchtrack.tracking.state import StepResult
 from torchtrack.tracking.validation.status import Status
 
 
+@runtime_checkable
 class Lines(Protocol):
     """Where lines go: a file, or standard output."""
 
