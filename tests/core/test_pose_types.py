@@ -7,7 +7,7 @@ import torch
 from kornia.geometry.liegroup import Se3, So3
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from torchtrack.core.lie import se3_exp
+from torchtrack.core.lie import quaternion_from_rotation, se3_exp
 from torchtrack.core.pose_types import as_pose_matrices
 from torchtrack.errors import PoseError
 
@@ -78,3 +78,13 @@ def test_pypose():
 def test_what_is_no_pose_is_refused(poses, message):
     with pytest.raises(PoseError, match=message):
         as_pose_matrices(poses)
+
+
+def test_orders_of_twists_and_quaternions_are_as_the_docs_say():
+    xi = torch.tensor([[0.3, -0.2, 0.5, 0.1, 0.2, 0.6]], dtype=torch.float64)
+    exchanged = torch.cat([xi[:, 3:], xi[:, :3]], 1)
+    torch.testing.assert_close(as_pose_matrices(RigidTransform.from_exp_coords(xi.numpy())), se3_exp(xi))
+    torch.testing.assert_close(as_pose_matrices(Se3.exp(exchanged)), se3_exp(xi))
+    xyzw = quaternion_from_rotation(ROTATIONS)
+    torch.testing.assert_close(torch.from_numpy(Rotation.from_quat(xyzw.numpy()).as_matrix()), ROTATIONS)
+    torch.testing.assert_close(So3.from_wxyz(xyzw[:, [3, 0, 1, 2]]).matrix(), ROTATIONS)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+import torch
 import tyro
 import yaml
 from tiny_sequence import write_tiny_sequence
@@ -25,7 +26,7 @@ from torchtrack.config.formats import OutputFormat
 from torchtrack.config.load import load
 from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.run import RunConfig
-from torchtrack.io import read_calibration
+from torchtrack.io import Trajectory, read_calibration, write_tum
 from torchtrack.run.sinks.poses import COLUMNS
 from torchtrack.sim import SceneConfig
 from torchtrack.sim.suite import scenes_of
@@ -196,7 +197,7 @@ def test_formats_extras_and_live_sources_are_true():
     extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert {"aedat", "hdf5", "ros", "live"} <= {name for pair in named for name in pair if name} <= set(extras)
     addresses = {span for span in spans() if "://" in span and "=" not in span}
-    assert {"dv://HOST:PORT", "davis://", "evk4://", "stdin://"} == addresses
+    assert {"dv://HOST:PORT", "davis://", "evk4://", "ros:///TOPIC", "stdin://"} == addresses
     assert all(is_live(address) for address in addresses | {"-"})
 
 
@@ -246,6 +247,16 @@ def test_learning_runs(code, tmp_path):
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert re.fullmatch(r"(\d+\.\d+ mm\n){2}", done.stdout) and len(code.splitlines()) < 30
+
+
+@pytest.mark.parametrize("code", blocks("python bop"))
+def test_results_for_bop_are_written(code, tmp_path, monkeypatch, capsys):
+    (tmp_path / "outputs" / "mug").mkdir(parents=True)
+    write_tum(tmp_path / "outputs" / "mug" / "trajectory_mug.tum", Trajectory(torch.tensor([5_000, 105_000]), torch.eye(4).repeat(2, 1, 1)))
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "example.py", "exec"), {})
+    assert capsys.readouterr().out == "3 images\n"
+    assert len((tmp_path / "outputs" / "torchtrack_ycbv-test.csv").read_text().splitlines()) == 4
 
 
 @pytest.mark.parametrize("code", blocks("python live"))

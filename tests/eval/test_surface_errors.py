@@ -50,7 +50,9 @@ def test_mssd_and_mspd_take_the_symmetry_that_fits_best():
         in_image.append(min(max(math.dist(a, b) for a, b in table) for table in pixels))
     np.testing.assert_allclose(mssd_m(estimated, TRUE, POINTS, symmetries), in_space, rtol=1e-9)
     np.testing.assert_allclose(mspd_px(estimated, TRUE, POINTS, symmetries, K), in_image, rtol=1e-9)
-    assert float(mssd_m(estimated, TRUE, POINTS, symmetries_of())[3:].min()) > 2 * max(in_space[3:])
+    # Without the symmetry those that are turned by it are wrong.
+    alone = mssd_m(estimated, TRUE, POINTS, symmetries_of())
+    assert alone[:3].tolist() == pytest.approx(in_space[:3]) and bool((alone[3:] > torch.tensor(in_space[3:])).all())
 
 
 @pytest.mark.parametrize("case", ["random", "doubles", "all within"])
@@ -84,7 +86,9 @@ def test_of_a_model():
     shifted[:, 0, 3] += 0.004
     errors = surface_errors(shifted, TRUE, model)
     assert errors.mean_add_mm == pytest.approx(4.0) and errors.mean_adds_mm < 4.0
-    assert errors.recall_add == 1.0 and errors.auc_add == pytest.approx(1.0) and errors.auc_adds <= 1.0
+    assert errors.recall_add == 1.0 and errors.auc_add < errors.auc_adds < 1.0
+    # Up to 4 mm counts the share of the first of five, from there on all.
+    assert errors.auc_add == pytest.approx((0.2 * 4 + 96) / 100)
     far = TRUE.clone()
     far[:, 2, 3] += 0.05
     assert surface_errors(far, TRUE, model).recall_add == 0.0

@@ -76,7 +76,7 @@ def test_ground_truth_is_checked_as_a_trajectory_is():
 
 
 def test_settings_of_a_trajectory_need_one():
-    with pytest.raises(ValidationError, match="name and time_unit are of a trajectory"):
+    with pytest.raises(ValidationError, match="name, time_unit, frame_us and T_cam_world are of a trajectory"):
         PoseConfig(translation_m=(0, 0, 1), time_unit="us")
 
 
@@ -104,7 +104,7 @@ def test_a_trajectory_of_bop(tmp_path):
 
 
 def test_what_is_of_a_trajectory_needs_one():
-    with pytest.raises(ValidationError, match="frame_us and T_cam_world: of a trajectory; leave it out"):
+    with pytest.raises(ValidationError, match="T_cam_world are of a trajectory; leave them out"):
         PoseConfig(translation_m=(0, 0, 0.5), frame_us=10, T_cam_world=T_CAM_WORLD.tolist())
     with pytest.raises(ValidationError, match="T_cam_world: the upper left 3x3 block is not a rotation"):
         PoseConfig(trajectory="/poses.tum", T_cam_world=(2 * T_CAM_WORLD).tolist())

@@ -284,3 +284,29 @@ def test_poses_of_cuda_graphs_are_those_of_the_cpu():
     assert stated["took"] >= COUNT // 4
     assert stated["apart"] < 1e-4
     assert stated["status"] == 0
+
+
+def test_torch_compile_leaves_a_tracker_as_it_is_and_says_so():
+    """In a process of its own, without checks of types, which a compiler would compile."""
+    code = """
+import warnings
+import torch
+from helpers import SMALL_CAMERA, box_model, pose
+from tracked_boxes import moving_box, windows
+from torchtrack import Tracker
+from torchtrack.errors import TorchtrackWarning
+
+events, end_us = windows(moving_box(pose(), 3)[1], 3)[0]
+tracker = Tracker([box_model()], SMALL_CAMERA)
+state = tracker.init(pose(), 0)
+with torch.inference_mode(), warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always", TorchtrackWarning)
+    result = torch.compile(tracker)(events, state, end_us)[1]
+    print(torch.equal(result.T_cam_obj, tracker.step(state, events, end_us)[1].T_cam_obj))
+print(*[warning.message for warning in caught if warning.category is TorchtrackWarning])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=TESTS)
+    assert done.returncode == 0, done.stderr
+    same, message = done.stdout.splitlines()
+    assert same == "True"
+    assert message.startswith("torch.compile leaves a tracker as it is:") and "use Tracker(..., compiled=True)" in message

@@ -18,6 +18,8 @@ from torchtrack.core.pose_types import as_pose_matrices
 
 Models = Literal["textured", "geometry"]
 Row = tuple[float, float, float, float]
+# What says more about a file of poses.
+_OF_TRAJECTORIES = ("name", "time_unit", "frame_us", "T_cam_world")
 
 
 def _as_rows(pose: Any) -> Any:
@@ -45,9 +47,8 @@ class PoseConfig(Settings):
         ways = [name for name in ("matrix", "translation_m", "trajectory") if getattr(self, name) is not None]
         if len(ways) != 1:
             raise ValueError(f"give exactly one of matrix, translation_m (with quaternion_xyzw) or trajectory; got {' and '.join(ways) or 'none'}")
-        of_trajectory = [name for name in ("name", "frame_us", "T_cam_world", "time_unit") if getattr(self, name) is not None]
-        if self.trajectory is None and of_trajectory:
-            raise ValueError(f"{' and '.join(of_trajectory)}: of a trajectory; leave it out, or give the trajectory")
+        if self.trajectory is None and any(getattr(self, name) is not None for name in _OF_TRAJECTORIES):
+            raise ValueError(f"{', '.join(_OF_TRAJECTORIES[:-1])} and {_OF_TRAJECTORIES[-1]} are of a trajectory; leave them out")
         return self
 
     @model_validator(mode="after")
@@ -149,7 +150,9 @@ class TrackingConfig(Settings):
 class RunConfig(TrackingConfig):
     """Settings of ``torchtrack track``."""
 
-    source: EventSourcePath = Field(description="Event file or sequence; or live: dv://HOST:PORT, evk4://, davis://, ros://TOPIC or stdin:// (EVT3).")
+    source: EventSourcePath = Field(
+        description="Event file or sequence; or live: dv://HOST:PORT, evk4://, davis://, ros:///TOPIC or stdin:// (EVT3)."
+    )
     events: EventsConfig = EventsConfig()
     objects: tuple[ObjectConfig, ...] = Field((), description="Objects to track; none given: all objects of the sequence.")
     camera: CameraConfig | None = Field(None, description="The camera; a sequence brings its own.")

@@ -4,6 +4,7 @@ The only state is an immutable :class:`TrackerState`; ``step`` is pure: the same
 """
 
 import copy
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, ForeignEvents, as_batch
 from torchtrack.core.pose_types import as_pose_matrices
+from torchtrack.errors import TorchtrackWarning
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import predicted_after
@@ -111,7 +113,12 @@ class Tracker(TrackedObjects):
     def forward(
         self, events: EventBatch | ForeignEvents, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None = None
     ) -> tuple[TrackerState, StepResult]:
-        """:meth:`step`, as a layer of a network: what comes in first."""
+        """:meth:`step`, as a layer of a network: what comes in first.
+
+        Warns (:class:`~torchtrack.errors.TorchtrackWarning`) under ``torch.compile``, which leaves a tracker as it is.
+        """
+        if torch.compiler.is_compiling():
+            return torch.compiler.disable(_step_uncompiled)(self, events, state, t_end_us)  # type: ignore[no-any-return]
         return self.step(state, events, t_end_us)
 
     def step(
@@ -214,6 +221,19 @@ class Tracker(TrackedObjects):
         if isinstance(t_end_us, int):
             return torch.full_like(state.t_us, t_end_us)
         return torch.as_tensor(t_end_us, dtype=torch.int64, device=state.t_us.device).expand(self.streams).clone()
+
+
+def _step_uncompiled(
+    tracker: Tracker, events: EventBatch | ForeignEvents, state: TrackerState, t_end_us: int | Int[Tensor, "s"] | None
+) -> tuple[TrackerState, StepResult]:
+    """A step without the compiler, which would take many minutes for many small parts, and again for other numbers of events."""
+    warnings.warn(
+        "torch.compile leaves a tracker as it is: numbers of events, searches and windows in parts change from window to window. For compiled "
+        "steady windows use Tracker(..., compiled=True); of a weighting network of your own, compile the network.",
+        TorchtrackWarning,
+        stacklevel=3,
+    )
+    return tracker.step(state, events, t_end_us)
 
 
 def _counted(done: tuple[TrackerState, StepResult]) -> tuple[TrackerState, StepResult]:
