@@ -40,7 +40,7 @@ README = "\n\n".join([FRONT, *(text for name, text in PAGES.items() if name != "
 SETTINGS = {"track": RunConfig, "evaluate": EvaluateConfig, "demo": DemoConfig, "simulate": SceneConfig}
 COMMANDS = ("track", "evaluate", "simulate", "demo", "outline", "model", "info", "convert", "bench", "settings")
 BLOCKS = ("ACCURACY", "ABLATION", "PAPER TABLES", "SPEED")
-FILE_SUFFIXES = ("py", "yaml", "txt", "npz", "json", "csv", "tum", "mp4", "png", "obj", "glb", "md")
+FILE_SUFFIXES = ("py", "yaml", "txt", "npz", "json", "csv", "tum", "mp4", "png", "obj", "glb", "md", "mcap")
 
 
 def blocks(language):

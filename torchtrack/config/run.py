@@ -151,7 +151,7 @@ class RunConfig(TrackingConfig):
     """Settings of ``torchtrack track``."""
 
     source: EventSourcePath = Field(
-        description="Event file or sequence; or live: dv://HOST:PORT, evk4://, davis://, ros:///TOPIC or stdin:// (EVT3)."
+        description="Event file, sequence, or live: dv://HOST:PORT, evk4://, davis://, ros:///TOPIC or stdin:// (EVT3)."
     )
     events: EventsConfig = EventsConfig()
     objects: tuple[ObjectConfig, ...] = Field((), description="Objects to track; none given: all objects of the sequence.")
