@@ -118,7 +118,7 @@ class Tracker(TrackedObjects):
         Warns (:class:`~torchtrack.errors.TorchtrackWarning`) under ``torch.compile``, which leaves a tracker as it is.
         """
         if torch.compiler.is_compiling():
-            return torch.compiler.disable(_step_uncompiled)(self, events, state, t_end_us)  # type: ignore[no-any-return]
+            return torch.compiler.disable(_step_uncompiled)(self, events, state, t_end_us)
         return self.step(state, events, t_end_us)
 
     def step(
