@@ -150,9 +150,7 @@ class TrackingConfig(Settings):
 class RunConfig(TrackingConfig):
     """Settings of ``torchtrack track``."""
 
-    source: EventSourcePath = Field(
-        description="Event file, sequence, or live: dv://HOST:PORT, evk4://, davis://, ros:///TOPIC or stdin:// (EVT3)."
-    )
+    source: EventSourcePath = Field(description="Event file, sequence, or live: dv://HOST:PORT, evk4://, davis://, ros:///TOPIC or stdin:// (EVT3).")
     events: EventsConfig = EventsConfig()
     objects: tuple[ObjectConfig, ...] = Field((), description="Objects to track; none given: all objects of the sequence.")
     camera: CameraConfig | None = Field(None, description="The camera; a sequence brings its own.")
