@@ -2,11 +2,13 @@
 
 from itertools import pairwise
 
+import numpy as np
 from jaxtyping import Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtrack.core import host_sync
-from torchtrack.core.events import EventBatch, of_streams, stream_bounds
+from torchtrack.core.events import EventBatch, stream_bounds
 from torchtrack.errors import EventDataError
 
 
@@ -27,36 +29,33 @@ def check_step(state_us: Int[Tensor, "s"], events: EventBatch, t_end_us: Int[Ten
                 f"stream {stream}: the window ends at {end_us} µs, before the state, which is of {start_us} µs. Step on from where the state is, "
                 "or make a new one with Tracker.init."
             )
-    events = of_streams(events, len(state_us))
-    if len(events) == 0:
-        return
-    bounds = [0, len(events)] if len(state_us) == 1 else stream_bounds(events, len(state_us)).tolist()
-    back = events.t_us[1:] < events.t_us[:-1]
-    if len(bounds) > 2:
-        back = back & (events.stream_index[1:] == events.stream_index[:-1])
-    if bool(back.any()):
-        at = int(back.nonzero()[0])
-        before, after = events.t_us[at : at + 2].tolist()
+    # Rows of NumPy look at the same memory, and take a fraction of the time that as many tensor operations do.
+    bounds_us, times_us = zip(state_us.tolist(), t_end_us.tolist(), strict=True), events.t_us.numpy()
+    for stream, (part, (start_us, end_us)) in enumerate(zip(_parts(events, len(state_us)), bounds_us, strict=True)):
+        if (of_stream_us := times_us[part]).size:
+            _check_stream(f"stream {stream}", of_stream_us, (start_us, end_us), part.start)
+
+
+def _parts(events: EventBatch, streams: int) -> list[slice]:
+    """Where the events of each stream are; those of no stream lie after them."""
+    if streams == 1 and len(events) and events.stream_index.numpy()[-1] == 0:
+        return [slice(0, len(events))]
+    return [slice(first, last) for first, last in pairwise(stream_bounds(events, streams).tolist())]
+
+
+def _check_stream(stream: str, t_us: NDArray[np.int64], window_us: tuple[int, int], first: int) -> None:
+    (start_us, end_us), back = window_us, t_us[1:] < t_us[:-1]
+    if back.any():
+        at = int(back.argmax())
         raise EventDataError(
-            f"stream {int(events.stream_index[at])}: time goes back from {before} to {after} µs at event {at + 1}. "
-            "Sort the events of each stream by time."
+            f"{stream}: time goes back from {t_us[at]} to {t_us[at + 1]} µs at event {first + at + 1}. Sort the events of each stream by time."
         )
-    _check_within(bounds, state_us, events, t_end_us)
-
-
-def _check_within(bounds: list[int], state_us: Tensor, events: EventBatch, t_end_us: Tensor) -> None:
-    """Sorted events lie within their windows where the first and the last one do."""
-    for stream, (first, last) in enumerate(pairwise(bounds)):
-        if first == last:
-            continue
-        (oldest, newest), start_us, end_us = events.t_us[[first, last - 1]].tolist(), int(state_us[stream]), int(t_end_us[stream])
-        if oldest < start_us:
-            raise EventDataError(
-                f"stream {stream}: an event of {oldest} µs is older than the state, which is of {start_us} µs. "
-                "Give each event once, in time order; leave out what comes late."
-            )
-        if newest > end_us:
-            raise EventDataError(
-                f"stream {stream}: an event of {newest} µs is after the window's end at {end_us} µs. "
-                "Cut the events with slice_time, or leave out t_end_us."
-            )
+    if t_us[0] < start_us:
+        raise EventDataError(
+            f"{stream}: an event of {t_us[0]} µs is older than the state, which is of {start_us} µs. "
+            "Give each event once, in time order; leave out what comes late."
+        )
+    if t_us[-1] > end_us:
+        raise EventDataError(
+            f"{stream}: an event of {t_us[-1]} µs is after the window's end at {end_us} µs. Cut the events with slice_time, or leave out t_end_us."
+        )
