@@ -29,7 +29,8 @@ from torchtrack.core import host_sync
 
 P, R = ParamSpec("P"), TypeVar("R")
 _BACKEND = "torchtrack.backends.numba.operations"
-_WANTED: ContextVar[bool] = ContextVar("a backend is wanted", default=True)
+# Whether a backend computes; where it is not known, the arguments tell.
+_USED: ContextVar[bool | None] = ContextVar("a backend is used", default=None)
 
 
 @dataclass
@@ -50,7 +51,10 @@ class Operation:
 
     def body(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[..., Any]:
         """What takes a call with these arguments."""
-        if not may_accelerate(_a_tensor_of(args)):
+        used = _USED.get()
+        if used is None:
+            used = _are_on_cpu(args) and backend_is_installed()
+        if not used or torch.is_grad_enabled():
             return self.reference
         _load()
         if self.accelerated is None or (self.supports is not None and not self.supports(*args, **kwargs)):
@@ -65,14 +69,14 @@ OPERATIONS: dict[str, Operation] = {}
 def accelerable(reference: Callable[P, R]) -> Callable[P, R]:
     """Decorator: a backend may take this function's place."""
     name = f"{reference.__module__.removeprefix('torchtrack.')}.{reference.__qualname__}"
-    OPERATIONS[name] = Operation(name, reference)
+    operation = OPERATIONS[name] = Operation(name, reference)
 
     @wraps(reference)
     def chosen(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling():
             # Here, not further down: a compiler follows whatever it comes by, and knows plain functions and texts alone.
             return reference(*args, **kwargs)
-        result: R = OPERATIONS[name].body(args, kwargs)(*args, **kwargs)
+        result: R = operation.body(args, kwargs)(*args, **kwargs)
         return result
 
     chosen.operation = name  # type: ignore[attr-defined]
@@ -97,17 +101,22 @@ def accelerates(chosen: Callable[P, R], supports: Callable[P, bool] | None = Non
 
 def may_accelerate(values: Tensor) -> bool:
     """Whether a backend may compute with tensors like this one: on the CPU, where no gradients are recorded, and one is installed and wanted."""
-    return host_sync.read_at_once(values) and not torch.is_grad_enabled() and _WANTED.get() and backend_is_installed()
+    return host_sync.read_at_once(values) and not torch.is_grad_enabled() and _USED.get() is not False and backend_is_installed()
 
 
 @contextmanager
-def backend(*, wanted: bool) -> Iterator[None]:
-    """Within it, the backend is used where it applies, or not at all."""
-    token = _WANTED.set(wanted and _WANTED.get())
+def backend(*, wanted: bool, values: Tensor | None = None) -> Iterator[None]:
+    """Within it, the backend is used where it applies, or not at all.
+
+    Args:
+        values: a tensor on the device of all that is computed within: then no call looks for one among its arguments.
+    """
+    used = _USED.get() if values is None else values.is_cpu
+    token = _USED.set(used if wanted and _USED.get() is not False and backend_is_installed() else False)
     try:
         yield
     finally:
-        _WANTED.reset(token)
+        _USED.reset(token)
 
 
 @cache
@@ -122,15 +131,15 @@ def _load() -> None:
     import_module(_BACKEND)
 
 
-def _a_tensor_of(args: tuple[Any, ...]) -> Tensor:
-    """A tensor among the arguments, or of a dataclass among them, or within that: all are on one device."""
+def _are_on_cpu(args: tuple[Any, ...]) -> bool:
+    """Whether the arguments are: of the first tensor among them, or of a dataclass among them, or within that. All are on one device."""
     for value in args:
-        if isinstance(value, Tensor):
-            return value
+        if (is_cpu := getattr(value, "is_cpu", None)) is not None:
+            return bool(is_cpu)
         for inner in getattr(value, "__dict__", {}).values():
-            if isinstance(inner, Tensor):
-                return inner
+            if (is_cpu := getattr(inner, "is_cpu", None)) is not None:
+                return bool(is_cpu)
             for innermost in getattr(inner, "__dict__", {}).values():
-                if isinstance(innermost, Tensor):
-                    return innermost
+                if (is_cpu := getattr(innermost, "is_cpu", None)) is not None:
+                    return bool(is_cpu)
     raise TypeError("an accelerable function needs a tensor among its positional arguments, or a dataclass that holds one")

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch, pad_streams
 from torchtrack.tracking.adapt import objects_as_known
+from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import farthest_event_px
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.initialization import held_back
@@ -46,22 +47,22 @@ def expect(tracked: TrackedObjects, state: TrackerState, events: EventBatch, t_u
         reads: asks for what has to be decided.
     """
     window_s = _seconds_after(tracked, state, t_us)
-    dt_s = window_s[tracked.stream_index]
-    scheduled = schedule(state, tracked.objects, t_us, tracked.config)
+    dt_s, objects = window_s[tracked.stream_index], tracked.objects
+    scheduled = schedule(state, objects, t_us, tracked.config)
     lost = has(scheduled.triggers, Trigger.LOST)
     # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.
     never_found = ~(state.health.mean_score > 0)
     if tracked.config.motion.speed_from_events and not reads.none_of(never_found):
-        state = held_back(state, never_found, tracked.objects, tracked.sensors.seen(pad_streams(events, tracked.streams, t_us)), dt_s)
+        state = held_back(state, never_found, objects, tracked.sensors.seen(pad_streams(events, tracked.streams, t_us)), dt_s)
     if not reads.none_of(lost):
-        state = LastSeen.from_state(state, tracked.objects, t_us, tracked.config).in_place_of(state, lost)
-    return Expected(predicted_after(tracked, state, dt_s), window_s, dt_s, scheduled)
+        state = LastSeen.from_state(state, objects, t_us, tracked.config).in_place_of(state, lost)
+    return Expected(predicted_after(tracked, state, dt_s, objects), window_s, dt_s, scheduled)
 
 
-def predicted_after(tracked: TrackedObjects, state: TrackerState, dt_s: Float[Tensor, "b"]) -> Prediction:
-    """Predicted pose and motion of each object after a time, and how certain they are."""
+def predicted_after(tracked: TrackedObjects, state: TrackerState, dt_s: Float[Tensor, "b"], objects: ObjectBatch | None = None) -> Prediction:
+    """Predicted pose and motion of each object after a time, and how certain they are; ``objects`` are the tracked ones as a batch, where at hand."""
     config = tracked.config
-    objects = objects_as_known(tracked.objects, state, tracked.on_surfaces is not None, config)
+    objects = objects_as_known(objects or tracked.objects, state, tracked.on_surfaces is not None, config)
     axes_obj = tracked.revolution_axes if tracked.revolves and config.motion.spin_fades else None
     return forecast(state.motion, dt_s, objects, axes_obj, tracked.far_pose, config)
 

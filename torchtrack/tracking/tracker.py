@@ -148,7 +148,7 @@ class Tracker(TrackedObjects):
         events = as_batch(events)
         t_us = self._window_end(state, events, t_end_us)
         check_step(state.t_us, events, t_us)
-        with torch.autocast(t_us.device.type, enabled=False), dispatch.backend(wanted=self.kernels):
+        with torch.autocast(t_us.device.type, enabled=False), dispatch.backend(wanted=self.kernels, values=self.intrinsics):
             steady = None if extra_terms else self._steady(state, events, t_us)
             if steady is not None:
                 return _counted(steady)

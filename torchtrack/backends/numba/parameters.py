@@ -1,6 +1,8 @@
 """What kernels go by: settings and constants of the pipeline, as plain numbers. Making them takes no Numba."""
 
+from collections.abc import Callable
 from functools import cache
+from operator import attrgetter
 from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
@@ -290,6 +292,7 @@ class PatchSettings(NamedTuple):
 
 
 T = TypeVar("T")
+Getter = Callable[[Any], tuple[Any, ...]]
 
 
 def filled(kind: type[T], *sources: Any, **more: Any) -> T:
@@ -301,15 +304,27 @@ def filled(kind: type[T], *sources: Any, **more: Any) -> T:
         more: fields that no source has.
     """
     kinds: Any = kind
-    plan = _plan(kinds, tuple(source if isinstance(source, ModuleType) else type(source) for source in sources), tuple(more))
-    made: T = kind(*(more[name] if place is None else getattr(sources[place], name) for place, name in plan))
+    getters, order = _plan(kinds, tuple([source if isinstance(source, ModuleType) else type(source) for source in sources]), tuple(more))
+    values = [value for getter, source in zip(getters, sources, strict=True) for value in getter(source)]
+    values += more.values()
+    made: T = kinds._make([values[place] for place in order])
     return made
 
 
 @cache
-def _plan(kind: type[Any], sources: tuple[Any, ...], given: tuple[str, ...]) -> tuple[tuple[int | None, str], ...]:
-    """Of every field, the number of its source and its name there; no source where it is given. Looked up once: settings are slow to say no."""
-    return tuple((None, name) if name in given else _place(name, sources) for name in kind._fields)
+def _plan(kind: type[Any], sources: tuple[Any, ...], given: tuple[str, ...]) -> tuple[tuple[Getter, ...], tuple[int, ...]]:
+    """What is read of each source, and where each field is among all that is read and what is given. Looked up once: settings are slow to say no."""
+    places = {name: _place(name, sources) for name in kind._fields if name not in given}
+    read = [[(name, spelled) for name, (number, spelled) in places.items() if number == source] for source in range(len(sources))]
+    names = [name for of_source in read for name, _ in of_source] + list(given)
+    return tuple(_getter([spelled for _, spelled in of_source]) for of_source in read), tuple(names.index(name) for name in kind._fields)
+
+
+def _getter(names: list[str]) -> Getter:
+    """Reads attributes as a tuple, also where there is one or none."""
+    if len(names) > 1:
+        return attrgetter(*names)
+    return lambda source: tuple(getattr(source, name) for name in names)
 
 
 def _place(name: str, sources: tuple[Any, ...]) -> tuple[int, str]:

@@ -62,7 +62,8 @@ def triggers(evidence: TriggerEvidence, config: TrackerConfig) -> Int[Tensor, "b
         return torch.zeros_like(evidence.earlier)
     for conditions in _CONDITIONS:
         flags = flags_of({bit: condition(evidence, config) for bit, condition in conditions.items()})
-        evidence = replace(evidence, earlier=evidence.earlier | flags)
+        if not none_of(flags):
+            evidence = replace(evidence, earlier=evidence.earlier | flags)
     return evidence.earlier
 
 
@@ -86,6 +87,8 @@ Condition = Callable[[TriggerEvidence, TrackerConfig], Bool[Tensor, "b"]]
 def is_drifting(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """DRIFT: objects that have explained too little, by smeared events, for so long that they are looked for farther away."""
     due, search = evidence.is_drift_due, config.relocalization
+    if none_of(due):
+        return due
     return due & (evidence.drift_s >= 1e-6 * search.drift_us) if search.drift_us else torch.zeros_like(due)
 
 
@@ -110,9 +113,9 @@ def is_held(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b
 
     Where something passes before an object, its edges smear the events around it, and what is laid along them explains more.
     """
+    if none_of(evidence.earlier):
+        return torch.zeros_like(evidence.is_due)
     drifts, search = has(evidence.earlier, Trigger.DRIFT), config.relocalization
-    if none_of(drifts):
-        return drifts
     sure = drifts & ~evidence.is_starting & (evidence.sigma_px < search.score_drop_sigma_px)
     explains = evidence.score >= search.held_from * evidence.reference_explained_ratio
     return sure & explains & are_many(evidence.matches, config.validation) & (search.held_from > 0)
@@ -148,6 +151,8 @@ def is_new(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"
 def has_score_dropped(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """SCORE_DROP: objects that are sure of their place, and explain far less all at once."""
     dropped = evidence.score < config.relocalization.score_drop_below * evidence.mean_score
+    if none_of(dropped):
+        return dropped
     return _is_sure(evidence, config.relocalization) & ~has(evidence.earlier, DRIFTS) & dropped
 
 
