@@ -25,8 +25,6 @@ PACKET_US, WINDOW_US, HOUR_US = 2_000, 5_000, 3_600_000_000
 # Every so many packets: late, twice, clock back by 0.1 s, by 1000 s, a gap of 50 ms, an hour forward, a burst of noise, a wild time.
 LATE, TWICE, BACK, FAR_BACK, GAP, FORWARD, BURST, WILD = 53, 101, 5_003, 25_013, 2_003, 20_011, 1_009, 499
 HOT_PIXELS, BURST_EVENTS = 5, 5_000
-# How often a step of the first minute is taken again: what it takes is what a step takes on this machine now, whatever else runs on it.
-REFERENCE_EVERY, REFERENCE_AT = 50, 2_000
 # Once in so many windows, a fixed one is taken again: its time is that of a step on this machine now, whatever else runs there.
 REFERENCE_EVERY = 50
 Packet = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]

@@ -130,6 +130,18 @@ def test_wild_times_cost_their_events(part, waits, ahead_us):
     assert problems.counts == {Problem.WILD: COUNT - kept.sum()}
 
 
+@parts
+@pytest.mark.parametrize("ahead_us", [300_000, 3_000_000_000, 10**15])
+def test_a_wild_time_in_a_packet_that_comes_late_costs_its_event(part, ahead_us):
+    numbers = packets(1000)
+    order = np.concatenate([*numbers[:10], *numbers[11:14], numbers[10], *numbers[14:]])
+    t_us, wild = stream().t_us.copy(), numbers[10][len(numbers[10]) // 2]
+    t_us[wild] += ahead_us
+    mended_events, problems = mended(at(t_us)[order], part)
+    assert mended_events.t_us.tolist() == np.delete(stream().t_us, wild).tolist()
+    assert problems.counts == {Problem.WILD: 1, Problem.SORTED: len(numbers[10]) - 1}
+
+
 def test_a_leap_forward_that_lasts_is_a_gap():
     mended_events, problems = mended(at(moved(3_600_000_000)), 1000)
     assert mended_events.t_us.tolist() == moved(3_600_000_000).tolist()

@@ -219,7 +219,8 @@ class Mender:
     def _wild(self, back_us: int) -> int:
         """How many of the newest events are wild, if the stream goes on at ``back_us``; 0 if they are too many, or not apart."""
         times = self._newest_times(_FEW + 1)
-        ahead = int((times > back_us).sum())
+        # What goes on there may itself be late by what is sorted in.
+        ahead = int((times > back_us + REORDER_US).sum())
         if not 0 < ahead <= _FEW:
             return 0
         before = times[-ahead - 1] if ahead < len(times) else self._recent.newest_us
