@@ -1,8 +1,11 @@
 """Pictures of what was tracked: the right colours at the right places, and videos that are whole or not there."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from torchtrack.tracking.frontend.time_surface import empty_last_event
 from torchtrack.tracking.state import StepResult
 from torchtrack.tracking.validation.status import Status
 from torchtrack.viz import OverlayObject, OverlayWriter, draw_overlay, overlay_objects, save_still
+from torchtrack.viz.lettering import write
 
 CAMERA = Camera(200.0, 200.0, 119.5, 89.5, 240, 180)
 SCALE = 4
@@ -25,7 +29,7 @@ SCALE = 4
 
 def nothing(status: Status = Status.TRACKING) -> OverlayObject:
     none = np.zeros((0, 2))
-    return OverlayObject("box", status, 0.9, none, none, none, none, None)
+    return OverlayObject("box", status, 0.9, none, np.zeros((0, 2), np.int64), None, none, none, None)
 
 
 def quiet(camera: Camera = CAMERA) -> torch.Tensor:
@@ -65,7 +69,7 @@ def test_time_surface_decays():
 
 
 def test_contours_in_red_truth_in_green():
-    contour, truth = np.array([[50.0, 100.0], [200.4, 150.3]]), np.array([[120.0, 60.0]])
+    contour, truth = np.array([[50.0, 100.0], [200.4, 150.3]]), np.array([[120.0, 60.0], [np.nan, np.nan]])
     image = draw_overlay(quiet(), 0, CAMERA, [replace(nothing(), contour=contour, truth=truth)])
     for u, v in contour:
         assert has_colour(block(image, u, v), "red")
@@ -80,6 +84,39 @@ def test_corners_and_their_flow():
     assert has_colour(image[100 * SCALE - 4 : 101 * SCALE + 4, 110 * SCALE : 135 * SCALE], "yellow")
     assert has_colour(image[149 * SCALE : 152 * SCALE, 29 * SCALE : 32 * SCALE], "yellow")
     assert not has_colour(image[145 * SCALE : 155 * SCALE, 33 * SCALE : 60 * SCALE], "yellow")
+
+
+def test_contour_points_are_joined_by_lines():
+    contour, truth = np.array([[50.0, 100.0], [90.0, 100.0]]), np.array([[50.0, 140.0], [90.0, 140.0]])
+    thing = replace(nothing(), contour=contour, truth=truth, links=np.array([[0, 1]]))
+    image = draw_overlay(quiet(), 0, CAMERA, [thing])
+    for u in range(50, 91):
+        assert has_colour(block(image, u, 100), "red") and has_colour(block(image, u, 140), "green")
+    # An end behind the camera: nothing is drawn to there.
+    image = draw_overlay(quiet(), 0, CAMERA, [replace(thing, truth=np.array([[50.0, 140.0], [np.nan, np.nan]]))])
+    assert has_colour(block(image, 50, 140), "green") and not has_colour(block(image, 60, 140), "green")
+
+
+@pytest.mark.parametrize("ground", [0, 255])
+def test_letters_are_legible_on_any_ground(ground: int):
+    """Each is lighter than what is around it by more than half of the scale; letters and their ground are in one place."""
+    image = np.full((40, 200, 3), ground, np.uint8)
+    write(image, "box: tracking", (8, 22), (80, 255, 80))
+    letters = np.argwhere(image[..., 1] > 200) if ground == 0 else np.argwhere((image != ground).any(-1))
+    top, left, bottom, right = *letters.min(0), *letters.max(0)
+    if ground == 0:
+        top, left, bottom, right = top - 3, left - 3, bottom + 3, right + 3
+    grey = image[top : bottom + 1, left : right + 1, 1].astype(int)
+    assert 0.05 < (grey > 200).mean() < 0.4 and np.median(grey) <= 70
+    # Dark ground on all sides of the letters.
+    assert np.concatenate([grey[0], grey[-1], grey[:, 0], grey[:, -1]]).max() <= 70
+
+
+def test_text_outside_of_the_picture_is_left_out():
+    image = picture(50)
+    for at in ((-500, 20), (5, -100), (5, 500), (500, 20)):
+        write(image, "box", at, (255, 255, 255))
+    assert (image == 50).all()
 
 
 @pytest.mark.parametrize(("status", "colour"), [(Status.TRACKING, "green"), (Status.LOST, "red")])
@@ -135,13 +172,14 @@ def test_objects_of_a_result():
     assert (first.name, first.status, first.quality) == ("near", Status.TRACKING, 0.75)
     np.testing.assert_allclose(first.contour, [[70, 80]])
     # 5 cm aside, 45 cm away, 200 px focal length.
+    assert first.truth is not None
     np.testing.assert_allclose(first.truth, [[119.5 + 200 / 9, 89.5 + 200 / 9]])
     np.testing.assert_allclose(first.corners, [[70, 80]])
     np.testing.assert_allclose(first.flow, [[0, 0]])
     length = 0.3 * model.diameter_m
     np.testing.assert_allclose(first.axes[:3], [[119.5, 89.5], [119.5 + 400 * length, 89.5], [119.5, 89.5 + 400 * length]], rtol=1e-6)
     assert (second.name, second.status) == ("behind", Status.OUT_OF_VIEW)
-    assert second.truth.shape == (0, 2)
+    assert second.truth is None
     assert second.axes is None
     image = draw_overlay(quiet(), 1000, CAMERA, [first, second])
     assert has_colour(block(image, 70, 80), "red")
@@ -221,10 +259,47 @@ def test_without_a_picture_nothing_is_written(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
-def test_video_that_cannot_be_opened(tmp_path: Path, capfd):
-    with pytest.raises(TorchtrackError, match=r"cannot write the video '.*overlay\.nonsense' \(64x48, MPEG-4\).*\.mp4.*opencv-python-headless"):
-        OverlayWriter(tmp_path / "overlay.nonsense").add(0, picture(0))
+def test_video_of_another_name(tmp_path: Path):
+    with pytest.raises(TorchtrackError, match=r"cannot write the video '.*overlay\.avi': its name must end in \.mp4"):
+        OverlayWriter(tmp_path / "overlay.avi").add(0, picture(0))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit of file sizes")
+def test_a_full_disk_is_an_error_and_leaves_no_video(tmp_path: Path):
+    """A process may write files of so many bytes and no more: as on a disk that is full."""
+    code = """
+import resource, sys
+import numpy as np
+from torchtrack.viz import OverlayWriter
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+with OverlayWriter(sys.argv[1], stills=0) as writer:
+    for number in range(40):
+        writer.add(number * 10_000, np.roll(noise, 97 * number, 1))
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "overlay.mp4"], capture_output=True, text=True, check=False)
+    assert "OutputError: cannot write to" in done.stderr and "overlay.mp4'" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def events_like(number: int) -> np.ndarray:
+    """A picture of 640x480 pixels, enlarged: noise in a fiftieth of them that is new in each picture, and edges that move on."""
+    rng = np.random.default_rng(number)
+    image = (rng.random((480, 640)) < 0.02) * rng.integers(30, 190, (480, 640))
+    image[:, (np.arange(0, 640, 60) + number) % 640] = 190
+    return np.repeat(np.repeat(np.repeat(image[..., None], 3, 2), 2, 0), 2, 1).astype(np.uint8)
+
+
+def test_a_second_of_events_has_less_than_four_megabytes(tmp_path: Path):
+    """A quarter of it, at the frame rate and the slowness of a run by default."""
+    with OverlayWriter(tmp_path / "overlay.mp4", stills=0) as writer:
+        for number in range(30):
+            writer.add(round(number * 1e6 / 120), events_like(number))
+    assert (tmp_path / "overlay.mp4").stat().st_size < 1_000_000
+    with av.open(tmp_path / "overlay.mp4") as video:
+        stream = video.streams.video[0]
+        assert stream.codec_context.codec.canonical_name == "vp9" and stream.codec_context.pix_fmt == "yuv420p"
 
 
 def test_pictures_of_different_sizes(tmp_path: Path):

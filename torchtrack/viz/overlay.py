@@ -21,6 +21,8 @@ from torchtrack.core.lie import transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.state import StepResult
 from torchtrack.tracking.validation.status import Status
+from torchtrack.viz.contour_lines import contour_links
+from torchtrack.viz.lettering import Colour, write, write_lines
 
 # Sensors are enlarged by a whole number until they are at least this wide.
 _LEAST_WIDTH_PX = 900
@@ -43,7 +45,8 @@ class OverlayObject:
         status: what the tracker says of it.
         quality: between 0 and 1.
         contour: points of its contours at the estimated pose.
-        truth: the same points at the true pose; none where it is not known.
+        links: pairs of points that follow each other along a contour; they are drawn as lines, other points as dots.
+        truth: the same points at the true pose, NaN behind the camera; None where it is not known.
         corners: corners of its region.
         flow: their velocity (px/s); zero where there is none.
         axes: the object's centre and the tips of its axes; none where it is behind the camera.
@@ -53,7 +56,8 @@ class OverlayObject:
     status: Status
     quality: float
     contour: Float[np.ndarray, "m 2"]
-    truth: Float[np.ndarray, "k 2"]
+    links: Int[np.ndarray, "l 2"]
+    truth: Float[np.ndarray, "m 2"] | None
     corners: Float[np.ndarray, "n 2"]
     flow: Float[np.ndarray, "n 2"]
     axes: Float[np.ndarray, "4 2"] | None
@@ -90,13 +94,14 @@ def _overlay_object(result: StepResult, b: int, model: ObjectModel, camera: Came
     contours, corners = result.contours, result.corners
     seen = contours.mask[b]
     flow = torch.where(corners.has_flow[b][:, None], corners.flow[b], 0.0)[corners.mask[b]]
-    truth = np.zeros((0, 2)) if true_pose is None else _pixels(contours.points_obj[b][seen], true_pose, camera)
+    pixels = _array(contours.pixels[b][seen])
     return OverlayObject(
         name=name,
         status=Status(int(result.status[b])),
         quality=float(result.quality[b]),
-        contour=_array(contours.pixels[b][seen]),
-        truth=truth,
+        contour=pixels,
+        links=contour_links(pixels, _array(contours.normals[b][seen])),
+        truth=None if true_pose is None else _pixels(contours.points_obj[b][seen], true_pose, camera),
         corners=_array(corners.pixels[b][corners.mask[b]]),
         flow=_array(flow),
         axes=_axes(result.T_cam_obj[b], model, camera),
@@ -108,16 +113,17 @@ def _array(values: Tensor) -> np.ndarray:
 
 
 def _pixels(points_obj: Tensor, T_cam_obj: Tensor, camera: Camera) -> np.ndarray:
-    """Ideal pixels of those points that are in front of the camera."""
+    """Ideal pixels of points; NaN behind the camera."""
     points = transform_points(T_cam_obj.cpu().double(), points_obj.detach().cpu().double())
-    return _array(project(points[points[:, 2] > MIN_DEPTH_M], camera.intrinsics(torch.float64)))
+    pixels = project(points, camera.intrinsics(torch.float64))
+    return _array(torch.where(points[:, 2:] > MIN_DEPTH_M, pixels, torch.nan))
 
 
 def _axes(T_cam_obj: Tensor, model: ObjectModel, camera: Camera) -> np.ndarray | None:
     """The object's centre and the tips of its axes, if all are in front of the camera."""
     tips = torch.cat([torch.zeros(1, 3), torch.eye(3)]) * _AXIS_FRACTION * model.diameter_m
     pixels = _pixels(model.centre + tips, T_cam_obj, camera)
-    return pixels if len(pixels) == 4 else None
+    return pixels if np.isfinite(pixels).all() else None
 
 
 def draw_overlay(
@@ -143,13 +149,15 @@ def draw_overlay(
     scale = scale or -(-_LEAST_WIDTH_PX // camera.width)
     canvas = _Canvas(_event_picture(newest[: camera.height, : camera.width], t_us, decay_s, scale), camera, scale)
     for thing in objects:
-        canvas.dots(thing.contour, _RED, width=scale + 1)
-        canvas.dots(thing.truth, _GREEN, width=1)
+        canvas.lines(thing.contour, thing.links, _RED, width=min(scale + 1, 4))
+    for thing in objects:
+        if thing.truth is not None:
+            canvas.lines(thing.truth, thing.links, _GREEN, width=1)
     for thing in objects:
         canvas.arrows(thing.corners, thing.corners + thing.flow * _ARROW_S, _YELLOW)
         if thing.axes is not None:
             canvas.axes(thing.axes, thing.name)
-    canvas.legend([(f"t = {t_us * 1e-6:.4f} s", _WHITE), *(_legend_line(thing) for thing in objects)])
+    write_lines(canvas.image, [(f"t = {t_us * 1e-6:.4f} s", _WHITE), *(_legend_line(thing) for thing in objects)])
     return canvas.image
 
 
@@ -161,7 +169,7 @@ def _event_picture(last_event_us: np.ndarray, t_us: int, decay_s: float, scale: 
     return cv2.cvtColor(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST), cv2.COLOR_GRAY2BGR)
 
 
-def _legend_line(thing: OverlayObject) -> tuple[str, tuple[int, int, int]]:
+def _legend_line(thing: OverlayObject) -> tuple[str, Colour]:
     colour = {Status.TRACKING: _GREEN, Status.UNCERTAIN: _ORANGE}.get(thing.status, _RED)
     return f"{thing.name}: {thing.status.name.lower().replace('_', ' ')}, quality {thing.quality:.2f}", colour
 
@@ -174,16 +182,26 @@ class _Canvas:
         self.camera = camera
         self.scale = scale
 
-    def dots(self, ideal: np.ndarray, colour: tuple[int, int, int], width: int) -> None:
-        """A square dot at each point."""
+    def lines(self, ideal: np.ndarray, links: np.ndarray, colour: Colour, width: int) -> None:
+        """A line along each link, and a square dot at each point that has none."""
+        placed, near = self._place(ideal)
+        drawn = links[near[links].all(1)]
+        ends = np.round(placed[drawn] * (1 << _FRACTION_BITS)).astype(np.int32)
+        # Smoothed, a line of one pixel between two would be two faint ones.
+        cv2.polylines(self.image, list(ends), False, colour, width, cv2.LINE_AA if width > 1 else cv2.LINE_8, _FRACTION_BITS)
+        alone = near.copy()
+        alone[drawn] = False
+        self._dots(placed[alone], colour, width)
+
+    def _dots(self, placed: np.ndarray, colour: Colour, width: int) -> None:
         height, width_px = self.image.shape[:2]
         offset = np.arange(width) - (width - 1) // 2
         square = np.stack(np.meshgrid(offset, offset), -1).reshape(1, -1, 2)
-        at = (np.round(self._place(ideal)[0]).astype(np.int64)[:, None] + square).reshape(-1, 2)
+        at = (np.round(placed).astype(np.int64)[:, None] + square).reshape(-1, 2)
         u, v = at[((at >= 0) & (at < [width_px, height])).all(1)].T
         self.image[v, u] = colour
 
-    def arrows(self, start: np.ndarray, end: np.ndarray, colour: tuple[int, int, int]) -> None:
+    def arrows(self, start: np.ndarray, end: np.ndarray, colour: Colour) -> None:
         """A small circle at each start, and a line to the end with a tip."""
         (tail, tail_ok), (tip, tip_ok) = self._place(start), self._place(end)
         for a, b in zip(_fixed(tail[tail_ok & tip_ok]), _fixed(tip[tail_ok & tip_ok]), strict=True):
@@ -198,17 +216,7 @@ class _Canvas:
         centre, *tips = _fixed(placed)
         for tip, colour in zip(tips, (_RED, _GREEN, _BLUE), strict=True):
             cv2.line(self.image, centre, tip, colour, 2, cv2.LINE_AA, _FRACTION_BITS)
-        self._text(name, (int(placed[0, 0]) + 6, int(placed[0, 1]) - 6), _WHITE)
-
-    def legend(self, lines: Sequence[tuple[str, tuple[int, int, int]]]) -> None:
-        """Lines of text in the upper left corner."""
-        for number, (text, colour) in enumerate(lines):
-            self._text(text, (8, 22 + 22 * number), colour)
-
-    def _text(self, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
-        # A black rim keeps it legible on events.
-        for shade, width in (((0, 0, 0), 4), (colour, 1)):
-            cv2.putText(self.image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, shade, width, cv2.LINE_AA)
+        write(self.image, name, (int(placed[0, 0]) + 6, int(placed[0, 1]) - 6), _WHITE)
 
     def _place(self, ideal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where ideal pixels lie in the picture, and which are near enough to it to be drawn."""

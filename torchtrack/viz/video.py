@@ -10,15 +10,18 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from torchtrack.errors import OutputError, TorchtrackError
+from torchtrack.errors import TorchtrackError
 from torchtrack.io.atomic import atomic_path, writing
+from torchtrack.viz.vp9 import Vp9File
 
 # A pause of the events longer than this is shortened to it (seconds of video).
 _LONGEST_PAUSE_S = 2.0
+# Of the video, per second of events, where it plays so slowly that this is less than what a second of video may have at most.
+_BITS_PER_EVENT_SECOND, _MOST_BITS_PER_SECOND = 24e6, 12e6
 
 
 class OverlayWriter:
-    """Writes pictures as an MPEG-4 video that keeps the events' time, and some of them as PNG stills beside it.
+    """Writes pictures as a video (VP9 in MP4, which browsers play) that keeps the events' time, and some of them as PNG stills beside it.
 
     Used as a context, it leaves nothing behind when the block ends with an error; without any picture it writes nothing::
 
@@ -36,12 +39,13 @@ class OverlayWriter:
     def __init__(self, path: str | os.PathLike[str], *, frames_per_second: float = 30.0, slow_motion: float = 4.0, stills: int = 4) -> None:
         self.path = Path(path)
         self._frames_per_second = frames_per_second
+        self._bits_per_second = min(_BITS_PER_EVENT_SECOND / slow_motion, _MOST_BITS_PER_SECOND)
         self._period_us = 1e6 / (frames_per_second * slow_motion)
         self._frames = 0
         self._start_us = 0.0
         self._stills = _EvenStills(stills)
         self._files = ExitStack()
-        self._video: cv2.VideoWriter | None = None
+        self._video: Vp9File | None = None
         self._size = (0, 0)
 
     def __enter__(self) -> "OverlayWriter":
@@ -51,7 +55,9 @@ class OverlayWriter:
         if error is None:
             self.close()
             return
-        self._release()
+        if self._video is not None:
+            self._video.abandon()
+            self._video = None
         self._files.__exit__(kind, error, trace)
 
     def is_due(self, t_us: int) -> bool:
@@ -62,7 +68,8 @@ class OverlayWriter:
         """Show ``image`` (BGR) from the last picture's end up to ``t_us``; one that is not due is passed over.
 
         Raises:
-            TorchtrackError: if the video cannot be opened, or the image is not of the size of the first.
+            TorchtrackError: if the image is not of the size of the first, or the video's name does not end in ``.mp4``.
+            OutputError: if the video cannot be written.
         """
         if not self.is_due(t_us):
             return
@@ -82,8 +89,10 @@ class OverlayWriter:
 
     def close(self) -> None:
         """Finish the video and write the stills."""
-        self._release()
         try:
+            if self._video is not None:
+                video, self._video = self._video, None
+                video.close()
             for t_us, picture in self._stills.chosen():
                 still = self.path.with_name(f"{self.path.stem}_{t_us * 1e-6:.3f}s.png")
                 with writing(still):
@@ -92,23 +101,12 @@ class OverlayWriter:
             self._stills = _EvenStills(0)
             self._files.close()
 
-    def _open(self, image: np.ndarray) -> cv2.VideoWriter:
+    def _open(self, image: np.ndarray) -> Vp9File:
+        if self.path.suffix.lower() != ".mp4":
+            raise TorchtrackError(f"cannot write the video '{self.path}': its name must end in .mp4.")
         height, width = _even(image).shape[:2]
         temporary = self._files.enter_context(_unfinished(self.path))
-        video = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), self._frames_per_second, (width, height))
-        if not video.isOpened():
-            error = TorchtrackError(
-                f"cannot write the video '{self.path}' ({width}x{height}, MPEG-4): expected a name that ends in .mp4, and an OpenCV with "
-                "FFmpeg. Install opencv-python-headless from PyPI, or switch the overlay off."
-            )
-            self._files.__exit__(type(error), error, None)
-            raise error
-        return video
-
-    def _release(self) -> None:
-        if self._video is not None:
-            self._video.release()
-            self._video = None
+        return Vp9File(temporary, self.path, (width, height), self._frames_per_second, self._bits_per_second)
 
 
 @contextmanager
@@ -116,9 +114,6 @@ def _unfinished(path: Path) -> Iterator[Path]:
     """A path beside a video's to write it to; what was written replaces ``path`` when the block ends without an error.
 
     It is always the same: what a process that was killed has left is written over, or taken away, by the next one.
-
-    Raises:
-        OutputError: if the video is not whole, as on a disk that is full, which OpenCV does not tell.
     """
     unfinished = path.with_name(f"{path.stem}.part{path.suffix}")
     with writing(path):
@@ -127,8 +122,6 @@ def _unfinished(path: Path) -> Iterator[Path]:
         yield unfinished
         if unfinished.exists():
             with writing(path):
-                if not cv2.VideoCapture(str(unfinished)).isOpened():
-                    raise OutputError(f"cannot write to '{path}': the video is not whole. Is the disk full?")
                 unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -145,7 +138,7 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def _even(image: np.ndarray) -> np.ndarray:
-    """The image with even height and width, which MPEG-4 needs."""
+    """The image with even height and width, whose halves are the size of its colours."""
     height, width = image.shape[:2]
     return cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_CONSTANT)
 
