@@ -39,7 +39,7 @@ PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted((REPOSIT
 README = "\n\n".join([FRONT, *(text for name, text in PAGES.items() if name != "settings.md")])
 SETTINGS = {"track": RunConfig, "evaluate": EvaluateConfig, "demo": DemoConfig, "simulate": SceneConfig}
 COMMANDS = ("track", "evaluate", "simulate", "demo", "outline", "model", "info", "convert", "bench", "settings")
-BLOCKS = ("ACCURACY", "ABLATION", "PAPER TABLES", "SPEED")
+BLOCKS = ("ACCURACY", "ABLATION", "TRIAL", "PAPER TABLES", "SPEED")
 FILE_SUFFIXES = ("py", "yaml", "txt", "npz", "json", "csv", "tum", "mp4", "png", "obj", "glb", "md", "mcap")
 
 
@@ -148,6 +148,14 @@ def test_example_of_a_config_is_one(text, tmp_path):
     path.write_text(text)
     config = load(RunConfig, path)
     assert config.objects[0].mesh == tmp_path / "mug.obj" and config.objects[0].unit == "mm"
+
+
+@pytest.mark.parametrize("text", blocks("yaml evaluate"))
+def test_example_of_an_evaluation_is_one(text, tmp_path):
+    path = tmp_path / "trial.yaml"
+    path.write_text(text)
+    group = load(EvaluateConfig, path).methods["bursts_and_latency"].tracker.association
+    assert (group.burst_us, group.pixel_latency) == (0, False)
 
 
 @pytest.mark.parametrize("text", blocks("yaml simulate"))

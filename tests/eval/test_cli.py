@@ -38,3 +38,15 @@ def test_a_cell_that_the_paper_does_not_have(tmp_path, capsys):
     path.write_text("report: paper\ncells: {'01 normal': {source: a.npz}}\n")
     assert main(["evaluate", "--config", str(path), "--quiet"]) == 2
     assert "no '01 normal'" in capsys.readouterr().err
+
+
+def test_a_trial_by_its_options(tmp_path, capsys):
+    path, marked = write_tiny_sequence(tmp_path, "tiny", duration_us=12_000), tmp_path / "results.md"
+    marked.write_text("<!-- TRIAL -->\n<!-- /TRIAL -->\n")
+    arguments = ["evaluate", str(path), "--methods", "causal,ls", "--jobs", "1", "--quiet", "-o", str(tmp_path / "out")]
+    assert main([*arguments, "--report", "trial", "--runs", "2", "--table", str(marked)]) == 0
+    output = capsys.readouterr().out
+    assert "| left out | runs | δR (°)" in output and "Windows lost by kind of scene" in output
+    assert "| ls " in marked.read_text()
+    assert main([*arguments, "--report", "trial", "--measured-only"]) == 0
+    assert "| ls       | 1 " in capsys.readouterr().out

@@ -6,6 +6,7 @@ import pytest
 import torch
 import trimesh
 from helpers import random_pose
+from pydantic import ValidationError
 from tiny_sequence import write_tiny_sequence
 
 from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
@@ -269,3 +270,87 @@ def test_sequences_in_hdf5_are_found_in_a_folder_and_other_hdf5_is_not(folder, t
     convert(folder / "one.npz", tmp_path / "one.h5")
     convert(folder / "one.npz", tmp_path / "events_alone.h5", "dsec")
     assert [path.name for path in find_sequences([tmp_path])] == ["one.h5"]
+
+
+# ---- trials
+
+
+LESS = {"all": {"preset": "causal"}, "less": {"joins": ["all"], "tracker": {"relocalization": {"hypotheses": 0}}}}
+
+
+def trial(folder, tmp_path, **changes):
+    marked = tmp_path / "results.md"
+    marked.write_text("<!-- TRIAL -->\n<!-- /TRIAL -->\n")
+    settings = {"paths": (folder,), "methods": LESS, "jobs": 1, "report": "trial", "table": marked, "output": tmp_path / "out"}
+    return EvaluateConfig.model_validate({**settings, **changes})
+
+
+def test_a_trial_goes_on_with_more_runs_and_tells_what_it_has_so_far(folder, tmp_path, monkeypatch):
+    done = []
+    first = evaluate(trial(folder, tmp_path), done.append)
+    # One run of a method after the other.
+    assert [(job.method, job.path.stem, job.start.run) for job in done] == [
+        *[("all", "one", 1), ("all", "two", 1)],
+        *[("less", "one", 1), ("less", "two", 1)],
+    ]
+    assert "| less" in (tmp_path / "results.md").read_text() and "one run" in (tmp_path / "results.md").read_text()
+    tracked = measured_by(monkeypatch)
+    second = evaluate(trial(folder, tmp_path, runs=2, resume=True))
+    assert tracked == [("one", "all"), ("two", "all"), ("one", "less"), ("two", "less")]
+    assert [result.run for result in second.results] == 6 * [1] + 6 * [2]
+    assert figures(first)[0] == figures(second)[0][:6]
+    by_run = [[result.errors.rotation_deg.tolist() for result in second.results if result.run == run] for run in (1, 2)]
+    assert by_run[0] != by_run[1]
+    tracked.clear()
+    so_far = evaluate(trial(folder, tmp_path, runs=3, measured_only=True))
+    assert figures(so_far) == figures(second) and not tracked
+    assert max(len(line) for line in (tmp_path / "results.md").read_text().splitlines() if not line.startswith("|")) <= 120
+
+
+def test_a_start_that_is_off_is_another_measurement(folder, tmp_path, monkeypatch):
+    straight = evaluate(trial(folder, tmp_path))
+    tracked = measured_by(monkeypatch)
+    turned = evaluate(trial(folder, tmp_path, resume=True, start_angles_deg={"tw*": 8}))
+    assert tracked == [("two", "all"), ("two", "less")]
+    before, after = ([float(result.errors.rotation_deg[0]) for result in entry.results if result.method == "less"] for entry in (straight, turned))
+    assert after[0] == before[0] and after[1] > before[1] + 0.1 and after[2] > before[2] + 0.1
+
+
+def test_what_does_not_fit_a_trial_is_told_before_anything_is_measured(folder, tmp_path):
+    with pytest.raises(ValidationError, match="runs and table are of report: trial"):
+        EvaluateConfig(paths=(folder,), runs=2)
+    config = trial(folder, tmp_path)
+    (tmp_path / "results.md").write_text("no marks")
+    with pytest.raises(ConfigError, match="needs the lines '<!-- TRIAL -->'"):
+        evaluate(config)
+    assert not (tmp_path / "out").exists()
+
+
+def test_methods_are_joined_in_the_order_of_their_names():
+    methods = EvaluateConfig.model_validate(
+        {
+            "methods": {
+                "both": {"joins": ["short", "inner"], "tracker": {"window": {"count": 99}}},
+                "short": {"preset": "causal", "tracker": {"window": {"duration_us": 2500, "parts": 1}}},
+                "longer": {"tracker": {"window": {"duration_us": 4000}}},
+                "inner": {"joins": ["longer"]},
+            }
+        }
+    ).methods
+    window = methods["both"].tracker.window
+    assert (methods["both"].preset, window.duration_us, window.parts, window.count) == ("causal", 4000, 1, 99)
+    assert methods["inner"] == methods["longer"]
+
+
+@pytest.mark.parametrize(
+    ("joins", "message"),
+    [
+        ("other", "give a list of labels"),
+        ([], "give a list"),
+        (["nowhere"], "nowhere is no other method; there are all, other"),
+        (["all"], "all is no"),
+    ],
+)
+def test_methods_that_cannot_be_joined_are_told(joins, message):
+    with pytest.raises(ValidationError, match=rf"methods\.all\.joins: {message}"):
+        EvaluateConfig.model_validate({"methods": {"all": {"joins": joins}, "other": {}}})

@@ -172,7 +172,8 @@ def test_written_geometry_has_each_vertex_once(cube, tmp_path):
 
 
 # Lists of scenes hold no scene of their own.
-SHIPPED = [path for path in sorted(CONFIGS.rglob("*.yaml")) if "scenes" not in read_yaml(path)]
+TRIAL = CONFIGS / "trial.yaml"
+SHIPPED = [path for path in sorted(CONFIGS.rglob("*.yaml")) if "scenes" not in read_yaml(path) and path.parent.name != "trial"]
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -192,6 +193,45 @@ def test_shipped_scenes_stay_in_view_and_apart(path):
             for other_low, other_high in boxes[:i]:
                 apart = ((low > other_high) | (other_low > high)).any(-1)
                 assert float(apart.double().mean()) > 0.9
+
+
+@pytest.fixture(scope="module")
+def boxes_of_trial():
+    """Of each scene of the trial: its config, and the corners of every object's box in the image over time, ``[objects, times, 2]``."""
+    boxes = []
+    for config in scenes_of(TRIAL):
+        world, corners = make_world(config), []
+        t_s = torch.arange(0, config.duration_s, 0.02, dtype=torch.float64)
+        for number in range(len(config.objects)):
+            points = transform_points(world.object_poses(number, t_s), world.points[number].expand(len(t_s), -1, -1))
+            pixels = project(points, world.camera.intrinsics(torch.float64).expand(len(t_s), -1))
+            corners.append(torch.stack([pixels.amin(1), pixels.amax(1)]))
+        boxes.append((config, *torch.stack(corners, 1)))
+    return boxes
+
+
+def test_the_trial_has_many_objects_in_many_scenes_of_each_kind(boxes_of_trial):
+    kinds = [config.name.split("_")[0] for config, _, _ in boxes_of_trial]
+    assert sum(len(config.objects) for config, _, _ in boxes_of_trial) >= 60
+    assert len(set(kinds)) == 12 and all(kinds.count(kind) >= 2 for kind in kinds)
+    assert len({config.seed for config, _, _ in boxes_of_trial}) == len(boxes_of_trial)
+
+
+def test_scenes_of_the_trial_are_of_their_kind(boxes_of_trial):
+    for config, low, high in boxes_of_trial:
+        kind, sensor = config.name.split("_")[0], torch.tensor([config.camera.width, config.camera.height])
+        middle_inside = ((low + high > 0) & (low + high < 2 * sensor)).all(-1)
+        outside = ((high < 0) | (low > sensor)).any(-1)
+        overlap = ~((low[0] > high[-1]) | (low[-1] > high[0])).any(-1)
+        if kind == "leaving":
+            assert bool(outside.any() and middle_inside[:, [0, -1]].all()), config.name
+        else:
+            assert bool(middle_inside.all()), config.name
+        if kind in ("crossing", "twins"):
+            assert bool(overlap.any()), config.name
+        assert ((high - low).mean() < 60) == (kind in ("far", "small")), config.name
+        assert len({item.shape for item in config.objects}) == (1 if kind == "twins" else len(config.objects))
+        assert (len(config.occluders) > 0) == (kind in ("hidden", "held"))
 
 
 def test_the_suite_of_the_paper_has_all_its_sequences():

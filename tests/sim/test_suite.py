@@ -1,5 +1,7 @@
 """Many scenes at once: variants, lists, folders; what is there is kept, what fails is told."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -65,7 +67,7 @@ def test_suites_that_make_no_sense_are_errors(suite):
         scenes_of(folder / "empty")
 
 
-def test_a_suite_runs_in_processes_tells_its_progress_and_is_taken_up_again(suite, tmp_path):
+def test_a_suite_runs_in_processes_tells_its_progress_and_is_taken_up_again(suite, tmp_path, monkeypatch):
     needs_numba()
     scenes, progress = scenes_of(suite), []
     out = tmp_path / "out"
@@ -81,6 +83,12 @@ def test_a_suite_runs_in_processes_tells_its_progress_and_is_taken_up_again(suit
     assert all(is_done(scene, out / f"{scene.name}.npz") for scene in scenes)
     # Other settings make another sequence; a damaged one is made again.
     assert not is_done(scenes[0].model_copy(update={"seed": 9}), out / "a.npz")
+    # A setting that its file does not know yet is as by default.
+    stored = read_sequence(out / "a.npz").meta["scene"]
+    del stored["objects"][0]["attached_to"]
+    monkeypatch.setattr("torchtrack.sim.suite.read_sequence", lambda path: SimpleNamespace(meta={"scene": stored}))
+    assert is_done(scenes[0], out / "a.npz")
+    monkeypatch.undo()
     (out / "a.npz").write_bytes((out / "a.npz").read_bytes()[:1000])
     assert not is_done(scenes[0], out / "a.npz")
     again = []

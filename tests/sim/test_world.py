@@ -140,3 +140,20 @@ def test_light_stays_where_it_is_when_the_camera_turns():
     world = make_world(scene(camera_motion=MOVES))
     T = world.camera_poses(seconds(0.3))[0].numpy()
     assert T[:3, :3] @ np.array(world.scenery(T, 0.3).light_direction) == pytest.approx(world.config.render.light_direction)
+
+
+def test_what_is_attached_moves_along():
+    item = ObjectConfig(label="bracket", shape="lbracket", motion=MotionConfig(position_m=(0, 0, 0.5)))
+    finger = ObjectConfig(label="finger", shape="finger", attached_to="bracket", motion=MotionConfig(position_m=(0.05, 0, 0.01), **STILL))
+    world = make_world(scene(objects=(item,), occluders=(finger,), peak_speed="fast", camera_motion=MOVES))
+    t_s = seconds(0.0, 0.1, 0.3)
+    relative = se3_inverse(world.object_poses(0, t_s)) @ world.object_poses(1, t_s)
+    assert torch.allclose(relative, relative[:1].expand(3, 4, 4), atol=1e-12)
+    assert relative[0, :3, 3].tolist() == pytest.approx([0.05, 0, 0.01])
+
+
+@pytest.mark.parametrize("carrier", ["nothing", "finger", "other"])
+def test_only_objects_that_are_not_attached_themselves_carry_others(carrier):
+    finger, other = (ObjectConfig(label=label, shape="finger", attached_to=to) for label, to in (("finger", carrier), ("other", "bracket")))
+    with pytest.raises(ValidationError, match=rf"'finger' cannot be carried by '{carrier}'; name one of .*\(bracket\)"):
+        scene(occluders=(finger, other))

@@ -108,10 +108,16 @@ class Evaluate:
     """Where these are: on this machine, or Ray's (the cluster at RAY_ADDRESS)."""
     streams: _Number = None
     """Sequences that each tracks at once, as one batch."""
-    report: Annotated[Literal["sequences", "compact"] | None, _option("sequences|compact")] = None
-    """A row per sequence, object and method; or one per method, also as Markdown, LaTeX, CSV and JSON."""
+    report: Annotated[Literal["sequences", "compact", "trial"] | None, _option("sequences|compact|trial")] = None
+    """A row per sequence, object and method; one per method; or what each method's left out components are worth."""
+    runs: _Number = None
+    """Of a trial: runs of each method, which differ by roundings alone."""
+    table: Annotated[str | None, _option("FILE")] = None
+    """Of a trial: a Markdown file that gets its table, between <!-- TRIAL --> and <!-- /TRIAL -->."""
     resume: bool = False
     """Take up an evaluation into the same folder that was broken off: what it measured with the same settings is kept."""
+    measured_only: bool = False
+    """Measure nothing: report what an evaluation into the same folder has measured that was broken off, or still runs."""
     estimate_latency: bool = False
     """Track nothing; find how late the events of each sequence are against its ground truth."""
     quiet: bool = False

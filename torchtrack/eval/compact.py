@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
-from typing import Any
 
 from torchtrack.eval.grid import Cell, Grid, Report
 from torchtrack.eval.results import Evaluation, ObjectResult
@@ -40,7 +39,7 @@ def compact_report(evaluation: Evaluation, methods: Sequence[str]) -> Report:
     names = [*(_column_name(*column, columns) for column in columns), "mean", "change", "lost", "peak", "step"]
     header = (Cell("method"), *(Cell(name) for name in names))
     note = f"Mean, change, lost and step: over the {len(shared)} of {len(columns)} objects that every method tracked; change: to {methods[0]}."
-    return Report((Grid(_TITLE, (header,), rows, (note,)),), tuple(_record(result) for result in evaluation.results))
+    return Report((Grid(_TITLE, (header,), rows, (note,)),), tuple(result.as_row() for result in evaluation.results))
 
 
 def _column_name(sequence: str, label: str, columns: Sequence[tuple[str, str]]) -> str:
@@ -88,9 +87,3 @@ def _cell(result: ObjectResult | None) -> str:
 
 def _errors(rotation_deg: float, translation_mm: float) -> str:
     return f"{rotation_deg:.2f} / {translation_mm:.2f}"
-
-
-def _record(result: ObjectResult) -> dict[str, Any]:
-    names = {"method": result.method, "sequence": result.sequence, "object": result.object}
-    status = {f"windows_{name.lower()}": count for name, count in result.status.items()}
-    return {**names, **result.metrics.as_dict(), **status, "step_ms": result.median_step_ms}

@@ -16,12 +16,15 @@ from torchtrack.core.limits import limits as file_limits
 from torchtrack.core.windows import EventWindow
 from torchtrack.errors import EventDataError
 from torchtrack.eval.compact import compact_report
-from torchtrack.eval.grid import Report
+from torchtrack.eval.grid import Report, markdown
 from torchtrack.eval.journal import Journal, Measured, identity
+from torchtrack.eval.marked import check_marks, replace_between
 from torchtrack.eval.paper import check_cells, paper_report
 from torchtrack.eval.results import Evaluation, Failure, NotApplicable, ObjectResult, write_results
 from torchtrack.eval.sources import cell_sequences, find_sequences
+from torchtrack.eval.start import StartError, start_angle_deg
 from torchtrack.eval.surface_errors import SurfaceErrors, surface_errors
+from torchtrack.eval.trial import trial_report
 from torchtrack.io.atomic import check_writable
 from torchtrack.run.executor import TaskFailure, Tell
 from torchtrack.run.executor.groups import run_in_groups
@@ -38,11 +41,12 @@ from torchtrack.tracking.validation.status import Status
 
 @dataclass(frozen=True)
 class Job:
-    """One sequence under one method."""
+    """One run of one sequence under one method."""
 
     path: Path
     method: str
     config: RunConfig
+    start: StartError
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,8 @@ class Plan:
     failures: tuple[Failure, ...] = ()
 
 
+# Between these marks in a Markdown file stands the table of a trial.
+_TRIAL_MARK = "TRIAL"
 # What became of one job: what was measured and what the method is not made for, or why it failed.
 Outcome = Measured | Failure
 
@@ -63,24 +69,36 @@ def plan(config: EvaluateConfig, simulating: Told = lambda name, share: None) ->
 
     Raises:
         ConfigError: if nothing is named, or a cell is none of the paper's.
+        ConfigError: also if the file of the table has no marks to put it between.
         MissingFileError: if a path that is named is not there.
         OutputError: if the output folder cannot be written into.
     """
     check_cells(config.cells)
     check_writable(config.output / "metrics.json")
+    if config.table is not None:
+        check_marks(config.table, _TRIAL_MARK)
     searched = find_sequences(config.paths) if config.paths or not config.cells else []
     cells, failures = cell_sequences(config.cells, config.cache, config.jobs, simulating, config.executor)
     failed = {failure.sequence for failure in failures}
     paths = dict.fromkeys([*searched, *(path for path in cells.values() if path.stem not in failed)])
-    jobs = [Job(path, label, _run_config(path, method, config)) for path in paths for label, method in config.methods.items()]
-    return Plan(tuple(jobs), cells, failures)
+    return Plan(tuple(_jobs(list(paths), config)), cells, failures)
+
+
+def _jobs(paths: Sequence[Path], config: EvaluateConfig) -> Iterator[Job]:
+    """What is to be measured; of a trial, one run of a method after the other, so that what there is so far can be compared."""
+    methods = config.methods.items()
+    by_method = [(path, label, method) for label, method in methods for path in paths]
+    by_sequence = [(path, label, method) for path in paths for label, method in methods]
+    for run in range(1, config.runs + 1):
+        for path, label, method in by_method if config.report == "trial" else by_sequence:
+            yield Job(path, label, _run_config(path, method, config), StartError(start_angle_deg(path.stem, config.start_angles_deg), run))
 
 
 def evaluate(config: EvaluateConfig, on_done: Callable[[Job], None] = lambda job: None, planned: Plan | None = None) -> Evaluation:
     """Track every sequence with every method; write ``metrics.json``, ``errors.csv`` and the report's tables into the output folder.
 
-    A sequence that fails is reported; the others go on. Until all is done without a failure, ``outcomes.jsonl`` beside the results
-    keeps what was measured, for ``config.resume``.
+    A sequence that fails is reported; the others go on. Until all is done without a failure, and of a trial always, ``outcomes.jsonl``
+    beside the results keeps what was measured, for ``config.resume``.
 
     Args:
         config: what to do.
@@ -104,16 +122,20 @@ def evaluate(config: EvaluateConfig, on_done: Callable[[Job], None] = lambda job
     write_results(evaluation, config.output)
     if report := report_of(evaluation, config, planned):
         report.write(config.output)
-    if not evaluation.failures:
+        if config.table is not None:
+            replace_between(config.table, _TRIAL_MARK, markdown(report.grids[0]))
+    # A trial may go on with more methods or runs.
+    if not evaluation.failures and config.report != "trial":
         journal.remove()
     return evaluation
 
 
 def _measured_once(jobs: Sequence[Job], config: EvaluateConfig, journal: Journal, on_done: Callable[[Job], None]) -> list[Outcome]:
     """The outcome of every job; what the journal knows is not measured again, where that is asked for."""
-    names = [identity(job.path, job.method, job.config) for job in jobs]
-    asked = set(names)
-    known = {name: measured for name, measured in (journal.read() if config.resume else {}).items() if name in asked}
+    names = [identity(job.path, job.method, job.config, job.start) for job in jobs]
+    known = journal.read() if config.resume or config.measured_only else {}
+    if config.measured_only:
+        return [known[name] for name in names if name in known]
     journal.begin(known)
     outcomes: dict[int, Outcome] = {number: known[name] for number, name in enumerate(names) if name in known}
     for number in outcomes:
@@ -136,6 +158,9 @@ def report_of(evaluation: Evaluation, config: EvaluateConfig, planned: Plan) -> 
     """The tables that the settings ask for beside the rows of every sequence; None for none."""
     if config.report == "compact":
         return compact_report(evaluation, tuple(config.methods))
+    if config.report == "trial":
+        sequences = dict.fromkeys(job.path.stem for job in planned.jobs)
+        return trial_report(evaluation, tuple(config.methods), tuple(sequences), _limits(config))
     if config.report == "paper":
         return paper_report(evaluation, config.cells, planned.cells, tuple(config.methods))
     return None
@@ -148,7 +173,8 @@ def _run_config(path: Path, method: MethodConfig, config: EvaluateConfig) -> Run
 def _outcomes(jobs: Sequence[Job], config: EvaluateConfig) -> Iterator[tuple[int, Outcome]]:
     """The outcome of each job as it comes, with its number."""
     function = partial(measure, limits=_limits(config))
-    for numbers, outcomes in run_in_groups(function, jobs, [job.method for job in jobs], config.streams, config.executor, config.jobs):
+    alike = [(job.method, job.start.run) for job in jobs]
+    for numbers, outcomes in run_in_groups(function, jobs, alike, config.streams, config.executor, config.jobs):
         for number, outcome in zip(numbers, outcomes, strict=True):
             job = jobs[number]
             yield number, Failure(job.path.stem, job.method, outcome.reason) if isinstance(outcome, TaskFailure) else outcome
@@ -168,7 +194,7 @@ class _Measurement:
     """
 
     def __init__(self, job: Job, limits: tuple[float, float]) -> None:
-        session = open_session(job.config)
+        session = job.start.applied(open_session(job.config))
         if any(truth is None for truth in session.ground_truth):
             raise EventDataError(f"'{job.path}' has no ground truth (poses, pose_t) to evaluate against. Use `torchtrack track` for it.")
         reasons = [unsuitable(job.config.preset, model) for model in session.models]
@@ -203,7 +229,7 @@ class _Measurement:
         median_step_ms = 1e3 * sorted(seconds)[len(seconds) // 2]
         metrics, unseen_turns = summarise(errors, *self._limits), of_object.axis is not None
         names = self.session.name, self.session.labels[number], self._job.method
-        return ObjectResult(*names, errors, metrics, status, median_step_ms, unseen_turns, self._surface(number))
+        return ObjectResult(*names, errors, metrics, status, median_step_ms, unseen_turns, self._surface(number), run=self._job.start.run)
 
     def _surface(self, number: int) -> SurfaceErrors | None:
         """What the surface of an object is off by; None where nothing was tracked."""

@@ -14,6 +14,7 @@ import torchtrack
 from torchtrack.config.run import RunConfig
 from torchtrack.errors import UnknownFormatError
 from torchtrack.eval.results import NotApplicable, ObjectResult
+from torchtrack.eval.start import StartError
 from torchtrack.eval.surface_errors import SurfaceErrors
 from torchtrack.io.atomic import writing
 from torchtrack.io.line_file import LineFile
@@ -23,14 +24,14 @@ Measured = Sequence[ObjectResult | NotApplicable]
 """What was measured of one sequence under one method."""
 
 
-def identity(path: Path, method: str, config: RunConfig) -> str:
-    """What tells a measurement from others: the sequence as it is on disk, the method with all its settings, and the version of this package.
+def identity(path: Path, method: str, config: RunConfig, start: StartError) -> str:
+    """What tells a measurement from others: the sequence as it is on disk, the method with all its settings, the start, and this package's version.
 
     From which error on a window counts as lost is asked when a measurement is read.
     """
     there = path.stat() if path.exists() else None
     file = (str(path.resolve()), there and there.st_size, there and there.st_mtime_ns)
-    text = json.dumps([file, method, config.model_dump(mode="json"), torchtrack.__version__], sort_keys=True)
+    text = json.dumps([file, method, config.model_dump(mode="json", exclude={"output"}), asdict(start), torchtrack.__version__], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

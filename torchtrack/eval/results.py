@@ -16,7 +16,7 @@ from torchtrack.run.sinks.summary import finite
 class ObjectResult:
     """Errors of one object in one sequence under one method, its windows by status, how long a step took, and what its surface is off by.
 
-    ``unseen_turns`` tells of surfaces of revolution, whose turns about their axis are no errors.
+    ``unseen_turns`` tells of surfaces of revolution, whose turns about their axis are no errors; ``run`` is which of several it was.
     """
 
     sequence: str
@@ -28,13 +28,20 @@ class ObjectResult:
     median_step_ms: float
     unseen_turns: bool = False
     surface: SurfaceErrors | None = None
+    run: int = 1
 
     def as_json(self) -> dict[str, Any]:
         """One entry of ``metrics.json``."""
-        names = {"sequence": self.sequence, "object": self.object, "method": self.method}
+        names = {"sequence": self.sequence, "object": self.object, "method": self.method, "run": self.run}
         surface = {} if self.surface is None else asdict(self.surface)
         further = {"status": self.status, "median_step_ms": self.median_step_ms, "unseen_turns": self.unseen_turns}
         return finite({**names, **self.metrics.as_dict(), **surface, **further})
+
+    def as_row(self) -> dict[str, Any]:
+        """One row of ``tables.csv``: name to value, none of them nested."""
+        names = {"method": self.method, "run": self.run, "sequence": self.sequence, "object": self.object}
+        status = {f"windows_{name.lower()}": count for name, count in self.status.items()}
+        return {**names, **self.metrics.as_dict(), **status, "step_ms": self.median_step_ms}
 
 
 @dataclass(frozen=True)
@@ -77,8 +84,8 @@ def write_results(evaluation: Evaluation, folder: Path) -> None:
         path.write_text(json.dumps(entries, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
     with atomic_path(folder / "errors.csv") as path, path.open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(("sequence", "object", "method", "t_us", "rotation_deg", "translation_cm"))
+        rows.writerow(("sequence", "object", "method", "run", "t_us", "rotation_deg", "translation_cm"))
         for result in evaluation.results:
             errors = result.errors
             for values in zip(errors.t_us.tolist(), errors.rotation_deg.tolist(), errors.translation_cm.tolist(), strict=True):
-                rows.writerow((result.sequence, result.object, result.method, values[0], f"{values[1]:.6g}", f"{values[2]:.6g}"))
+                rows.writerow((result.sequence, result.object, result.method, result.run, values[0], f"{values[1]:.6g}", f"{values[2]:.6g}"))

@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.core.lie import rotation_angle_deg
@@ -72,13 +72,18 @@ class Metrics:
         return asdict(self)
 
 
+def is_lost(errors: PoseErrors, lost_rotation_deg: float, lost_translation_cm: float) -> Bool[np.ndarray, "p"]:
+    """Of each window whether its rotation or translation is off by more than the limits."""
+    # A pose that is not finite is as lost as can be, and must not pass a comparison.
+    return ~((errors.rotation_deg.numpy() <= lost_rotation_deg) & (errors.translation_cm.numpy() <= lost_translation_cm))
+
+
 def summarise(errors: PoseErrors, lost_rotation_deg: float = 10.0, lost_translation_cm: float = 5.0) -> Metrics:
     """Mean, median and maximum over all windows, and the share of them whose rotation or translation is off by more than the limits."""
     rotation, translation = errors.rotation_deg.numpy(), errors.translation_cm.numpy()
     if len(rotation) == 0:
         return Metrics(0, **dict.fromkeys((field.name for field in fields(Metrics)[1:]), float("nan")))
-    # A pose that is not finite is as lost as can be, and must not pass a comparison.
-    lost = ~((rotation <= lost_rotation_deg) & (translation <= lost_translation_cm))
+    lost = is_lost(errors, lost_rotation_deg, lost_translation_cm)
     settled = errors.t_us.numpy() >= int(errors.t_us[0]) + SETTLING_US
     return Metrics(
         windows=len(rotation),

@@ -137,6 +137,14 @@ def bar(length_m: float = 0.5, width_m: float = 0.05, thickness_m: float = 0.02)
     return trimesh.creation.box((width_m, length_m, thickness_m))
 
 
+def finger(length_m: float = 0.08, radius_m: float = 0.008) -> trimesh.Trimesh:
+    """A rod with round ends along y, such as holds an object."""
+    rod = trimesh.creation.capsule(height=length_m - 2 * radius_m, radius=radius_m, count=[24, 24])
+    rod.apply_translation(-rod.bounds.mean(0))
+    rod.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    return rod
+
+
 def _prism(loops: Sequence[Float[ndarray, "_ 2"]], depth_m: float, spacing: float = 0.012) -> trimesh.Trimesh:
     """A prism over an outline with holes; each loop counterclockwise, the first around all others."""
     loops = [_subdivided(loop, spacing) for loop in loops]
@@ -186,6 +194,7 @@ SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
     "wedge": wedge,
     "planar": planar_pattern,
     "bar": bar,
+    "finger": finger,
     "torus_knot": curved.torus_knot,
     "vase": curved.vase,
     "mug": curved.mug,

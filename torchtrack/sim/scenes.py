@@ -59,7 +59,8 @@ class ObjectConfig(Settings):
 
     label: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$", description="Name, also in file names.")
     shape: (
-        Literal["cube", "lbracket", "satellite", "book", "wedge", "planar", "bar", "torus_knot", "vase", "mug", "animal", "robot", "duck"] | None
+        Literal["cube", "lbracket", "satellite", "book", "wedge", "planar", "bar", "finger", "torus_knot", "vase", "mug", "animal", "robot", "duck"]
+        | None
     ) = Field(None, description="A built-in object; or give mesh.")
     mesh: ConfigPath | None = Field(None, description="PLY, OBJ, STL, GLB, glTF or OFF file, with its texture or colours.")
     unit: Literal["m", "cm", "mm", "inch"] = Field("m", description="Unit of the mesh file's coordinates.")
@@ -68,6 +69,7 @@ class ObjectConfig(Settings):
     reflectance: float = Field(0.6, gt=0, le=1, description="Share of light that an object without texture gives back.")
     gloss: float = Field(0.08, ge=0, le=2, description="Strength of the highlight.")
     motion: MotionConfig = Field(default_factory=MotionConfig, description="Mean pose and swing.")
+    attached_to: str | None = Field(None, description="Label of an object that carries it along, as it does fingers: its motion is relative to that.")
 
     @model_validator(mode="after")
     def _one_model(self) -> "ObjectConfig":
@@ -149,6 +151,13 @@ class SceneConfig(Settings):
         labels = [item.label for item in (*self.objects, *self.occluders)]
         if len(set(labels)) != len(labels):
             raise ValueError(f"labels must differ, got {', '.join(labels)}")
+        carriers = {item.label for item in self.objects if item.attached_to is None}
+        for item in (*self.objects, *self.occluders):
+            if item.attached_to is not None and item.attached_to not in carriers:
+                raise ValueError(
+                    f"attached_to: '{item.label}' cannot be carried by '{item.attached_to}'; name one of the objects that are not attached themselves"
+                    f" ({', '.join(sorted(carriers)) or 'there is none'})"
+                )
         if isinstance(self.peak_speed, float) and not 1 <= self.peak_speed <= 20_000:
             raise ValueError(f"peak_speed must be between 1 and 20000 px/s, got {self.peak_speed}")
         if self.peak_speed is not None and self.speed != 1:

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load, read_yaml
@@ -101,11 +101,12 @@ def _matching(folder: Path, pattern: str) -> list[Path]:
 
 
 def is_done(scene: SceneConfig, path: Path) -> bool:
-    """Whether a whole sequence of just this scene is there already."""
+    """Whether a whole sequence of just this scene is there already; settings that its file does not know yet are as by default."""
     try:
-        return path.is_file() and bool(read_sequence(path).meta.get("scene") == scene.model_dump(mode="json"))
-    except TorchtrackError:
+        known = SceneConfig.model_validate(read_sequence(path).meta.get("scene")) if path.is_file() else None
+    except (TorchtrackError, ValidationError):
         return False
+    return known is not None and known.model_dump(mode="json") == scene.model_dump(mode="json")
 
 
 def simulate_to_file(scene: SceneConfig, path: Path, progress: Progress | None = None, *, preview: bool = False) -> Path:

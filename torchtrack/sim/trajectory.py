@@ -153,6 +153,23 @@ class SpinMotion:
         return T
 
 
+@dataclass(frozen=True)
+class AttachedMotion:
+    """A motion relative to something that moves itself.
+
+    Args:
+        carrier: the motion of what carries it.
+        relative: its motion in the carrier's frame.
+    """
+
+    carrier: Motion
+    relative: Motion
+
+    def pose(self, t_s: Float[Tensor, "q"]) -> Float[Tensor, "q 4 4"]:
+        """Poses at times in seconds."""
+        return self.carrier.pose(t_s) @ self.relative.pose(t_s)
+
+
 class SplineMotion:
     """A cubic spline in position and in rotation (scipy's ``RotationSpline``) through poses; at rest beyond both ends.
 

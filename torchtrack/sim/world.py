@@ -17,7 +17,7 @@ from torchtrack.errors import ConfigError
 from torchtrack.sim.lens import ideal_camera
 from torchtrack.sim.render import Scenery
 from torchtrack.sim.scenes import Model, ObjectConfig, SceneConfig
-from torchtrack.sim.trajectory import make_motion
+from torchtrack.sim.trajectory import AttachedMotion, Motion, make_motion
 
 # Speeds are looked up this often in a scene when the largest one is sought.
 _SPEED_SAMPLES = 1000
@@ -53,9 +53,14 @@ class World:
         """Make all motions anew, objects and camera at ``speed``."""
         config, self.speed = self.config, speed
         seed = 1000 * config.seed
-        self.objects = [make_motion(item.motion, speed, seed + i) for i, item in enumerate(config.objects)]
+        own = [make_motion(item.motion, speed, seed + i) for i, item in enumerate(config.objects)]
+        by_label: dict[str | None, Motion] = {item.label: motion for item, motion in zip(config.objects, own, strict=True)}
+        self.objects = [_carried(motion, by_label.get(item.attached_to)) for item, motion in zip(config.objects, own, strict=True)]
         # What hides the objects keeps its own pace.
-        self.occluders = [make_motion(item.motion, config.speed, seed + 500 + i) for i, item in enumerate(config.occluders)]
+        self.occluders = [
+            _carried(make_motion(item.motion, config.speed, seed + 500 + i), by_label.get(item.attached_to))
+            for i, item in enumerate(config.occluders)
+        ]
         self._camera_motion = make_motion(config.camera_motion, speed, seed + 900) if config.camera_motion else None
 
     @property
@@ -133,6 +138,11 @@ class World:
             f"peak_speed: no point of the objects of '{self.config.name}' can be brought to {target_px_s:g} px/s: at {_MOST_SPEED_UP} times "
             f"their pace they reach {_MOST_SPEED_UP * so_far:.3g} px/s. Change their motions."
         )
+
+
+def _carried(motion: Motion, carrier: Motion | None) -> Motion:
+    """The motion in the world of what is attached to something; of what is not, its own."""
+    return motion if carrier is None else AttachedMotion(carrier, motion)
 
 
 def longest_way(T_cam_obj: Float[Tensor, "p 4 4"], points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "q"]:
