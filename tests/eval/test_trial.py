@@ -89,10 +89,19 @@ def test_the_spread_is_that_of_all_methods_together():
     assert pooled_spread(entries[2:]) is None
 
 
-def test_one_run_is_compared_where_others_have_told_the_spread():
+@pytest.mark.parametrize(("changed", "expected"), [(1, "within spread"), (10, "gains")])
+def test_a_change_on_one_track_of_many_is_chance(changed, expected):
+    names = [f"far_{number}" for number in range(10)]
+    results = [entry for name in names for entry in runs("all", [1.0], [1.0], sequence=name)]
+    results += [entry for number, name in enumerate(names) for entry in runs("less", *2 * [[90.0 if number < changed else 1.0]], sequence=name)]
+    table = rows(report(results, ("all", "less"), names).grids[0])
+    assert (table["less"]["change lost"], table["less"]["verdict"]) == (f"+{10 * changed:.2f}", expected)
+
+
+def test_a_method_that_ran_once_is_not_judged():
     results = [*runs("all", [1.0], [1.1], [0.9]), *runs("less", [3.0])]
     table = rows(report(results, ("all", "less")).grids[0])
-    assert (table["less"]["runs"], table["less"]["verdict"]) == ("1", "gains")
+    assert (table["less"]["runs"], table["less"]["change δR"], table["less"]["verdict"]) == ("1", "+2.000", "one run")
     assert table["all"]["δR (°)"] == "1.000 ± 0.100"
 
 

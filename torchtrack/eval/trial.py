@@ -6,9 +6,13 @@ Methods run several times, with other roundings each time. Figures of a run are 
 - δR and δT: the mean error over its windows that are not lost. One lost window may be off by 90°: it says nothing of accuracy.
 
 A change is the mean over a method's runs less that over the first method's. Errors are compared on the windows that no run of
-either has lost, so that losing the difficult ones is no gain. A change counts if it is larger than twice its standard deviation,
-which is that of a mean over the runs of each. That between the runs of one method is at least that of all methods together: three
-runs tell little of their own. A change of less than 1 % of an error, or of 0.1 % of the windows, does not count either.
+either has lost, so that losing the difficult ones is no gain. A change counts if it is larger than
+
+- twice its standard deviation between runs, which is that of a mean over the runs of each; that between the runs of one method is at
+  least that of all methods together, as three runs tell little of their own;
+- twice its standard error over tracks: one track of many that is lost by one method and not by another is chance, even if it is so
+  in all runs, as a run that differs by roundings alone may go wrong in the same way;
+- 1 % of an error, or 0.1 % of the windows.
 """
 
 import math
@@ -51,6 +55,9 @@ class Figures(NamedTuple):
     lost: float
 
 
+_NO_FIGURES = Figures(0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class Comparison:
     """A method against the first one.
@@ -58,11 +65,13 @@ class Comparison:
     Args:
         own: what was measured in each run.
         with_all, without: of each run of the first method and of this one, on the windows that both have.
+        over_tracks: standard errors of the change over tracks.
     """
 
     own: Sequence[Figures]
     with_all: Sequence[Figures]
     without: Sequence[Figures]
+    over_tracks: Figures = _NO_FIGURES
 
     @property
     def change(self) -> Figures:
@@ -109,7 +118,18 @@ def compared(first: Sequence[Arm], other: Sequence[Arm], limits: Limits) -> Comp
     tracks = [track for track in first[0] if all(track in arm for arm in (*first, *other))]
     held = {track: reduce(np.intersect1d, [_held_us(arm[track].errors, limits) for arm in (*first, *other)]) for track in tracks}
     own = [_figures(arm, {track: _held_us(result.errors, limits) for track, result in arm.items()}, limits) for arm in other]
-    return Comparison(own, [_figures(arm, held, limits) for arm in first], [_figures(arm, held, limits) for arm in other])
+    runs = [[_figures(arm, held, limits) for arm in arms] for arms in (first, other)]
+    return Comparison(own, *runs, _standard_errors(first, other, held, limits))
+
+
+def _standard_errors(first: Sequence[Arm], other: Sequence[Arm], held_us: Mapping[Track, Int[ndarray, "h"]], limits: Limits) -> Figures:
+    """Of the change from the first method to the other, from how it differs between tracks."""
+    changes = []
+    for track, times in held_us.items():
+        with_all, without = ([_figures(arm, {track: times}, limits) for arm in arms] for arms in (first, other))
+        changes.append(Comparison([], with_all, without).change)
+    columns = [[value for value in values if math.isfinite(value)] for values in zip(*changes, strict=True)]
+    return Figures(*(math.sqrt(_variance(values) / max(len(values), 1)) for values in columns))
 
 
 def _held_us(errors: PoseErrors, limits: Limits) -> Int[ndarray, "h"]:
@@ -144,14 +164,14 @@ def pooled_spread(comparisons: Sequence[Comparison]) -> Figures | None:
 
 def verdict(entry: Comparison, spread: Figures | None) -> str:
     """Whether what the method leaves out is worth anything: without it, is any figure worse, by more than chance, and is none better?"""
-    if spread is None:
+    if spread is None or min(len(entry.with_all), len(entry.without)) < 2:
         return "one run"
     with_all, without = list(zip(*entry.with_all, strict=True)), list(zip(*entry.without, strict=True))
     least = (_LEAST_RELATIVE * fmean(with_all[0]), _LEAST_RELATIVE * fmean(with_all[1]), _LEAST_LOST)
     worse = better = False
     for number, change in enumerate(entry.change):
         of_mean = sum(max(_variance(values[number]), spread[number] ** 2) / len(values[number]) for values in (with_all, without))
-        counts_from = max(_SIGMAS * math.sqrt(of_mean), least[number])
+        counts_from = max(_SIGMAS * math.sqrt(of_mean), _SIGMAS * entry.over_tracks[number], least[number])
         worse, better = worse or change > counts_from, better or change < -counts_from
     if worse and better:
         return "mixed"
