@@ -118,8 +118,8 @@ def compared(first: Sequence[Arm], other: Sequence[Arm], limits: Limits) -> Comp
     tracks = [track for track in first[0] if all(track in arm for arm in (*first, *other))]
     held = {track: reduce(np.intersect1d, [_held_us(arm[track].errors, limits) for arm in (*first, *other)]) for track in tracks}
     own = [_figures(arm, {track: _held_us(result.errors, limits) for track, result in arm.items()}, limits) for arm in other]
-    runs = [[_figures(arm, held, limits) for arm in arms] for arms in (first, other)]
-    return Comparison(own, *runs, _standard_errors(first, other, held, limits))
+    with_all, without = ([_figures(arm, held, limits) for arm in arms] for arms in (first, other))
+    return Comparison(own, with_all, without, _standard_errors(first, other, held, limits))
 
 
 def _standard_errors(first: Sequence[Arm], other: Sequence[Arm], held_us: Mapping[Track, Int[ndarray, "h"]], limits: Limits) -> Figures:
