@@ -16,9 +16,9 @@ from typing import Annotated
 import torch
 import tyro
 
+from torchtrack.core.atomic import atomic_path
 from torchtrack.errors import TorchtrackError
 from torchtrack.eval.sources import find_sequences
-from torchtrack.io.atomic import atomic_path
 from torchtrack.learn.training import Trainer, TrainingConfig
 from torchtrack.sim.suite import run_suite, scenes_of
 

@@ -139,6 +139,18 @@ def test_importing_the_package_loads_nothing_heavy():
     assert "Tracker" in result.stdout
 
 
+@pytest.mark.parametrize("arguments", [["--help"], ["track", "--help"]])
+def test_help_loads_nothing_heavy(arguments):
+    code = (
+        "import sys\nfrom torchtrack.cli import main\n"
+        f"try: code = main({arguments})\nexcept SystemExit as end: code = end.code\n"
+        "assert 'torch' not in sys.modules\nsys.exit(code)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert "usage" in result.stdout.lower()
+
+
 def test_importing_a_tracker_leaves_the_compiler_alone():
     """It takes as long to load as PyTorch itself."""
     modules = "'torchtrack.tracking.tracker' in sys.modules, 'torch._dynamo' in sys.modules"

@@ -35,7 +35,7 @@ def do(task, tell):
         os.kill(os.getpid(), signal.SIGKILL)
     if what == "write for ever":
         # Here, so that the processes of the other tasks start quickly.
-        from torchtrack.io.atomic import atomic_path
+        from torchtrack.core.atomic import atomic_path
 
         with atomic_path(value) as path:
             path.write_text(str(os.getpid()))

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from torchtrack.bench.plots import Plot, draw
+from torchtrack.core.atomic import atomic_path
 from torchtrack.core.dispatch import backend_is_installed
 from torchtrack.errors import ConfigError, MissingFileError
-from torchtrack.io.atomic import atomic_path
 
 
 @dataclass(frozen=True)

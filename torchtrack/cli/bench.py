@@ -13,8 +13,8 @@ from torchtrack.bench.results import Report, as_markdown, machine, older_medians
 from torchtrack.bench.setup import Setup
 from torchtrack.cli.console import output_console
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.core.atomic import check_writable
 from torchtrack.errors import ConfigError, MissingExtraError
-from torchtrack.io.atomic import check_writable
 from torchtrack.run.runner import threads
 
 

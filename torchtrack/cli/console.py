@@ -9,8 +9,8 @@ from typing import Any
 from rich.console import Console
 
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.core.atomic import writing
 from torchtrack.errors import OutputError
-from torchtrack.io.atomic import writing
 
 _NAME = "standard output"
 

@@ -6,8 +6,8 @@ from rich.table import Table
 
 from torchtrack.cli.console import output_console
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.core.atomic import atomic_path, check_other_file, check_writable
 from torchtrack.errors import UnknownFormatError
-from torchtrack.io.atomic import atomic_path, check_other_file, check_writable
 from torchtrack.object_model.report import ModelReport, SurfaceReport, describe_model
 from torchtrack.object_model.settings import METRES_PER_UNIT, Unit
 

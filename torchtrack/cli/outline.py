@@ -10,10 +10,10 @@ from numpy import ndarray
 
 from torchtrack.cli.console import output_console
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.core.atomic import atomic_path, check_other_file
 from torchtrack.core.camera import Camera, undistort
 from torchtrack.errors import MissingFileError, ModelError, UnknownFormatError
 from torchtrack.io import read_calibration
-from torchtrack.io.atomic import atomic_path, check_other_file
 
 # The picture is enlarged before it is thresholded: edges are then found to a fraction of a pixel.
 _ENLARGEMENT = 8

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.core.atomic import atomic_path
 from torchtrack.core.lie import check_pose
 from torchtrack.errors import PoseError
 from torchtrack.io import Trajectory
-from torchtrack.io.atomic import atomic_path
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 

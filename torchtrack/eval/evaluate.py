@@ -12,6 +12,7 @@ from torchtrack.baselines import unsuitable
 from torchtrack.config.evaluate import EvaluateConfig, MethodConfig
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import WindowConfig
+from torchtrack.core.atomic import check_writable
 from torchtrack.core.limits import limits as file_limits
 from torchtrack.core.windows import EventWindow
 from torchtrack.errors import EventDataError
@@ -25,7 +26,6 @@ from torchtrack.eval.sources import cell_sequences, find_sequences
 from torchtrack.eval.start import StartError, start_angle_deg
 from torchtrack.eval.surface_errors import SurfaceErrors, surface_errors
 from torchtrack.eval.trial import trial_report
-from torchtrack.io.atomic import check_writable
 from torchtrack.run.executor import TaskFailure, Tell
 from torchtrack.run.executor.groups import run_in_groups
 from torchtrack.run.executor.tasks import without_errors

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchtrack.io.atomic import atomic_path
+from torchtrack.core.atomic import atomic_path
 from torchtrack.run.sinks.summary import finite
 
 _LATEX = {"\\": r"\textbackslash{}", "°": r"$^\circ$", "δ": r"$\delta$", "Δ": r"$\Delta$", "†": r"$^\dagger$"}

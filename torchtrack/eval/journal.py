@@ -12,11 +12,11 @@ import torch
 
 import torchtrack
 from torchtrack.config.run import RunConfig
+from torchtrack.core.atomic import writing
 from torchtrack.errors import UnknownFormatError
 from torchtrack.eval.results import NotApplicable, ObjectResult
 from torchtrack.eval.start import StartError
 from torchtrack.eval.surface_errors import SurfaceErrors
-from torchtrack.io.atomic import writing
 from torchtrack.io.line_file import LineFile
 from torchtrack.run.metrics import PoseErrors, summarise
 

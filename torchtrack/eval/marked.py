@@ -4,8 +4,8 @@ import re
 import textwrap
 from pathlib import Path
 
+from torchtrack.core.atomic import atomic_path
 from torchtrack.errors import ConfigError, MissingFileError
-from torchtrack.io.atomic import atomic_path
 
 _WIDTH = 120
 

@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from torchtrack.core.atomic import atomic_path
 from torchtrack.eval.surface_errors import SurfaceErrors
-from torchtrack.io.atomic import atomic_path
 from torchtrack.run.metrics import Metrics, PoseErrors
 from torchtrack.run.sinks.summary import finite
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from torchtrack.config.events import ReadingConfig
 from torchtrack.config.formats import OutputFormat
+from torchtrack.core.atomic import check_other_file, temporary_folder, writing
 from torchtrack.errors import UnknownFormatError
-from torchtrack.io.atomic import check_other_file, temporary_folder, writing
 from torchtrack.io.container import ContainerWriter, is_container, read_source
 from torchtrack.io.event_file import DEFAULT_CHOICES
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, EventSource

@@ -4,7 +4,7 @@ import os
 from io import FileIO
 from pathlib import Path
 
-from torchtrack.io.atomic import writing
+from torchtrack.core.atomic import writing
 
 
 class LineFile:

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from torchtrack.core.atomic import temporary_folder, writing
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, check_events
 from torchtrack.errors import EventDataError
-from torchtrack.io.atomic import temporary_folder, writing
 from torchtrack.io.sequence_arrays import distortion_arrays, pose_arrays
 from torchtrack.io.trajectory import Trajectory
 

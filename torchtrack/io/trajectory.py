@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.events import TimeUnit
+from torchtrack.core.atomic import atomic_path
 from torchtrack.core.lie import (
     check_pose,
     continuous_quaternions,
@@ -21,7 +22,6 @@ from torchtrack.core.lie import (
 )
 from torchtrack.core.limits import check_limit
 from torchtrack.errors import PoseError
-from torchtrack.io.atomic import atomic_path
 from torchtrack.io.pose_times import pose_times_us
 from torchtrack.io.seconds import format_seconds
 from torchtrack.io.whole_text import read_text_file

@@ -10,9 +10,9 @@ from typing import Any
 from torchtrack.config.load import as_yaml
 from torchtrack.config.run import RunConfig
 from torchtrack.config.tracker import WindowConfig
+from torchtrack.core.atomic import writing
 from torchtrack.core.windows import EventWindow
 from torchtrack.errors import EventDataError, MissingFileError, OutputError, TorchtrackError, UnknownFormatError
-from torchtrack.io.atomic import writing
 from torchtrack.io.keep_up import KeepUp
 from torchtrack.io.ros_live import RosSource
 from torchtrack.run.interrupt import Interrupt

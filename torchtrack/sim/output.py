@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from torchtrack.core.atomic import atomic_path
 from torchtrack.errors import EventDataError
-from torchtrack.io.atomic import atomic_path
 from torchtrack.io.container import ContainerWriter
 from torchtrack.io.sequence import write_sequence
 from torchtrack.io.sequence_types import SequenceObject

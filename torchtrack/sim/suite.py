@@ -19,9 +19,9 @@ from pydantic import Field, ValidationError
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load, read_yaml
 from torchtrack.config.settings import Settings
+from torchtrack.core.atomic import check_writable
 from torchtrack.core.limits import limits
 from torchtrack.errors import ConfigError, MissingFileError, TorchtrackError
-from torchtrack.io.atomic import check_writable
 from torchtrack.io.sequence import read_sequence
 from torchtrack.run.executor import TaskFailure, Tell, run_tasks
 from torchtrack.run.runner import threads

@@ -18,10 +18,10 @@ from numpy import ndarray
 from pydantic import Field, model_validator
 
 from torchtrack.config.settings import ConfigPath, Settings
+from torchtrack.core.atomic import atomic_path, check_writable
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.core.files import read_bytes
 from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
-from torchtrack.io.atomic import atomic_path, check_writable
 from torchtrack.sim.event_camera import EventCamera
 from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
 from torchtrack.sim.surface import grey_reflectance

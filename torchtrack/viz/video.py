@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from torchtrack.core.atomic import atomic_path, writing
 from torchtrack.errors import TorchtrackError
-from torchtrack.io.atomic import atomic_path, writing
 from torchtrack.viz.vp9 import Vp9File
 
 # A pause of the events longer than this is shortened to it (seconds of video).

@@ -7,8 +7,8 @@ import os
 import sys
 from pathlib import Path
 
+from torchtrack.core.atomic import missing_folders, remove_empty, writing
 from torchtrack.errors import OutputError
-from torchtrack.io.atomic import missing_folders, remove_empty, writing
 
 SUMMARY, CONFIG, POSES = "summary.json", "config.yaml", "poses.csv"
 # What a run writes; all else in the folder is the user's own.

@@ -10,9 +10,9 @@ import torch
 
 from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
+from torchtrack.core.atomic import writing
 from torchtrack.core.lie import rotation_from_quaternion
 from torchtrack.errors import ConfigError, MissingFileError, UnknownFormatError
-from torchtrack.io.atomic import writing
 from torchtrack.run.sinks.folder import CONFIG, POSES, ended
 from torchtrack.run.sinks.poses import COLUMNS, tum_path
 from torchtrack.run.sinks.record import Earlier

@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 
+from torchtrack.core.atomic import temporary_folder, writing
 from torchtrack.core.lie import quaternion_from_rotation, with_signs_of
 from torchtrack.errors import OutputError
-from torchtrack.io.atomic import temporary_folder, writing
 from torchtrack.io.extras import optional
 from torchtrack.io.ros_poses import NAMES, POSE, TF_TOPIC, TRANSFORMS, ObjectPose, PoseMessages, pose_topic
 from torchtrack.run.stepping import Step

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 import torchtrack
-from torchtrack.io.atomic import writing
+from torchtrack.core.atomic import writing
 from torchtrack.io.problems import ClockChange, Problems
 from torchtrack.run.metrics import Metrics, summarise
 from torchtrack.run.sinks.record import ObjectRecord, Record

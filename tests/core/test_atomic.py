@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from places import REPOSITORY
 
+from torchtrack.core.atomic import atomic_path, check_other_file, check_writable
 from torchtrack.errors import EventDataError, OutputError
-from torchtrack.io.atomic import atomic_path, check_other_file, check_writable
 from torchtrack.io.convert import WRITERS, convert
 from torchtrack.io.line_file import LineFile
 
