@@ -142,7 +142,7 @@ def test_importing_the_package_loads_nothing_heavy():
 @pytest.mark.parametrize("arguments", [["--help"], ["track", "--help"]])
 def test_help_loads_nothing_heavy(arguments):
     code = (
-        "import sys\nfrom torchtrack.cli import main\n"
+        "import sys\nfrom torchtrack.cli.main import main\n"
         f"try: code = main({arguments})\nexcept SystemExit as end: code = end.code\n"
         "assert 'torch' not in sys.modules\nsys.exit(code)"
     )
