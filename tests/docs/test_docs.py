@@ -13,8 +13,11 @@ import pytest
 import torch
 import tyro
 import yaml
+from helpers import SMALL_CAMERA, box_model, pose, pose_errors
 from tiny_sequence import write_tiny_sequence
+from tracked_boxes import follow, moving_box, windows
 
+from torchtrack import Tracker
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.main import _Command, split_overrides
 from torchtrack.cli.settings import as_markdown
@@ -26,6 +29,8 @@ from torchtrack.config.formats import OutputFormat
 from torchtrack.config.load import load
 from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.run import RunConfig
+from torchtrack.core.camera import project
+from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.io import Trajectory, read_calibration, write_tum
 from torchtrack.run.sinks.poses import COLUMNS
 from torchtrack.sim import SceneConfig
@@ -83,6 +88,22 @@ def test_python_that_needs_data_names_what_is_there(code):
     assert imported or used
     for module, name in (*imported, *used):
         assert hasattr(import_module(module), name), f"{module}.{name}"
+
+
+def test_the_cost_term_draws_a_pose_to_where_it_says():
+    """Half a millimetre beside the truth, where events alone leave it."""
+    (code,), shown = blocks("python cost-term"), {}
+    exec(compile(code, "architecture.md", "exec"), shown)
+    trajectory, events = moving_box(pose(), 4)
+    *before, (last, end_us) = windows(events, 4)
+    tracker = Tracker([box_model()], SMALL_CAMERA, dtype=torch.float64)
+    state, _ = follow(tracker, tracker.init(pose()[None], 0), before)
+    T_said = retract_about(trajectory.at(torch.tensor([end_us])), torch.tensor([[0.0, 0, 0, 5e-4, 0, 0]]).double(), tracker.centre_obj)
+    points_obj = torch.tensor([[[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05], [-0.05, 0, 0], [0, -0.05, 0]]]).double()
+    pixels = project(transform_points(T_said, points_obj), tracker.intrinsics)
+    _, with_pairs = shown["step_with_pairs"](tracker, state, last, end_us, points_obj, pixels)
+    millimetres = [float(pose_errors(result.T_cam_obj, T_said)[1]) for result in (tracker.step(state, last, end_us)[1], with_pairs)]
+    assert millimetres[0] > 0.2 and millimetres[1] < 0.02
 
 
 @pytest.mark.parametrize("arguments", commands(), ids=" ".join)
