@@ -37,7 +37,7 @@ def tracked(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     steps = Steps()
     path = write_tiny_sequence(folder, labels=("left", "right.2"), duration_us=20_000)
-    run(RunConfig(source=path, output=folder / "out", overlay={"enabled": False}, ros_bag=True), [steps])
+    run(RunConfig(source=path, output=folder / "out", overlay={"enabled": False}, ros={"bag": True}), [steps])
     return folder / "out", steps.steps
 
 

@@ -124,6 +124,12 @@ class OverlayConfig(Settings):
     stills: int = Field(4, ge=0, le=100, description="PNG stills, taken evenly over the video.")
 
 
+class RosConfig(Settings):
+    """What is written for ROS 2."""
+
+    bag: bool = Field(False, description="Also write poses.mcap: poses and transforms as messages, for Foxglove and rosbag2 (extra ros).")
+
+
 class TrackingConfig(Settings):
     """How objects are tracked: preset, tracker, arithmetic."""
 
@@ -166,7 +172,7 @@ class RunConfig(TrackingConfig):
     )
     overlay: OverlayConfig = OverlayConfig()
     limits: Limits = Field(default_factory=current_limits, description="How large files may be.")
-    ros_bag: bool = Field(False, description="Also write poses.mcap: poses and transforms as ROS 2 messages, for Foxglove and rosbag2 (extra ros).")
+    ros: RosConfig = RosConfig()
     alignment: bool = Field(False, description="Measure how far events lie from the contours, at the tracked and at the initial pose.")
     reference_angular_velocity: ConfigPath | None = Field(
         None, description="Text file of three numbers, for the summary (a camera turns the other way)."

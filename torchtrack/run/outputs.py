@@ -104,7 +104,7 @@ class RunOutputs:
         part = "" if self._resumed_us is None else f"_from_{self._resumed_us}us"
         if config.overlay.enabled:
             self._open_sink(Overlay(folder / f"overlay{part}.mp4", session, config.overlay, config.tracker))
-        if config.ros_bag:
+        if config.ros.bag:
             self._open_sink(PoseBag(folder / f"poses{part}.mcap", session.labels))
         if isinstance(session.live, RosSource):
             self._open_sink(RosPublisher(session.live, session.labels))

@@ -19,7 +19,7 @@ from torchtrack.run.sinks.record import Earlier
 from torchtrack.tracking.validation.status import Status
 
 # Settings that say where results go and how fast they are had, not what they are.
-_MAY_DIFFER = {"output", "overlay", "ros_bag", "threads", "device", "kernels", "compiled", "limits"}
+_MAY_DIFFER = {"output", "overlay", "ros", "threads", "device", "kernels", "compiled", "limits"}
 
 
 def has_begun(folder: Path) -> bool:
