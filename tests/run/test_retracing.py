@@ -14,7 +14,7 @@ from torchtrack.core.lie import retract_about
 from torchtrack.core.windows import EventWindow
 from torchtrack.run.refine import Refinement, refined_steps
 from torchtrack.run.retrace import Retracer
-from torchtrack.run.retracing import Gap, _in_reverse, retraced
+from torchtrack.run.retracing import Gap, in_reverse, retraced
 from torchtrack.run.runner import track
 from torchtrack.run.smooth import SmoothedObjects
 from torchtrack.run.stepping import Step
@@ -87,7 +87,7 @@ RETRACED = TrackerConfig(smoothing=SmoothingConfig(retrace_s=0.06))
 def test_a_window_in_reverse_is_one_of_the_other_end():
     _, events = moving_box(pose(), 2)
     window = EventWindow(events.slice_time(5000, 10_000), 5000, 10_000)
-    reverse = _in_reverse(window, 10_000)
+    reverse = in_reverse(window, 10_000)
     assert (reverse.t_us.diff() >= 0).all()
     assert int(reverse.t_us[0]) > 10_000
     assert int(reverse.t_us[-1]) <= 15_000

@@ -15,6 +15,7 @@ from torchtrack.cli.console import flushed, report, take_any_text
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.options import Demo, Evaluate, Model, Outline, Settings, Simulate, Track
 from torchtrack.cli.options_files import Bench, Convert, Info
+from torchtrack.cli.options_pose import Pose
 from torchtrack.config.load import load, typed
 from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import ConfigError, TorchtrackError
@@ -30,6 +31,7 @@ _Command = (
     | Annotated[Demo, subcommand("demo")]
     | Annotated[Outline, subcommand("outline")]
     | Annotated[Model, subcommand("model")]
+    | Annotated[Pose, subcommand("pose")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Convert, subcommand("convert")]
     | Annotated[Bench, subcommand("bench")]

@@ -23,7 +23,7 @@ def initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) -> 
         PoseError: if it is no rigid motion, or a trajectory has nothing measured at the start.
     """
     if obj.initial_pose is not None:
-        T = _configured_pose(obj.initial_pose, start_us)
+        T = configured_pose(obj.initial_pose, start_us)
         check_pose(T, f"initial_pose of '{obj.label}'")
         return T
     if truth is None:
@@ -31,7 +31,12 @@ def initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) -> 
     return truth.measured_at(start_us, f"the ground truth of '{obj.label}'")
 
 
-def _configured_pose(pose: PoseConfig, start_us: int) -> Float[Tensor, "4 4"]:
+def configured_pose(pose: PoseConfig, start_us: int) -> Float[Tensor, "4 4"]:
+    """``T_cam_obj`` (float64) as one of the ways to give it says.
+
+    Raises:
+        PoseError: if a trajectory has nothing measured at the start.
+    """
     if pose.trajectory is not None:
         T_cam_world = None if pose.T_cam_world is None else torch.tensor(pose.T_cam_world, dtype=torch.float64)
         read = read_trajectory(pose.trajectory, name=pose.name, frame_us=pose.frame_us, T_cam_world=T_cam_world, time_unit=pose.time_unit)

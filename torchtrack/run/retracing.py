@@ -75,15 +75,15 @@ def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> li
 def _followed_back(steps: Sequence[Step], number: int, alone: Tracker) -> Iterator[tuple[int, TrackerState, StepResult]]:
     """The states and results of an object at the end of each step but the last, the latest first, from what comes after it."""
     about_us = steps[-1].window.t_end_us
-    state = _turned(steps[-1].state, number, alone)
+    state = turned_back(steps[-1].state, number, alone)
     for at in reversed(range(len(steps) - 1)):
         window = steps[at + 1].window
-        events = _in_reverse(window, about_us).to(state.T_cam_obj.device)
+        events = in_reverse(window, about_us).to(state.T_cam_obj.device)
         state, result = alone.step(state, events, 2 * about_us - window.t_start_us)
         yield at, state, result
 
 
-def _in_reverse(window: EventWindow, about_us: int) -> EventBatch:
+def in_reverse(window: EventWindow, about_us: int) -> EventBatch:
     """The events of a window with time running backwards, mirrored at ``about_us``: its start is their end."""
     events = window.events
     x, y, t_us, polarity, stream = (values.flip(0) for values in (events.x, events.y, events.t_us, events.polarity, events.stream_index))
@@ -91,7 +91,7 @@ def _in_reverse(window: EventWindow, about_us: int) -> EventBatch:
     return EventBatch(x, y, 2 * about_us + 1 - t_us, ~polarity, stream)
 
 
-def _turned(state: TrackerState, number: int, alone: Tracker) -> TrackerState:
+def turned_back(state: TrackerState, number: int, alone: Tracker) -> TrackerState:
     """What is known of one object, as the state of a tracker of it alone for which time runs backwards."""
     known = take_part(state, slice(number, number + 1), slice(0, 1))
     fresh = first_state(alone, known.T_cam_obj, known.t_us)

@@ -44,8 +44,8 @@ def outlines_by_view(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], 
     if host_sync.read_at_once(view):
         used, view = view.unique(return_inverse=True)
         towards = towards[used]
-    outlines = _outlines_from(prediction, towards, config)
-    return _moved_to(outlines, view, T_cam_obj, objects.intrinsics)
+    outlines = outlines_from(prediction, towards, config)
+    return moved_to(outlines, view, T_cam_obj, objects.intrinsics)
 
 
 def thinned(contours: Contours) -> Contours:
@@ -63,7 +63,7 @@ def outlines_at(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], confi
     return thinned(prediction.objects.copies(0, len(T_cam_obj)).contours(T_cam_obj, config.contours))
 
 
-def _outlines_from(prediction: Prediction, towards: Float[Tensor, "v 3"], config: TrackerConfig) -> Contours:
+def outlines_from(prediction: Prediction, towards: Float[Tensor, "v 3"], config: TrackerConfig) -> Contours:
     """The outlines of an object straight before the camera, which it sees from some directions."""
     up, other_up = (constant(axis, towards.dtype, towards.device) for axis in (_UP, _OTHER_UP))
     right = torch.linalg.cross(torch.where(towards[:, 2:].abs() < _ALONG, up, other_up), towards, dim=-1)
@@ -77,7 +77,7 @@ def _outlines_from(prediction: Prediction, towards: Float[Tensor, "v 3"], config
     return outlines_at(prediction, poses, config)
 
 
-def _moved_to(outlines: Contours, view: Int[Tensor, "n"], T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"]) -> Contours:
+def moved_to(outlines: Contours, view: Int[Tensor, "n"], T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"]) -> Contours:
     """The contour points of a view each, seen from other poses."""
     of_views = (outlines.points_obj, outlines.tangents_obj, outlines.kind, outlines.mask)
     points, tangents, kind, mask = (values.index_select(0, view) for values in of_views)

@@ -1,0 +1,129 @@
+"""``torchtrack pose``: the first pose of an object in a recording, as the block of a config."""
+
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from torchtrack.cli.console import output_console
+from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.config.load import load
+from torchtrack.config.run import ObjectConfig, RunConfig
+from torchtrack.config.settings import CommandLineText
+from torchtrack.core.files import naming
+from torchtrack.errors import ConfigError, EventDataError, TorchtrackWarning
+from torchtrack.io.atomic import atomic_path, check_other_file, check_writable
+from torchtrack.run.first_pose.picks import pose_of_picks, read_picks
+from torchtrack.run.first_pose.request import as_block, object_of, opened_start, parsed_box, placed_picks, read_near
+from torchtrack.run.first_pose.searching import pose_in_box, pose_near, refined_pose
+from torchtrack.run.first_pose.start import Start
+from torchtrack.run.first_pose.tracked import FirstPose
+from torchtrack.run.runner import threads
+from torchtrack.tracking.start_check import check_in_view
+
+# A pose whose contours explain less than this may be a wrong one.
+_DOUBTFUL_QUALITY = 0.5
+
+
+@dataclass(frozen=True)
+class Ways:
+    """How the pose is to be come by: one of these.
+
+    Args:
+        points: a file of picks.
+        near: a file with a rough pose.
+        search: whether it is looked for, in the ``box`` where that is given.
+        box: as typed.
+    """
+
+    points: Path | None = None
+    near: Path | None = None
+    search: bool = False
+    box: str | None = None
+
+    def check(self) -> None:
+        """Refuse none, or several of them.
+
+        Raises:
+            ConfigError: then.
+        """
+        given = [name for name, value in (("--points", self.points), ("--near", self.near), ("--search", self.search)) if value]
+        if len(given) != 1:
+            got = " and ".join(given) or "none of them"
+            raise ConfigError(f"command line: pose needs one of --points FILE, --near FILE or --search [--box u0,v0,u1,v1], got {got}.")
+        if self.box is not None and not self.search:
+            raise ConfigError("command line: --box is where to --search, and of no use otherwise.")
+
+
+def write_pose(source: str, settings: dict[str, Any], ways: Ways, label: str | None, output: Path | None) -> int:
+    """Find the first pose of an object, and show or write it; returns the exit code.
+
+    Args:
+        source: a recording, a sequence, or a config of ``torchtrack track``.
+        settings: of the run, by dotted key.
+        label: of the object, where there are several.
+    """
+    ways.check()
+    with naming(Path(source)):
+        config = _run_config(source, settings)
+    if output is not None:
+        for path in filter(None, (Path(source), ways.points, ways.near)):
+            check_other_file(path, output)
+        check_writable(output)
+    obj, begun = object_of(config, label), time.perf_counter()
+    with threads(config.threads), naming(Path(source)):
+        start = opened_start(config, obj)
+        pose = _pose(ways, start, obj)
+        check_in_view(pose.T_cam_obj[None], [start.model], [start.camera])
+    _tell(pose, obj.label, time.perf_counter() - begun)
+    _show(as_block(pose.T_cam_obj, obj.label, start.at_us), output)
+    return ExitCode.DONE
+
+
+def _run_config(source: str, settings: dict[str, Any]) -> RunConfig:
+    if Path(source).suffix.lower() in (".yaml", ".yml"):
+        return load(RunConfig, Path(source), settings)
+    return load(RunConfig, None, {"source": CommandLineText(source), **settings})
+
+
+def _pose(ways: Ways, start: Start, obj: ObjectConfig) -> FirstPose:
+    if ways.points is not None:
+        return _pose_of_picks(ways.points, start, obj)
+    if ways.near is not None:
+        return pose_near(start, read_near(ways.near, obj.label, start.at_us))
+    return pose_in_box(start, None if ways.box is None else parsed_box(ways.box, start.camera))
+
+
+def _pose_of_picks(path: Path, start: Start, obj: ObjectConfig) -> FirstPose:
+    T_cam_obj = pose_of_picks(placed_picks(read_picks(path), obj), start.camera)
+    try:
+        return refined_pose(start, T_cam_obj)
+    except EventDataError as error:
+        warnings.warn(f"the pose is that of the picks alone, not refined: {error}", TorchtrackWarning, stacklevel=2)
+        return FirstPose(T_cam_obj, start.at_us, torch.nan)
+
+
+def _tell(pose: FirstPose, label: str, seconds: float) -> None:
+    """Say on stderr how good the pose is: the terminal's output is the block."""
+    Console(stderr=True, highlight=False, soft_wrap=True).print(
+        f"'{label}': events explain {100 * pose.quality:.0f} % of its moving contour; {seconds:.1f} s", markup=False
+    )
+    if pose.quality < _DOUBTFUL_QUALITY:
+        message = (
+            f"the events explain {100 * pose.quality:.0f} % of the contour of '{label}': the pose may be wrong. Look at the first still of "
+            "`torchtrack track`, check the model and its unit, or give a box, more points, or another time (--at-us)."
+        )
+        warnings.warn(message, TorchtrackWarning, stacklevel=2)
+
+
+def _show(block: str, output: Path | None) -> None:
+    if output is None:
+        output_console().print(block, markup=False, end="")
+        return
+    with atomic_path(output) as temporary:
+        temporary.write_text(block, encoding="utf-8")
+    output_console().print(f"the pose is in {output}", markup=False)

@@ -1,0 +1,78 @@
+"""Poses at the start, followed through the first windows: the one that goes on to explain events best is the first pose.
+
+All are tracked as one batch, each in a stream of its own. The best is then followed back to the start, with the events in reverse
+(:mod:`torchtrack.run.retracing`), and so the pose is of the time that was asked for.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchtrack.config.presets import preset
+from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.events import EventBatch, concatenate
+from torchtrack.core.windows import EventWindow, windows_by_time
+from torchtrack.run.first_pose.start import Start
+from torchtrack.run.retracing import in_reverse, turned_back
+from torchtrack.tracking.initialization import first_state
+from torchtrack.tracking.state import StepResult, TrackerState, take_part
+from torchtrack.tracking.tracker import Tracker
+
+# How long poses are followed (µs); what is explained at the end of it, for the last part of the windows, is compared.
+_FOLLOWED_US, _COMPARED = 60_000, 0.5
+
+
+@dataclass(frozen=True)
+class FirstPose:
+    """A pose at the start.
+
+    Args:
+        T_cam_obj: the pose (float64).
+        at_us: its time.
+        quality: share of the moving contour that events explained, in the last windows it was followed through.
+    """
+
+    T_cam_obj: Float[Tensor, "4 4"]
+    at_us: int
+    quality: float
+
+
+def best_followed(start: Start, T_cam_obj: Float[Tensor, "n 4 4"]) -> FirstPose:
+    """The pose that explains most of what comes after the start."""
+    config = _alone_config()
+    windows = list(windows_by_time([start.events.slice_time(start.at_us, start.at_us + _FOLLOWED_US)], config.window.duration_us, start.at_us))
+    count = len(T_cam_obj)
+    tracker = Tracker([start.model] * count, [start.camera] * count, config, range(count))
+    state = first_state(tracker, T_cam_obj.double(), torch.full((count,), start.at_us))
+    scores = []
+    with torch.inference_mode():
+        for window in windows:
+            state, _ = tracker.step(state, _for_all(window.events, count), window.t_end_us)
+            scores.append(state.health.score)
+        compared = torch.stack(scores[-max(1, round(_COMPARED * len(scores))) :]).mean(0)
+        best = int(compared.argmax())
+        alone = Tracker([start.model], start.camera, config)
+        T_start = _followed_back(take_part(state, slice(best, best + 1), slice(best, best + 1)), windows, alone)
+    return FirstPose(T_start, start.at_us, float(compared[best]))
+
+
+def _alone_config() -> TrackerConfig:
+    """The usual settings, without a search for other poses: these are all tried as it is."""
+    config = preset("causal")
+    return config.model_copy(update={"relocalization": config.relocalization.model_copy(update={"hypotheses": 0})})
+
+
+def _for_all(events: EventBatch, count: int) -> EventBatch:
+    return concatenate([events.of_stream(stream) for stream in range(count)])
+
+
+def _followed_back(state: TrackerState, windows: Sequence[EventWindow], alone: Tracker) -> Float[Tensor, "4 4"]:
+    """The pose at the start of the windows, of an object whose state at their end is known."""
+    about_us = windows[-1].t_end_us
+    state = turned_back(state, 0, alone)
+    for window in reversed(windows):
+        state, _ = alone.step(state, in_reverse(window, about_us), 2 * about_us - window.t_start_us)
+    return state.T_cam_obj[0].clone()
