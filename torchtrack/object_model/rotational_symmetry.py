@@ -7,6 +7,7 @@ of the surface and about the axes of the object's frame are tried, and all that 
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.spatial import cKDTree
@@ -18,8 +19,8 @@ from torchtrack.object_model.symmetry import revolution_axis
 
 # Parts of a full rotation that are tried: smaller ones move any surface by little. So many stand for all of a surface of revolution.
 _FOLDS, _ALL_AROUND = (2, 3, 4, 5, 6), 72
-# A surface comes onto itself when its rotated samples lie this near to it, in the mean (diameters).
-_SAME = 0.015
+# A surface comes onto itself when all but a few of its rotated samples lie this near to it (diameters).
+_SAME, _NEARLY_ALL = 0.025, 0.98
 _SAMPLES = 2000
 # Rotations are the same within this (rad); an object has no more of them than a surface of revolution whose ends may be swapped.
 _SAME_RAD, _MOST = 0.02, 2 * _ALL_AROUND
@@ -60,7 +61,7 @@ def rotation_group(model: ObjectModel) -> RotationGroup:
     for axis in axes:
         for fold in _FOLDS:
             rotation = so3_exp(2 * math.pi / fold * axis)
-            apart_m = float(surface.query((samples @ rotation.mT).numpy())[0].mean())
+            apart_m = float(np.quantile(surface.query((samples @ rotation.mT).numpy())[0], _NEARLY_ALL))
             if apart_m < _SAME * model.diameter_m and not _is_among(rotation, group) and len(group) < _MOST:
                 group = _closed(torch.cat([group, rotation[None]]))
     return RotationGroup(group, middle)

@@ -25,6 +25,7 @@ FEWEST_PICKS = 4
 _ON_A_LINE = 0.02
 # Picks that are farther off than this from the pose that fits them best (px) are doubtful.
 _DOUBTFUL_PX = 10.0
+_LOOK = "Look whether each line has the point of its pixel."
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,8 @@ def read_picks(path: Path) -> Picks:
     rows = [row for row in csv.reader(lines) if row and not row[0].lstrip().startswith("#")]
     header = tuple(word.strip().lower() for word in rows[0]) if rows else ()
     if header != COLUMNS:
-        raise PoseError(f"'{path}': expected the first line '{','.join(COLUMNS)}', got '{','.join(header)}'. Pixels come first, then the model's x, y, z.")
+        got = ",".join(header)
+        raise PoseError(f"'{path}': expected the first line '{','.join(COLUMNS)}', got '{got}'. Pixels come first, then the model's x, y, z.")
     values = np.array([_numbers(row, path) for row in rows[1:]]).reshape(-1, len(COLUMNS))
     return Picks(values[:, :2], values[:, 2:], f"'{path}'")
 
@@ -89,13 +91,13 @@ def pose_of_picks(picks: Picks, camera: Camera) -> Float[Tensor, "4 4"]:
     ideal = undistort(picks.pixels, camera)
     solved, turn, translation = cv2.solvePnP(picks.points, ideal, camera.matrix, None, flags=cv2.SOLVEPNP_SQPNP)
     if not solved or not np.isfinite(turn).all():
-        raise PoseError(f"{picks.name}: no pose puts these points on their pixels. Look whether each line has the point of its pixel.")
+        raise PoseError(f"{picks.name}: no pose puts these points on their pixels. {_LOOK}")
     turn, translation = cv2.solvePnPRefineLM(picks.points, ideal, camera.matrix, None, turn, translation)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], translation[:, 0]
     points_cam = picks.points @ T[:3, :3].T + T[:3, 3]
     if (points_cam[:, 2] <= 0).any():
-        raise PoseError(f"{picks.name}: the pose that fits these points best has some behind the camera. Look whether each line has the point of its pixel.")
+        raise PoseError(f"{picks.name}: the pose that fits these points best has some behind the camera. {_LOOK}")
     off_px = np.linalg.norm(points_cam @ camera.matrix.T / points_cam[:, 2:] - np.pad(ideal, ((0, 0), (0, 1)), constant_values=1.0), axis=1)
     if off_px.max() > _DOUBTFUL_PX:
         worst = int(off_px.argmax())

@@ -98,7 +98,8 @@ def parsed_box(text: str, camera: Camera) -> Box:
         raise ConfigError(f"--box: expected left, top, right and bottom side in pixels, as in --box 100,80,260,220, got '{text}'.") from None
     inside = max(u0, 0) + 2 < min(u1, camera.width - 1) and max(v0, 0) + 2 < min(v1, camera.height - 1)
     if not inside:
-        raise ConfigError(f"--box: {text} is no part of the image of {camera.width}x{camera.height}; expected left,top,right,bottom, some pixels apart.")
+        size = f"{camera.width}x{camera.height}"
+        raise ConfigError(f"--box: {text} is no part of the image of {size}; expected left,top,right,bottom, some pixels apart.")
     u, v = np.linspace(u0, u1, 9), np.linspace(v0, v1, 9)
     border = [np.stack([u, np.full(9, end)], 1) for end in (v0, v1)] + [np.stack([np.full(9, end), v], 1) for end in (u0, u1)]
     return Box.around(torch.from_numpy(undistort(np.concatenate(border), camera)).float())

@@ -12,20 +12,18 @@ from torchtrack.run.first_pose.outlines import ViewedObject
 from torchtrack.run.first_pose.rotations import all_rotations, rotations_around
 from torchtrack.run.first_pose.search_view import BOX_PX, SIDE_PX, SearchView
 from torchtrack.run.first_pose.start import Box, Start, box_of_events
-from torchtrack.run.first_pose.tracked import FirstPose, best_followed
-from torchtrack.run.first_pose.trials import Scored, Trials, search
-from torchtrack.tracking.contours.points import Contours
+from torchtrack.run.first_pose.tracked import FOLLOWED_US, FirstPose, best_followed
+from torchtrack.run.first_pose.trials import Trials, search
 
 # Events that are looked at, for each pixel around the box, and how many at least and at most; and the longest time of them (s).
 _EVENTS_PER_PX, _FEWEST, _MOST = 12, 300, 100_000
-_LONGEST_S = 0.1
+_LONGEST_S = 1e-6 * FOLLOWED_US
 # How far a box that somebody drew is off, of its size.
 _BOX_ERROR = 0.15
 # Poses that are followed through the first windows.
 _FOLLOWED = 12
-# Around a rough pose: rotations (degrees), and relative depths.
-_NEAR_DEG, _NEAR_STEP_DEG = 45.0, 9.0
-_PICKED_DEG, _PICKED_STEP_DEG = 10.0, 5.0
+# Around a rough pose, and around one that picked points give: how far rotations go, and their steps (degrees).
+_NEAR_DEG, _PICKED_DEG = (45.0, 9.0), (15.0, 5.0)
 
 
 def pose_in_box(start: Start, box: Box | None = None) -> FirstPose:
@@ -47,13 +45,13 @@ def pose_in_box(start: Start, box: Box | None = None) -> FirstPose:
 def pose_near(start: Start, T_cam_obj: Float[Tensor, "4 4"]) -> FirstPose:
     """The pose of an object up to some 40° and 20 % of its depth from a given one."""
     steps = torch.tensor([-0.12, -0.06, 0.0, 0.06, 0.12]) * BOX_PX
-    return _around(start, T_cam_obj, (_NEAR_DEG, _NEAR_STEP_DEG), torch.tensor([0.78, 0.86, 0.94, 1.03, 1.13, 1.25]), steps)
+    return _around(start, T_cam_obj, _NEAR_DEG, torch.tensor([0.78, 0.86, 0.94, 1.03, 1.13, 1.25]), steps)
 
 
 def refined_pose(start: Start, T_cam_obj: Float[Tensor, "4 4"]) -> FirstPose:
     """A pose that is a few degrees off, refined on the events."""
     steps = torch.tensor([-0.04, 0.0, 0.04]) * BOX_PX
-    return _around(start, T_cam_obj, (_PICKED_DEG, _PICKED_STEP_DEG), torch.tensor([0.92, 1.0, 1.08]), steps)
+    return _around(start, T_cam_obj, _PICKED_DEG, torch.tensor([0.92, 1.0, 1.08]), steps)
 
 
 def _around(start: Start, T_cam_obj: Float[Tensor, "4 4"], turn_deg: tuple[float, float], scales: Tensor, steps: Tensor) -> FirstPose:
@@ -75,9 +73,8 @@ def projected_box(start: Start, T_cam_obj: Float[Tensor, "4 4"]) -> Box:
     Raises:
         PoseError: if it reaches behind the camera.
     """
-    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3) * start.model.half_extent + start.model.centre
     points = start.model.surface_points if len(start.model.surface_points) else start.model.segments.flatten(0, 1)
-    points_cam = transform_points(T_cam_obj.double(), (points if len(points) else corners).double())
+    points_cam = transform_points(T_cam_obj.double(), points.double())
     if float(points_cam[:, 2].min()) <= 0:
         raise PoseError(f"'{start.model.name}' reaches behind the camera at the given pose. Is its translation in metres?")
     fx, fy, cx, cy = start.camera.intrinsics(torch.float64)
@@ -100,9 +97,10 @@ def lines_in(start: Start, box: Box, view: SearchView) -> EventLines:
     numbers = inside.nonzero()[:, 0]
     wanted = int((_EVENTS_PER_PX * 2 * box.size.sum()).clamp(_FEWEST, _MOST))
     if len(numbers) < _FEWEST:
+        where = f"the box ({box.u0:.0f}, {box.v0:.0f}) to ({box.u1:.0f}, {box.v1:.0f})"
         raise EventDataError(
-            f"{len(numbers)} events in the box ({box.u0:.0f}, {box.v0:.0f}) to ({box.u1:.0f}, {box.v1:.0f}) in {_LONGEST_S:g} s after {start.at_us} µs, "
-            f"at least {_FEWEST} are needed: nothing moves there. Give another box, or a later time (--at-us)."
+            f"{len(numbers)} events in {where} in {1e3 * _LONGEST_S:g} ms after {start.at_us} µs, at least {_FEWEST} are needed: "
+            "nothing moves there. Give another box, or a later time (--at-us)."
         )
     numbers = numbers[:wanted]
     last_s = float(start.age_s[numbers[-1]])

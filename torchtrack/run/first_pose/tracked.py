@@ -5,7 +5,7 @@ All are tracked as one batch, each in a stream of its own. The best is then foll
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -18,11 +18,11 @@ from torchtrack.core.windows import EventWindow, windows_by_time
 from torchtrack.run.first_pose.start import Start
 from torchtrack.run.retracing import in_reverse, turned_back
 from torchtrack.tracking.initialization import first_state
-from torchtrack.tracking.state import StepResult, TrackerState, take_part
+from torchtrack.tracking.state import TrackerState, take_part
 from torchtrack.tracking.tracker import Tracker
 
 # How long poses are followed (µs); what is explained at the end of it, for the last part of the windows, is compared.
-_FOLLOWED_US, _COMPARED = 60_000, 0.5
+FOLLOWED_US, _COMPARED = 60_000, 0.5
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,14 @@ class FirstPose:
 
 
 def best_followed(start: Start, T_cam_obj: Float[Tensor, "n 4 4"]) -> FirstPose:
-    """The pose that explains most of what comes after the start."""
+    """The pose that explains most of what comes after the start.
+
+    Args:
+        start: with events in the first ``FOLLOWED_US``.
+        T_cam_obj: poses to choose from, each near enough to be tracked from there if it is the right one.
+    """
     config = _alone_config()
-    windows = list(windows_by_time([start.events.slice_time(start.at_us, start.at_us + _FOLLOWED_US)], config.window.duration_us, start.at_us))
+    windows = list(windows_by_time([start.events.slice_time(start.at_us, start.at_us + FOLLOWED_US)], config.window.duration_us, start.at_us))
     count = len(T_cam_obj)
     tracker = Tracker([start.model] * count, [start.camera] * count, config, range(count))
     state = first_state(tracker, T_cam_obj.double(), torch.full((count,), start.at_us))

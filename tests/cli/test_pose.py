@@ -1,0 +1,154 @@
+"""The command ``pose``: each of its ways leads to the pose of a moving bracket, and what is wrong is said."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from solid_models import l_prism
+from tiny_sequence import CAMERA, box_events, true_poses
+
+from torchtrack.cli.main import main
+from torchtrack.config.load import load
+from torchtrack.config.run import RunConfig
+from torchtrack.core.camera import project
+from torchtrack.core.lie import rotation_angle_deg, so3_exp, transform_points
+from torchtrack.errors import TorchtrackWarning
+from torchtrack.io import write_sequence
+from torchtrack.object_model import ObjectModel
+from torchtrack.object_model.rotational_symmetry import rotation_group
+from torchtrack.run.first_pose.request import PoseFile, as_block
+from torchtrack.run.initial_pose import configured_pose
+
+AT_US = 20_000
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A sequence of a bracket whose edges fire, its mesh in mm, and the pose at ``AT_US``."""
+    folder, mesh, trajectory = tmp_path_factory.mktemp("scene"), l_prism(), true_poses(120_000, step_us=250)
+    x, y, t_us = box_events(mesh, trajectory)
+    polarity = np.arange(len(t_us)) % 2
+    path = folder / "bracket.npz"
+    write_sequence(
+        path, x=x, y=y, t_us=t_us, polarity=polarity, camera=CAMERA, labels=("bracket",), meshes=[mesh], trajectories=[trajectory], meta={}
+    )
+    mesh.copy().apply_scale(1000).export(folder / "in_mm.stl")
+    return folder, trajectory.at(torch.tensor([AT_US]))[0]
+
+
+def command(*arguments):
+    return main(["pose", *(str(argument) for argument in arguments)])
+
+
+def written_pose(path):
+    pose = load(PoseFile, path).initial_pose
+    return configured_pose(pose, 0)
+
+
+def error_deg(T, truth):
+    group = rotation_group(ObjectModel.from_mesh(l_prism()))
+    return float(group.angles_deg(T[None, :3, :3], truth[None, :3, :3]))
+
+
+def rough(truth, angle_deg, farther):
+    T = truth.clone()
+    T[:3, :3] = so3_exp(torch.deg2rad(torch.tensor([angle_deg, 0.0, 0.0], dtype=torch.float64))) @ T[:3, :3]
+    T[:3, 3] *= farther
+    return T
+
+
+def arguments(folder):
+    return (folder / "bracket.npz", "--mesh", folder / "in_mm.stl", "--unit", "mm", "--at-us", AT_US)
+
+
+def test_a_search_in_a_box(scene, tmp_path, capsys):
+    folder, truth = scene
+    points = transform_points(truth[None], torch.from_numpy(l_prism().vertices)[None])
+    pixels = project(points, CAMERA.intrinsics(torch.float64)[None])[0]
+    sides = ",".join(f"{value:.0f}" for value in (*(pixels.amin(0) - 2).tolist(), *(pixels.amax(0) + 3).tolist()))
+    assert command(*arguments(folder), "--search", "--box", sides, "-o", tmp_path / "pose.yaml") == 0
+    assert error_deg(written_pose(tmp_path / "pose.yaml"), truth) < 5
+    shown = capsys.readouterr()
+    assert "the pose is in" in shown.out and "'in_mm': events explain" in shown.err
+    assert f"start_us: {AT_US}" in (tmp_path / "pose.yaml").read_text()
+
+
+def test_near_a_rough_pose(scene, tmp_path):
+    folder, truth = scene
+    near = tmp_path / "near.yaml"
+    near.write_text(as_block(rough(truth, 35.0, 1.15), "bracket", AT_US))
+    assert command(*arguments(folder), "--near", near, "-o", tmp_path / "pose.yaml") == 0
+    assert error_deg(written_pose(tmp_path / "pose.yaml"), truth) < 5
+
+
+def test_picked_points_in_the_numbers_of_the_file(scene, tmp_path, capsys):
+    folder, truth = scene
+    corners = torch.from_numpy(l_prism().vertices)[[0, 1, 3, 5, 8, 10]]
+    pixels = project(transform_points(truth[None], corners[None]), CAMERA.intrinsics(torch.float64)[None])[0]
+    pixels = pixels + torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rows = [",".join(f"{value:.3f}" for value in (*pixel.tolist(), *(1000 * corner).tolist())) for pixel, corner in zip(pixels, corners, strict=True)]
+    (tmp_path / "picks.csv").write_text("u,v,x,y,z\n" + "\n".join(rows) + "\n")
+    assert command(*arguments(folder), "--points", tmp_path / "picks.csv") == 0
+    block = yaml.safe_load(capsys.readouterr().out)
+    path = tmp_path / "shown.yaml"
+    path.write_text(yaml.safe_dump(block))
+    T = written_pose(path)
+    assert float(rotation_angle_deg(T[:3, :3], truth[:3, :3])) < 3
+    assert torch.allclose(T[:3, 3], truth[:3, 3], atol=0.02)
+
+
+def test_a_block_goes_into_a_config(scene, tmp_path):
+    folder, truth = scene
+    block = yaml.safe_load(as_block(truth, "bracket", AT_US))
+    config = {"source": str(folder / "bracket.npz"), "start_us": AT_US, "objects": [{"label": "bracket", **block}]}
+    (tmp_path / "bracket.yaml").write_text(yaml.safe_dump(config))
+    pose = load(RunConfig, tmp_path / "bracket.yaml").objects[0].initial_pose
+    assert torch.allclose(torch.tensor(pose.translation_m, dtype=torch.float64), truth[:3, 3], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("more", "code", "message"),
+    [
+        ((), 2, "pose needs one of --points FILE, --near FILE or --search [--box u0,v0,u1,v1], got none of them"),
+        (("--search", "--near", "a.yaml"), 2, "got --near and --search"),
+        (("--near", "a.yaml", "--box", "1,2,3,4"), 2, "--box is where to --search"),
+        (("--search", "--box", "1,2,3"), 2, "expected left, top, right and bottom side in pixels"),
+        (("--search", "--box", "500,500,600,600"), 2, "is no part of the image of 120x90"),
+        (("--search", "--box", "0,0,12,12"), 1, "at least 300 are needed: nothing moves there"),
+        (("--search", "--label", "mug", "--mesh", "nowhere.obj"), 1, "nowhere.obj"),
+        (("--points", "nowhere.csv"), 1, "file of picks 'nowhere.csv' does not exist"),
+        (("--near", "nowhere.yaml"), 1, "nowhere.yaml"),
+        (("--search", "--at-us", "90000000"), 1, "no events"),
+        (("--search", "-o", "bracket.npz"), 1, "bracket.npz"),
+    ],
+)
+def test_what_is_wrong_is_said(scene, monkeypatch, capsys, more, code, message):
+    folder, _ = scene
+    monkeypatch.chdir(folder)
+    given = ["bracket.npz", "--mesh", "in_mm.stl", "--unit", "mm", "--at-us", AT_US]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchtrackWarning)
+        assert command(*given, *more) == code
+    shown = " ".join(capsys.readouterr().err.split())
+    assert message in shown and "Traceback" not in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("bracket.npz", "--search"), "none is configured: give --mesh"),
+        (("bracket.npz", "--search", "--unit", "mm"), "of the file that --mesh names"),
+        (("two.yaml", "--search"), "there are a, b: say which, with --label"),
+        (("two.yaml", "--search", "--label", "c"), "there is no 'c'; there are a, b"),
+        (("two.yaml", "--label", "a", "--near", "two.yaml"), "the object has no initial_pose to look near"),
+    ],
+)
+def test_which_object_is_meant(scene, monkeypatch, capsys, arguments, message):
+    folder, _ = scene
+    monkeypatch.chdir(folder)
+    objects = [{"label": label, "mesh": "in_mm.stl", "unit": "mm"} for label in "ab"]
+    (folder / "two.yaml").write_text(yaml.safe_dump({"source": "bracket.npz", "objects": objects}))
+    assert command(*arguments) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
