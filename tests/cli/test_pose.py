@@ -117,6 +117,7 @@ def test_a_block_goes_into_a_config(scene, tmp_path):
         (("--search", "--box", "1,2,3"), 2, "expected left, top, right and bottom side in pixels"),
         (("--search", "--box", "500,500,600,600"), 2, "is no part of the image of 120x90"),
         (("--search", "--box", "0,0,12,12"), 1, "at least 300 are needed: nothing moves there"),
+        (("--search", "--box", "0,40,119,50"), 1, "in no rotation the object fills a box of this shape"),
         (("--search", "--label", "mug", "--mesh", "nowhere.obj"), 1, "nowhere.obj"),
         (("--points", "nowhere.csv"), 1, "file of picks 'nowhere.csv' does not exist"),
         (("--near", "nowhere.yaml"), 1, "nowhere.yaml"),

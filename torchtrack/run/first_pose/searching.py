@@ -83,8 +83,8 @@ def projected_box(start: Start, T_cam_obj: Float[Tensor, "4 4"]) -> Box:
 
 def _searched(start: Start, box: Box, view: SearchView, viewed: ViewedObject, trials: Trials) -> FirstPose:
     lines = lines_in(start, box, view)
-    found = search(trials, viewed, lines, rotation_group(start.model))
-    return best_followed(start, view.to_camera(found.best(_FOLLOWED).T_view_obj))
+    best = search(trials, viewed, lines, rotation_group(start.model))
+    return best_followed(start, view.to_camera(best.best(_FOLLOWED).T_view_obj))
 
 
 def lines_in(start: Start, box: Box, view: SearchView) -> EventLines:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -118,10 +119,8 @@ def box_of_events(start: Start, count: int) -> Box:
     Raises:
         EventDataError: if the events are scattered all over.
     """
-    import cv2
-
     cells = _counts(start, count)
-    full = np.quantile(cells[cells > 0], 0.9)
+    full = np.quantile(cells[cells > 0], 0.9) if cells.any() else 0.0
     busy = (cells > max(_SHARE * full, 1.0)).astype(np.uint8)
     joined = cv2.morphologyEx(busy, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
+from torchtrack.errors import PoseError
 from torchtrack.object_model.rotational_symmetry import RotationGroup
 from torchtrack.run.first_pose.event_lines import EventLines, direction_of, near_events
 from torchtrack.run.first_pose.outlines import ViewedObject
@@ -33,6 +34,9 @@ _COMPARED, _PULLED, _PULLED_AGAIN = 3000, 192, 64
 _APART_DEG, _SAME_DEG = 7.0, 3.0
 # Events lie on an outline that comes through their cell of so many pixels, or through the next one: at a first look, and at the last.
 _COARSE_CELL_PX, _FINE_CELL_PX = 4, 2
+
+
+_LOOK = "Draw the box around the whole object, and check the model (`torchtrack model`)."
 
 
 @dataclass(frozen=True)
@@ -82,8 +86,14 @@ class Scored:
 
 
 def search(trials: Trials, viewed: ViewedObject, lines: EventLines, group: RotationGroup) -> Scored:
-    """The best of what is tried, pulled onto the events."""
+    """The best of what is tried, pulled onto the events.
+
+    Raises:
+        PoseError: if the object fills a box of this shape in no rotation.
+    """
     first = _looked_at(trials, viewed, lines).best(_COMPARED).apart(group, _APART_DEG, _PULLED)
+    if len(first.score) == 0:
+        raise PoseError(f"in no rotation the object fills a box of this shape. {_LOOK}")
     T = viewed.pulled(first.T_view_obj, lines.density, FAR_PX)
     again = scored(T, viewed, lines).apart(group, _SAME_DEG, _PULLED_AGAIN)
     T = viewed.pulled(again.T_view_obj, lines.density, NEAR_PX)
@@ -101,8 +111,8 @@ def scored(T_view_obj: Float[Tensor, "n 4 4"], viewed: ViewedObject, lines: Even
 
 def _looked_at(trials: Trials, viewed: ViewedObject, lines: EventLines) -> Scored:
     """The best scale and shift of each rotation."""
-    found = [_best_places(trials, rotations, outlines, viewed, lines) for rotations, outlines in viewed.by_view(trials.rotations, trials.depth_m)]
-    return Scored(torch.cat([some.T_view_obj for some in found]), torch.cat([some.score for some in found]))
+    parts = [_best_places(trials, rotations, outlines, viewed, lines) for rotations, outlines in viewed.by_view(trials.rotations, trials.depth_m)]
+    return Scored(torch.cat([some.T_view_obj for some in parts]), torch.cat([some.score for some in parts]))
 
 
 def _best_places(trials: Trials, rotations: Float[Tensor, "n 3 3"], outlines: Contours, viewed: ViewedObject, lines: EventLines) -> Scored:
@@ -171,5 +181,5 @@ def covered_share(pixels: Float[Tensor, "n m 2"], mask: Bool[Tensor, "n m"], lin
     u, v = (pixels / cell_px).floor().nan_to_num(-1.0).unbind(-1)
     inside = mask & (u >= 0) & (u < side) & (v >= 0) & (v < side)
     place = torch.where(inside, v * side + u, 0).long()
-    drawn = torch.zeros(len(pixels), side * side).scatter_reduce(1, place, inside.float(), "amax").view(-1, side, side)
-    return (max_pool2d(drawn, 3, 1, 1) * weights).sum((1, 2))
+    drawn = torch.zeros(len(pixels), side * side).scatter_reduce(1, place, inside.float(), "amax").view(-1, 1, side, side)
+    return (max_pool2d(drawn, 3, 1, 1)[:, 0] * weights).sum((1, 2))
