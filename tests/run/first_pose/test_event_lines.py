@@ -11,7 +11,7 @@ from torchtrack.run.first_pose.search_view import BOX_PX, SIDE_PX, SearchView
 from torchtrack.run.first_pose.start import Box
 
 SIDE = 96
-BOX = Box(20, 20, 76, 76)
+BOX = Box(20.0, 20.0, 76.0, 76.0)
 
 
 def moving_square(velocity_px, count=6000):
@@ -34,8 +34,8 @@ def test_events_are_near_along_their_own_line():
     lines = EventLines.from_events(*moving_square((6.0, 5.0)), BOX, SIDE)
     upright, level = direction_of(torch.tensor([[1.0, 0.0], [0.0, 1.0]]))
     on_left = torch.tensor([[28.0, 48.0]])
-    assert near_events(lines.coarse, on_left, upright) > 0.8
-    assert near_events(lines.coarse, on_left, level) < near_events(lines.coarse, on_left, upright) - 0.3
+    assert near_events(lines.coarse, on_left, upright[None]) > 0.8
+    assert near_events(lines.coarse, on_left, level[None]) < near_events(lines.coarse, on_left, upright[None]) - 0.3
     assert near_events(lines.fine, torch.tensor([[48.0, 48.0], [-5.0, 48.0]]), torch.tensor([0, 0])).tolist() == [0, 0]
     assert float(lines.weights.sum()) == pytest.approx(1)
 
@@ -47,7 +47,7 @@ def test_directions_are_of_lines():
 
 def test_a_view_shows_what_the_camera_sees():
     camera = Camera(fx=300.0, fy=320.0, cx=310.0, cy=250.0, width=640, height=480)
-    view = SearchView.of_box(camera, Box(400, 60, 520, 200))
+    view = SearchView.of_box(camera, Box(400.0, 60.0, 520.0, 200.0))
     T_cam_obj = se3_exp(torch.tensor([[0.3, 0.2, 0.1, 0.25, -0.2, 0.6]], dtype=torch.float64))
     points = torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.05
     seen = project(transform_points(T_cam_obj, points), camera.intrinsics(torch.float64)[None])[0]
@@ -60,13 +60,13 @@ def test_a_view_shows_what_the_camera_sees():
 
 def test_rotations_are_spread_evenly():
     rotations = all_rotations()
-    wanted = rotations_around(torch.eye(3), 30, 15)
+    wanted = rotations_around(torch.eye(3), 30.0, 15.0)
     cosines = (torch.einsum("nij,mij->nm", wanted, rotations) - 1) / 2
     assert float(torch.rad2deg(cosines.clamp(-1, 1).acos()).amin(1).max()) < 10
     assert bool((wanted - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2)).eq(0).any())
 
 
 def test_a_box_grows_and_holds():
-    box = Box(10, 20, 30, 60)
-    assert box.grown(0.5) == Box(0, 0, 40, 80) and box.centre.tolist() == [20, 40] and box.size.tolist() == [20, 40]
+    box = Box(10.0, 20.0, 30.0, 60.0)
+    assert box.grown(0.5) == Box(0.0, 0.0, 40.0, 80.0) and box.centre.tolist() == [20, 40] and box.size.tolist() == [20, 40]
     assert box.holds(torch.tensor([[10.0, 20.0], [9.0, 20.0], [30.0, 61.0]])).tolist() == [True, False, False]

@@ -82,7 +82,7 @@ def direction_of(normals: Float[Tensor, "*n 2"]) -> Int[Tensor, "*n"]:
     return (torch.atan2(normals[..., 1], normals[..., 0]) * (DIRECTIONS / math.pi)).round().long() % DIRECTIONS
 
 
-def near_events(table: Float[Tensor, "o h w"], pixels: Float[Tensor, "*n 2"], directions: Int[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+def near_events(table: Float[Tensor, "o h w"], pixels: Float[Tensor, "*n 2"], directions: Int[Tensor, "*#n"]) -> Float[Tensor, "*n"]:
     """What a table of an :class:`EventLines` has at some pixels; zero outside."""
     _, height, width = table.shape
     u, v = pixels.round().nan_to_num(-1.0).unbind(-1)

@@ -97,7 +97,7 @@ class Box:
         u, v = share * (self.u1 - self.u0), share * (self.v1 - self.v0)
         return Box(self.u0 - u, self.v0 - v, self.u1 + u, self.v1 + v)
 
-    def holds(self, pixels: Float[Tensor, "e 2"]) -> Bool[Tensor, "e"]:
+    def holds(self, pixels: Float[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
         """Which pixels lie in it."""
         u, v = pixels.unbind(-1)
         return (u >= self.u0) & (u <= self.u1) & (v >= self.v0) & (v <= self.v1)
