@@ -22,8 +22,9 @@ _FOLDS, _ALL_AROUND = (2, 3, 4, 5, 6), 72
 # A surface comes onto itself when all but a few of its rotated samples lie this near to it (diameters).
 _SAME, _NEARLY_ALL = 0.025, 0.98
 _SAMPLES = 2000
-# Rotations are the same within this (rad); an object has no more of them than a surface of revolution whose ends may be swapped.
-_SAME_RAD, _MOST = 0.02, 2 * _ALL_AROUND
+# Rotations are the same within this (rad), those of a surface of revolution within less; and there are no more of them than of one whose ends
+# may be swapped.
+_SAME_RAD, _SAME_AROUND_RAD, _MOST = 0.15, 0.04, 2 * _ALL_AROUND
 
 
 @dataclass(frozen=True)
@@ -51,32 +52,44 @@ def rotation_group(model: ObjectModel) -> RotationGroup:
     points = model.surface_points.double()
     if len(points) == 0 or len(model.texture_points):
         return RotationGroup(identity[None], model.centre.double())
-    middle = points.mean(0)
+    middle, axes = _middle_and_axes(model)
     arms = points - middle
     surface, samples = cKDTree(arms.numpy()), arms[:: max(1, len(arms) // _SAMPLES)]
-    axes = torch.cat([torch.linalg.eigh(arms.mT @ arms).eigenvectors.mT, identity])
     revolution = revolution_axis(model)
     angles = torch.arange(_ALL_AROUND if revolution else 1, dtype=torch.float64) * (2 * math.pi / _ALL_AROUND)
     group = identity[None] if revolution is None else so3_exp(angles[:, None] * revolution.direction_obj)
-    for axis in axes:
+    same_rad = _SAME_RAD if revolution is None else _SAME_AROUND_RAD
+    for axis in torch.cat([identity, axes]):
         for fold in _FOLDS:
             rotation = so3_exp(2 * math.pi / fold * axis)
             apart_m = float(np.quantile(surface.query((samples @ rotation.mT).numpy())[0], _NEARLY_ALL))
-            if apart_m < _SAME * model.diameter_m and not _is_among(rotation, group) and len(group) < _MOST:
-                group = _closed(torch.cat([group, rotation[None]]))
+            if apart_m < _SAME * model.diameter_m and not _is_among(rotation, group, same_rad) and len(group) < _MOST:
+                group = _closed(torch.cat([group, rotation[None]]), same_rad)
     return RotationGroup(group, middle)
 
 
-def _is_among(rotation: Float[Tensor, "3 3"], group: Float[Tensor, "g 3 3"]) -> bool:
-    return bool(((group - rotation).square().sum((1, 2)) < 2 * _SAME_RAD**2).any())
+def _middle_and_axes(model: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
+    """The middle of a surface, and its principal axes, one a row: by the moments of its triangles."""
+    corners = model.triangles.double()
+    areas = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1)
+    areas = areas / areas.sum()
+    middle = areas @ corners.mean(1)
+    arms = corners - middle
+    sums = arms.sum(1)
+    moments = torch.einsum("f,fki,fkj->ij", areas, arms, arms) + torch.einsum("f,fi,fj->ij", areas, sums, sums)
+    return middle, torch.linalg.eigh(moments).eigenvectors.mT
 
 
-def _closed(group: Float[Tensor, "g 3 3"]) -> Float[Tensor, "h 3 3"]:
+def _is_among(rotation: Float[Tensor, "3 3"], group: Float[Tensor, "g 3 3"], same_rad: float) -> bool:
+    return bool(((group - rotation).square().sum((1, 2)) < 2 * same_rad**2).any())
+
+
+def _closed(group: Float[Tensor, "g 3 3"], same_rad: float) -> Float[Tensor, "h 3 3"]:
     """All products of some rotations, as far as there are not too many of them."""
     grown = True
     while grown and len(group) < _MOST:
         grown = False
         for product in torch.einsum("aij,bjk->abik", group, group).flatten(0, 1):
-            if len(group) < _MOST and not _is_among(product, group):
+            if len(group) < _MOST and not _is_among(product, group, same_rad):
                 group, grown = torch.cat([group, product[None]]), True
     return group

@@ -61,7 +61,8 @@ def read_picks(path: Path) -> Picks:
         got = ",".join(header)
         raise PoseError(f"'{path}': expected the first line '{','.join(COLUMNS)}', got '{got}'. Pixels come first, then the model's x, y, z.")
     values = np.array([_numbers(row, path) for row in rows[1:]]).reshape(-1, len(COLUMNS))
-    return Picks(values[:, :2], values[:, 2:], f"'{path}'")
+    # OpenCV takes no views of arrays.
+    return Picks(values[:, :2].copy(), values[:, 2:].copy(), f"'{path}'")
 
 
 def _numbers(row: list[str], path: Path) -> list[float]:
