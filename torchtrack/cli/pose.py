@@ -14,9 +14,9 @@ from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.config.load import load
 from torchtrack.config.run import ObjectConfig, RunConfig
 from torchtrack.config.settings import CommandLineText
+from torchtrack.core.atomic import atomic_path, check_other_file, check_writable
 from torchtrack.core.files import naming
 from torchtrack.errors import ConfigError, EventDataError, TorchtrackWarning
-from torchtrack.io.atomic import atomic_path, check_other_file, check_writable
 from torchtrack.run.first_pose.picks import pose_of_picks, read_picks
 from torchtrack.run.first_pose.request import as_block, object_of, opened_start, parsed_box, placed_picks, read_near
 from torchtrack.run.first_pose.searching import pose_in_box, pose_near, refined_pose
