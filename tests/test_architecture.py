@@ -33,6 +33,7 @@ ORDER = (
     ("run",),
     ("sim",),
     ("learn", "eval"),
+    ("report",),
     ("bench",),
     ("cli",),
     ("__main__",),

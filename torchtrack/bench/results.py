@@ -16,6 +16,7 @@ import torch
 from torchtrack.bench.plots import Plot, draw
 from torchtrack.core.atomic import atomic_path
 from torchtrack.core.dispatch import backend_is_installed
+from torchtrack.core.machine import processor
 from torchtrack.errors import ConfigError, MissingFileError
 
 
@@ -91,7 +92,7 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
     """What the figures depend on."""
     return {
         "device": torch.cuda.get_device_name(device) if device is not None and device.type == "cuda" else "cpu",
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
@@ -99,12 +100,6 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
         "torch": torch.__version__,
         "kernels": f"numba {version('numba')}" if backend_is_installed() else "none, as Numba is not installed",
     }
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines() if cpuinfo.is_file() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor() or "unknown")
 
 
 def plain(value: float) -> str:

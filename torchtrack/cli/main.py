@@ -16,6 +16,7 @@ from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.options import Demo, Evaluate, Model, Outline, Settings, Simulate, Track
 from torchtrack.cli.options_files import Bench, Convert, Info
 from torchtrack.cli.options_pose import Pose
+from torchtrack.cli.options_report import Report
 from torchtrack.config.load import load, typed
 from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import ConfigError, TorchtrackError
@@ -32,6 +33,7 @@ _Command = (
     | Annotated[Outline, subcommand("outline")]
     | Annotated[Model, subcommand("model")]
     | Annotated[Pose, subcommand("pose")]
+    | Annotated[Report, subcommand("report")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Convert, subcommand("convert")]
     | Annotated[Bench, subcommand("bench")]

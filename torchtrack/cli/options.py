@@ -68,24 +68,26 @@ class Track:
     """Go on with a run in the same folder that ended early, from its last pose; of several, leave out those that are complete."""
     poses: Annotated[str | None, _option("-|FILE")] = None
     """Also write a line of JSON per window and object as soon as it is tracked; to - (standard output, which has nothing else then)."""
+    rerun: Annotated[str | None, _option("FILE|live")] = None
+    """Show all of it in the Rerun viewer: live, or later from a file (.rrd)."""
     quiet: bool = False
     """No progress bar."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.cli.track import track, track_many
+        from torchtrack.cli.track import ExtraOutputs, track, track_many
 
         if not self.configs:
             raise ConfigError("command line: track needs a config file or a source.")
-        given = _given(self, ("configs", "quiet", "resume", "poses", *_OF_MANY)) | overrides
+        given = _given(self, ("configs", "quiet", "resume", "poses", "rerun", *_OF_MANY)) | overrides
         of_many = {name: getattr(self, name) for name in _OF_MANY if getattr(self, name) is not None}
         if len(self.configs) > 1:
-            if self.poses is not None:
-                raise ConfigError("command line: poses: only for one source, and several are given.")
+            if of_one := [name for name in ("poses", "rerun") if getattr(self, name) is not None]:
+                raise ConfigError(f"command line: {', '.join(of_one)}: only for one source, and several are given.")
             return track_many(self.configs, given, **of_many, resume=self.resume, quiet=self.quiet)
         if of_many:
             raise ConfigError(f"command line: {', '.join(of_many)}: only for several sources, and one is given.")
-        return track(self.configs[0], given, poses=self.poses, resume=self.resume, quiet=self.quiet)
+        return track(self.configs[0], given, ExtraOutputs(self.poses, self.rerun), resume=self.resume, quiet=self.quiet)
 
 
 @dataclass(frozen=True)

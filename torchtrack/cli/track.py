@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +25,31 @@ from torchtrack.run.sinks import Sink
 from torchtrack.run.sinks.folder import check_folder
 from torchtrack.run.sinks.pose_lines import PoseLines
 from torchtrack.run.sinks.progress import ProgressBar
+from torchtrack.run.sinks.rerun_log import RerunLog, check_target
 from torchtrack.run.sinks.resume import check_resumable, is_complete
 from torchtrack.run.sinks.summary import RunSummary
 
 
-def track(config_or_source: str, overrides: Mapping[str, Any], *, poses: str | None = None, resume: bool = False, quiet: bool) -> int:
-    """Track one source, or go on with that, show the summary; returns the exit code.
+@dataclass(frozen=True)
+class ExtraOutputs:
+    """Where a run goes beside its folder.
 
-    ``poses`` is a file, or ``-`` for standard output, that gets lines of JSON; the summary goes to standard error in the second case.
+    Args:
+        poses: a file, or ``-`` for standard output, that gets lines of JSON; the summary goes to standard error in the second case.
+        rerun: a file for the Rerun viewer (``.rrd``), or ``live`` for the viewer itself.
     """
+
+    poses: str | None = None
+    rerun: str | None = None
+
+
+_NO_EXTRA = ExtraOutputs()
+
+
+def track(config_or_source: str, overrides: Mapping[str, Any], extra: ExtraOutputs = _NO_EXTRA, *, resume: bool = False, quiet: bool) -> int:
+    """Track one source, or go on with that, show the summary; returns the exit code."""
     with naming(Path(config_or_source)):
-        return run_and_show(_run_config(config_or_source, overrides), quiet, resume, poses)
+        return run_and_show(_run_config(config_or_source, overrides), quiet, resume, extra)
 
 
 def track_many(
@@ -78,21 +93,25 @@ def _run_config(config_or_source: str, overrides: Mapping[str, Any]) -> RunConfi
     return load(RunConfig, None, {"source": CommandLineText(config_or_source), **overrides})
 
 
-def run_and_show(config: RunConfig, quiet: bool, resume: bool = False, poses: str | None = None) -> int:
+def run_and_show(config: RunConfig, quiet: bool, resume: bool = False, extra: ExtraOutputs = _NO_EXTRA) -> int:
     """One run, and its table; returns the exit code."""
-    only_poses = poses == "-"
+    only_poses = extra.poses == "-"
     console = Console(stderr=True, highlight=False, soft_wrap=True) if only_poses else output_console()
     if resume:
         check_resumable(config)
     check_folder(config.output)
+    if extra.rerun is not None:
+        check_target(extra.rerun)
     session = open_session(config)
     if config.compiled and not quiet:
         Console(stderr=True).print("compiling the tracker, which takes a minute or two for the first time")
     sinks: list[Sink] = [] if quiet or only_poses else [ProgressBar(Console(stderr=True), session.name, session.known_duration_s)]
     with ExitStack() as stack:
-        if poses is not None:
-            lines = stack.enter_context(closing(OutputLines() if only_poses else LineFile(Path(poses))))
+        if extra.poses is not None:
+            lines = stack.enter_context(closing(OutputLines() if only_poses else LineFile(Path(extra.poses))))
             sinks.append(PoseLines(lines, session.labels))
+        if extra.rerun is not None:
+            sinks.append(RerunLog(extra.rerun, session))
         return _show_run(console, run(config, sinks, session, resume=resume), config.output)
 
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.core.lie import quaternion_from_rotation, with_signs_of
+from torchtrack.core.lie import hat, quaternion_from_rotation, with_signs_of
 from torchtrack.io.line_file import LineFile
 from torchtrack.io.seconds import format_seconds
 from torchtrack.run.sinks.folder import POSES
@@ -21,6 +21,7 @@ from torchtrack.tracking.validation.status import Status
 COLUMNS = (
     *("t_us", "label", "tx", "ty", "tz", "qx", "qy", "qz", "qw"),
     *("status", "quality", "observations", "rotation_error_deg", "translation_error_cm"),
+    *("rotation_std_deg", "translation_std_cm"),
 )
 
 
@@ -58,17 +59,35 @@ class PoseFiles:
         quaternions = self._quaternions.tolist()
         judged = zip(result.status.tolist(), result.quality.tolist(), result.observation_count.tolist(), strict=True)
         columns = zip(self._labels, T[:, :3, 3].tolist(), quaternions, judged, strict=True)
+        stds = standard_deviations(result.covariance.cpu(), T).tolist()
         rows: list[Sequence[object]] = []
         for index, (label, translation, quaternion, (status, quality, count)) in enumerate(columns):
             pose = [f"{value:.12g}" for value in (*translation, *quaternion)]
             self._tum[index].write(f"{format_seconds(t_us)} {' '.join(pose)}\n")
             errors = [f"{value:.6g}" for value in self._record.newest_errors(index)]
-            rows.append([t_us, label, *pose, Status(status).name, f"{quality:.4g}", count, *(errors or ("", ""))])
+            rows.append(
+                [t_us, label, *pose, Status(status).name, f"{quality:.4g}", count, *(errors or ("", "")), *(f"{value:.4g}" for value in stds[index])]
+            )
         self._table.write(_rows(rows))
 
     def close(self) -> None:
         """Close the files."""
         self._files.close()
+
+
+def standard_deviations(covariance: Float[Tensor, "b 6 6"], T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 2"]:
+    """Standard deviations of rotation (°) and position (cm) of the object's origin, each over all three axes.
+
+    Args:
+        covariance: of the left perturbation ``[φ, ρ]``, which moves the origin ``t`` by ``φ × t + ρ``.
+        T_cam_obj: the poses.
+    """
+    lever = -hat(T_cam_obj[:, :3, 3])
+    to_origin = torch.cat([lever, torch.eye(3, dtype=lever.dtype).expand_as(lever)], -1)
+    of_position = to_origin @ covariance.to(lever.dtype) @ to_origin.mT
+    variances = [covariance[:, :3, :3], of_position]
+    rotation, position = (part.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=0).sqrt() for part in variances)
+    return torch.stack([rotation.to(lever.dtype).rad2deg(), 100 * position], -1)
 
 
 def tum_path(folder: Path, label: str) -> Path:

@@ -14,6 +14,7 @@ import torch
 
 import torchtrack
 from torchtrack.core.atomic import writing
+from torchtrack.core.machine import describe_machine
 from torchtrack.io.problems import ClockChange, Problems
 from torchtrack.run.metrics import Metrics, summarise
 from torchtrack.run.sinks.record import ObjectRecord, Record
@@ -58,6 +59,7 @@ class RunSummary:
         interrupted: whether ``ended`` is ``interrupted``.
         device, threads: where the tracker ran.
         versions: of torchtrack and what it stands on.
+        machine: its system, processor and cores.
         windows, events: how many.
         duration_s: stream time tracked.
         event_rate_per_s: events by stream time.
@@ -93,6 +95,7 @@ class RunSummary:
     step_median_ms: float
     step_p95_ms: float
     objects: dict[str, ObjectSummary]
+    machine: dict[str, str | int] = field(default_factory=dict)
     joined_windows: int = 0
     dropped_windows: int = 0
     dropped_events: int = 0
@@ -139,6 +142,7 @@ def summarise_run(source: str, labels: Sequence[str], record: Record, facts: Fac
         device=device_name(facts.device),
         threads=torch.get_num_threads(),
         versions=versions(),
+        machine=describe_machine(),
         windows=record.windows,
         events=record.event_count,
         duration_s=record.duration_s,
