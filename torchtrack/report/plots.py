@@ -84,7 +84,7 @@ def _draw_band(axes: Axes, row: int, track: ObjectTrack) -> None:
 
 def error_plot(run: FinishedRun, limits: Limits) -> str:
     """Errors over time, with what the tracker expects of them dotted; standard deviations alone where no truth is known."""
-    figure = _figure(2)
+    figure = _figure(2.0)
     of_what = "error" if limits.has_truth else "standard deviation"
     rows = figure.subplots(2, 1, sharex=True)
     for column, (axes, unit, reach) in enumerate(
