@@ -22,6 +22,7 @@ from torchtrack.core.lie import transform_points
 from torchtrack.errors import ConfigError
 from torchtrack.io.atomic import check_writable, writing
 from torchtrack.io.extras import optional
+from torchtrack.object_model.symmetry import revolution_axis
 from torchtrack.run.metrics import pose_errors
 from torchtrack.run.session import Session
 from torchtrack.run.sinks.poses import standard_deviations
@@ -30,6 +31,8 @@ from torchtrack.tracking.validation.status import Status
 from torchtrack.viz.contour_lines import contour_links
 
 LIVE = "live"
+# Of the viewer: the package, the extra that brings it, and what it is for.
+_PACKAGE = ("rerun-sdk", "viz", "showing a run in Rerun")
 # Darker and brighter events in the image.
 _OFF, _ON = 110, 230
 # Events are compared with contours up to this distance (px), and so many of them are drawn of each object.
@@ -41,7 +44,7 @@ _RED, _GREEN, _YELLOW = (255, 40, 40), (80, 255, 80), (255, 220, 0)
 
 def check_target(target: str) -> None:
     """Raise where a run cannot be shown: :class:`ConfigError` for a wrong name, OutputError, or MissingExtraError."""
-    optional("rerun", "rerun-sdk", "viz", "showing a run in Rerun")
+    optional("rerun", *_PACKAGE)
     if target != LIVE:
         if Path(target).suffix != ".rrd":
             raise ConfigError(f"rerun: '{target}' is neither 'live', which opens the viewer, nor a file that ends in .rrd.")
@@ -61,10 +64,12 @@ class RerunLog:
 
     def __init__(self, target: str, session: Session) -> None:
         check_target(target)
-        self._rr: Any = optional("rerun", "rerun-sdk", "viz", "showing a run in Rerun")
+        self._rr: Any = optional("rerun", *_PACKAGE)
         self._session = session
         self._table = undistortion_table(session.camera).double().numpy()
         self._paths: list[deque[list[float]]] = [deque(maxlen=_PATH_WINDOWS) for _ in session.labels]
+        # Turns that nothing shows are no errors, as in the summary.
+        self._axes = [revolution_axis(model) for model in session.models]
         self._status: dict[str, int] = {}
         self._newest_s = time.perf_counter()
         self._recording = self._rr.RecordingStream(f"torchtrack: {session.name}")
@@ -78,8 +83,7 @@ class RerunLog:
 
     def _blueprint(self) -> Any:
         """Camera and scene above, curves and status below."""
-        import rerun.blueprint as views
-
+        views = optional("rerun.blueprint", *_PACKAGE)
         curves = [views.TimeSeriesView(origin=f"plots/{name}", name=name) for name in ("quality", "error", "std", "time", "residual")]
         above = views.Horizontal(views.Spatial2DView(origin="camera", name="camera"), views.Spatial3DView(origin="/", name="scene"))
         return views.Blueprint(views.Vertical(above, views.Horizontal(*curves, views.TextLogView(origin="status", name="status")), row_shares=[3, 1]))
@@ -134,7 +138,7 @@ class RerunLog:
             return
         true = truth.at(result.t_us[:1].cpu())[0]
         self._log(f"truth/{label}", rr.Transform3D(translation=true[:3, 3].numpy(), mat3x3=true[:3, :3].numpy()))
-        errors = pose_errors(result.t_us[:1].cpu(), T[None], truth)
+        errors = pose_errors(result.t_us[:1].cpu(), T[None], truth, self._axes[index])
         self._log_scalars(label, "error", {"rotation_deg": float(errors.rotation_deg[0]), "position_cm": float(errors.translation_cm[0])})
         self._log_true_contours(step, index, label, true)
 
