@@ -48,7 +48,8 @@ def shared_limits(runs: Sequence[FinishedRun]) -> Limits:
     tracks = [track for run in runs for track in run.tracks]
     has_truth = all(any(np.isfinite(track.error).any() for track in run.tracks) for run in runs)
     shown = [track.error if has_truth else track.std for track in tracks]
-    return Limits(*(_reach([values[:, column] for values in shown]) for column in (0, 1)), has_truth)
+    rotation_deg, translation_cm = (_reach([values[:, column] for values in shown]) for column in (0, 1))
+    return Limits(rotation_deg, translation_cm, has_truth)
 
 
 def _reach(values: Sequence[np.ndarray]) -> float:
