@@ -109,7 +109,8 @@ class RerunLog:
         rr, events = self._rr, step.window.events
         now_s = time.perf_counter()
         self._recording.set_time("time", duration=1e-6 * step.window.t_end_us)
-        self._log("camera/events", rr.EncodedImage(contents=event_png(events, self._session.camera.width, self._session.camera.height)))
+        image = event_png(events, self._session.camera.width, self._session.camera.height)
+        self._log("camera/events", rr.EncodedImage(contents=image, media_type="image/png"))
         self._log("plots/time/step_ms", rr.Scalars(1e3 * step.seconds))
         self._log("plots/time/all_else_ms", rr.Scalars(max(1e3 * (now_s - self._newest_s - step.seconds), 0.0)))
         seen = self._table[events.y.cpu().numpy(), events.x.cpu().numpy()]
