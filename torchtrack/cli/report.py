@@ -5,8 +5,8 @@ from pathlib import Path
 
 from torchtrack.cli.console import output_console
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.core.atomic import check_writable
 from torchtrack.errors import ConfigError
-from torchtrack.io.atomic import check_writable
 from torchtrack.report import write_report
 
 

@@ -12,8 +12,8 @@ import jinja2
 import yaml
 from markupsafe import Markup
 
+from torchtrack.core.atomic import atomic_path
 from torchtrack.errors import ConfigError
-from torchtrack.io.atomic import atomic_path
 from torchtrack.report.finished import FinishedRun, read_run
 from torchtrack.report.plots import Limits, error_plot, shared_limits, status_plot, trajectory_plot
 

@@ -16,11 +16,11 @@ import torch
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
+from torchtrack.core.atomic import check_writable, writing
 from torchtrack.core.camera import distort, undistortion_table
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import ConfigError
-from torchtrack.io.atomic import check_writable, writing
 from torchtrack.io.extras import optional
 from torchtrack.object_model.symmetry import revolution_axis
 from torchtrack.run.metrics import pose_errors
