@@ -1,10 +1,12 @@
-"""Settings by names that they had before are refused with those that they have now."""
+"""Settings by names that they had before are refused with those that they have now, and those that are gone with the reason."""
+
+import re
 
 import pytest
 
 from torchtrack.config.explain import dotted_keys
 from torchtrack.config.load import load
-from torchtrack.config.renamed import KEYS, SECTIONS
+from torchtrack.config.renamed import KEYS, REMOVED, SECTIONS
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.errors import ConfigError
 
@@ -29,3 +31,14 @@ def test_all_the_names_that_settings_have_now_are_settings():
     for section, keys in KEYS.items():
         assert {f"{SECTIONS.get(section, section)}.{key}" for key in keys.values()} <= known
         assert not known & {f"{section}.{key}" for key in keys}
+
+
+def test_settings_that_were_removed_are_refused_with_the_reason():
+    for section, keys in REMOVED.items():
+        for key, why in keys.items():
+            with pytest.raises(ConfigError, match=f"{section}.{key} .*: removed, leave it out: {re.escape(why)}$"):
+                load(TrackerConfig, overrides={f"{section}.{key}": 1})
+
+
+def test_a_setting_that_was_removed_is_none():
+    assert not set(dotted_keys(TrackerConfig)) & {f"{section}.{key}" for section, keys in REMOVED.items() for key in keys}

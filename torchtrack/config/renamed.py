@@ -1,4 +1,4 @@
-"""Names that settings of the tracker had before: they are refused with the name that they have now."""
+"""Settings of the tracker that have another name now, or are gone: they are refused with the new name, or with the reason."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -51,6 +51,27 @@ KEYS = {
         "swelling_px": "silhouette_offset_px",
     },
 }
+
+# Settings that were removed, by their sections: what is done in their place, or why nothing is.
+REMOVED: dict[str, dict[str, str]] = {
+    "window": {},
+    "contours": {},
+    "association": {},
+    "solver": {},
+    "motion": {},
+    "relocalization": {},
+    "validation": {},
+}
+
+
+def removed(location: tuple[int | str, ...]) -> str | None:
+    """Why a setting at a place that is not known was removed; None where there never was one.
+
+    Args:
+        location: its keys, from the outermost.
+    """
+    *before, name = location
+    return REMOVED.get(str(before[-1]), {}).get(str(name)) if before else None
 
 
 def renamed(location: tuple[int | str, ...], value: Any) -> str | None:
