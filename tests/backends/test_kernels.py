@@ -71,11 +71,9 @@ def all_kinds():
 
 SETTINGS = {
     "as it is": ContourConfig(),
-    "no occluding": ContourConfig(occluding=False),
     "no creases": ContourConfig(creases=False),
     "no texture": ContourConfig(texture=False),
-    "few points": ContourConfig(max_edge_points=40, spacing_px=2.0),
-    "as close as can be": ContourConfig(spacing_px=0.0),
+    "few points": ContourConfig(max_edge_points=40),
 }
 
 
@@ -119,7 +117,7 @@ def test_hidden_contours_of_objects_before_one_another(streams, depth_m, seed):
     diameters, shape = torch.tensor([model.diameter_m for model in models]).double(), (3, SMALL_CAMERA.height, SMALL_CAMERA.width)
     contours = mesh_contours(groups, T, intrinsics, ContourConfig())
     scene = Scene(groups, T, intrinsics, streams, diameters, shape, shared=True)
-    by_kernels, plain = both_ways(lambda: remove_hidden(contours, scene, ContourConfig()))
+    by_kernels, plain = both_ways(lambda: remove_hidden(contours, scene))
     assert torch.equal(by_kernels.mask, plain.mask)
     assert 0 < int(plain.mask.sum()) < int(contours.mask.sum())
 

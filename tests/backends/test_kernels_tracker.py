@@ -41,7 +41,7 @@ SETTINGS = {
     "no gathering": {"relocalization": {"by_inlier_ratio": False}},
     "hold": {"motion": {"model": "hold", "without_events": "hold"}},
     "steps": {"solver": {"iterations": 3, "loss": "huber"}},
-    "refreshed": {"contours": {"refresh_rounds": (0, 2)}},
+    "refreshed": {"contours": {"source": "splat"}},
     "no prior": {"solver": {"prior": False}},
 }
 

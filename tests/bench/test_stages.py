@@ -6,8 +6,10 @@ from tracked_boxes import started
 
 from torchtrack.bench.clock import Clock
 from torchtrack.bench.stages import STAGES, StageTimes, owner_of, timed
-from torchtrack.config.tracker import CornerConfig, FlowConfig, TrackerConfig
+from torchtrack.config.tracker import AssociationConfig, CornerConfig, TrackerConfig
 
+# Corners and their flow are stages, too.
+ALONG_FLOW = TrackerConfig(corners=CornerConfig(max_corners=32), association=AssociationConfig(search="along_flow"))
 PLACES = [place for places in STAGES.values() for place in places]
 
 
@@ -60,7 +62,7 @@ def test_a_stage_that_fails_is_counted_too():
 
 
 def test_every_stage_of_a_step_is_timed_and_the_step_is_the_same():
-    tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(corners=CornerConfig(max_corners=32), flow=FlowConfig(always=True)))
+    tracker, state, _, (events, end_us), _ = started(config=ALONG_FLOW)
     expected = tracker.step(state, events, end_us)[1]
     times = StageTimes(Clock(torch.device("cpu")))
     with timed(times):

@@ -10,7 +10,7 @@ from tracked_boxes import SCENES, assert_same, follow, started
 
 from torchtrack import Tracker
 from torchtrack.config.relocalization import RelocalizationConfig
-from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig, WindowConfig
+from torchtrack.config.tracker import CornerConfig, TrackerConfig, WindowConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
@@ -20,6 +20,7 @@ from torchtrack.tracking.frontend.corners import detect_corners
 from torchtrack.tracking.frontend.time_surface import empty_last_event, object_regions, time_surface, update_last_event
 
 COUNT = 6
+CORNERS = TrackerConfig(corners=CornerConfig(max_corners=20))
 # In their first windows boxes are searched for as new ones, once in a while: not in all windows.
 STEADY = TrackerConfig(relocalization=RelocalizationConfig(new_below=0))
 
@@ -142,7 +143,7 @@ def corners_of(pixels, largest_px):
     mask, stream = torch.ones(pixels.shape[:2], dtype=torch.bool), torch.zeros(len(pixels), dtype=torch.int64)
     regions = object_regions(pixels, mask, stream, (120, 160), 12, largest_px)
     surface = time_surface(last, now, regions, 0.03, torch.float32)
-    return regions, detect_corners(surface, regions, last, now, torch.tensor([0.01]), table, SurfaceConfig(), CornerConfig(max_corners=20))
+    return regions, detect_corners(surface, regions, last, now, torch.tensor([0.01]), table, CORNERS)
 
 
 def test_regions_of_one_size_give_the_same_corners(nothing_is_read):

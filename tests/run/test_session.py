@@ -60,7 +60,7 @@ def test_an_end_before_the_first_event_is_told_with_its_time(sequence_path, tmp_
 @pytest.mark.parametrize("mode", ["time", "count"])
 def test_an_hour_without_events_costs_no_windows(sequence_path, tmp_path, mode):
     changed = with_times(sequence_path, tmp_path, lambda t: np.where(t > 20_000, t + 3_600_000_000, t))
-    window = {"mode": mode, "duration_us": 5000, "count": 200, "max_age_us": 5000}
+    window = {"mode": mode, "duration_us": 5000, "count": 200}
     summary = run(quick(changed, tmp_path / "out", tracker={"window": window}))
     assert summary.windows < 130
     assert summary.duration_s < 0.6

@@ -23,7 +23,6 @@ from torchtrack import Tracker, preset
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import (
     CornerConfig,
-    FlowConfig,
     MotionConfig,
     TrackerConfig,
 )
@@ -152,14 +151,12 @@ def test_results_have_their_shapes_and_types(dtype):
 
 
 def test_flow_that_matching_makes_no_use_of_is_estimated_where_it_is_asked_for():
-    corners = CornerConfig(max_corners=32)
-    tracker, state, result, window, _ = started(config=TrackerConfig(corners=corners))
+    tracker, state, result, _, _ = started(config=TrackerConfig(corners=CornerConfig(max_corners=32)))
     assert result.corners.mask.any()
     assert not result.corners.has_flow.any()
-    asked = tracker_of(config=TrackerConfig(corners=corners, flow=FlowConfig(always=True)))
-    without, with_flow = (each.step(state, *window)[1] for each in (tracker, asked))
-    assert with_flow.corners.has_flow.any()
-    assert torch.equal(with_flow.T_cam_obj, without.T_cam_obj)
+    with_flow = tracker.sensors.with_flow(result.corners, state.maps.last_event_us, state.t_us, tracker.config)
+    assert with_flow.has_flow.any()
+    assert torch.equal(with_flow.pixels, result.corners.pixels)
 
 
 def test_contours_are_those_of_the_pose(dtype):

@@ -21,7 +21,7 @@ from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.errors import ModelError
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.association.matches import Matches
-from torchtrack.tracking.contours.index import index_contours
+from torchtrack.tracking.contours.index import INDEX_CELL_PX, index_contours
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 from torchtrack.tracking.estimation.terms import CostTerm, Linearisation, PoseProblem
@@ -146,7 +146,7 @@ class EventLineTracker(Tracker):
         pixels, age_s = seen.pixels, seen.age_s
         velocity = object_plane_velocity(pixels, window.velocity, self._centre_cam(window.T_start), self.intrinsics)
         matching = self.config.association
-        index = index_contours(contours, self.image_size, int(max(matching.gates_px)) + 1, matching.index_cell_px)
+        index = index_contours(contours, self.image_size, int(max(matching.gates_px)) + 1, INDEX_CELL_PX)
         near = seen.mask & (index.look_up(torch.addcmul(pixels, velocity, age_s[..., None])) >= 0)
         chosen, exists = select_ranked(near, matching.max_events)
         taken = take_points(torch.cat([pixels, age_s[..., None]], -1), chosen)

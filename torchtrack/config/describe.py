@@ -33,7 +33,7 @@ def _type_name(annotation: Any) -> str:
         return " | ".join(inner)
     if origin in (Union, UnionType):
         return " | ".join(_type_name(member) for member in inner)
-    if origin is tuple:
+    if origin in (tuple, frozenset):
         return "list"
     return _PLAIN_NAMES.get(annotation, getattr(annotation, "__name__", str(annotation)))
 
@@ -47,7 +47,7 @@ def _default(field: FieldInfo) -> str:
     if isinstance(default, Path):
         # Within the working folder, which differs from user to user.
         return str(default.relative_to(Path.cwd())) if default.is_relative_to(Path.cwd()) else str(default)
-    return str(list(default)) if isinstance(default, tuple) else str(default).lower() if isinstance(default, bool) else str(default)
+    return str(list(default)) if isinstance(default, tuple | frozenset) else str(default).lower() if isinstance(default, bool) else str(default)
 
 
 def _meaning(field: FieldInfo) -> str:

@@ -7,6 +7,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from torchtrack.config.fixed import fixed
 from torchtrack.config.renamed import removed, renamed
 
 Location = tuple[int | str, ...]
@@ -33,6 +34,8 @@ def _reason(details: ErrorDetails, settings: type[BaseModel]) -> str:
     if details["type"] == "extra_forbidden":
         if now := renamed(details["loc"], details["input"]):
             return f"renamed to {now}"
+        if what := fixed(details["loc"]):
+            return what
         if why := removed(details["loc"]):
             return f"removed, leave it out: {why}"
         return f"unknown setting{_suggestion(details['loc'], settings)}"

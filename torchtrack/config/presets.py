@@ -13,7 +13,6 @@ from torchtrack.config.tracker import (
     MotionConfig,
     SmoothingConfig,
     SolverConfig,
-    SurfaceConfig,
     TrackerConfig,
     WindowConfig,
 )
@@ -52,12 +51,11 @@ def _paper() -> TrackerConfig:
     """
     return TrackerConfig(
         window=WindowConfig(duration_us=3_000),
-        surface=SurfaceConfig(margin_px=16),
         corners=CornerConfig(max_corners=400, cell_px=5),
         flow=FlowConfig(radius_px=6, iterations=10),
-        contours=ContourConfig(source="splat", texture=False, creases=False, refresh_rounds=(0, 1, 2)),
+        contours=ContourConfig(source="splat", texture=False, creases=False),
         association=AssociationConfig(
-            along_flow=True,
+            search="along_flow",
             gates_px=(8.0, 8.0, 8.0),
             motion_compensation=False,
             max_events=0,

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from torchtrack.config.fixed import fixed
+
 SECTIONS = {"search": "relocalization", "quality": "validation", "matching": "association", "learning": "adaptation"}
 KEYS = {
     "search": {
@@ -47,6 +49,7 @@ KEYS = {
         "below_share": "below_ratio",
         "up_to_share": "up_to_ratio",
     },
+    "association": {"along_flow": "search"},
     "solver": {
         "swelling_px": "silhouette_offset_px",
     },
@@ -83,11 +86,14 @@ def renamed(location: tuple[int | str, ...], value: Any) -> str | None:
     """
     *before, name = location
     if name in SECTIONS:
-        inner = KEYS[str(name)]
-        keys = [f"'{key}' is now '{inner[key]}'" for key in value if key in inner] if isinstance(value, Mapping) else []
-        return ", ".join([f"'{'.'.join(map(str, (*before, SECTIONS[str(name)])))}'", *keys])
+        place, inner = (*before, SECTIONS[str(name)]), KEYS[str(name)]
+        names = {key: inner.get(key, key) for key in value} if isinstance(value, Mapping) else {}
+        now = {key: fixed((*place, new)) or (f"now '{new}'" if new != key else None) for key, new in names.items()}
+        return ", ".join([f"'{'.'.join(map(str, place))}'", *(f"'{key}' is {what}" for key, what in now.items() if what)])
     section = str(before[-1]) if before else ""
-    for old, new in (*SECTIONS.items(), ("solver", "solver")):
+    for old, new in (*SECTIONS.items(), *((section, section) for section in KEYS if section not in SECTIONS)):
         if section == new and name in KEYS[old]:
-            return f"'{'.'.join(map(str, (*before, KEYS[old][str(name)])))}'"
+            place = (*before, KEYS[old][str(name)])
+            what = fixed(place)
+            return f"'{'.'.join(map(str, place))}'" + (f", which is {what}" if what else "")
     return None

@@ -1,9 +1,10 @@
-"""Settings of the tracker, stage by stage in data-flow order; every addition to the paper is a switch of its own."""
+"""Settings of the tracker, stage by stage in data-flow order; what is not in the paper can be left out, by a setting or in ``disabled``."""
 
 from typing import Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_serializer, model_validator
 
+from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.settings import Settings
 from torchtrack.config.validation import ValidationConfig
@@ -17,28 +18,13 @@ class WindowConfig(Settings):
     count: int = Field(5_000, ge=10, description="Events of a window in mode 'count'.")
     parts: int = Field(4, ge=1, le=100, description="Parts in which a window is taken while an object's motion is not known; 1 for never.")
     max_unknown_px: float = Field(2.0, gt=0, description="Unknown part of a motion in a window from which it is taken in parts (px).")
-    max_age_us: int = Field(20_000, ge=100, description="In mode 'count', a window is closed after this long (µs) with fewer events.")
 
 
 class SurfaceConfig(Settings):
     """The time surface (Eq. 5) and its guided filter."""
 
     tau_s: float = Field(0.03, gt=0, le=10, description="Decay constant τ (s).")
-    margin_px: int = Field(12, ge=12, le=128, description="Border around an object's contours that its region includes (px).")
-    max_region_px: int = Field(
-        256, ge=64, le=4096, description="Side of all regions on a GPU, which takes one size for all: of larger objects, the middle (px)."
-    )
     filters: Literal["sliced", "kornia"] = Field("sliced", description="kornia's guided filter and Harris response, or our faster equal of them.")
-    filter_size_px: int = Field(5, ge=3, le=31, description="Side of the guided filter's window (px, odd).")
-    filter_eps: float = Field(0.01, gt=0, description="Regularisation of the guided filter, in squared intensity.")
-    filter_subsample: int = Field(1, ge=1, le=4, description="Subsampling of kornia's guided filter.")
-
-    @field_validator("filter_size_px")
-    @classmethod
-    def _odd(cls, size: int) -> int:
-        if size % 2 == 0:
-            raise ValueError(f"the filter's window needs a middle pixel: give an odd size, such as {size + 1}")
-        return size
 
 
 class CornerConfig(Settings):
@@ -46,20 +32,13 @@ class CornerConfig(Settings):
 
     max_corners: int = Field(0, ge=0, le=2000, description="Corners per object that are observed beside the events; 0 switches corners off.")
     cell_px: int = Field(8, ge=3, le=64, description="At most one corner in a cell of this side (px): corners are spread evenly.")
-    relative_threshold: float = Field(1e-3, ge=0, le=1, description="Least Harris response, as a share of the region's largest.")
-    snap: bool = Field(True, description="Move each corner to the newest event of its 3x3 neighbourhood.")
-    fresh_only: bool = Field(True, description="Drop corners whose neighbourhood has no event within the window.")
 
 
 class FlowConfig(Settings):
     """Event flow of each corner (Eq. 6-11)."""
 
-    always: bool = Field(False, description="Estimate it also where corners are not matched along it, which needs none.")
     radius_px: int = Field(5, ge=1, le=20, description="Events within this distance of the corner take part (px).")
-    span_s: float = Field(0.02, gt=0, le=1, description="Events up to this old take part (s).")
     iterations: int = Field(3, ge=1, le=50, description="Reweightings.")
-    tuning: float = Field(4.685, gt=0, description="b of the bisquare weight (Eq. 8), in units of the residual's scale.")
-    min_events: int = Field(8, ge=3, description="Fewer events give no flow.")
 
 
 class ContourConfig(Settings):
@@ -68,33 +47,23 @@ class ContourConfig(Settings):
     source: Literal["mesh", "splat"] = Field(
         "mesh", description="Exact contours of the mesh, or the boundary of its splatted point cloud (the paper)."
     )
-    occluding: bool = Field(True, description="Edges between a front and a back face.")
     creases: bool = Field(True, description="Sharp edges of the mesh.")
     texture: bool = Field(True, description="Edges of the texture.")
-    segments: bool = Field(True, description="Segments of a polyline model.")
     max_edge_points: int = Field(800, ge=16, le=10_000, description="Points sampled on occluding contours, creases and segments.")
-    max_texture_points: int = Field(4000, ge=0, le=20_000, description="Points of texture edges.")
-    spacing_px: float = Field(0.5, ge=0, description="Contour points no closer than this in the image: events lie on whole pixels (px).")
     remove_hidden: bool = Field(True, description="Remove contours behind a surface of any object of the stream.")
-    exact_faces: int = Field(512, ge=0, le=5000, description="Models of up to this many faces hide their own contours exactly, face by face.")
-    depth_cell_px: int = Field(4, ge=1, le=16, description="Cell of the depth buffer (px).")
-    depth_margin: float = Field(0.06, ge=0, le=1, description="A contour is hidden by what is nearer by this share of the object's diameter.")
-    splat_radius_px: int = Field(3, ge=1, le=16, description="Closing radius of the splatted point cloud (px).")
     mid_window: bool = Field(
         True, description="Contours are those that show in the middle of a window: what comes into sight at its end has not fired."
     )
-    refresh_rounds: tuple[int, ...] = Field((0,), description="Rounds of matching before which contours are extracted anew.")
 
 
 class AssociationConfig(Settings):
     """Association of corners and events with contours."""
 
-    along_flow: bool = Field(False, description="Corners search along their flow (the paper), instead of the nearest contour.")
+    search: Literal["nearest", "along_flow"] = Field("nearest", description="The nearest contour, or that along a corner's flow (the paper).")
     residual: Literal["normal", "point"] = Field("normal", description="Distance normal to the contour, or to the matched point in both coordinates.")
     gates_px: tuple[float, ...] = Field((5.0, 2.5, 1.5, 1.2), min_length=1, description="One round of matching and solving per gate (px).")
     max_gate_px: float = Field(16.0, gt=0, description="The first gate opens up to this where the prediction is uncertain (px).")
     gate_sigmas: float = Field(3.0, gt=0, description="Width of an uncertain object's first gate, in standard deviations of its prediction.")
-    index_cell_px: int = Field(2, ge=1, le=4, description="Cell of the index of nearest contour points (px).")
     fine_below_px: float = Field(
         120.0, ge=0, description="Of objects smaller than this in the image (px) and not uncertain, contours are looked up finer than by cells."
     )
@@ -234,6 +203,17 @@ class TrackerConfig(Settings):
     relocalization: RelocalizationConfig = RelocalizationConfig()
     validation: ValidationConfig = ValidationConfig()
     smoothing: SmoothingConfig = SmoothingConfig()
+    disabled: frozenset[Component] = Field(
+        frozenset(), description="Components that are left out, for an ablation: docs/method.md lists their names."
+    )
+
+    def uses(self, component: Component) -> bool:
+        """Whether a component takes part."""
+        return component not in self.disabled
+
+    @field_serializer("disabled", when_used="json")
+    def _in_order(self, disabled: frozenset[Component]) -> list[str]:
+        return sorted(disabled)
 
     @model_validator(mode="after")
     def _observes_something(self) -> "TrackerConfig":

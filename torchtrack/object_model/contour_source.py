@@ -17,6 +17,10 @@ from torchtrack.object_model import ObjectModel
 _SHARP_COSINE = 0.5
 # Directions that a model is looked at from, and how many times more points may face a camera between two of them, or near it.
 _VIEWS, _MORE_FACING = 512, 1.1
+# Points of texture edges of a model, at most: as many as a model is sampled with unless it is asked for more. It bounds time; not measured.
+MAX_TEXTURE_POINTS = 4000
+# Models of up to this many faces hide their own contours exactly, face by face: of more, one depth buffer takes less time. Not measured closely.
+EXACT_FACES = 512
 
 
 class ContourKind(IntEnum):
@@ -53,17 +57,16 @@ class ContourModel(nn.Module):
         super().__init__()
         self.numbers = tuple(members)
         self.register_buffer("members", torch.tensor(members))
-        segments = model.segments if config.segments else model.segments[:0]
-        points = torch.cat([model.edge_points, segments])
-        normals = torch.cat([model.edge_normals, torch.zeros_like(segments)])
+        points = torch.cat([model.edge_points, model.segments])
+        normals = torch.cat([model.edge_normals, torch.zeros_like(model.segments)])
         is_segment = torch.zeros(len(points), dtype=torch.bool)
         is_segment[len(model.edge_points) :] = True
         self.register_buffer("edge_ends", points.clone())
         self.register_buffer("face_normals", _in_rows(normals))
         self.register_buffer("face_offsets", _in_rows((normals * points[:, :1]).sum(-1)))
         self.register_buffer("is_segment", is_segment)
-        self.register_buffer("is_crease", torch.cat([model.edge_is_crease, torch.zeros(len(segments), dtype=torch.bool)]) & config.creases)
-        texture_count = min(len(model.texture_points), config.max_texture_points) if config.texture else 0
+        self.register_buffer("is_crease", torch.cat([model.edge_is_crease, torch.zeros(len(model.segments), dtype=torch.bool)]) & config.creases)
+        texture_count = min(len(model.texture_points), MAX_TEXTURE_POINTS) if config.texture else 0
         spread = torch.linspace(0, max(len(model.texture_points) - 1, 0), texture_count).long()
         for name in ("texture_points", "texture_tangents", "texture_normals"):
             self.register_buffer(name, getattr(model, name)[spread].clone())
@@ -73,17 +76,16 @@ class ContourModel(nn.Module):
         # Edges that may be the silhouette of what is smooth in reality.
         self.register_buffer("is_bent", self.edges[-1] == int(ContourKind.SMOOTH))
         self.register_buffer("surface_points", _in_rows(model.surface_points))
-        exact = len(model.triangles) <= config.exact_faces
+        exact = len(model.triangles) <= EXACT_FACES
         triangles = model.triangles if exact else model.triangles[:0]
         self.register_buffer("triangles", triangles.clone())
         self.register_buffer("triangle_normals", _normals(triangles))
 
-    def active_edges(self, camera_obj: Float[Tensor, "b 3"], occluding: bool) -> Bool[Tensor, "b e"]:
+    def active_edges(self, camera_obj: Float[Tensor, "b 3"]) -> Bool[Tensor, "b e"]:
         """Which edges are contours for a camera at ``camera_obj`` (object frame)."""
         facing = torch.einsum("esk,bk->bes", self.face_normals, camera_obj) > self.face_offsets
         front, back = facing.unbind(-1)
-        active = self.is_crease & (front | back) | self.is_segment
-        return active | (front != back) if occluding else active
+        return self.is_crease & (front | back) | self.is_segment | (front != back)
 
 
 def _in_rows(values: Float[Tensor, "n *c"]) -> Float[Tensor, "n *c"]:

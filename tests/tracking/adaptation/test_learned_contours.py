@@ -14,6 +14,7 @@ from torchtrack import Tracker
 from torchtrack.config.tracker import AdaptationConfig, ContourConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg
+from torchtrack.object_model import contour_source
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.adaptation.learned_contours import LearnedContours
 
@@ -202,9 +203,10 @@ def test_switched_off_there_is_nothing(config):
     assert tracker.init(pose()[None], 0).appearance.learned is None
 
 
-def test_nothing_is_learned_on_dense_meshes():
+def test_nothing_is_learned_on_dense_meshes(monkeypatch):
+    monkeypatch.setattr(contour_source, "EXACT_FACES", 0)
     _, events = plate_sequence()
-    tracker = Tracker([plate_model()], PLATE_CAMERA, TrackerConfig(contours=ContourConfig(exact_faces=0)))
+    tracker = Tracker([plate_model()], PLATE_CAMERA)
     state, results = follow(tracker, tracker.init(PLATE_POSE[None], 0), windows(events, 2))
     assert not bool(state.appearance.learned.drafted.any())
     assert not bool((results[-1].contours.kind == int(ContourKind.LEARNED)).any())

@@ -384,7 +384,7 @@ def test_the_concentration_of_an_object_does_not_depend_on_the_others():
 
 def along(observations, contours, *, gate_px=8.0, velocity=(0.0, 0.0), **settings):
     moving = moving_objects(velocity, len(contours.pixels), contours.pixels.dtype)
-    return match_along_flow(observations, contours, moving, gate_px, AssociationConfig(along_flow=True, **settings))
+    return match_along_flow(observations, contours, moving, gate_px, AssociationConfig(search="along_flow", **settings))
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])

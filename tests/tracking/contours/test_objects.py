@@ -6,6 +6,7 @@ from helpers import SMALL_CAMERA, box_model, pose
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import ContourConfig
+from torchtrack.object_model import contour_source
 from torchtrack.tracking.contours.objects import repeat_row
 
 CONTOURS = ContourConfig()
@@ -77,9 +78,10 @@ def test_copying_leaves_the_originals_as_they_were():
     assert [model.members.tolist() for model in objects.models] == [[0, 2], [1]]
 
 
-@pytest.mark.parametrize("config", [CONTOURS, ContourConfig(exact_faces=0), SPLAT], ids=["faces", "buffer", "splat"])
-def test_copies_hide_neither_one_another_nor_themselves(config):
+@pytest.mark.parametrize(("config", "exact_faces"), [(CONTOURS, 512), (CONTOURS, 0), (SPLAT, 512)], ids=["faces", "buffer", "splat"])
+def test_copies_hide_neither_one_another_nor_themselves(monkeypatch, config, exact_faces):
     """A copy before another one would hide it, were they in one stream."""
+    monkeypatch.setattr(contour_source, "EXACT_FACES", exact_faces)
     objects = batch_of(box_model(), box_model(PLATE_EXTENTS_M))
     poses = torch.stack([pose(), pose(translation=(0.0, 0.0, 0.4)), pose(translation=(0.01, 0.0, 0.7))]).float()
     together = objects.copies(0, 3).contours(poses, config)

@@ -8,15 +8,15 @@ from helpers import BOX_EXTENTS_M, SMALL_CAMERA, box_model, generator, pose, ran
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import project
 from torchtrack.core.lie import se3_inverse, transform_points
-from torchtrack.object_model import ObjectModel
+from torchtrack.object_model import ObjectModel, contour_source
 from torchtrack.object_model.contour_source import group_by_model
 from torchtrack.tracking.contours.surface_rays import rays_of, surface_points
 
 INTRINSICS = SMALL_CAMERA.intrinsics(torch.float64)[None]
 
 
-def models_of(*models, **kwargs):
-    return [group.double() for group in group_by_model(models, ContourConfig(**kwargs))]
+def models_of(*models):
+    return [group.double() for group in group_by_model(models, ContourConfig())]
 
 
 def pixels_around(T_cam_obj, count=200):
@@ -55,9 +55,10 @@ def test_beside_the_object_nothing_is_met():
     assert bool(torch.isfinite(met.shifted_to(torch.tensor([[[6.0, 5.0]]], dtype=torch.float64), INTRINSICS)).all())
 
 
-def test_nothing_is_met_on_a_dense_mesh():
+def test_nothing_is_met_on_a_dense_mesh(monkeypatch):
+    monkeypatch.setattr(contour_source, "EXACT_FACES", 0)
     T = pose()[None]
-    assert not surface_points(models_of(box_model(), exact_faces=0), T, pixels_around(T), INTRINSICS).mask.any()
+    assert not surface_points(models_of(box_model()), T, pixels_around(T), INTRINSICS).mask.any()
 
 
 def test_objects_do_not_disturb_one_another():

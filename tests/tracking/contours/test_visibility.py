@@ -8,7 +8,7 @@ from solid_models import ball, l_prism
 
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import Camera
-from torchtrack.object_model import ObjectModel
+from torchtrack.object_model import ObjectModel, contour_source
 from torchtrack.object_model.contour_source import group_by_model
 from torchtrack.tracking.contours import visibility
 from torchtrack.tracking.contours.sampling import mesh_contours
@@ -28,7 +28,7 @@ def extracted(models, T, *, streams=None, camera=SMALL_CAMERA, stream_count=None
     shape = (stream_count or int(streams.max()) + 1, camera.height, camera.width)
     shared = len(streams.unique()) < len(streams)
     contours = mesh_contours(groups, T, intrinsics, config)
-    return contours, remove_hidden(contours, Scene(groups, T, intrinsics, streams, diameters, shape, shared), config)
+    return contours, remove_hidden(contours, Scene(groups, T, intrinsics, streams, diameters, shape, shared))
 
 
 def ray_hits(points_cam, triangles_cam):
@@ -98,11 +98,11 @@ def test_one_triangle_hides_what_is_behind_it_and_inside_its_cone(dtype):
 
 
 @pytest.mark.parametrize("exact_faces", [0, 5000], ids=["buffer", "exact"])
-def test_a_part_in_front_hides_the_part_behind(exact_faces):
+def test_a_part_in_front_hides_the_part_behind(monkeypatch, exact_faces):
     """Two balls in line: none of the smaller one behind is seen."""
+    monkeypatch.setattr(contour_source, "EXACT_FACES", exact_faces)
     model = ObjectModel.from_mesh([ball(0.05, (0, 0, -0.06)), ball(0.03, (0, 0, 0.06))], name="balls")
-    config = ContourConfig(exact_faces=exact_faces)
-    before, after = extracted([model], pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.5))[None], config=config)
+    before, after = extracted([model], pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.5))[None])
     front = before.points_obj[..., 2] < 0
     assert int((before.mask & ~front).sum()) > 80
     assert not (after.mask & ~front).any()
@@ -110,9 +110,10 @@ def test_a_part_in_front_hides_the_part_behind(exact_faces):
 
 
 @pytest.mark.parametrize("exact_faces", [0, 5000], ids=["buffer", "exact"])
-def test_the_smooth_silhouette_of_a_ball_is_not_hidden(exact_faces):
+def test_the_smooth_silhouette_of_a_ball_is_not_hidden(monkeypatch, exact_faces):
+    monkeypatch.setattr(contour_source, "EXACT_FACES", exact_faces)
     model = ObjectModel.from_mesh(ball(0.05), name="ball")
-    before, after = extracted([model] * 3, random_pose(3), streams=[0, 1, 2], config=ContourConfig(exact_faces=exact_faces))
+    before, after = extracted([model] * 3, random_pose(3), streams=[0, 1, 2])
     assert (after.mask.sum(1) > 0.95 * before.mask.sum(1)).all()
 
 

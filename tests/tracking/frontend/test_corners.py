@@ -4,13 +4,15 @@ import pytest
 import torch
 from helpers import generator, random_events
 
-from torchtrack.config.tracker import CornerConfig, SurfaceConfig
+from torchtrack.config.components import Component
+from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig
 from torchtrack.tracking.frontend.corners import detect_corners, no_corners, select_corners, snap_to_newest
 from torchtrack.tracking.frontend.filters import corner_response
+from torchtrack.tracking.frontend.sensors import REGION_MARGIN_PX
 from torchtrack.tracking.frontend.time_surface import NEVER_US, Regions, empty_last_event, object_regions, time_surface, update_last_event
 
 SURFACE = SurfaceConfig()
-FILTER_PX = SURFACE.filter_size_px
+CORNERS = TrackerConfig(corners=CornerConfig(max_corners=32))
 NOW_US = 1_000_000
 
 
@@ -32,13 +34,14 @@ def pixel_table(streams, height, width, dtype=torch.float32):
     return torch.stack([u, v], -1).to(dtype).expand(streams, -1, -1, -1)
 
 
-def detect(last_event_us, regions, *, config=None, window_s=1.0, surface_config=SURFACE, dtype=torch.float32, t_us=NOW_US):
+def detect(last_event_us, regions, *, most=32, without=(), window_s=1.0, surface_config=SURFACE, dtype=torch.float32, t_us=NOW_US):
     streams, height, width = last_event_us.shape
     now = torch.full((streams,), t_us)
     surface = time_surface(last_event_us, now, regions, surface_config.tau_s, dtype)
     window = torch.full((streams,), window_s, dtype=dtype)
     table = pixel_table(streams, height, width, dtype)
-    return detect_corners(surface, regions, last_event_us, now, window, table, surface_config, config or CornerConfig(max_corners=32))
+    config = TrackerConfig(surface=surface_config, corners=CornerConfig(max_corners=most), disabled=frozenset(without))
+    return detect_corners(surface, regions, last_event_us, now, window, table, config)
 
 
 def actual(corners, number=0):
@@ -66,7 +69,7 @@ def square_of_events(u0, v0, u1, v1, t_us=NOW_US, width=96, height=96):
 def test_the_corners_of_a_square_are_found_and_nothing_else(square):
     u0, v0, u1, v1 = square
     response = corner_response(squares((*square, 1.0)), SURFACE)
-    pixels, mask = select_corners(response, region(96, 96), CornerConfig(max_corners=32, relative_threshold=0.05), FILTER_PX)
+    pixels, mask = select_corners(response, region(96, 96), CornerConfig(max_corners=32))
     places = pixels[mask]
     assert len(places) == 4
     for corner in ((u0, v0), (u1, v0), (u0, v1), (u1, v1)):
@@ -77,7 +80,7 @@ def test_at_most_one_corner_in_a_cell_and_each_the_largest_around():
     response = torch.rand((2, 96, 128), generator=generator(3))
     regions = Regions(torch.zeros(2, 2, dtype=torch.int64), torch.tensor([[128, 96]] * 2), (96, 128), torch.tensor([0, 0]))
     config = CornerConfig(cell_px=8, max_corners=500)
-    pixels, mask = select_corners(response, regions, config, FILTER_PX)
+    pixels, mask = select_corners(response, regions, config)
     for number in range(2):
         places = pixels[number][mask[number]]
         assert len(places) > 30
@@ -93,7 +96,7 @@ def test_corners_are_the_strongest_and_at_most_as_many_as_asked_for():
     places = [(20 + 10 * i, 20 + 10 * j) for i in range(6) for j in range(6)]
     for rank, (u, v) in enumerate(places):
         response[0, v, u] = 1 + rank
-    pixels, mask = select_corners(response, region(96, 96), CornerConfig(max_corners=5), FILTER_PX)
+    pixels, mask = select_corners(response, region(96, 96), CornerConfig(max_corners=5))
     assert pixels.shape == (1, 5, 2)
     assert mask.all()
     assert {tuple(pixel) for pixel in pixels[0].tolist()} == set(places[-5:])
@@ -102,41 +105,41 @@ def test_corners_are_the_strongest_and_at_most_as_many_as_asked_for():
 def test_weak_responses_are_no_corners():
     response = torch.zeros(1, 96, 96)
     response[0, 30, 30], response[0, 60, 60], response[0, 30, 60], response[0, 60, 30] = 1.0, 2e-3, 0.5e-3, -1.0
-    pixels, mask = select_corners(response, region(96, 96), CornerConfig(max_corners=32, relative_threshold=1e-3), FILTER_PX)
+    pixels, mask = select_corners(response, region(96, 96), CornerConfig(max_corners=32))
     assert {tuple(pixel) for pixel in pixels[mask].tolist()} == {(30, 30), (60, 60)}
 
 
 def test_a_surface_without_anything_has_no_corners():
-    _, mask = select_corners(torch.zeros(1, 64, 64), region(64, 64), CornerConfig(max_corners=32, relative_threshold=0), FILTER_PX)
+    _, mask = select_corners(torch.zeros(1, 64, 64), region(64, 64), CornerConfig(max_corners=32))
     assert not mask.any()
 
 
 def test_corners_stay_within_the_region_of_their_object():
     response = torch.rand((1, 96, 96), generator=generator(5))
     regions = Regions(torch.zeros(1, 2, dtype=torch.int64), torch.tensor([[50, 70]]), (96, 96), torch.tensor([0]))
-    pixels, mask = select_corners(response, regions, CornerConfig(max_corners=500), FILTER_PX)
+    pixels, mask = select_corners(response, regions, CornerConfig(max_corners=500))
     places = pixels[mask]
     assert len(places) > 5
     assert (places >= 0).all()
     assert (places < torch.tensor([50, 70])).all()
 
 
-@pytest.mark.parametrize(("filter_size_px", "reach"), [(3, 8), (5, 10), (15, 20)])
-def test_what_the_filters_reach_from_beyond_the_region_is_left_out(filter_size_px, reach):
+def test_what_the_filters_reach_from_beyond_the_region_is_left_out():
     """Twice the half window of the guided filter, which averages twice, and six for what follows: exactly."""
+    reach = 2 * 2 + 6
     response = torch.rand((1, 96, 128), generator=generator(6))
     for last in (False, True):
         corner = (127 - reach, 95 - reach) if last else (reach, reach)
         beyond = (corner[0] + 1, corner[1]) if last else (corner[0] - 1, corner[1])
         response[0, beyond[1], beyond[0]], response[0, corner[1], corner[0]] = 3.0, 2.0
-    pixels, mask = select_corners(response, region(128, 96), CornerConfig(max_corners=500), filter_size_px)
+    pixels, mask = select_corners(response, region(128, 96), CornerConfig(max_corners=500))
     chosen = {tuple(pixel) for pixel in pixels[mask].tolist()}
     assert {(reach, reach), (127 - reach, 95 - reach)} <= chosen
     assert all(reach <= u <= 127 - reach and reach <= v <= 95 - reach for u, v in chosen)
 
 
 def test_cells_larger_than_the_region_give_no_corners():
-    _, mask = select_corners(torch.rand((1, 32, 32), generator=generator()), region(32, 32), CornerConfig(max_corners=32, cell_px=64), FILTER_PX)
+    _, mask = select_corners(torch.rand((1, 32, 32), generator=generator()), region(32, 32), CornerConfig(max_corners=32, cell_px=64))
     assert not mask.any()
 
 
@@ -166,7 +169,7 @@ def test_snapping_stays_on_the_sensor_and_in_its_stream():
 def test_detected_corners_lie_on_the_newest_event_beside_them():
     last = square_of_events(30, 30, 60, 60, t_us=NOW_US - 8_000)
     last[0, 30:61, 30] = NOW_US - 1_000
-    corners = detect(last, region(96, 96), config=CornerConfig(max_corners=32, relative_threshold=0.05))
+    corners = detect(last, region(96, 96))
     left = corners.sensor_pixels[0][corners.mask[0] & (corners.sensor_pixels[0, :, 0] < 40)]
     assert len(left) >= 2
     assert (left[:, 0] == 30).all()
@@ -175,10 +178,9 @@ def test_detected_corners_lie_on_the_newest_event_beside_them():
 
 
 @pytest.mark.parametrize("fresh_only", [True, False])
-def test_stale_corners_are_dropped_where_asked_for(fresh_only):
+def test_stale_corners_are_dropped_unless_that_is_disabled(fresh_only):
     last = torch.maximum(square_of_events(20, 20, 40, 40, t_us=NOW_US - 6_000), square_of_events(60, 60, 80, 80, t_us=NOW_US - 2_000))
-    config = CornerConfig(max_corners=32, relative_threshold=0.05, fresh_only=fresh_only)
-    corners = detect(last, region(96, 96), config=config, window_s=5e-3)
+    corners = detect(last, region(96, 96), without=() if fresh_only else [Component.FRESH_CORNERS], window_s=5e-3)
     ages = corners.age_s[corners.mask]
     assert bool((ages < 5e-3).any())
     assert bool((ages >= 5e-3).any()) != fresh_only
@@ -192,7 +194,7 @@ def test_an_event_at_the_start_of_the_window_is_of_the_one_before():
 
 def test_without_events_there_are_no_corners():
     assert not detect(empty_last_event(1, 96, 96), region(96, 96)).mask.any()
-    assert not detect(empty_last_event(1, 96, 96), region(96, 96), config=CornerConfig(max_corners=32, fresh_only=False)).mask.any()
+    assert not detect(empty_last_event(1, 96, 96), region(96, 96), without=[Component.FRESH_CORNERS]).mask.any()
 
 
 def test_corners_of_nothing():
@@ -206,15 +208,15 @@ def test_ideal_pixels_come_from_the_table_of_the_stream():
     last = square_of_events(30, 30, 60, 60)
     table = pixel_table(1, 96, 96) * 2 + 1
     surface = time_surface(last, torch.tensor([NOW_US]), region(96, 96), SURFACE.tau_s, torch.float32)
-    corners = detect_corners(surface, region(96, 96), last, torch.tensor([NOW_US]), torch.ones(1), table, SURFACE, CornerConfig(max_corners=32))
+    corners = detect_corners(surface, region(96, 96), last, torch.tensor([NOW_US]), torch.ones(1), table, CORNERS)
     assert corners.mask.any()
     torch.testing.assert_close(corners.pixels, corners.sensor_pixels * 2.0 + 1)
 
 
 def test_a_region_beyond_the_border_of_the_sensor_finds_the_same_corners():
     last = square_of_events(14, 14, 44, 44)
-    inner = detect(last, region(96, 96), config=CornerConfig(max_corners=32, relative_threshold=0.05))
-    beyond = detect(last, region(128, 128, origin=(-24, -24)), config=CornerConfig(max_corners=32, relative_threshold=0.05))
+    inner = detect(last, region(96, 96))
+    beyond = detect(last, region(128, 128, origin=(-24, -24)))
     assert len(actual(inner)) >= 4
     assert actual(inner) <= actual(beyond)
     assert (beyond.sensor_pixels >= 0).all()
@@ -232,8 +234,8 @@ def two_objects(dtype, surface_config=SURFACE):
 
     def corners(pixels):
         mask = torch.ones(pixels.shape[:2], dtype=torch.bool)
-        regions = object_regions(pixels, mask, torch.zeros(len(pixels), dtype=torch.int64), (120, 160), surface_config.margin_px, 256)
-        return detect(last, regions, config=CornerConfig(max_corners=400, snap=False), surface_config=surface_config, dtype=dtype)
+        regions = object_regions(pixels, mask, torch.zeros(len(pixels), dtype=torch.int64), (120, 160), REGION_MARGIN_PX, 256)
+        return detect(last, regions, most=400, without=[Component.CORNER_SNAP], surface_config=surface_config, dtype=dtype)
 
     together = corners(torch.cat([small, large]))
     return [actual(together, 0), actual(together, 1)], [actual(corners(small)), actual(corners(large))]
@@ -244,12 +246,6 @@ def test_corners_do_not_depend_on_the_rest_of_the_batch(dtype, filters):
     together, alone = two_objects(dtype, SurfaceConfig(filters=filters, tau_s=0.3))
     assert together == alone
     assert min(len(corners) for corners in alone) > 3
-
-
-def test_corners_do_not_depend_on_the_rest_of_the_batch_with_a_wide_filter(dtype):
-    together, alone = two_objects(dtype, SurfaceConfig(filter_size_px=15, filter_eps=1.0, margin_px=32, tau_s=0.3))
-    assert min(len(corners) for corners in alone) > 3
-    assert together == alone
 
 
 def test_more_regions_than_are_filtered_at_a_time():

@@ -17,7 +17,7 @@ from torchtrack.core.dispatch import accelerates
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.tracking.contours import points
 from torchtrack.tracking.contours.points import MIN_PX_PER_M, Contours
-from torchtrack.tracking.contours.sampling import MAX_ACTIVE_EDGES, MIN_TEXTURE_COSINE, mesh_points
+from torchtrack.tracking.contours.sampling import MAX_ACTIVE_EDGES, MIN_TEXTURE_COSINE, SPACING_PX, mesh_points
 from torchtrack.tracking.relocalization import sampling
 from torchtrack.tracking.relocalization.event_image import BORDER_PX
 
@@ -81,7 +81,7 @@ def _active_edges(
     # Of eight edges at a time, mostly none is one.
     shows, used = np.zeros(-(-len(active) // 8) * 8, np.bool_), 0
     for e in range(len(active)):
-        shows[e] = is_segment[e] | (is_crease[e] & (front[e] | back[e])) | (settings.occluding & (front[e] != back[e]))
+        shows[e] = is_segment[e] | (is_crease[e] & (front[e] | back[e])) | (front[e] != back[e])
     eight = shows.view(np.uint64)
     for k in range(len(eight)):
         if eight[k]:
@@ -324,10 +324,9 @@ _TO_SHOW = ContourConfig()
 def sampling_settings(config: ContourConfig = _TO_SHOW) -> SamplingSettings:
     """What a kernel goes by that samples contours, or only shows what was sampled."""
     return SamplingSettings(
-        occluding=config.occluding,
         most_edges=MAX_ACTIVE_EDGES,
         max_edge_points=config.max_edge_points,
-        spacing_px=config.spacing_px,
+        spacing_px=SPACING_PX,
         texture=int(ContourKind.TEXTURE),
         least_cosine=MIN_TEXTURE_COSINE,
         least_depth_m=MIN_DEPTH_M,

@@ -154,7 +154,6 @@ class SamplingSettings(NamedTuple):
     """What :mod:`torchtrack.backends.numba.contours` goes by: settings, and constants of :mod:`torchtrack.tracking.contours.sampling`.
 
     Args:
-        occluding: whether edges between a front and a back face are contours.
         most_edges: of more active edges, as many are taken.
         max_edge_points: points on edges, at most.
         spacing_px: points are no closer than this in the image.
@@ -164,7 +163,6 @@ class SamplingSettings(NamedTuple):
         least_px_per_m: tangents that the image shows shorter have no direction in it.
     """
 
-    occluding: bool
     most_edges: int
     max_edge_points: int
     spacing_px: float

@@ -165,8 +165,8 @@ def _linearise(
 def knows(config: TrackerConfig) -> bool:
     """Whether the kernel does all that is set: the settings of the preset ``default``, and most beside them."""
     matching, solver = config.association, config.solver
-    usual = solver.prior and solver.iterations == 1 and solver.loss == "tukey" and not any(config.contours.refresh_rounds)
-    return usual and not matching.along_flow and matching.residual == "normal"
+    usual = solver.prior and solver.iterations == 1 and solver.loss == "tukey" and config.contours.source == "mesh"
+    return usual and matching.search == "nearest" and matching.residual == "normal"
 
 
 @accelerates(rounds.align_rounds, supports=lambda start, table, observations, gates, config: knows(config) and not start.extra_terms)

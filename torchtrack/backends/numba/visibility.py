@@ -9,7 +9,6 @@ from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, entries, inverse_depth, lens, placed, turned
 from torchtrack.backends.numba.parameters import GridSettings
-from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.contours import visibility
@@ -246,17 +245,15 @@ def hidden_by_self_numba(scene: Scene, contours: Contours) -> Bool[Tensor, "b m"
 
 
 @accelerates(visibility.hidden_in_buffer)
-def hidden_in_buffer_numba(
-    scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"], exact: Bool[Tensor, "b 1"], config: ContourConfig
-) -> Bool[Tensor, "b m"]:
+def hidden_in_buffer_numba(scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"], exact: Bool[Tensor, "b 1"]) -> Bool[Tensor, "b m"]:
     """Sample by sample and point by point."""
     streams, height, width = scene.image_shape
-    hidden, margin_m, first = torch.zeros_like(contours.mask), config.depth_margin * scene.diameters_m, np.empty((streams, 2))
+    hidden, margin_m, first = torch.zeros_like(contours.mask), visibility.DEPTH_MARGIN * scene.diameters_m, np.empty((streams, 2))
     points_cam, pixels, normals, mask = as_arrays(
         *(value.transpose(1, 2) for value in (contours.points_cam, contours.pixels, contours.normals)), contours.mask
     )
     T_cam_obj, intrinsics, stream_index, diameters_m = as_arrays(scene.T_cam_obj, scene.intrinsics, scene.stream_index, scene.diameters_m)
-    cell_px = float(config.depth_cell_px)
+    cell_px = float(visibility.DEPTH_CELL_PX)
     rows, columns = around(pixels, mask, stream_index, cell_px, height, width, first)
     steps_per_m, enough = visibility.DEPTH_STEPS_PER_M, visibility.SAMPLES_PER_CELL
     settings = GridSettings(rows, columns, cell_px, height, width, steps_per_m, MIN_DEPTH_M, enough)

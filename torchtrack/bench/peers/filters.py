@@ -14,12 +14,12 @@ from numpy import ndarray
 from torchtrack.bench.peers.comparison import Comparison, Work
 from torchtrack.bench.surface import WINDOW_US, random_events
 from torchtrack.config.tracker import SurfaceConfig
-from torchtrack.tracking.frontend.filters import sliced_guided_filter, sliced_harris
+from torchtrack.tracking.frontend.filters import FILTER_EPS, FILTER_SIZE_PX, sliced_guided_filter, sliced_harris
 from torchtrack.tracking.frontend.time_surface import Regions, empty_last_event, time_surface, update_last_event
 
 # Width and height: an object's region, and the whole sensor.
 SIZES = ((208, 208), (640, 480))
-_CONFIG = SurfaceConfig()
+_TAU_S = SurfaceConfig().tau_s
 _HARRIS_K, _HARRIS_WINDOW_PX = 0.04, 7
 # Borders are treated differently (px).
 _BORDER_PX = 12
@@ -30,11 +30,9 @@ def compare(comparison: Comparison) -> None:
     for width, height in SIZES:
         image = surface_image(width, height).to(comparison.setup.device)
         plain, size = image[0].cpu().numpy(), f"{width}x{height}"
-        guided = comparison.time(
-            f"guided filter {size}: torchtrack", partial(sliced_guided_filter, image, _CONFIG.filter_size_px, _CONFIG.filter_eps)
-        )
+        guided = comparison.time(f"guided filter {size}: torchtrack", partial(sliced_guided_filter, image, FILTER_SIZE_PX, FILTER_EPS))
         harris = comparison.time(f"Harris {size}: torchtrack", partial(sliced_harris, image))
-        expected = sliced_guided_filter(image, _CONFIG.filter_size_px, _CONFIG.filter_eps)[0].cpu().numpy()
+        expected = sliced_guided_filter(image, FILTER_SIZE_PX, FILTER_EPS)[0].cpu().numpy()
         works = (
             (guided, "kornia", "kornia", partial(_kornia_guided, image), expected),
             (guided, "OpenCV", "opencv-contrib-python-headless, in place of opencv-python-headless", partial(_opencv_guided, plain), expected),
@@ -54,7 +52,7 @@ def surface_image(width: int, height: int) -> Float[torch.Tensor, "1 h w"]:
     newest = update_last_event(empty_last_event(1, height, width), random_events(width, height, width * height // 4))
     zeros = torch.zeros(1, 2, dtype=torch.int64)
     regions = Regions(zeros, torch.tensor([[width, height]]), (height, width), zeros[:, 0])
-    return time_surface(newest, torch.tensor([WINDOW_US]), regions, _CONFIG.tau_s, torch.float32)
+    return time_surface(newest, torch.tensor([WINDOW_US]), regions, _TAU_S, torch.float32)
 
 
 def _compare_images(comparison: Comparison, name: str, ours: ndarray | None, theirs: ndarray) -> None:
@@ -68,7 +66,7 @@ def _compare_images(comparison: Comparison, name: str, ours: ndarray | None, the
 
 
 def _kornia_guided(image: torch.Tensor) -> Work:
-    return lambda: guided_blur(image[:, None], image[:, None], _CONFIG.filter_size_px, _CONFIG.filter_eps)[0, 0].cpu()
+    return lambda: guided_blur(image[:, None], image[:, None], FILTER_SIZE_PX, FILTER_EPS)[0, 0].cpu()
 
 
 def _kornia_harris(image: torch.Tensor) -> Work:
@@ -79,7 +77,7 @@ def _opencv_guided(image: ndarray) -> Work:
     # Only OpenCV's contributed modules have it, and its type stubs do not know.
     contributed: Any = cv2
     guided_filter = contributed.ximgproc.guidedFilter
-    return lambda: guided_filter(image, image, _CONFIG.filter_size_px // 2, _CONFIG.filter_eps)
+    return lambda: guided_filter(image, image, FILTER_SIZE_PX // 2, FILTER_EPS)
 
 
 def _opencv_harris(image: ndarray) -> Work:

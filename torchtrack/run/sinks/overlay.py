@@ -26,7 +26,7 @@ class Overlay:
     """
 
     def __init__(self, path: Path, session: Session, config: OverlayConfig, tracker: TrackerConfig) -> None:
-        self._session, self._config = session, _with_flow_of_corners(tracker)
+        self._session, self._config = session, _with_corners(tracker)
         first_stream = torch.zeros(len(session.models), dtype=torch.int64)
         self._sensors = Sensors(*sensor_tables([session.camera]), stream_index=first_stream, tiles=None)
         self._last_event_us = empty_last_event(1, *self._sensors.image_size)
@@ -46,15 +46,16 @@ class Overlay:
         """The result of a step with the corners around its contours and their flow."""
         result, window = each_tensor(Tensor.cpu, step.result), step.window
         window_s = torch.tensor([1e-6 * (window.t_end_us - window.t_start_us)])
-        corners = self._sensors.corners(result.contours, self._last_event_us, torch.tensor([window.t_end_us]), window_s, self._config)
-        return replace(result, corners=corners)
+        t_us = torch.tensor([window.t_end_us])
+        corners = self._sensors.corners(result.contours, self._last_event_us, t_us, window_s, self._config)
+        return replace(result, corners=self._sensors.with_flow(corners, self._last_event_us, t_us, self._config))
 
     def close(self) -> None:
         """Finish the video."""
         self._writer.close()
 
 
-def _with_flow_of_corners(config: TrackerConfig) -> TrackerConfig:
-    """The settings with corners and their flow switched on."""
+def _with_corners(config: TrackerConfig) -> TrackerConfig:
+    """The settings with corners switched on."""
     corners = config.corners.model_copy(update={"max_corners": config.corners.max_corners or _CORNERS})
-    return config.model_copy(update={"corners": corners, "flow": config.flow.model_copy(update={"always": True})})
+    return config.model_copy(update={"corners": corners})

@@ -101,7 +101,7 @@ class ObjectBatch:
         if not config.remove_hidden:
             return contours
         scene = Scene(self.models, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, self.image_shape, self.shared)
-        return remove_hidden(contours, scene, config)
+        return remove_hidden(contours, scene)
 
     def copies(self, number: int, count: int) -> "ObjectBatch":
         """One object many times, each in a stream of its own: copies do not hide one another."""

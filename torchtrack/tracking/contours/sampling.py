@@ -19,6 +19,8 @@ from torchtrack.core.padded import select_ranked
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.tracking.contours.points import Contours, assemble, widened
 
+# Contour points lie no closer than this in the image (px): events lie on whole pixels, and small objects cost less.
+SPACING_PX = 0.5
 # Of a model with no more edges than this, all are looked at.
 _FEW_EDGES = 512
 
@@ -61,7 +63,7 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     """Points on the active edges, spread evenly in the image."""
     batch = len(T_cam_obj)
     camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])
-    active = model.active_edges(camera_obj[..., 0], config.occluding)
+    active = model.active_edges(camera_obj[..., 0])
     ends, edges = model.edge_ends.expand(batch, -1, -1, -1), model.edges.expand(batch, -1, -1)
     places = _places_for(active)
     if places < active.shape[1]:
@@ -71,7 +73,7 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     lengths = lengths * active
     cumulative = lengths.cumsum(-1)
     total = cumulative[:, -1:]
-    counts = (total / config.spacing_px).ceil().nan_to_num(0.0).clamp(max=config.max_edge_points)
+    counts = (total / SPACING_PX).ceil().nan_to_num(0.0).clamp(max=config.max_edge_points)
     count = max(int(counts.amax()), 1) if host_sync.read_at_once(counts) else config.max_edge_points
     number = torch.arange(count, device=lengths.device, dtype=lengths.dtype)
     target = (number + 0.5) / counts.clamp(min=1) * total
@@ -112,11 +114,11 @@ def _texture_mask(model: ContourModel, T_cam_obj: Tensor) -> Tensor:
     return (normals * points).sum(-1) < -MIN_TEXTURE_COSINE * points.square().sum(-1).sqrt()
 
 
-def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> _Points:
+def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor) -> _Points:
     """Points of the texture that looks at the camera."""
     spacing_px = model.texture_spacing_m * intrinsics[:, 0] / T_cam_obj[:, 2, 3].clamp(min=MIN_DEPTH_M)
     # Every second, third and so on, where they lie closer than need be.
-    every = (config.spacing_px / spacing_px).floor().clamp(1, len(model.texture_points)).long()
+    every = (SPACING_PX / spacing_px).floor().clamp(1, len(model.texture_points)).long()
     number = torch.arange(len(model.texture_points), device=every.device)
     facing = _texture_mask(model, T_cam_obj) & (number % every[:, None] == 0)
     # On a GPU, which would have to be waited for to know how many there are, there are places for as many as there can be.
@@ -132,7 +134,7 @@ def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, 
     if len(model.edge_ends):
         parts.append(_edge_points(model, T_cam_obj, intrinsics, config))
     if len(model.texture_points):
-        parts.append(_texture_points(model, T_cam_obj, intrinsics, config))
+        parts.append(_texture_points(model, T_cam_obj, intrinsics))
     if len(parts) == 2:
         return parts[1]
     return tuple(torch.cat(column, 1) for column in zip(*parts, strict=True))

@@ -15,6 +15,9 @@ from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.tracking.contours.points import Contours, assemble
 
+# Closing radius of the splatted point cloud (px): 10,000 samples of a surface leave holes between them. Set with the first contours; not measured.
+_CLOSING_RADIUS_PX = 3
+
 
 def _close(occupied: Float[Tensor, "b h w"], radius: int) -> Float[Tensor, "b h w"]:
     """Morphological closing with a square of side ``2 radius + 1``."""
@@ -64,7 +67,7 @@ def _model_boundary(surface_points: Tensor, T_cam_obj: Tensor, intrinsics: Tenso
     # Twice the image's half size about its centre: what lies beyond is no boundary in the image, and may be endless.
     principal = intrinsics[:, None, 2:]
     near_image = ((pixels - principal).abs() < 2 * principal.abs() + 1).all(-1)
-    on_boundary, normals = boundary_points(pixels, near_image & (points_cam[..., 2] > MIN_DEPTH_M), config.splat_radius_px)
+    on_boundary, normals = boundary_points(pixels, near_image & (points_cam[..., 2] > MIN_DEPTH_M), _CLOSING_RADIUS_PX)
     index, mask = select_ranked(on_boundary, config.max_edge_points)
     normals = take_points(normals, index)
     # A tangent parallel to the image plane: only its projection matters.

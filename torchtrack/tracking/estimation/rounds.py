@@ -16,7 +16,7 @@ from torchtrack.tracking.association.matches import MatchesWithCues, both_coordi
 from torchtrack.tracking.association.nearest import ContourTable, contour_table, match_nearest
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.weights import effective_weight
-from torchtrack.tracking.contours.index import ContourIndex, index_contours
+from torchtrack.tracking.contours.index import INDEX_CELL_PX, ContourIndex, index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.implicit_gradient import with_gradient
@@ -77,7 +77,7 @@ def index_for(
     Args:
         radius_px: :func:`index_radius`, where it was asked for ahead.
     """
-    return index_contours(contours, image_size, radius_px or AsyncValue.to(index_radius(gate_scale, config)), config.association.index_cell_px)
+    return index_contours(contours, image_size, radius_px or AsyncValue.to(index_radius(gate_scale, config)), INDEX_CELL_PX)
 
 
 def align(
@@ -161,13 +161,13 @@ def align_rounds(
     objects, matching = prediction.objects, config.association
     place = _first_place(begin, observations, config)
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, gates.wider, strict=True)):
-        if number and number in config.contours.refresh_rounds:
+        if number and config.contours.source == "splat":
             contours = objects.contours(begin.T_cam_obj, config.contours)
             index = index_for(contours, objects.image_size, config, gates.gate_scale, start.index.radius_px)
             table = _table(contours, index, objects, matching)
             place = _first_place(begin, observations, config)
         moving = begin.moving(compensated=matching.motion_compensation, offset=offset if config.solver.acceleration_in_window else None)
-        if matching.along_flow:
+        if matching.search == "along_flow":
             contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
             matches = match_along_flow(observations, contours, moving, gate_px, matching)
         else:

@@ -10,11 +10,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.tracker import CornerConfig, SurfaceConfig
+from torchtrack.config.components import Component
+from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig
 from torchtrack.core.constants import constant
-from torchtrack.tracking.frontend.filters import corner_response
+from torchtrack.tracking.frontend.filters import FILTER_SIZE_PX, corner_response
 from torchtrack.tracking.frontend.time_surface import Regions, at_pixels
 
+# Least Harris response of a corner, as a share of the region's largest: set with the first corners, and not measured alone.
+RELATIVE_THRESHOLD = 1e-3
+# A corner is moved to the newest event this near (px): its 3x3 pixels.
+_SNAP_PX = 1
 # Sobel, Harris window and local maximum reach this far into a region from its border (px), beside the guided filter.
 _RESPONSE_REACH_PX = 6
 # Large temporaries page-fault on the CPU: regions are filtered this many at a time.
@@ -49,14 +54,12 @@ def _response(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> Float[T
     return torch.cat([corner_response(part, config) for part in surface.split(_CHUNK)])
 
 
-def select_corners(
-    response: Float[Tensor, "b h w"], regions: Regions, config: CornerConfig, filter_size_px: int
-) -> tuple[Int[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
+def select_corners(response: Float[Tensor, "b h w"], regions: Regions, config: CornerConfig) -> tuple[Int[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
     """The strongest local maxima, at most one per cell: pixels within the region, and which of them are corners."""
     _, height, width = response.shape
     cell = config.cell_px
     rows, columns = height // cell, width // cell
-    own = _own_area(response, regions, 2 * (filter_size_px // 2) + _RESPONSE_REACH_PX)
+    own = _own_area(response, regions, 2 * (FILTER_SIZE_PX // 2) + _RESPONSE_REACH_PX)
     # Rows first: along them, what is compared lies side by side in memory.
     score = own[:, : rows * cell, : columns * cell].unflatten(1, (rows, cell)).amax(2).unflatten(2, (columns, cell)).amax(3).flatten(1)
     best, chosen = score.topk(min(config.max_corners, score.shape[1]))
@@ -64,7 +67,7 @@ def select_corners(
     step = torch.arange(cell, device=response.device)
     within = _values_around(own, first_u, first_v, step).argmax(-1)
     u, v = first_u + within % cell, first_v + torch.div(within, cell, rounding_mode="floor")
-    strong = best > config.relative_threshold * best[:, :1]
+    strong = best > RELATIVE_THRESHOLD * best[:, :1]
     # The largest of its 5x5 neighbourhood.
     largest = best >= _values_around(own, u, v, torch.arange(-2, 3, device=response.device)).amax(-1)
     return torch.stack([u, v], -1), strong & (best > 0) & largest
@@ -111,25 +114,24 @@ def detect_corners(
     t_us: Int[Tensor, "s"],
     window_s: Float[Tensor, "s"],
     ideal_pixels: Float[Tensor, "s sensor_h sensor_w 2"],
-    surface_config: SurfaceConfig,
-    config: CornerConfig,
+    config: TrackerConfig,
 ) -> Corners:
     """Corners of each object's region: filtered surface, Harris, even selection, snapped to the newest event.
 
     Args:
-        window_s: length of the window of each stream; older corners are dropped with ``fresh_only``.
+        window_s: length of the window of each stream; older corners are dropped.
         ideal_pixels: undistortion table of each stream.
     """
-    response = _response(surface, surface_config)
-    local, mask = select_corners(response, regions, config, surface_config.filter_size_px)
+    local, mask = select_corners(_response(surface, config.surface), regions, config.corners)
     _, height, width = last_event_us.shape
     sensor = local + regions.origin[:, None]
     on_it = torch.minimum(sensor.clamp(min=0), constant((width - 1, height - 1), sensor.dtype, sensor.device))
     mask = mask & (on_it == sensor).all(-1)
-    sensor, newest_us = snap_to_newest(on_it, last_event_us, regions.stream_index, 1 if config.snap else 0)
+    reach_px = _SNAP_PX if config.uses(Component.CORNER_SNAP) else 0
+    sensor, newest_us = snap_to_newest(on_it, last_event_us, regions.stream_index, reach_px)
     stream = regions.stream_index[:, None]
     age_s = ((t_us[stream] - newest_us).clamp(0, 10**9) * 1e-6).to(surface.dtype)
-    if config.fresh_only:
+    if config.uses(Component.FRESH_CORNERS):
         mask = mask & (age_s < window_s[stream])
     pixels = at_pixels(ideal_pixels, stream, sensor[..., 0], sensor[..., 1])
     return Corners(sensor, pixels, age_s, mask, torch.zeros_like(pixels), torch.zeros_like(mask))

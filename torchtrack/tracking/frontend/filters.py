@@ -15,6 +15,9 @@ from torch.nn.functional import pad
 
 from torchtrack.config.tracker import SurfaceConfig
 
+# Side of the guided filter's window (px, odd), and its regularisation (squared intensity; a surface is from 0 to 1). Both were set with the
+# first corners, and not measured alone.
+FILTER_SIZE_PX, FILTER_EPS = 5, 0.01
 _HARRIS_K = 0.04
 _HARRIS_WINDOW_PX, _HARRIS_SIGMA_PX = 7, 1.0
 # Our sums of the Sobel operator are this many times the gradient.
@@ -29,9 +32,9 @@ def corner_response(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> F
     """
     if config.filters == "kornia":
         image = surface[:, None]
-        filtered = guided_blur(image, image, config.filter_size_px, config.filter_eps, subsample=config.filter_subsample)
+        filtered = guided_blur(image, image, FILTER_SIZE_PX, FILTER_EPS)
         return harris_response(filtered, _HARRIS_K)[:, 0]
-    return sliced_harris(sliced_guided_filter(surface, config.filter_size_px, config.filter_eps))
+    return sliced_harris(sliced_guided_filter(surface, FILTER_SIZE_PX, FILTER_EPS))
 
 
 def _bordered(images: Float[Tensor, "b h w"], reach: tuple[int, int], border: str) -> Tensor:

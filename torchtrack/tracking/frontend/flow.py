@@ -11,6 +11,10 @@ from torchtrack.core.constants import disc
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.time_surface import at_pixels
 
+# b of the bisquare weight (Eq. 8), in units of the residual's scale: the paper's.
+BISQUARE_B = 4.685
+# Events up to this old take part (s), and fewer than so many give no flow. Both were set with the first corners, and not measured alone.
+SPAN_S, MIN_EVENTS = 0.02, 8
 # Floor of the residual's scale (px): events sit on whole pixels, so no smaller scale means anything.
 _MIN_SCALE_PX = 0.3
 
@@ -41,7 +45,7 @@ def newest_events_around(
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     u, v = u.clamp(0, width - 1), v.clamp(0, height - 1)
     stream = stream_index[:, None, None]
-    span_us = int(config.span_s * 1e6)
+    span_us = int(SPAN_S * 1e6)
     age_us = (event_us[..., None] - at_pixels(last_event_us, stream, u, v)).clamp(-1, span_us + 1)
     # Newer events belong to what follows: only the trail behind a corner is its motion.
     mask = inside & (age_us >= 0) & (age_us <= span_us)
@@ -65,11 +69,11 @@ def irls_flow(
         flow = _weighted_flow(offsets, times_s, weight)
         residual_sq = torch.addcmul(offsets, flow, times_s[..., None, :], value=-1).square().sum(-2)
         scale = torch.linalg.vecdot(residual_sq.sqrt(), weight) / weight.sum(-1).clamp(min=1e-6)
-        bound_sq = (config.tuning * scale.clamp(min=_MIN_SCALE_PX)).square()
+        bound_sq = (BISQUARE_B * scale.clamp(min=_MIN_SCALE_PX)).square()
         weight = (1 - residual_sq / bound_sq[..., None]).clamp(min=0).square() * mask
     flow = _weighted_flow(offsets, times_s, weight)[..., 0]
     lever = (weight * times_s.square()).sum(-1)
-    valid = (count >= config.min_events) & (lever > 0) & torch.isfinite(flow).all(-1)
+    valid = (count >= MIN_EVENTS) & (lever > 0) & torch.isfinite(flow).all(-1)
     return torch.where(valid[..., None], flow, 0), valid
 
 

@@ -25,6 +25,11 @@ from torchtrack.tracking.frontend.time_surface import at_pixels, object_regions,
 from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 
+# Border around an object's contours in which its corners are looked for (px). The filters reach 10 px into it, so that there are none there:
+# 2 px more, or, where corners are matched along their flow, 6. The preset `paper` kept those when the others were made smaller, to save time.
+REGION_MARGIN_PX, _ALONG_FLOW_MARGIN_PX = 12, 16
+# Side of all regions on a GPU, which takes one size for all (px): of larger objects, the middle. It bounds memory, and was not measured.
+_MAX_REGION_PX = 256
 # Poses that a search draws lie within this many of its least standard deviations.
 _DRAWN_SIGMAS = 4.0
 
@@ -115,12 +120,15 @@ class Sensors:
         """Corners of the time surface around each object's contours, with their flow where it is made use of."""
         if config.corners.max_corners == 0:
             return no_corners(contours.pixels)
-        margin_px, largest_px = config.surface.margin_px, config.surface.max_region_px
-        regions = object_regions(self.on_sensor(contours.pixels), contours.mask, self.stream_index, self.image_size, margin_px, largest_px)
+        along_flow = config.association.search == "along_flow"
+        margin_px = _ALONG_FLOW_MARGIN_PX if along_flow else REGION_MARGIN_PX
+        regions = object_regions(self.on_sensor(contours.pixels), contours.mask, self.stream_index, self.image_size, margin_px, _MAX_REGION_PX)
         surface = time_surface(last_event_us, t_us, regions, config.surface.tau_s, self.ideal_pixels.dtype)
-        corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config.surface, config.corners)
-        if not (config.flow.always or config.association.along_flow):
-            return corners
+        corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config)
+        return self.with_flow(corners, last_event_us, t_us, config) if along_flow else corners
+
+    def with_flow(self, corners: Corners, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], config: TrackerConfig) -> Corners:
+        """The corners at ``t_us`` with their flow."""
         return estimate_flow(corners, last_event_us, t_us, self.stream_index, self.ideal_pixels, config.flow)
 
     def on_sensor(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:

@@ -1,0 +1,31 @@
+"""Parts of the tracker that can be left out, each by its name, to see what it is worth."""
+
+from enum import StrEnum
+
+
+class Component(StrEnum):
+    """What ``tracker.disabled`` may name; docs/method.md says what each does."""
+
+    # corners
+    CORNER_SNAP = "corner_snap"
+    FRESH_CORNERS = "fresh_corners"
+    # association
+    POLARITY_PRIOR = "polarity_prior"
+    DARK_SHIFT = "dark_shift"
+    SILHOUETTE_DARK_SHIFT = "silhouette_dark_shift"
+    WIDE_GATES = "wide_gates"
+    SUBCELL_LOOKUP = "subcell_lookup"
+    # estimation and validation
+    VELOCITY_IN_WINDOW = "velocity_in_window"
+    PARTLY_HIDDEN = "partly_hidden"
+    # why other poses are tried
+    LOW_SCORE = "low_score"
+    SCORE_DROP = "score_drop"
+    DRIFT = "drift"
+    HELD = "held"
+    LAST_SEEN = "last_seen"
+    # how they are compared
+    MATCH_COUNT = "match_count"
+    INLIER_RATIO = "inlier_ratio"
+    LINE_ENDS = "line_ends"
+    TENTATIVE = "tentative"
