@@ -11,8 +11,7 @@ from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator,
 from predicted_boxes import boxes
 from solid_models import ball, l_prism
 
-from torchtrack.config.tracker import ContourConfig
-from torchtrack.config.validation import ValidationConfig
+from torchtrack.config.tracker import ContourConfig, TrackerConfig
 from torchtrack.core.camera import undistortion_table
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
 from torchtrack.core.image_velocity import MovingObjects
@@ -69,6 +68,7 @@ def all_kinds():
     return [box, ObjectModel.from_mesh(l_prism()), ObjectModel.from_mesh(ball(0.05)), textured_plate(), lines, box]
 
 
+CORNERS_ALONE = {"corners": {"max_corners": 32}, "association": {"max_events": 0}}
 SETTINGS = {
     "as it is": ContourConfig(),
     "no creases": ContourConfig(creases=False),
@@ -235,10 +235,11 @@ def random_matches(batch=3, count=900):
 
 
 @pytest.mark.parametrize("speed", [0.0, 40.0, 900.0])
-@pytest.mark.parametrize("settings", [{}, {"min_on_contour": 1, "min_speed_px_s": 100.0}, {"min_observations": 5000}])
+@pytest.mark.parametrize("settings", [{}, CORNERS_ALONE, {"validation": {"min_observations": 5000}}])
 def test_what_events_explain(speed, settings):
+    config = TrackerConfig.model_validate(settings)
     contours, objects = random_contours(), moving_objects((speed, 0.5 * speed), 3)
-    by_kernels, plain = both_ways(lambda: fit_measures(contours, random_matches(), objects, IMAGE_SIZE, ValidationConfig(**settings)))
+    by_kernels, plain = both_ways(lambda: fit_measures(contours, random_matches(), objects, IMAGE_SIZE, config))
     assert_as_close(by_kernels, plain, tolerance=1e-6)
 
 
@@ -246,7 +247,7 @@ def test_what_is_remembered_of_sides():
     matches, before = random_matches(), uniform(3, 8, low=-1, seed=8)
     weights = torch.where(matches.near, matches.weights, 0)
     window_s = torch.full((3,), 5e-3).double()
-    assert_as_close(*both_ways(lambda: remembered(before, matches.directions, matches.dark, weights, window_s, 0.05)))
+    assert_as_close(*both_ways(lambda: remembered(before, matches.directions, matches.dark, weights, window_s)))
 
 
 # ---- every object for itself
@@ -259,7 +260,7 @@ def test_what_is_not_a_number_stays_with_its_object(what):
     (spoilt.points_cam if what == "points" else spoilt.pixels)[1] = torch.nan
     objects = MovingObjects(torch.eye(4).double().expand(3, 4, 4), random_twist(3), torch.ones(3, 3).double(), torch.ones(3, 4).double())
     with torch.inference_mode():
-        alone, neighbours = (fit_measures(owner, random_matches(), objects, IMAGE_SIZE, ValidationConfig()) for owner in (contours, spoilt))
+        alone, neighbours = (fit_measures(owner, random_matches(), objects, IMAGE_SIZE, TrackerConfig()) for owner in (contours, spoilt))
         index, other = (index_contours(owner, IMAGE_SIZE, 7, 2) for owner in (contours, spoilt))
     for first, second in zip(alone, neighbours, strict=True):
         assert torch.equal(first[[0, 2]], second[[0, 2]])

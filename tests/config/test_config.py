@@ -152,7 +152,7 @@ def test_a_pose_is_given_in_exactly_one_way(values, expected):
         ({"camera": {"fx": 100, "fy": 100}}, "cx, cy, width, height missing"),
         ({"camera": {"calibration": "calib.txt", "fx": 100}}, "not both"),
         ({"device": "gpu"}, "device"),
-        ({"tracker": {"association": {"max_events": 0}}}, "nothing would be observed: .* set matching.max_events"),
+        ({"tracker": {"association": {"max_events": 0}}}, "nothing would be observed: .* set association.max_events"),
     ],
 )
 def test_settings_that_contradict_themselves(values, expected):

@@ -18,8 +18,10 @@ from torchtrack.errors import ConfigError
     [
         ("search.turns", "search.*: renamed to 'relocalization', 'turns' is now 'rotations'"),
         ("search.hypotheses", "search.*: renamed to 'relocalization'$"),
-        ("relocalization.doubt_us", "relocalization.doubt_us .*: renamed to 'relocalization.drift_us'"),
-        ("quality.certain_at", "quality.*: renamed to 'validation', 'certain_at' is now 'validated_from'"),
+        ("relocalization.margin", "relocalization.margin .*: renamed to 'relocalization.accept_margin'$"),
+        ("relocalization.doubt_us", "renamed to 'relocalization.drift_us', which is a component now: 'disabled: .drift.' switches it off"),
+        ("quality.certain_at", "quality.*: renamed to 'validation', 'certain_at' is fixed at 0.75 now"),
+        ("matching.min_observations", "matching.*: renamed to 'association'$"),
         ("solver.swelling_px", "solver.swelling_px .*: renamed to 'solver.silhouette_offset_px'"),
     ],
 )

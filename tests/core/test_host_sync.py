@@ -177,7 +177,7 @@ def test_of_a_larger_object_the_middle_is_taken(nothing_is_read):
     [
         TrackerConfig(),
         TrackerConfig(window=WindowConfig(parts=2, max_unknown_px=0.01)),
-        TrackerConfig(relocalization=RelocalizationConfig(from_sigma_px=1e-3, hypotheses=4, samples=50)),
+        TrackerConfig(relocalization=RelocalizationConfig(trigger_sigma_px=1e-3, hypotheses=4, rotations=10)),
     ],
     ids=["default", "in parts", "searched"],
 )

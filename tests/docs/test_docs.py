@@ -21,6 +21,7 @@ from torchtrack import Tracker
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.main import _Command, split_overrides
 from torchtrack.cli.settings import as_markdown
+from torchtrack.config.components import Component
 from torchtrack.config.demo import DemoConfig
 from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.config.events import is_live
@@ -154,6 +155,10 @@ def test_settings_named_alone_exist():
     every = {part for key in dotted_keys(RunConfig) for part in key.split(".")}
     named = {"initial_pose", "start_us", "translation_m", "quaternion_xyzw", "matrix", "trajectory", "polylines", "mesh", "unit", "scale", "centre"}
     assert named | {"source", "sensor_latency_us"} <= every & set(spans())
+
+
+def test_what_each_component_does_is_said():
+    assert {str(component) for component in Component} <= set(spans())
 
 
 def test_files_exist():

@@ -9,6 +9,7 @@ from tracked_boxes import WINDOW_US, moving_box
 from tracked_boxes import windows as cut
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.haste import in_haste
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import EventBatch
@@ -137,7 +138,8 @@ def test_in_haste_no_other_poses_are_tried_and_few_to_find_what_is_lost():
     none, few = (in_haste(usual, searches=searches) for searches in (False, True))
     assert none.relocalization.hypotheses == 0
     assert 0 < few.relocalization.hypotheses < usual.relocalization.hypotheses
-    assert few.relocalization.samples < usual.relocalization.samples
+    assert few.relocalization.rotations < usual.relocalization.rotations
+    assert not few.uses(Component.SCORE_DROP)
     assert not few.relocalization.at_start
     assert none.window.parts == few.window.parts == 1
     assert none.association == few.association == usual.association

@@ -86,7 +86,7 @@ def test_events_of_a_curved_object_lie_on_its_outline(ball, lens, background):
 
 @pytest.mark.parametrize(("luminance", "outside_is_dark"), [(0.05, True), (0.9, False)], ids=["before dark", "before bright"])
 def test_events_of_a_lit_limb_lie_to_its_dark_side(ball, luminance, outside_is_dark):
-    """Whatever the motion: what ``matching.silhouette_dark_shift_px`` takes back."""
+    """Whatever the motion: what the component ``silhouette_dark_shift`` takes back."""
     sequence = simulate(ball_scene(ball, background=BackgroundConfig(luminance=luminance), render={}))
     seen, nearest, moved = around_the_middle(sequence, torch.linspace(0, len(sequence.events) - 1, 600).long())
     distance, leads = np.linalg.norm(seen, axis=1) - np.linalg.norm(nearest, axis=1), (moved * nearest).sum(1) > 0

@@ -16,7 +16,9 @@ from torchtrack.config.tracker import AdaptationConfig, AssociationConfig, Corne
 from torchtrack.tracking import graphs
 
 # What is compiled for each round of matching is the same: two are enough to see that they follow one another.
-SMALL = TrackerConfig(adaptation=AdaptationConfig(points=0), corners=CornerConfig(max_corners=0), association=AssociationConfig(gates_px=(5.0, 1.5)))
+SMALL = TrackerConfig(
+    adaptation=AdaptationConfig(learned_points=0), corners=CornerConfig(max_corners=0), association=AssociationConfig(gates_px=(5.0, 1.5))
+)
 
 
 class Counting(graphs.CompiledStep):

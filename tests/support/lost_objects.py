@@ -2,7 +2,7 @@
 
 import torch
 
-from torchtrack.tracking.relocalization import hypotheses
+from torchtrack.tracking.relocalization import hypotheses, last_seen, schedule, triggers
 from torchtrack.tracking.relocalization.acceptance import AcceptanceTest
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen
@@ -62,3 +62,10 @@ def searched(lost, test=None, propose=hypotheses.around_prediction):
     tried = refined(proposed, lost)
     choice = (test or acceptance_test()).row(0).choose(tried, proposed, lost)
     return exchanged(lost, proposed, tried, choice).scored
+
+
+def drifting_soon(monkeypatch, diameters_s=1.5):
+    """What drifts is looked for after 10 ms, and as far as it may have gone by then: a slip of some windows is enough."""
+    monkeypatch.setattr(triggers, "DRIFT_US", 10_000)
+    monkeypatch.setattr(schedule, "DRIFT_US", 10_000)
+    monkeypatch.setattr(last_seen, "_DRIFT_DIAMETERS_S", diameters_s)

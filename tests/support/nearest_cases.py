@@ -3,14 +3,18 @@
 import torch
 from helpers import IMAGE_SIZE, moving_objects
 
-from torchtrack.config.tracker import AssociationConfig
+from torchtrack.config.components import Component
+from torchtrack.config.tracker import AssociationConfig, TrackerConfig
 from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.contours.index import index_contours
 
+UNSHIFTED = frozenset({Component.DARK_SHIFT, Component.SILHOUETTE_DARK_SHIFT})
 
-def matching(**settings):
+
+def matching(*, shifted=False, **settings):
     """Settings without what corrects and weights the matches, unless it is asked for."""
-    return AssociationConfig(**{"dark_shift_px": 0.0, "silhouette_dark_shift_px": 0.0, "concentration": False, "polarity": False, **settings})
+    association = AssociationConfig(**{"concentration": False, "polarity": False, **settings})
+    return TrackerConfig(association=association, disabled=frozenset() if shifted else UNSHIFTED)
 
 
 def nearest(observations, contours, *, velocity=(0.0, 0.0), believed=None, gate_px=3.0, index=None, cell_px=1, **settings):

@@ -8,8 +8,8 @@ from helpers import SMALL_CAMERA, box_model, drifting, edge_events, pose
 from states import changed
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import (
-    AssociationConfig,
     MotionConfig,
     TrackerConfig,
 )
@@ -82,7 +82,7 @@ def in_motion(config=None, displaced=None, dtype=torch.float32):
     """A box in full motion, whose pose may be displaced: tracker, prediction, events, found alone, and the true pose."""
     if displaced is not None and config is None:
         # Looked up by cells, as the tracker does with what may be far off.
-        config = TrackerConfig(association=AssociationConfig(fine_below_px=0))
+        config = TrackerConfig(disabled={Component.SUBCELL_LOOKUP})
     tracker, state, _, (events, end_us), trajectory = started(dtype, config)
     if displaced is not None:
         state = changed(state, T_cam_obj=retract_about(state.T_cam_obj, displaced, tracker.centre_obj.double()))

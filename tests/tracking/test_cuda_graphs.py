@@ -10,16 +10,22 @@ from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
 from tracked_boxes import follow, moving_box, windows
 
 from torchtrack import Tracker
-from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.events import concatenate
 from torchtrack.tracking import cuda_graphs, graphs
+from torchtrack.tracking.adaptation import learned_contours
 from torchtrack.tracking.cuda_graphs import CudaGraphs
 from torchtrack.tracking.state import each_tensor
 
 COUNT = 12
-# Windows that something is learned from are taken without a graph: every third.
-LEARNING = TrackerConfig(adaptation=AdaptationConfig(first_windows=0, every=3, up_to_ratio=1.0))
+
+
+@pytest.fixture
+def often_learning(monkeypatch):
+    """Something is learned of every object in one window of three, which is taken without a graph."""
+    for name, value in {"FIRST_WINDOWS": 0, "EVERY": 3, "UP_TO_RATIO": 1.0}.items():
+        monkeypatch.setattr(learned_contours, name, value)
 
 
 @dataclass(frozen=True)
@@ -110,13 +116,14 @@ def test_there_is_a_graph_for_each_size(recorded):
     assert len(graphs) == len(recorded) == 2
 
 
+@pytest.mark.usefixtures("often_learning")
 @pytest.mark.parametrize("streams", [1, 2])
 def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams):
     parts = [moving_box(pose(), COUNT, SMALL_CAMERA, seed=stream, stream=stream)[1] for stream in range(streams)]
     cut = [(concatenate([window[0] for window in step]), step[0][1]) for step in zip(*(windows(events, COUNT) for events in parts), strict=True)]
     actual = []
     for by_graphs in (False, True):
-        tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, LEARNING, list(range(streams)))
+        tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, TrackerConfig(), list(range(streams)))
         if by_graphs:
             # As on a GPU: there is a graph, and nothing is read back within it.
             def advance_as_there(*args, tracker=tracker, learns):

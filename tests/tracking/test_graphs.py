@@ -17,18 +17,24 @@ from tracked_boxes import PREDICT, WIDE_CAMERA, follow, merged, moving_box, tens
 from torchtrack import Tracker
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.run import RunConfig
-from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.errors import ConfigError
 from torchtrack.run.runner import run
 from torchtrack.tracking import graphs as room
+from torchtrack.tracking.adaptation import learned_contours
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 
-# Something is learned from every third window.
-LEARNING = TrackerConfig(adaptation=AdaptationConfig(first_windows=0, every=3, up_to_ratio=1.0))
 TESTS = Path(__file__).resolve().parents[1] / "support"
 COUNT = 12
+
+
+@pytest.fixture
+def often_learning(monkeypatch):
+    """Something is learned of every object, in one window of three."""
+    for name, value in {"FIRST_WINDOWS": 0, "EVERY": 3, "UP_TO_RATIO": 1.0}.items():
+        monkeypatch.setattr(learned_contours, name, value)
 
 
 class Graphs:
@@ -83,10 +89,11 @@ def both_ways(config=None, streams=1, count=COUNT, mode=torch.inference_mode, mo
     return actual
 
 
+@pytest.mark.usefixtures("often_learning")
 @pytest.mark.parametrize("streams", [1, 2])
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_poses_are_those_of_a_step(graphs, streams, mode):
-    (state, expected), (compiled_state, actual) = both_ways(LEARNING, streams, mode=mode)
+    (state, expected), (compiled_state, actual) = both_ways(TrackerConfig(), streams, mode=mode)
     assert sum(graphs.calls) >= COUNT // 3
     for single, other in zip(expected, actual, strict=True):
         torch.testing.assert_close(other.T_cam_obj, single.T_cam_obj, rtol=0, atol=1e-6)
@@ -97,24 +104,27 @@ def test_poses_are_those_of_a_step(graphs, streams, mode):
     assert actual[-1].T_cam_obj.is_inference() == (mode is torch.inference_mode)
 
 
+@pytest.mark.usefixtures("often_learning")
 def test_each_tensor_of_the_state_that_a_graph_is_compiled_for_is_one_alone(graphs):
     """The compiler takes one tensor in two places for one in both, whatever comes later."""
-    both_ways(LEARNING)
+    both_ways(TrackerConfig())
     for state in graphs.compiled_for:
         places = [tensor.data_ptr() for tensor in tensors_of(state) if tensor.numel()]
         assert len(set(places)) == len(places) > 20
 
 
+@pytest.mark.usefixtures("often_learning")
 def test_poses_of_a_smooth_object_are_those_of_a_step(graphs):
-    (state, _), (compiled_state, _) = both_ways(LEARNING, model=bevelled_model)
+    (state, _), (compiled_state, _) = both_ways(TrackerConfig(), model=bevelled_model)
     assert sum(graphs.calls) >= COUNT // 3
     # What lies halfway between two pixels is counted at one or the other.
     torch.testing.assert_close(compiled_state.T_cam_obj, state.T_cam_obj, rtol=0, atol=1e-4)
     assert torch.equal(compiled_state.maps.last_event_us, state.maps.last_event_us)
 
 
+@pytest.mark.usefixtures("often_learning")
 def test_windows_that_are_learned_from_are_taken_without_a_graph(graphs):
-    (state, _), (compiled_state, _) = both_ways(LEARNING)
+    (state, _), (compiled_state, _) = both_ways(TrackerConfig())
     # One call prepares the graph.
     assert graphs.calls == [1 + sum(window % 3 > 0 for window in range(5, COUNT))]
     expected, actual = (vars(owner.appearance.learned) for owner in (state, compiled_state))

@@ -34,6 +34,7 @@ from torchtrack.errors import ModelError, PoseError
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.frontend.time_surface import NEVER_US
 from torchtrack.tracking.initialization import first_state
+from torchtrack.tracking.motion.model import COAST_S
 from torchtrack.tracking.validation.status import Status
 
 # ---- bad set-ups
@@ -247,7 +248,7 @@ def test_without_events_the_motion_goes_on_where_asked_for_and_dies_away(dtype):
     assert 0 < float(after.velocity.norm()) <= float(state.velocity.norm())
     for step in range(60):
         after, result = tracker.step(after, EventBatch.empty(), 35_000 + step * WINDOW_US)
-    died_away = torch.exp(torch.tensor(-61 * 5e-3 / PREDICT.motion.coast_s))
+    died_away = torch.exp(torch.tensor(-61 * 5e-3 / COAST_S))
     torch.testing.assert_close(after.velocity, state.velocity * died_away, rtol=1e-4, atol=1e-6)
     after, result = tracker.step(after, EventBatch.empty(), 2_000_000)
     assert float(after.velocity.norm()) < 1e-3
@@ -312,9 +313,7 @@ def test_an_object_that_others_explain_better_is_lost():
 
 
 def test_a_jump_is_told_as_diverged():
-    config = TrackerConfig(
-        validation=ValidationConfig(max_step_rotation_rad=1e-6, max_step_translation=1e-6), motion=MotionConfig(without_events="hold")
-    )
+    config = TrackerConfig(validation=ValidationConfig(max_rotation_rad=1e-6, max_translation=1e-6), motion=MotionConfig(without_events="hold"))
     _, events = moving_box(pose(), 2)
     tracker = tracker_of(config=config)
     _, results = follow(tracker, tracker.init(pose()[None], 0), windows(events, 2))

@@ -12,12 +12,13 @@ from states import changed
 from tracked_boxes import WINDOW_US, follow, moving_box, started, tracker_of, windows
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import MotionConfig, SolverConfig, TrackerConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import difference_about, retract_about, transform_points
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.expectation import predicted_after
-from torchtrack.tracking.motion.model import initial_covariance, left_covariance
+from torchtrack.tracking.motion.model import COAST_S, initial_covariance, left_covariance
 from torchtrack.tracking.validation.status import Status
 
 
@@ -100,7 +101,7 @@ def test_without_a_prior_there_is_no_velocity():
 
 @pytest.mark.parametrize("in_window", [True, False])
 def test_the_velocity_is_learned(in_window, dtype):
-    config = TrackerConfig(solver=SolverConfig(velocity_in_window=in_window))
+    config = TrackerConfig(disabled=frozenset() if in_window else {Component.VELOCITY_IN_WINDOW})
     _, state, _, _, _ = started(dtype, config, count=10)
     assert state.velocity[0].tolist() == pytest.approx([0.8, -0.5, 1.2, 0.15, 0.1, 0.1], abs=0.12)
 
@@ -177,4 +178,4 @@ def test_a_spin_that_nothing_shows_fades_for_its_object_alone():
         velocities.append(silent(tracker, changed(state, velocity=spinning), 4)[-1].velocity)
     slowed, free = velocities
     assert torch.equal(slowed[1], free[1])
-    assert float(slowed[0].norm() / free[0].norm()) == pytest.approx(math.exp(-4 * WINDOW_US * 1e-6 / MotionConfig().coast_s), rel=1e-4)
+    assert float(slowed[0].norm() / free[0].norm()) == pytest.approx(math.exp(-4 * WINDOW_US * 1e-6 / COAST_S), rel=1e-4)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors, random_events
-from pydantic import ValidationError
 from tracked_boxes import HOLD, SAME_POSE, WINDOW_US, assert_same, follow, moving_box, poses_of, started, tracker_of, windows
 
 from torchtrack import Tracker, preset
@@ -100,8 +99,7 @@ def assert_tracked(config):
 
 
 def test_without_events_beside_the_corners_the_corners_are_all_that_is_observed():
-    # Few corners share a patch of the image: one has to be enough to explain it.
-    validation = ValidationConfig(min_observations=6, min_on_contour=1)
+    validation = ValidationConfig(min_observations=6)
     config = TrackerConfig(corners=CornerConfig(max_corners=32), association=AssociationConfig(max_events=0), validation=validation)
     _, _, result, _, _ = started(config=config)
     assert 6 <= int(result.observation_count) <= int(result.corners.mask.sum())
@@ -139,9 +137,3 @@ def test_noise_alone_moves_a_pose_hardly():
     degrees, millimetres = pose_errors(result.T_cam_obj, pose()[None])
     assert float(degrees) < 3
     assert float(millimetres) < 8
-
-
-@pytest.mark.parametrize("shares", [(0.5, 0.5), (0.6, 0.4)])
-def test_shares_in_the_wrong_order_are_refused(shares):
-    with pytest.raises(ValidationError, match="must be larger than smeared_share"):
-        AssociationConfig(smeared_share=shares[0], gathered_share=shares[1])

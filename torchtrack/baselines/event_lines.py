@@ -219,7 +219,7 @@ class EventLineTracker(Tracker):
     ) -> tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]]:
         """Status and quality of each object, and which poses are taken."""
         settings = self.config.validation
-        share = explained_ratio(contours, matches, self._contour_velocity(window, contours), self.image_size, settings)
+        share = explained_ratio(contours, matches, self._contour_velocity(window, contours), self.image_size, self.config)
         step = lie.small_difference_about(window.T_start, solution.T_cam_obj, self.centre_obj)
         in_view = visible_ratio(contours, self.image_size)
         status = judge(share, matches.mask.sum(-1), in_view, step, self.diameter_m, settings)

@@ -105,4 +105,13 @@ def _joined(label: str, methods: Mapping[str, Any], within: tuple[str, ...]) -> 
         raise ValueError(f"methods.{label}.joins: give a list of labels of methods; got {members!r}")
     if unknown := [str(member) for member in members if member not in methods or member in (label, *within)]:
         raise ValueError(f"methods.{label}.joins: {', '.join(unknown)} is no other method; there are {', '.join(methods)}")
-    return reduce(merged, [*(_joined(member, methods, (label, *within)) for member in members), own])
+    joined = [*(_joined(member, methods, (label, *within)) for member in members), own]
+    disabled = sorted({str(name) for each in joined for name in _disabled(each)})
+    return merged(reduce(merged, joined), {"tracker": {"disabled": disabled}} if disabled else {})
+
+
+def _disabled(method: Any) -> list[Any]:
+    """The components that a method leaves out; none where that is not said as it should be, which its own check tells."""
+    tracker = method.get("tracker") if isinstance(method, dict) else None
+    disabled = tracker.get("disabled") if isinstance(tracker, dict) else None
+    return disabled if isinstance(disabled, list) else []

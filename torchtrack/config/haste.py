@@ -1,10 +1,13 @@
 """Settings of a tracker that has come to be behind a live stream."""
 
+from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 
 # A search that takes about as long as ten windows, where one takes as long as a hundred.
-_HYPOTHESES, _SAMPLES, _ROTATIONS, _KEPT_ROTATIONS, _PULLED = 8, 300, 60, 30, 8
+_HYPOTHESES, _ROTATIONS = 8, 60
+# What is not searched for at all.
+_LEFT_OUT = frozenset({Component.LOW_SCORE, Component.SCORE_DROP})
 
 
 def in_haste(config: TrackerConfig, *, searches: bool) -> TrackerConfig:
@@ -14,10 +17,9 @@ def in_haste(config: TrackerConfig, *, searches: bool) -> TrackerConfig:
         config: of the tracker when it keeps up.
         searches: whether objects that are lost are searched for, by fewer poses than otherwise.
     """
+    search = _brief(config.relocalization) if searches else _without(config.relocalization)
     window = config.window.model_copy(update={"parts": 1})
-    return config.model_copy(
-        update={"window": window, "relocalization": _brief(config.relocalization) if searches else _without(config.relocalization)}
-    )
+    return config.model_copy(update={"window": window, "relocalization": search, "disabled": config.disabled | _LEFT_OUT})
 
 
 def _without(search: RelocalizationConfig) -> RelocalizationConfig:
@@ -26,7 +28,7 @@ def _without(search: RelocalizationConfig) -> RelocalizationConfig:
 
 def _brief(search: RelocalizationConfig) -> RelocalizationConfig:
     """A search for what is very uncertain alone."""
-    fewer = {"hypotheses": _HYPOTHESES, "samples": _SAMPLES, "rotations": _ROTATIONS, "kept_rotations": _KEPT_ROTATIONS, "pulled": _PULLED}
+    fewer = {"hypotheses": _HYPOTHESES, "rotations": _ROTATIONS}
     least: dict[str, object] = {name: min(count, getattr(search, name)) for name, count in fewer.items()}
-    none = {"low_score_below": 0.0, "score_drop_below": 0.0, "mirrored_below": 0.0, "slow_drift_below": 0.0, "new_below": 0.0, "at_start": False}
-    return search.model_copy(update={**least, **none, "realignments": 0, "from_sigma_px": max(search.from_sigma_px, search.wide_sigma_px)})
+    none = {"mirrored_below": 0.0, "slow_drift_below": 0.0, "new_below": 0.0, "at_start": False}
+    return search.model_copy(update={**least, **none, "realignments": 0, "trigger_sigma_px": max(search.trigger_sigma_px, search.wide_sigma_px)})

@@ -61,13 +61,12 @@ def _paper() -> TrackerConfig:
             max_events=0,
             concentration=False,
             polarity=False,
-            polarity_prior_s=0.0,
             weighting_network="none",
         ),
         solver=SolverConfig(iterations=5, damping=1e-3, prior=False),
         motion=MotionConfig(model="hold", without_events="hold"),
-        adaptation=AdaptationConfig(points=0),
-        validation=ValidationConfig(min_observations=6, min_on_contour=1, all_directions=False),
+        adaptation=AdaptationConfig(learned_points=0),
+        validation=ValidationConfig(min_observations=6, all_directions=False),
     )
 
 
@@ -78,7 +77,7 @@ def _lines(loss: Literal["tukey", "none"]) -> TrackerConfig:
         corners=CornerConfig(max_corners=0),
         association=AssociationConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500, weighting_network="none"),
         solver=SolverConfig(iterations=3, loss=loss, damping=1e-4, prior=False),
-        adaptation=AdaptationConfig(points=0),
+        adaptation=AdaptationConfig(learned_points=0),
         validation=ValidationConfig(all_directions=False),
     )
 
@@ -101,12 +100,10 @@ def _nns() -> TrackerConfig:
     return TrackerConfig(
         window=WindowConfig(duration_us=3_000),
         corners=CornerConfig(max_corners=400, cell_px=5),
-        association=AssociationConfig(
-            gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False, polarity=False, polarity_prior_s=0.0, weighting_network="none"
-        ),
+        association=AssociationConfig(gates_px=(8.0, 5.0, 3.0), max_events=0, concentration=False, polarity=False, weighting_network="none"),
         solver=SolverConfig(iterations=2),
-        adaptation=AdaptationConfig(points=0),
-        validation=ValidationConfig(min_observations=10, min_on_contour=1, all_directions=False),
+        adaptation=AdaptationConfig(learned_points=0),
+        validation=ValidationConfig(min_observations=10, all_directions=False),
     )
 
 

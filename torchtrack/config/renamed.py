@@ -30,7 +30,7 @@ KEYS = {
         "stands_from": "held_from",
         "adrift_share": "drift_min_ratio",
         "slip_margin": "elsewhere_margin",
-        "slip_share": "elsewhere_min_ratio",
+        "slip_share": "accept_ratio",
     },
     "quality": {
         "certain_at": "validated_from",
@@ -50,6 +50,9 @@ KEYS = {
         "up_to_share": "up_to_ratio",
     },
     "association": {"along_flow": "search"},
+    "adaptation": {"points": "learned_points"},
+    "validation": {"max_step_rotation_rad": "max_rotation_rad", "max_step_translation": "max_translation"},
+    "relocalization": {"from_sigma_px": "trigger_sigma_px", "margin": "accept_margin", "elsewhere_min_ratio": "accept_ratio"},
     "solver": {
         "swelling_px": "silhouette_offset_px",
     },
@@ -87,8 +90,8 @@ def renamed(location: tuple[int | str, ...], value: Any) -> str | None:
     *before, name = location
     if name in SECTIONS:
         place, inner = (*before, SECTIONS[str(name)]), KEYS[str(name)]
-        names = {key: inner.get(key, key) for key in value} if isinstance(value, Mapping) else {}
-        now = {key: fixed((*place, new)) or (f"now '{new}'" if new != key else None) for key, new in names.items()}
+        keys = list(map(str, value)) if isinstance(value, Mapping) else []
+        now = {key: fixed((*place, inner.get(key, key))) or (f"now '{inner[key]}'" if key in inner else None) for key in keys}
         return ", ".join([f"'{'.'.join(map(str, place))}'", *(f"'{key}' is {what}" for key, what in now.items() if what)])
     section = str(before[-1]) if before else ""
     for old, new in (*SECTIONS.items(), *((section, section) for section in KEYS if section not in SECTIONS)):

@@ -62,38 +62,13 @@ class AssociationConfig(Settings):
     search: Literal["nearest", "along_flow"] = Field("nearest", description="The nearest contour, or that along a corner's flow (the paper).")
     residual: Literal["normal", "point"] = Field("normal", description="Distance normal to the contour, or to the matched point in both coordinates.")
     gates_px: tuple[float, ...] = Field((5.0, 2.5, 1.5, 1.2), min_length=1, description="One round of matching and solving per gate (px).")
-    max_gate_px: float = Field(16.0, gt=0, description="The first gate opens up to this where the prediction is uncertain (px).")
-    gate_sigmas: float = Field(3.0, gt=0, description="Width of an uncertain object's first gate, in standard deviations of its prediction.")
-    fine_below_px: float = Field(
-        120.0, ge=0, description="Of objects smaller than this in the image (px) and not uncertain, contours are looked up finer than by cells."
-    )
-    fine_unless_plain: bool = Field(
-        True, description="So are those of larger objects of which more is seen than plain faces: texture, or smooth silhouettes."
-    )
-    flow_tolerance_px: float = Field(2.0, gt=0, description="How far beside the line of its flow a corner's contour may lie (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
     concentration: bool = Field(True, description="Trust observations less where those around them are smeared across the contour.")
-    smeared_share: float = Field(0.35, ge=0, lt=1, description="Share of observations on the contour at which a patch counts least.")
-    gathered_share: float = Field(0.6, gt=0, le=1, description="Share of observations on the contour at which a patch counts in full.")
-    least_trust: float = Field(0.02, ge=0, le=1, description="What a smeared patch still counts.")
     polarity: bool = Field(True, description="Trust events less whose polarity is not that of most others on the contour around them.")
     texture_polarity: bool = Field(True, description="Trust events on texture less whose polarity is not that of its darker side.")
-    polarity_prior_s: float = Field(
-        0.05,
-        ge=0,
-        le=10,
-        description="Which side of contours is darker is remembered for so long; while less is seen of an object, what says the opposite "
-        "counts less (s); 0 for not at all.",
-    )
-    polarity_gain: float = Field(1.5, ge=0, description="How fast trust falls with the majority of the others.")
-    least_agreement: float = Field(0.05, ge=0, le=1, description="What an event of the wrong polarity still counts.")
     edge_ambiguity_px: float = Field(
         1.7, ge=0, le=10, description="Parallel edges closer than about this may be taken for each other, and tell less (px); 0 for never."
     )
-    dark_shift_px: float = Field(
-        0.15, ge=0, le=2, description="Events lie this far to the dark side of a sharp edge, as a blurred step's logarithm does (px)."
-    )
-    silhouette_dark_shift_px: float = Field(0.06, ge=0, le=2, description="The same of a smooth silhouette, towards which its shading fades (px).")
     burst_px: float = Field(
         1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow pixels fire on (px)."
     )
@@ -107,26 +82,18 @@ class AssociationConfig(Settings):
     )
     max_events: int = Field(1500, ge=0, le=100_000, description="Recent events used as observations beside the corners, per object.")
 
-    @model_validator(mode="after")
-    def _shares_in_order(self) -> "AssociationConfig":
-        if self.gathered_share <= self.smeared_share:
-            raise ValueError(f"gathered_share ({self.gathered_share}) must be larger than smeared_share ({self.smeared_share})")
-        return self
-
 
 class SolverConfig(Settings):
     """Levenberg-Marquardt on SE(3) (Eq. 12-17)."""
 
     iterations: int = Field(1, ge=1, le=100, description="Iterations in each round.")
     loss: Literal["tukey", "huber", "none"] = Field("tukey", description="Robust loss, with the round's gate as its scale.")
-    gradient_iterations: int = Field(1, ge=0, le=100, description="Newton steps to the optimum where gradients of the pose are asked for.")
     damping: float = Field(1e-6, ge=0, description="Initial damping, as a share of the Hessian's diagonal.")
     prior: bool = Field(True, description="Weigh the observations against the prediction by its covariance, and find the velocity with the pose.")
     observation_px: float = Field(1.5, gt=0, description="Standard deviation of one observation (px), with its share of what all have in common.")
     common_px: float = Field(
         0.25, ge=0, le=10, description="The same of what observations of a smooth silhouette in one place of the image have in common beside it (px)."
     )
-    velocity_in_window: bool = Field(True, description="Older observations tell of the velocity: pose and velocity are found together.")
     acceleration_in_window: bool = Field(
         True, description="A velocity that is other than predicted became so steadily over the window, as far as it was certain."
     )
@@ -151,7 +118,6 @@ class MotionConfig(Settings):
         0.03, ge=0, le=10, description="An acceleration goes on in the windows after, and dies away with this time constant (s); 0 for not at all."
     )
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
-    coast_s: float = Field(0.2, gt=0, le=10, description="A predicted motion that no events confirm dies away with this time constant (s).")
     turn_s: float = Field(
         0.2, ge=0, le=10, description="A turn that events hardly show dies away with this time constant (s), not to run away; 0 for not at all."
     )
@@ -159,17 +125,9 @@ class MotionConfig(Settings):
 
 
 class AdaptationConfig(Settings):
-    """Contours learned online on the surface of objects whose models have few faces: print that a model does not show."""
+    """Contours learned online on the surface of objects whose models have few faces: texture that a model does not show."""
 
-    points: int = Field(512, ge=0, le=10_000, description="Learned contour points per object, at most; 0 switches learning off.")
-    events: int = Field(1000, ge=10, le=100_000, description="Events that are learned from in a window, per object.")
-    drafts: int = Field(4096, ge=16, le=100_000, description="Unexplained events that are kept until they make a contour, per object.")
-    trusted_from: float = Field(3.0, ge=1, le=10, description="Evidence from which a learned contour counts: about the windows that confirmed it.")
-    below_ratio: float = Field(0.6, ge=0, le=1, description="Learned contours count once the model's own explain less than this share of themselves.")
-    up_to_ratio: float = Field(0.8, ge=0, le=1, description="Nothing is learned where the model's own explain this share of themselves or more.")
-    max_sigma_px: float = Field(2.0, gt=0, description="Nothing is learned while the standard deviation of the prediction is larger (px).")
-    first_windows: int = Field(20, ge=0, description="The first windows are all learned from.")
-    every: int = Field(10, ge=1, description="After them, one window of this many is.")
+    learned_points: int = Field(512, ge=0, le=10_000, description="Contour points that are learned per object, at most; 0 for none.")
 
 
 class SmoothingConfig(Settings):
@@ -219,8 +177,8 @@ class TrackerConfig(Settings):
     def _observes_something(self) -> "TrackerConfig":
         if not (self.corners.max_corners or self.association.max_events):
             raise ValueError(
-                "nothing would be observed: corners.max_corners and matching.max_events are both 0; "
-                "set matching.max_events, such as to 1500, or for corners alone corners.max_corners, such as to 400"
+                "nothing would be observed: corners.max_corners and association.max_events are both 0; "
+                "set association.max_events, such as to 1500, or for corners alone corners.max_corners, such as to 400"
             )
         return self
 

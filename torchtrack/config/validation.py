@@ -12,24 +12,12 @@ class ValidationConfig(Settings):
     min_visible_ratio: float = Field(0.2, ge=0, le=1, description="A smaller share of the contour inside the image: out of view.")
     uncertain_below: float = Field(0.4, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is uncertain.")
     lost_below: float = Field(0.1, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is lost.")
-    refound_above: float = Field(
-        0.35, ge=0, le=1, description="Share of the moving contour explained by events from which an uncertain object is found again."
-    )
-    validated_from: float = Field(
-        0.75, ge=0, le=1, description="Share of the quality when seen well, from which the find of an uncertain object counts."
-    )
-    partly_hidden: bool = Field(
-        True,
-        description="A pose that explains little counts where events gather on its contours as when the object is seen well: it is partly hidden.",
-    )
     holds_on: bool = Field(
         True,
-        description="A pose by many events that goes on from the one before is not asked for `refound_above`: it was not lost, but is hidden more.",
+        description="A pose by many events that goes on from the one before is not asked for as much as a find: it was not lost, but is hidden more.",
     )
     all_directions: bool = Field(
         True, description="What has not been seen well for a while has to be held by more than parallel lines: those of what hides it are."
     )
-    min_on_contour: int = Field(3, ge=1, description="Observations on the contours of a patch of the image from which these are explained.")
-    min_speed_px_s: float = Field(30.0, ge=0, description="Contours moving slower than this across themselves need not fire (px/s).")
-    max_step_rotation_rad: float = Field(0.5, gt=0, description="A larger rotation against the prediction within one window has diverged (rad).")
-    max_step_translation: float = Field(0.5, gt=0, description="A larger move against the prediction within one window has diverged (diameters).")
+    max_rotation_rad: float = Field(0.5, gt=0, description="A larger rotation against the prediction within one window has diverged (rad).")
+    max_translation: float = Field(0.5, gt=0, description="A larger move against the prediction within one window has diverged (diameters).")

@@ -10,7 +10,7 @@ from torchtrack.core import host_sync
 from torchtrack.tracking.adaptation.pixel_latency import LOOK_US, late_share_after
 from torchtrack.tracking.adaptation.surface_learning import Surroundings, learn_after
 from torchtrack.tracking.association.observations import Observations
-from torchtrack.tracking.association.polarity import expected_polarity, is_asked
+from torchtrack.tracking.association.polarity import expected_polarity, is_asked, remembers_polarity
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.window_events import ObjectEvents
@@ -19,6 +19,9 @@ from torchtrack.tracking.relocalization.schedule import is_time
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import Status
+
+# Nothing is learned while the standard deviation of the prediction in the image is larger (px). Not measured alone.
+_MAX_SIGMA_PX = 2.0
 
 
 def objects_as_known(objects: ObjectBatch, state: TrackerState, on_surfaces: bool, config: TrackerConfig) -> ObjectBatch:
@@ -31,10 +34,10 @@ def objects_as_known(objects: ObjectBatch, state: TrackerState, on_surfaces: boo
     """
     appearance = state.appearance
     if appearance.learned is not None and on_surfaces:
-        counting = appearance.learned.that_count(config.adaptation)
+        counting = appearance.learned.that_count()
         if not host_sync.none_of(counting.mask):
             objects = replace(objects, learned=counting)
-    if config.association.polarity_prior_s:
+    if remembers_polarity(config):
         explained = state.health.score.detach(), state.health.reference_explained_ratio.detach()
         if not host_sync.none_of(is_asked(*explained)):
             objects = replace(objects, polarity=expected_polarity(appearance.darker_outside, *explained))
@@ -77,10 +80,10 @@ def learned_after(
     learned = state.appearance.learned
     if learned is None or lesson.on_surfaces is None:
         return state
-    trusted = (result.status <= int(Status.UNCERTAIN)) & (lesson.sigma_px < config.adaptation.max_sigma_px)
+    trusted = (result.status <= int(Status.UNCERTAIN)) & (lesson.sigma_px < _MAX_SIGMA_PX)
     T_cam_obj = state.T_cam_obj.to(lesson.sigma_px.dtype)
     around = Surroundings(prediction.objects, T_cam_obj, state.velocity, lesson.window_s, result.contours, trusted)
-    wanted = learned.wanted(lesson.on_surfaces, config.adaptation) if lesson.learns else None
+    wanted = learned.wanted(lesson.on_surfaces) if lesson.learns else None
     learned = learn_after(learned, around, scored, lesson.events, wanted, config)
     return replace(state, appearance=replace(state.appearance, learned=learned))
 
@@ -90,7 +93,7 @@ def learns_next(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, conf
     learned = state.appearance.learned
     if learned is None or on_surfaces is None:
         return False
-    wanted = learned.wanted(on_surfaces, config.adaptation)
+    wanted = learned.wanted(on_surfaces)
     return wanted is not None and host_sync.AsyncValue.to(wanted).any()
 
 

@@ -32,8 +32,8 @@ def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us
     config = tracked.config
     at_rest = torch.zeros(len(T_cam_obj), 6, dtype=tracked.intrinsics.dtype, device=T_cam_obj.device)
     covariance = initial_covariance(tracked.diameter_m, config.motion)
-    learns = config.adaptation.points and config.contours.source == "mesh"
-    learned = LearnedContours.none(len(at_rest), config.adaptation, at_rest) if learns else None
+    learns = config.adaptation.learned_points and config.contours.source == "mesh"
+    learned = LearnedContours.none(len(at_rest), config.adaptation.learned_points, at_rest) if learns else None
     return TrackerState(
         t_us=t_us,
         motion=MotionState(T_cam_obj.clone(), velocity=at_rest, acceleration=at_rest, covariance=covariance),

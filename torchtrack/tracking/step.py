@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.components import Component
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch
 from torchtrack.tracking.adapt import Lesson, learned_after, with_late_share
@@ -127,7 +128,7 @@ def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, s
     spread = required_spread(health.reference_normal_spread, health.time_since_validated_s, config.validation)
     scored = score_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference, spread)
     if tracked.turns:
-        return replace(scored, axis_ambiguous=may_have_rotated(tracked.has_turning_axis, health.time_since_validated_s, config.relocalization))
+        return replace(scored, axis_ambiguous=may_have_rotated(tracked.has_turning_axis, health.time_since_validated_s))
     return scored
 
 
@@ -151,7 +152,7 @@ def update(
     config = tracked.config
     scored, prediction = located.scored, located.prediction.detached()
     next_state, result = conclude(state, located.prediction, located.gate_scale, scored, seen.corners, expected.dt_s, config)
-    if config.relocalization.tentative:
+    if config.uses(Component.TENTATIVE):
         next_state, result = confirm_or_take_back(state, next_state, result, prediction, located.gate_scale, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, seen.observations, seen.contours, given.t_us, learns=given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)

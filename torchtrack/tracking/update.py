@@ -6,11 +6,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync, lie
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.linalg import inverse
-from torchtrack.tracking.association.polarity import is_seen_well, remembered
+from torchtrack.tracking.association.polarity import is_seen_well, remembered, remembers_polarity
 from torchtrack.tracking.association.weights import ON_CONTOUR_PX
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.rounds import Fit, may_be_anywhere
@@ -22,6 +23,7 @@ from torchtrack.tracking.validation.health import TrackHealth
 from torchtrack.tracking.validation.measures import visible_ratio
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import (
+    VALIDATED_FROM,
     Status,
     holding_on,
     is_smeared,
@@ -85,7 +87,7 @@ def judged_objects(
     in_view = visible_ratio(scored.fit.contours, objects.image_size)
     # A new pose of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     step = solution.from_prior[:, :6] * ~(scored.is_relocalized & may_be_anywhere(gate_scale))[:, None]
-    hidden = partly_hidden(scored.inlier_ratio, scored.reference_inlier_ratio, scored.count, scored.is_relocalized, config.validation)
+    hidden = partly_hidden(scored.inlier_ratio, scored.reference_inlier_ratio, scored.count, scored.is_relocalized, config)
     asked_less = torch.where(holding_on(scored.count, scored.is_relocalized, config.validation), 1, hidden)
     status = judge(explained, scored.count, in_view, step, objects.diameter_m, config.validation, gate_scale, asked_less)
     status = torch.where(prediction.usable, status, int(Status.DIVERGED))
@@ -94,16 +96,16 @@ def judged_objects(
     held = failed if config.motion.without_events == "hold" else failed & ~prediction.usable
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
     trusted = torch.where(failed, 0, torch.maximum(hidden, trust(explained, config.validation, reference, gate_scale)))
-    smeared = ~failed & is_smeared(scored.score, reference, scored.inlier_ratio, scored.reference_inlier_ratio, config.relocalization)
+    smeared = ~failed & is_smeared(scored.score, reference, scored.inlier_ratio, scored.reference_inlier_ratio)
     unsure = smeared | (~failed & scored.axis_ambiguous)
     status = torch.where(unsure, status.clamp(min=int(Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, scored, failed, trusted, dt_s, config)
     # Of an object that is partly hidden too little is seen to tell.
-    seen_well = ~failed & (explained >= config.validation.validated_from * reference)
+    seen_well = ~failed & (explained >= VALIDATED_FROM * reference)
     acceleration = _acceleration(prediction, scored, torch.where(seen_well, trusted, 0), dt_s)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     certain = (explained >= CERTAIN * reference) & (status == int(Status.TRACKING))
-    certain &= (scored.count >= CERTAIN_COUNT * health.reference_matches) | (not config.relocalization.by_matches)
+    certain &= (scored.count >= CERTAIN_COUNT * health.reference_matches) | (not config.uses(Component.MATCH_COUNT))
     health = replace(
         _with_references(health, scored, failed),
         # One good window among bad ones does not end a drift.
@@ -118,14 +120,14 @@ def _darker_outside(
     state: TrackerState, scored: ScoredFit, status: Int[Tensor, "b"], dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> Float[Tensor, "b 8"]:
     """Which side of contours is the darker one, with what the events on those of objects that are seen well say of it."""
-    if not config.association.polarity_prior_s:
+    if not remembers_polarity(config):
         return state.appearance.darker_outside
     matches = scored.fit.matches
     # What was relocalized stands on other matches than these.
     known = (status == int(Status.TRACKING)) & is_seen_well(scored.explained_ratio, state.health.reference_explained_ratio) & ~scored.is_relocalized
     # Chosen, not multiplied: what is not a number would stay.
     weights = torch.where(known[:, None] & (matches.offsets.abs() < ON_CONTOUR_PX), matches.weights, 0)
-    return remembered(state.appearance.darker_outside, matches.directions, matches.dark, weights, dt_s, config.association.polarity_prior_s)
+    return remembered(state.appearance.darker_outside, matches.directions, matches.dark, weights, dt_s)
 
 
 def _with_references(health: TrackHealth, scored: ScoredFit, failed: Bool[Tensor, "b"]) -> TrackHealth:

@@ -16,10 +16,11 @@ from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg
 from torchtrack.object_model import contour_source
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.tracking.adaptation.learned_contours import LearnedContours
+from torchtrack.tracking.adaptation import learned_contours
+from torchtrack.tracking.adaptation.learned_contours import TRUSTED_FROM, LearnedContours
 
 COUNT = 24
-OFF = TrackerConfig(adaptation=AdaptationConfig(points=0))
+OFF = TrackerConfig(adaptation=AdaptationConfig(learned_points=0))
 
 
 @cache
@@ -35,12 +36,8 @@ def plate_followed(config=None):
     return follow(tracker, tracker.init(PLATE_POSE[None], 0), windows(events, COUNT))
 
 
-def learning(**kwargs):
-    return TrackerConfig(adaptation=AdaptationConfig(**kwargs))
-
-
 def trusted(learned):
-    return learned.evidence >= AdaptationConfig().trusted_from
+    return learned.evidence >= TRUSTED_FROM
 
 
 def errors_of(results):
@@ -99,14 +96,15 @@ def test_an_object_that_its_model_explains_learns_nothing_beside_one_that_lacks_
     assert (after.appearance.learned.model_share != before.appearance.learned.model_share).all()
 
 
-def test_an_occluder_that_passes_teaches_nothing():
+def test_an_occluder_that_passes_teaches_nothing(monkeypatch):
     """Bars that sweep over a plate whose own texture is known by then."""
+    monkeypatch.setattr(learned_contours, "EVERY", 1)
     trajectory, events = plate_sequence()
     bars = torch.tensor([[[x_m, -0.1, 0.0], [x_m, 0.1, 0.0]] for x_m in (-0.3, -0.28, -0.26)], dtype=torch.float64)
     T_bars = replace(trajectory, T_cam_obj=torch.eye(4, dtype=torch.float64).repeat(len(trajectory.t_us), 1, 1))
     T_bars.T_cam_obj[:, 0, 3] = 5e-6 * trajectory.t_us
     T_bars.T_cam_obj[:, 2, 3] = 0.45
-    tracker = Tracker([plate_model()], PLATE_CAMERA, learning(every=1))
+    tracker = Tracker([plate_model()], PLATE_CAMERA)
     both = merged(events, line_events(T_bars, bars, seed=1))
     state, results = follow(tracker, tracker.init(PLATE_POSE[None], 0), windows(both, COUNT))
     assert float(errors_of(results)[1].max()) < 6
@@ -118,9 +116,10 @@ def test_an_occluder_that_passes_teaches_nothing():
     assert float((distance_m > 5e-3).double().mean()) < 0.03
 
 
-def test_what_falls_silent_is_forgotten():
+def test_what_falls_silent_is_forgotten(monkeypatch):
+    monkeypatch.setattr(learned_contours, "EVERY", 1)
     state, _ = plate_followed()
-    tracker = Tracker([plate_model()], PLATE_CAMERA, learning(every=1))
+    tracker = Tracker([plate_model()], PLATE_CAMERA)
     # From now on only the border and the frame fire: the text is gone.
     later = starting((COUNT + 12) * 5_000)
     events = line_events(later, PRINTED[:6]).slice_time(COUNT * 5_000, (COUNT + 12) * 5_000)
@@ -132,9 +131,10 @@ def test_what_falls_silent_is_forgotten():
 
 
 @pytest.mark.parametrize("points", [1, 40, 300])
-def test_no_more_is_learned_than_there_is_room_for(points):
+def test_no_more_is_learned_than_there_is_room_for(monkeypatch, points):
+    monkeypatch.setattr(learned_contours, "DRAFTS", 500)
     _, events = plate_sequence()
-    tracker = Tracker([plate_model()], PLATE_CAMERA, learning(points=points, drafts=500))
+    tracker = Tracker([plate_model()], PLATE_CAMERA, TrackerConfig(adaptation=AdaptationConfig(learned_points=points)))
     state, results = follow(tracker, tracker.init(PLATE_POSE[None], 0), windows(events, 12))
     assert state.appearance.learned.points_obj.shape == (1, points, 3)
     assert state.appearance.learned.drafts_obj.shape == (1, 500, 3)
@@ -179,9 +179,10 @@ def test_a_neighbour_that_fails_changes_nothing():
     assert not bool(states[1].appearance.learned.evidence[1].any())
 
 
-def test_the_state_before_is_left_as_it_was():
+def test_the_state_before_is_left_as_it_was(monkeypatch):
+    monkeypatch.setattr(learned_contours, "EVERY", 1)
     state, _ = plate_followed()
-    tracker = Tracker([plate_model()], PLATE_CAMERA, learning(every=1))
+    tracker = Tracker([plate_model()], PLATE_CAMERA)
     kept = [value.clone() for value in vars(state.appearance.learned).values() if torch.is_tensor(value)]
     events = line_events(starting((COUNT + 1) * 5_000), PRINTED).slice_time(COUNT * 5_000, (COUNT + 1) * 5_000)
     once, again = (tracker.step(state, events, (COUNT + 1) * 5_000) for _ in range(2))
@@ -192,9 +193,8 @@ def test_the_state_before_is_left_as_it_was():
 
 
 def test_only_some_of_the_later_windows_are_learned_from():
-    config = AdaptationConfig(first_windows=3, every=4)
-    learned = LearnedContours.none(1, config, torch.zeros(1))
-    assert [number for number in range(13) if replace(learned, windows=number).due(config)] == [0, 1, 2, 4, 8, 12]
+    learned = LearnedContours.none(1, 16, torch.zeros(1))
+    assert [number for number in range(45) if replace(learned, windows=number).due()] == [*range(20), 20, 30, 40]
 
 
 @pytest.mark.parametrize("config", [OFF, TrackerConfig(contours=ContourConfig(source="splat"))], ids=["off", "splat"])

@@ -7,9 +7,10 @@ import pytest
 import torch
 from close_edges import two_depths
 from helpers import IMAGE_SIZE, contours_at, generator, moving_objects, seen, upright_line
+from nearest_cases import matching
 from tracked_boxes import in_motion
 
-from torchtrack.config.tracker import AssociationConfig, SolverConfig, TrackerConfig
+from torchtrack.config.tracker import SolverConfig, TrackerConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.observations import join, select_events
@@ -41,7 +42,7 @@ def test_observations_are_counted_by_patch_where_they_are_on_a_contour():
     columns = torch.cat([torch.full((35,), 85.2), torch.full((8,), 87.0)]).double()
     table = contour_table(contours := upright_line(85.0), index_contours(contours, IMAGE_SIZE, 8, 1))
     observations, still = seen(torch.stack([columns, rows], -1)[None]), moving_objects((0.0, 0.0), 1, torch.float64)
-    matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, AssociationConfig(dark_shift_px=0.0))
+    matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, matching(concentration=True, polarity=True))
     assert matches.neighbours[0].tolist() == [30] * 30 + [5] * 5 + [30] * 8
 
 
@@ -88,7 +89,7 @@ def test_a_displaced_place_with_many_events_pulls_less_with_an_error_in_common()
     columns = 85 + noise + torch.cat([torch.full((100,), 0.5), torch.zeros(10)]).double()
     table = contour_table(contours := upright_line(85.0), index_contours(contours, IMAGE_SIZE, 8, 1))
     observations, still = seen(torch.stack([columns, rows], -1)[None]), moving_objects((0.0, 0.0), 1, torch.float64)
-    matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, AssociationConfig(dark_shift_px=0.0, polarity=False))
+    matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, matching(concentration=True))
     means = []
     for common_px2 in (0.0, 1.0):
         weights = matches.weights * effective_weight(matches.neighbours, torch.full_like(matches.neighbours, common_px2), 1.0)
@@ -157,5 +158,5 @@ def test_what_is_seen_between_close_edges_tells_less_where_that_counts():
     observations, still = seen(torch.tensor([[[79.8, 60.0], [82.1, 60.0]]]).double()), moving_objects((0.0, 0.0), 1, torch.float64)
     for close_px, expected in ((0.0, 0.0), (2.0, 2 * math.exp(-1))):
         table = contour_table(contours, index, close_px=close_px)
-        matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, AssociationConfig(dark_shift_px=0.0))
+        matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, matching(concentration=True, polarity=True))
         torch.testing.assert_close(matches.edge_ambiguity_px2, torch.full((1, 2), expected, dtype=torch.float64))

@@ -7,24 +7,34 @@ from functools import cache
 import pytest
 import torch
 from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
+from nearest_cases import matching
 from states import changed
 from tracked_boxes import WINDOW_US, follow, started
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.presets import preset
-from torchtrack.config.tracker import AssociationConfig, TrackerConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import simulate
 from torchtrack.tracking.adapt import objects_as_known
 from torchtrack.tracking.association.nearest import contour_table, match_nearest
-from torchtrack.tracking.association.polarity import expected_polarity, is_asked, is_seen_well, nothing_remembered, octant, remembered
+from torchtrack.tracking.association.polarity import (
+    expected_polarity,
+    is_asked,
+    is_seen_well,
+    nothing_remembered,
+    octant,
+    remembered,
+    remembers_polarity,
+)
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.validation.measures import explained_ratio
 from torchtrack.tracking.validation.status import Status
 
-OFF = TrackerConfig(association=AssociationConfig(polarity_prior_s=0.0))
+OFF = TrackerConfig(disabled={Component.POLARITY_PRIOR})
 RIGHT = 5  # the octant of (1, 0)
 
 
@@ -49,7 +59,7 @@ def after(dark, *, weights=1.0, window_s=0.005, before=0.0, dtype=torch.float64)
     directions = turned(torch.full(dark.shape, 10.0, dtype=dtype), dtype)
     weights = torch.as_tensor(weights, dtype=dtype).expand(dark.shape)
     sides = torch.full((1, 8), before, dtype=dtype)
-    return remembered(sides, directions, dark, weights, torch.full((1,), window_s, dtype=dtype), 0.05)
+    return remembered(sides, directions, dark, weights, torch.full((1,), window_s, dtype=dtype))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -76,7 +86,7 @@ def test_objects_learn_each_for_itself_and_are_not_differentiated():
     dark = torch.ones(2, 40, dtype=torch.float64)
     weights = torch.tensor([[1.0], [0.0]], dtype=torch.float64).expand(2, 40).clone().requires_grad_()
     directions = turned(torch.full((2, 40), 10.0))
-    actual = remembered(nothing_remembered(dark), directions, dark, weights, torch.full((2,), 0.005, dtype=torch.float64), 0.05)
+    actual = remembered(nothing_remembered(dark), directions, dark, weights, torch.full((2,), 0.005, dtype=torch.float64))
     assert not actual.requires_grad
     assert (actual[1] == 0).all()
     torch.testing.assert_close(actual[:1], after([1.0] * 40))
@@ -109,8 +119,7 @@ def matched(dark, *, expected=1.0, kind=ContourKind.SMOOTH):
     polarity = None if expected is None else torch.zeros(1, 8, dtype=torch.float64).index_fill(1, torch.tensor([RIGHT]), expected)
     table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1), polarity)
     observations = seen(places, polarity=torch.tensor(dark, dtype=torch.float64)[None])
-    config = AssociationConfig(concentration=False, dark_shift_px=0.0, silhouette_dark_shift_px=0.0)
-    return contours, match_nearest(observations, table, places, moving_objects((500.0, 0.0)), 3.0, config)[0]
+    return contours, match_nearest(observations, table, places, moving_objects((500.0, 0.0)), 3.0, matching(polarity=True))[0]
 
 
 @pytest.mark.parametrize("kind", [ContourKind.SMOOTH, ContourKind.CREASE])
@@ -142,12 +151,11 @@ def test_of_unknown_polarity_nothing_is_said():
 
 
 def test_contours_are_not_explained_by_events_that_are_not_as_expected():
-    config = TrackerConfig().validation
     shares = []
     for dark in ([1.0] * 60, [-1.0] * 60):
         contours, matches = matched(dark)
         moving = torch.tensor([500.0, 0.0], dtype=torch.float64).expand_as(contours.pixels)
-        shares.append(float(explained_ratio(contours, matches, moving, IMAGE_SIZE, config)))
+        shares.append(float(explained_ratio(contours, matches, moving, IMAGE_SIZE, TrackerConfig())))
     assert shares[0] > 0.1
     assert shares[1] == 0
 
@@ -218,4 +226,4 @@ def test_what_was_not_tracked_is_not_remembered():
 
 @pytest.mark.parametrize("name", ["paper", "nns"])
 def test_corners_have_no_polarity_to_remember(name):
-    assert preset(name).association.polarity_prior_s == 0
+    assert not remembers_polarity(preset(name))

@@ -3,24 +3,22 @@
 import pytest
 import torch
 from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
+from nearest_cases import matching
 
-from torchtrack.config.tracker import AssociationConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.nearest import contour_table, match_nearest
 from torchtrack.tracking.association.weights import on_and_around, patch, patch_sums, polarity_agreement
 from torchtrack.tracking.contours.index import index_contours
 
-CONFIG = AssociationConfig(polarity_gain=1.5, least_agreement=0.05)
 
-
-def agreement(dark, *, offsets=0.0, near=True, place=50.0, config=CONFIG):
+def agreement(dark, *, offsets=0.0, near=True, place=50.0):
     """Agreement of observations of one object, all in the patch of one place."""
     dark = torch.as_tensor(dark, dtype=torch.float64)[None]
     offsets, near = torch.as_tensor(offsets, dtype=torch.float64).expand(dark.shape), torch.as_tensor(near).expand(dark.shape)
     targets = torch.as_tensor(place, dtype=torch.float64).expand(dark.shape)[..., None].expand(*dark.shape, 2)
     cell, on = patch(targets), on_and_around(offsets, near)[:, 0]
     votes, voters = patch_sums(cell, torch.stack([on * dark, on], 1)).gather(2, cell[:, None].expand(-1, 2, -1)).unbind(1)
-    return polarity_agreement(dark, votes, voters, config)[0]
+    return polarity_agreement(dark, votes, voters)[0]
 
 
 def test_those_of_one_mind_count_in_full():
@@ -64,12 +62,6 @@ def test_other_patches_do_not_vote():
     assert float(agreement([-1.0] + [1.0] * 20, place=[50.0] + [70.0] * 20)[0]) == 1
 
 
-@pytest.mark.parametrize(("gain", "least"), [(0.0, 1.0), (0.5, 0.5), (100.0, 0.2)])
-def test_gain_and_least_are_those_of_the_settings(gain, least):
-    weights = agreement([1.0] * 1000 + [-1.0], config=AssociationConfig(polarity_gain=gain, least_agreement=0.2))
-    assert float(weights[-1]) == pytest.approx(least, abs=3e-3)
-
-
 def test_patches_are_sixteen_pixels_wide_and_wrap_around():
     pixels = torch.tensor([[[0.0, 0.0], [15.9, 15.9], [16.0, 0.0], [0.0, 16.0], [1024.0, 0.0], [-0.1, 0.0]]])
     assert patch(pixels)[0].tolist() == [0, 0, 1, 64, 0, 63]
@@ -85,8 +77,7 @@ def weights_on_a_line(polarity, *, speed=500.0, kind=ContourKind.CREASE, polarit
     places = torch.stack([torch.full_like(v, 80.0), v], -1)[None]
     observations = seen(places, polarity=torch.tensor(polarity, dtype=torch.float64)[None])
     table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1), of_texture=print_counts)
-    config = AssociationConfig(concentration=False, dark_shift_px=0.0, silhouette_dark_shift_px=0.0, polarity=polarity_counts)
-    return match_nearest(observations, table, places, moving_objects((speed, 0.0)), 3.0, config)[0].weights[0]
+    return match_nearest(observations, table, places, moving_objects((speed, 0.0)), 3.0, matching(polarity=polarity_counts))[0].weights[0]
 
 
 @pytest.mark.parametrize("kind", [ContourKind.SMOOTH, ContourKind.CREASE])

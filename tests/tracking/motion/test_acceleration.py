@@ -10,6 +10,7 @@ from states import changed
 from tracked_boxes import WINDOW_US, follow, started, windows
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.presets import preset
 from torchtrack.config.tracker import AssociationConfig, CornerConfig, MotionConfig, SolverConfig, TrackerConfig
 from torchtrack.core.events import EventBatch
@@ -184,7 +185,7 @@ def test_what_is_not_seen_has_no_acceleration():
 
 def test_an_object_that_is_partly_hidden_has_none_either():
     # What is hidden is also matched with an eye on polarities, if these are remembered.
-    tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(association=AssociationConfig(polarity_prior_s=0.0)))
+    tracker, state, _, (events, end_us), _ = started(config=TrackerConfig(disabled={Component.POLARITY_PRIOR}))
     seen, hidden = (
         tracker.step(changed(state, reference_explained_ratio=torch.full_like(state.health.score, full)), events, end_us) for full in (1.0, 10.0)
     )

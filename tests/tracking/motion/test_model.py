@@ -183,7 +183,7 @@ def test_what_is_unknown_stays_unknown_and_harms_no_neighbour():
 def test_velocities_die_away_where_nothing_confirms_them(dtype):
     velocity = torch.ones(3, 6, dtype=dtype)
     failed, dt_s = torch.tensor([True, False, True]), torch.tensor([0.1, 0.1, 0.3], dtype=dtype)
-    actual = fade(velocity, dt_s, failed, MotionConfig(coast_s=0.2))
+    actual = fade(velocity, dt_s, failed, MotionConfig())
     assert actual[:, 0].tolist() == pytest.approx([0.60653, 1.0, 0.22313], rel=1e-4)
     assert actual.dtype == dtype
     # Two windows are as good as one that is as long as both.
@@ -213,9 +213,9 @@ def test_a_velocity_that_is_set_aside_is_uncertain_by_as_much():
 def test_a_spin_dies_away_about_the_axis_alone():
     axis = double(0.0, 0.6, 0.8)[None]
     velocity = torch.cat([7.0 * axis + double(2.0, 0.0, 0.0), double(0.1, 0.2, 0.3)[None]], 1)
-    covariance, dt_s, config = random_covariance(), double(0.01), MotionConfig(coast_s=0.1)
+    covariance, dt_s, config = random_covariance(), double(0.01), MotionConfig()
     slower, narrower = without_spin(velocity, covariance, axis, dt_s, config)
-    kept = math.exp(-0.1)
+    kept = math.exp(-0.05)
     assert torch.allclose(slower, torch.cat([7.0 * kept * axis + double(2.0, 0.0, 0.0), velocity[:, 3:]], 1))
     for start in (0, 6):
         before, after = (matrix[0, start : start + 3, start : start + 3] for matrix in (covariance, narrower))

@@ -9,6 +9,7 @@ from helpers import SMALL_CAMERA, box_model, generator, pose
 from predicted_boxes import CENTRE_OBJ, CONTOURS, boxes
 from tracked_boxes import started
 
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import AssociationConfig, ContourConfig, TrackerConfig
 from torchtrack.core.camera import project
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
@@ -167,14 +168,18 @@ def test_contours_of_a_window_are_the_same_for_each_of_a_batch(dtype):
 
 
 def test_an_uncertain_prediction_opens_the_first_gate():
-    config = TrackerConfig(association=AssociationConfig(gates_px=(5.0, 2.0), max_gate_px=16.0, gate_sigmas=3.0))
+    config = TrackerConfig(association=AssociationConfig(gates_px=(5.0, 2.0)))
     sigma_px = torch.tensor([0.0, 1.0, 5 / 3, 2.5, 5.0, 100.0])
     assert gate_scale_of(sigma_px, config).tolist() == pytest.approx([1, 1, 1, 1.5, 3, 3.2])
 
 
 def test_a_first_gate_that_is_wider_than_the_limit_stays():
-    config = TrackerConfig(association=AssociationConfig(gates_px=(20.0, 2.0), max_gate_px=16.0))
+    config = TrackerConfig(association=AssociationConfig(gates_px=(20.0, 2.0)))
     assert gate_scale_of(torch.tensor([0.0, 100.0]), config).tolist() == [1, 1]
+
+
+def test_gates_that_are_not_to_open_stay():
+    assert gate_scale_of(torch.tensor([0.0, 100.0]), TrackerConfig(disabled={Component.WIDE_GATES})).tolist() == [1, 1]
 
 
 def test_in_motion_the_prediction_is_certain_to_a_pixel_or_two():

@@ -11,7 +11,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization.correlation import peaks, shifted
 from torchtrack.tracking.relocalization.view_sphere import outlines_at
 
-CONFIG = TrackerConfig(relocalization=RelocalizationConfig(kept_rotations=12))
+CONFIG = TrackerConfig(relocalization=RelocalizationConfig(rotations=24))
 
 
 def events_at(prediction, shift_px, dtype):

@@ -37,7 +37,7 @@ def test_a_displaced_box_is_found_again_by_the_search(dtype):
     assert float(pose_errors(before.fit.solution.T_cam_obj.double(), T_true)[0]) > 3
     assert float(degrees) < 1.0
     assert float(millimetres) < 3.0
-    assert float(better.explained_ratio) > float(before.explained_ratio) + tracker.config.relocalization.margin
+    assert float(better.explained_ratio) > float(before.explained_ratio) + tracker.config.relocalization.accept_margin
     assert better.fit.contours.pixels.shape[1] >= before.fit.contours.pixels.shape[1]
 
 

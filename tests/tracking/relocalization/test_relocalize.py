@@ -10,6 +10,7 @@ from states import changed
 from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, poses_of, started, tensors_of, windows
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
@@ -149,9 +150,8 @@ def test_a_lost_box_is_found_again_and_without_the_search_it_is_not():
 @pytest.mark.parametrize("farther", [1.0, 1.3, 1.5])
 def test_a_box_that_slipped_is_found_within_a_window_however_sure_it_is_of_itself(farther):
     """Ten to fifteen degrees off, with the covariance of one that is tracked well; held by that, no search finds it."""
-    slips, never = (
-        TrackerConfig(relocalization=RelocalizationConfig(drift_us=0, score_drop_below=to)) for to in (RelocalizationConfig().score_drop_below, 0)
-    )
+    slips = TrackerConfig(disabled={Component.DRIFT})
+    never = TrackerConfig(disabled={Component.DRIFT, Component.SCORE_DROP})
     actual, T_true = displaced_runs(slips, 1.0, displaced=farther * DISPLACED)
     held, _ = displaced_runs(never, 1.0, displaced=farther * DISPLACED)
     assert int(actual[0].status) == int(actual[-1].status) == Status.TRACKING

@@ -132,8 +132,8 @@ def test_as_many_are_sampled_as_are_to_be_tried_or_kept():
     covariance = 1e-2 * torch.eye(12, dtype=torch.float64)
     for few, count in (
         (RelocalizationConfig(hypotheses=5, rotations=40), 5),
-        (RelocalizationConfig(kept_rotations=3, rotations=2), 4),
-        (RelocalizationConfig(pulled=3), 4),
+        (RelocalizationConfig(rotations=6), 4),
+        (RelocalizationConfig(rotations=1, hypotheses=100), 2),
         (RelocalizationConfig(hypotheses=1), 1),
     ):
         config = TrackerConfig(relocalization=few)
@@ -151,7 +151,7 @@ def test_where_the_prediction_is_good_only_what_it_allows_is_sample():
     tracker, prediction, seen, scored, _ = in_motion()
     covariance = 1e-6 * torch.eye(12, dtype=torch.float64)
     offsets = sample(prediction, scored.fit.contours, covariance, 3.0, (seen.pixels, seen.mask), tracker.config)
-    drawn = draw_offsets(covariance, RelocalizationConfig().samples).float()
+    drawn = draw_offsets(covariance, 2000).float()
     assert ((offsets[:, None] == drawn).all(-1).any(-1)).all()
     assert float(offsets[:, :6].abs().max()) < 5e-3
 

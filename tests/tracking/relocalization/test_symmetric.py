@@ -5,10 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors, random_pose
+from lost_objects import drifting_soon
 from states import changed
 from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, windows
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.camera import project
@@ -16,6 +18,7 @@ from torchtrack.core.lie import difference_about, retract_about, rotation_angle_
 from torchtrack.object_model.symmetry import symmetry_planes
 from torchtrack.tracking.motion.model import Acceleration
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization import acceptance
 from torchtrack.tracking.relocalization.last_seen import where_last_seen
 from torchtrack.tracking.relocalization.symmetric import SymmetryPlanes, mirrored
 from torchtrack.tracking.validation.status import Status
@@ -150,11 +153,12 @@ def mirrored_state(tracker, state):
 
 
 @pytest.mark.parametrize("mirrored_below", [0.0, 0.8])
-def test_a_box_that_followed_its_mirror_image_is_found(mirrored_below):
-    search = RelocalizationConfig(
-        drift_us=10_000, mirrored_below=mirrored_below, score_drop_below=0, drift_min_ratio=1, last_seen_us=0, low_score_below=0
-    )
-    results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), relocalization=search), mirrored_state)
+def test_a_box_that_followed_its_mirror_image_is_found(monkeypatch, mirrored_below):
+    drifting_soon(monkeypatch)
+    monkeypatch.setattr(acceptance, "_DRIFT_MIN_RATIO", 1)
+    search, disabled = RelocalizationConfig(mirrored_below=mirrored_below), {Component.SCORE_DROP, Component.LAST_SEEN, Component.LOW_SCORE}
+    config = TrackerConfig(corners=CornerConfig(max_corners=32), relocalization=search, disabled=disabled)
+    results, trajectory = runs_on(config, mirrored_state)
     degrees, millimetres = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
     if mirrored_below:
         assert float(degrees) < 1 and float(millimetres) < 2
@@ -163,9 +167,10 @@ def test_a_box_that_followed_its_mirror_image_is_found(mirrored_below):
         assert float(degrees) > 5
 
 
-@pytest.mark.parametrize("last_seen_us", [0, 200_000])
-def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(last_seen_us):
+@pytest.mark.parametrize("as_last_seen", [False, True])
+def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(monkeypatch, as_last_seen):
     """Turned off by nearly a right angle and far away: much farther than it is looked for from there."""
+    drifting_soon(monkeypatch)
 
     def run_off(tracker, state):
         away = torch.tensor([[1.3, 0.0, 0.0, 0.0, 0.0, 0.15]], dtype=torch.float64)
@@ -178,10 +183,11 @@ def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(last_seen_us):
             velocity=torch.zeros_like(state.velocity),
         )
 
-    search = RelocalizationConfig(drift_us=10_000, mirrored_below=0, last_seen_us=last_seen_us, not_validated_us=0)
-    results, trajectory = runs_on(TrackerConfig(corners=CornerConfig(max_corners=32), relocalization=search), run_off)
+    search, disabled = RelocalizationConfig(mirrored_below=0, not_validated_us=0), frozenset() if as_last_seen else {Component.LAST_SEEN}
+    config = TrackerConfig(corners=CornerConfig(max_corners=32), relocalization=search, disabled=disabled)
+    results, trajectory = runs_on(config, run_off)
     degrees, _ = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
-    assert (float(degrees) < 1) == (last_seen_us > 0)
+    assert (float(degrees) < 1) == as_last_seen
 
 
 def test_where_an_object_was_last_seen_well_is_remembered_and_not_where_it_was_not():

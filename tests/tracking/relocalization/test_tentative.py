@@ -9,7 +9,7 @@ from helpers import pose
 from states import changed
 from tracked_boxes import assert_same, started, tracker_of
 
-from torchtrack.config.relocalization import RelocalizationConfig
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.tracking.expectation import predicted_after
@@ -117,7 +117,7 @@ def test_an_object_that_was_never_seen_well_keeps_what_it_is_given():
 
 
 def test_switched_off_and_where_nothing_is_uncertain_a_window_is_the_same():
-    config = TrackerConfig(relocalization=RelocalizationConfig(tentative=False))
+    config = TrackerConfig(disabled={Component.TENTATIVE})
     _, on, last, (events, end_us), _ = started()
     with_it, of_it = tracker_of().step(on, events, end_us)
     without, of_none = tracker_of(config=config).step(on, events, end_us)

@@ -5,52 +5,52 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors
-from lost_objects import SEEN_WELL, evidence
+from lost_objects import SEEN_WELL, drifting_soon, evidence
 from states import changed
 from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, windows
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import AssociationConfig, CornerConfig, MotionConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization.triggers import NONE, SEARCHED, Trigger, triggers
+from torchtrack.tracking.validation import status
 from torchtrack.tracking.validation.scored_fit import reference_where_known
 from torchtrack.tracking.validation.status import Status, is_smeared
 
 # The box fires few events: with corners beside them, enough is observed of one that slipped to say more than that it is too little.
 # Polarities of these events are drawn by lot: there is nothing to remember of them.
 # Were close edges taken for each other, it would come back by itself.
-FORGETFUL = AssociationConfig(polarity_prior_s=0.0, edge_ambiguity_px=0.0)
+FORGETFUL, UNREMEMBERED = AssociationConfig(edge_ambiguity_px=0.0), frozenset({Component.POLARITY_PRIOR})
 # What slips turns on: with turns that die away it would be drawn back.
 TURNING = MotionConfig(turn_s=0)
-SEARCHING = TrackerConfig(
-    corners=CornerConfig(max_corners=32),
-    association=FORGETFUL,
-    motion=TURNING,
-    relocalization=RelocalizationConfig(drift_us=10_000, drift_diameters_s=4),
-)
-NEVER_DRIFTING = TrackerConfig(
-    corners=CornerConfig(max_corners=32), association=FORGETFUL, motion=TURNING, relocalization=RelocalizationConfig(drift_us=0, score_drop_below=0)
-)
-# Nothing is ever in doubt, and looks farther away are for what was not seen well for long, or for nothing.
-UNSMEARED = {"drift_us": 10_000, "drift_diameters_s": 4, "drift_below": 0, "score_drop_below": 0, "not_validated_below": 0}
+SEARCHING = TrackerConfig(corners=CornerConfig(max_corners=32), association=FORGETFUL, motion=TURNING, disabled=UNREMEMBERED)
+NEVER_DRIFTING = SEARCHING.model_copy(update={"disabled": UNREMEMBERED | {Component.DRIFT, Component.SCORE_DROP}})
+# Looks farther away are for what was not seen well for long, or for nothing.
 SLOWLY, NEVER_SLOWLY = (
-    SEARCHING.model_copy(update={"relocalization": RelocalizationConfig(slow_drift_below=share, **UNSMEARED)}) for share in (0.85, 0.0)
+    SEARCHING.model_copy(
+        update={
+            "relocalization": RelocalizationConfig(slow_drift_below=share, not_validated_below=0),
+            "disabled": UNREMEMBERED | {Component.SCORE_DROP},
+        }
+    )
+    for share in (0.85, 0.0)
 )
 # Twenty degrees, onto other edges: farther than a pose that is sure of itself is looked for.
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
 
-def flags_of(given, **settings):
+def flags_of(given, *disabled, **settings):
     """The triggers of each object."""
-    config = TrackerConfig(relocalization=RelocalizationConfig(**settings))
+    config = TrackerConfig(relocalization=RelocalizationConfig(**settings), disabled=disabled)
     return [Trigger(number) for number in triggers(given, config).tolist()]
 
 
-def having(trigger, given, **settings):
+def having(trigger, given, *disabled, **settings):
     """Which objects have a trigger."""
-    return [bool(flags & trigger) for flags in flags_of(given, **settings)]
+    return [bool(flags & trigger) for flags in flags_of(given, *disabled, **settings)]
 
 
 # ---- each alone
@@ -103,11 +103,11 @@ def test_without_searches_there_are_no_triggers(trigger):
 def test_uncertain_objects_and_those_explained_worse_than_usual_are_searched_for():
     changes = {"last_score": [0.9, 0.71, 0.73, 0.9, 0.0], "mean_score": [0.9, 0.9, 0.9, 0.9, 0.0]}
     given = evidence(5, sigma_px=[1.0, 1.0, 1.0, 4.1, 1.0], score=changes["last_score"], **changes)
-    settings = {"from_sigma_px": 4.0, "low_score_below": 0.8}
-    assert having(Trigger.UNCERTAIN, given, **settings) == [False, False, False, True, False]
-    assert having(Trigger.LOW_SCORE, given, **settings) == [False, True, False, False, False]
+    assert having(Trigger.UNCERTAIN, given, trigger_sigma_px=4.0) == [False, False, False, True, False]
+    assert having(Trigger.LOW_SCORE, given) == [False, True, False, False, False]
+    assert not any(having(Trigger.LOW_SCORE, given, Component.LOW_SCORE))
     # One window that is a little worse is no reason.
-    assert not any(having(Trigger.LOW_SCORE, evidence(score=0.65), **settings))
+    assert not any(having(Trigger.LOW_SCORE, evidence(score=0.65)))
 
 
 def test_what_is_sure_of_its_place_and_explains_far_less_at_once_has_dropped():
@@ -119,9 +119,8 @@ def test_what_is_sure_of_its_place_and_explains_far_less_at_once_has_dropped():
         drift_s=[0.0] * 4 + [0.1],
         is_drift_due=True,
     )
-    settings = {"score_drop_below": 0.7, "score_drop_sigma_px": 6.0}
-    assert having(Trigger.SCORE_DROP, given, **settings) == [True, False, False, False, False]
-    assert not any(having(Trigger.SCORE_DROP, given, score_drop_below=0))
+    assert having(Trigger.SCORE_DROP, given) == [True, False, False, False, False]
+    assert not any(having(Trigger.SCORE_DROP, given, Component.SCORE_DROP))
 
 
 @pytest.mark.parametrize("at_start", [True, False])
@@ -130,7 +129,7 @@ def test_objects_whose_motion_is_not_known_are_searched_for(at_start):
 
 
 def test_very_uncertain_objects_wait_until_it_is_time_and_others_do_not():
-    settings = {"from_sigma_px": 4.0, "wide_sigma_px": 10.0}
+    settings = {"trigger_sigma_px": 4.0, "wide_sigma_px": 10.0}
     given = evidence(3, sigma_px=[11.0, 11.0, 9.0], is_due=[False, True, False], score=0.0, last_score=0.0)
     assert having(Trigger.UNCERTAIN, given, **settings) == having(Trigger.LOW_SCORE, given, **settings) == [False, True, True]
     assert all(having(SEARCHED, replace(given, is_starting=torch.ones(3, dtype=torch.bool)), **settings))
@@ -152,20 +151,20 @@ def test_new_objects_that_leave_much_unexplained_are_searched_for_when_it_is_tim
 
 
 def test_what_has_a_plane_of_symmetry_and_does_not_explain_all_may_be_mirrored_when_it_is_time():
-    settings, score = {"mirrored_below": 0.8, "score_drop_sigma_px": 6.0}, torch.tensor([0.7, 0.73, 0.7, 0.7, 0.7, 0.7])
+    settings, score = {"mirrored_below": 0.8}, torch.tensor([0.7, 0.73, 0.7, 0.7, 0.7, 0.7])
     flags = {name: [at != number for at in range(6)] for name, number in (("is_drift_due", 2), ("has_symmetry", 3))}
     given = evidence(6, sigma_px=[1.0] * 4 + [6.1, 1.0], score=score, last_score=0.7, is_starting=[False] * 5 + [True], **flags)
     assert having(Trigger.MIRROR_AMBIGUOUS, given, **settings) == [True] + [False] * 5
     # One window that is a little worse is no reason.
     assert not any(having(Trigger.MIRROR_AMBIGUOUS, replace(given, last_score=torch.full((6,), 0.73)), **settings))
-    only_mirrors = {"score_drop_below": 0, "low_score_below": 0, "from_sigma_px": 9.0, "at_start": False}
-    assert having(SEARCHED, given, **only_mirrors) == [True] + [False] * 5
-    for never in ({"mirrored_below": 0}, {"drift_us": 0}):
-        assert not any(having(Trigger.MIRROR_AMBIGUOUS, given, **never))
+    only_mirrors = {"trigger_sigma_px": 9.0, "at_start": False}
+    assert having(SEARCHED, given, Component.SCORE_DROP, Component.LOW_SCORE, **only_mirrors) == [True] + [False] * 5
+    assert not any(having(Trigger.MIRROR_AMBIGUOUS, given, mirrored_below=0))
+    assert not any(having(Trigger.MIRROR_AMBIGUOUS, given, Component.DRIFT))
 
 
 def test_what_may_have_rotated_is_looked_at_once_it_is_seen_well_again_and_sure_of_its_place():
-    settings = {"elsewhere_min_ratio": 0.9, "score_drop_sigma_px": 6.0}
+    settings = {"accept_ratio": 0.9}
     axis, known, due = ([number != wrong for number in range(5)] for wrong in (2, 3, 4))
     given = evidence(
         5,
@@ -187,14 +186,14 @@ def test_what_drifts_or_is_very_uncertain_is_looked_for_as_it_was_last_seen_when
     assert having(Trigger.NOT_VALIDATED, given, wide_sigma_px=10.0) == [True, False, True, False]
     later = replace(given, time_since_validated_s=torch.tensor([0.21, 0.21, 0.19, 0.21]))
     assert having(Trigger.NOT_VALIDATED, later) == [True, False, False, False]
-    for never in ({"last_seen_us": 0}, {"drift_us": 0}):
-        assert not any(having(Trigger.NOT_VALIDATED, given, **never))
+    for never in (Component.LAST_SEEN, Component.DRIFT):
+        assert not any(having(Trigger.NOT_VALIDATED, given, never))
 
 
-@pytest.mark.parametrize(("drift_us", "expected"), [(50_000, [False, True, False]), (20_000, [True, True, False]), (0, [False] * 3)])
-def test_an_object_drifts_once_it_explained_too_little_for_long_and_it_is_time(drift_us, expected):
+def test_an_object_drifts_once_it_explained_too_little_for_long_and_it_is_time():
     given = evidence(3, drift_s=[0.045, 0.051, 0.051], is_drift_due=[True, True, False])
-    assert having(Trigger.DRIFT, given, drift_us=drift_us) == expected
+    assert having(Trigger.DRIFT, given) == [False, True, False]
+    assert not any(having(Trigger.DRIFT, given, Component.DRIFT))
 
 
 def test_what_is_sure_of_its_place_and_was_not_seen_well_for_long_may_drift_slowly_when_it_is_time():
@@ -206,10 +205,10 @@ def test_what_is_sure_of_its_place_and_was_not_seen_well_for_long_may_drift_slow
         sigma_px=[1.0, 1.0, 1.0, 6.1, 1.0, 1.0],
         is_drift_due=[True] * 4 + [False, True],
     )
-    settings = {"slow_drift_below": 0.85, "drift_us": 50_000, "score_drop_sigma_px": 6.0}
+    settings = {"slow_drift_below": 0.85}
     assert having(Trigger.SLOW_DRIFT, given, **settings) == [True] + [False] * 5
-    for never in ({"slow_drift_below": 0}, {"drift_us": 0}):
-        assert not any(having(Trigger.SLOW_DRIFT, given, **{**settings, **never}))
+    assert not any(having(Trigger.SLOW_DRIFT, given, slow_drift_below=0))
+    assert not any(having(Trigger.SLOW_DRIFT, given, Component.DRIFT))
     # What drifts at once does not drift slowly, nor does what only starts.
     for other in ({"drift_s": torch.full((6,), 0.1)}, {"is_starting": torch.ones(6, dtype=torch.bool)}):
         assert not any(having(Trigger.SLOW_DRIFT, replace(given, **other), **settings))
@@ -221,25 +220,25 @@ def test_what_drifts_but_explains_enough_by_many_events_is_held():
     given = evidence(5, score=[0.21, 0.19, 0.21, 0.21, 0.21], matches=[120, 120, 119, 120, 120], sigma_px=[1.0] * 3 + [6.5, 1.0], **drifts)
     given = replace(given, is_starting=torch.tensor([False] * 4 + [True]))
     assert having(Trigger.HELD, given) == [True] + [False] * 4
-    assert not any(having(Trigger.HELD, given, held_from=0))
+    assert not any(having(Trigger.HELD, given, Component.HELD))
     slowly = evidence(is_drift_due=True, time_since_validated_s=0.2, last_score=0.3)
     assert having(Trigger.SLOW_DRIFT, slowly) == [True] and having(Trigger.HELD, slowly) == [False]
 
 
 def test_what_explains_much_less_than_when_seen_well_by_smeared_events_is_smeared():
     score, full = torch.tensor([0.5, 0.2, 0.0, 0.2, 0.5]), torch.tensor([0.9, 0.3, 0.0, 0.9, 0.9])
-    smeared = is_smeared(score, full, torch.full((5,), 0.6), torch.full((5,), 0.8), RelocalizationConfig(drift_below=0.6))
+    smeared = is_smeared(score, full, torch.full((5,), 0.6), torch.full((5,), 0.8))
     assert smeared.tolist() == [True, False, False, True, True]
 
 
 def test_what_is_partly_hidden_is_not_smeared():
     """Less is explained, but what is seen gathers as ever; nor does it tell anything where too few events are seen."""
     inlier_ratio = torch.tensor([0.7, 0.9, torch.nan])
-    assert not is_smeared(torch.full((3,), 0.3), torch.full((3,), 0.9), inlier_ratio, torch.full((3,), 0.8), RelocalizationConfig()).any()
+    assert not is_smeared(torch.full((3,), 0.3), torch.full((3,), 0.9), inlier_ratio, torch.full((3,), 0.8)).any()
 
 
 def test_of_those_whose_place_is_not_known_events_need_not_gather():
-    full = reference_where_known(torch.tensor([1.0, 3.9, 4.1]), torch.tensor([0.9, 0.8, 0.7]), RelocalizationConfig(from_sigma_px=4.0))
+    full = reference_where_known(torch.tensor([1.0, 3.9, 4.1]), torch.tensor([0.9, 0.8, 0.7]), RelocalizationConfig(trigger_sigma_px=4.0))
     torch.testing.assert_close(full, torch.tensor([0.9, 0.8, 0.0]))
 
 
@@ -262,7 +261,8 @@ def slipped(config, count=10, streams=1, displaced=0):
     return after, results, tracks[0][0].at(results[-1].t_us)
 
 
-def test_a_pose_that_slipped_drifts_and_is_relocalized():
+def test_a_pose_that_slipped_drifts_and_is_relocalized(monkeypatch):
+    drifting_soon(monkeypatch, diameters_s=4)
     after, results, T_true = slipped(SEARCHING, count=20)
     still_off, without, _ = slipped(NEVER_DRIFTING, count=20)
     statuses = [int(result.status) for result in results]
@@ -275,7 +275,9 @@ def test_a_pose_that_slipped_drifts_and_is_relocalized():
     assert float(still_off.health.drift_s) > 0.05
 
 
-def test_a_pose_that_drifts_slowly_is_relocalized_though_its_events_were_never_smeared():
+def test_a_pose_that_drifts_slowly_is_relocalized_though_its_events_were_never_smeared(monkeypatch):
+    drifting_soon(monkeypatch, diameters_s=4)
+    monkeypatch.setattr(status, "DRIFT_BELOW", 0)
     after, results, T_true = slipped(SLOWLY, count=30)
     lost, without, _ = slipped(NEVER_SLOWLY, count=30)
     degrees, millimetres = pose_errors(results[-1].T_cam_obj, T_true)
@@ -287,8 +289,10 @@ def test_a_pose_that_drifts_slowly_is_relocalized_though_its_events_were_never_s
     assert float(after.health.drift_s) == float(lost.health.drift_s) == 0
 
 
-@pytest.mark.parametrize(("config", "count"), [(SEARCHING, 10), (SLOWLY, 20)])
-def test_relocalizing_what_slipped_changes_nothing_for_its_neighbour(config, count):
+@pytest.mark.parametrize(("config", "count", "drift_below"), [(SEARCHING, 10, 0.6), (SLOWLY, 20, 0)])
+def test_relocalizing_what_slipped_changes_nothing_for_its_neighbour(monkeypatch, config, count, drift_below):
+    drifting_soon(monkeypatch, diameters_s=4)
+    monkeypatch.setattr(status, "DRIFT_BELOW", drift_below)
     _, alone, _ = slipped(config, count, streams=2, displaced=-1)
     _, neighbours, _ = slipped(config, count, streams=2, displaced=0)
     # Sums over as many columns as the fullest of the two has are rounded otherwise.
@@ -296,7 +300,8 @@ def test_relocalizing_what_slipped_changes_nothing_for_its_neighbour(config, cou
     assert float((poses_of(alone) - poses_of(neighbours)).abs().max()) > 1e-3
 
 
-def test_what_is_tracked_well_never_drifts():
+def test_what_is_tracked_well_never_drifts(monkeypatch):
+    drifting_soon(monkeypatch, diameters_s=4)
     state, results, _ = slipped(SEARCHING, displaced=-1)
     assert [int(result.status) for result in results] == [Status.TRACKING] * len(results)
     assert float(state.health.drift_s) == 0
@@ -305,7 +310,7 @@ def test_what_is_tracked_well_never_drifts():
 
 def test_how_far_events_gather_can_be_left_out():
     """Then poses are compared by what they explain alone."""
-    config = TrackerConfig(relocalization=RelocalizationConfig(by_inlier_ratio=False))
+    config = TrackerConfig(disabled={Component.INLIER_RATIO})
     state, results, _ = slipped(config, displaced=-1)
     assert_same(state.health.score, results[-1].quality)
     assert float(slipped(config)[0].health.drift_s) == 0

@@ -6,6 +6,8 @@ import pytest
 import torch
 from measured_matches import matches_at
 
+from torchtrack.config.components import Component
+from torchtrack.config.tracker import AssociationConfig, CornerConfig, TrackerConfig
 from torchtrack.config.validation import ValidationConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.contours.points import Contours
@@ -13,7 +15,9 @@ from torchtrack.tracking.validation.measures import explained_ratio, inlier_rati
 from torchtrack.tracking.validation.status import Status, holding_on, judge, needed_ratio, partly_hidden, trust
 
 IMAGE_SIZE = (150, 200)
-CONFIG = ValidationConfig()
+CONFIG, TRACKER = ValidationConfig(), TrackerConfig()
+
+CORNERS_ALONE = TrackerConfig(corners=CornerConfig(max_corners=32), association=AssociationConfig(max_events=0))
 
 
 def verdict(*, quality=1.0, count=100, in_view=1.0, rotated=0.0, moved=0.0, config=CONFIG):
@@ -36,7 +40,7 @@ def upright_line(u=80.0, count=80, first=20.0):
     return torch.stack([torch.full_like(v, u), v], -1)[None]
 
 
-def ratio(contours, matches, velocity=(100.0, 0.0), config=CONFIG):
+def ratio(contours, matches, velocity=(100.0, 0.0), config=TRACKER):
     moving = torch.tensor(velocity, dtype=torch.float64).expand_as(contours.pixels)
     return explained_ratio(contours, matches, moving, IMAGE_SIZE, config)
 
@@ -87,7 +91,7 @@ def test_the_gravest_reason_is_told(change, expected):
 
 
 def test_thresholds_are_those_of_the_settings():
-    config = ValidationConfig(min_observations=200, uncertain_below=0.9, lost_below=0.8, min_visible_ratio=0.7, max_step_rotation_rad=0.1)
+    config = ValidationConfig(min_observations=200, uncertain_below=0.9, lost_below=0.8, min_visible_ratio=0.7, max_rotation_rad=0.1)
     assert verdict(count=150, config=config) == Status.TOO_FEW_EVENTS
     assert verdict(count=250, quality=0.85, config=config) == Status.UNCERTAIN
     assert verdict(count=250, quality=0.75, config=config) == Status.LOST
@@ -102,10 +106,10 @@ def test_objects_are_judged_each_for_itself():
     assert status.tolist() == [Status.TRACKING, Status.UNCERTAIN, Status.LOST, Status.TOO_FEW_EVENTS]
 
 
-@pytest.mark.parametrize(("gate_scale", "expected"), [(1.0, Status.UNCERTAIN), (1.25, Status.UNCERTAIN), (1.5, Status.LOST), (3.0, Status.LOST)])
+@pytest.mark.parametrize(("gate_scale", "expected"), [(1.0, Status.UNCERTAIN), (1.5, Status.UNCERTAIN), (1.75, Status.LOST), (3.0, Status.LOST)])
 def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(gate_scale, expected):
-    """Between lost below 0.2 and caught above 0.45: 0.2625 is needed at 1.25 times the gate, 0.325 at 1.5, and no more than 0.45."""
-    config = ValidationConfig(lost_below=0.2, refound_above=0.45)
+    """Between lost below 0.2 and found again from 0.35: 0.275 is needed at 1.5 times the gate, 0.3125 at 1.75, and no more than 0.35."""
+    config = ValidationConfig(lost_below=0.2)
     status = judge(*(torch.tensor(value) for value in ([0.3], [100], [1.0])), torch.zeros(1, 6), torch.ones(1), config, torch.tensor([gate_scale]))
     assert Status(int(status)) == expected
 
@@ -115,9 +119,9 @@ def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(gate_scal
 
 def test_the_ratio_that_is_needed_rises_with_the_gate_to_its_limit():
     gate_scale = torch.tensor([1.0, 1.5, 2.0, 3.2])
-    assert needed_ratio(gate_scale, ValidationConfig(lost_below=0.2, refound_above=0.4)).tolist() == pytest.approx([0.2, 0.3, 0.4, 0.4])
+    assert needed_ratio(gate_scale, ValidationConfig(lost_below=0.2)).tolist() == pytest.approx([0.2, 0.275, 0.35, 0.35])
     # A ratio to be caught at that is less than that of a lost one asks for nothing more.
-    assert needed_ratio(gate_scale, ValidationConfig(lost_below=0.3, refound_above=0.1)).tolist() == pytest.approx([0.3] * 4)
+    assert needed_ratio(gate_scale, ValidationConfig(lost_below=0.4)).tolist() == pytest.approx([0.4] * 4)
 
 
 def test_trust_rises_from_lost_to_certain():
@@ -128,12 +132,12 @@ def test_trust_rises_from_lost_to_certain():
 
 
 def test_more_is_asked_of_finds_in_many_places_by_what_is_usual():
-    config = ValidationConfig(lost_below=0.1, uncertain_below=0.4, validated_from=0.75)
+    config = ValidationConfig(lost_below=0.1, uncertain_below=0.4)
     explained, usual, gate_scale = torch.tensor([0.4, 0.4, 0.6, 0.4]), torch.tensor([0.8, 0.8, 0.8, 0.2]), torch.tensor([1.0, 2.0, 3.0, 2.0])
     assert trust(explained, config, usual, gate_scale).tolist() == pytest.approx([1.0, 0.6, 1.0, 1.0])
 
 
-def hidden(inlier_ratio=0.8, usually=0.8, count=200, elsewhere=False, config=CONFIG):
+def hidden(inlier_ratio=0.8, usually=0.8, count=200, elsewhere=False, config=TRACKER):
     return float(partly_hidden(torch.tensor([inlier_ratio]), torch.tensor([usually]), torch.tensor([count]), torch.tensor([elsewhere]), config))
 
 
@@ -145,13 +149,13 @@ def test_what_gathers_as_ever_counts_however_little_is_explained(inlier_ratio, e
 def test_nothing_counts_as_hidden_that_does_not_tell():
     # Found by a search, too few observations, hardly gathering when seen well, never seen well, switched off.
     assert hidden(elsewhere=True) == hidden(count=100) == hidden(0.5, 0.5) == hidden(usually=0.0) == 0
-    assert hidden(config=ValidationConfig(partly_hidden=False)) == 0
-    assert hidden(count=30, config=ValidationConfig(min_observations=7)) == 1
+    assert hidden(config=TrackerConfig(disabled={Component.PARTLY_HIDDEN})) == 0
+    assert hidden(count=30, config=TrackerConfig(validation=ValidationConfig(min_observations=7))) == 1
 
 
 def test_of_a_hidden_object_no_more_is_asked_in_more_places():
-    config, gate_scale = ValidationConfig(lost_below=0.2, refound_above=0.4), torch.full((3,), 2.0)
-    assert needed_ratio(gate_scale, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.4, 0.3, 0.2])
+    config, gate_scale = ValidationConfig(lost_below=0.2), torch.full((3,), 2.0)
+    assert needed_ratio(gate_scale, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.35, 0.275, 0.2])
     stated = torch.full((2,), 0.3), torch.full((2,), 100), torch.ones(2), torch.zeros(2, 6), torch.ones(2)
     assert judge(*stated, config, gate_scale[:2], torch.tensor([0.0, 1.0])).tolist() == [Status.LOST, Status.UNCERTAIN]
 
@@ -182,10 +186,10 @@ def test_a_contour_without_matches_is_not():
     assert float(ratio(contours_at(upright_line()), matches_at(upright_line(), near=torch.zeros(1, 80, dtype=torch.bool)))) == 0
 
 
-@pytest.mark.parametrize(("least", "count", "expected"), [(3, 2, 0), (3, 3, 1), (1, 1, 1), (5, 4, 0)])
-def test_a_patch_needs_a_few_observations_on_its_contours(least, count, expected):
+@pytest.mark.parametrize(("config", "count", "expected"), [(TRACKER, 2, 0), (TRACKER, 3, 1), (CORNERS_ALONE, 1, 1)])
+def test_a_patch_needs_a_few_observations_on_its_contours_and_of_corners_alone_one(config, count, expected):
     contours = contours_at(upright_line(count=16, first=32.0))
-    actual = ratio(contours, matches_at(upright_line(count=count, first=36.0)), config=ValidationConfig(min_on_contour=least))
+    actual = ratio(contours, matches_at(upright_line(count=count, first=36.0)), config=config)
     assert float(actual) == expected
 
 
@@ -211,10 +215,11 @@ def test_what_does_not_move_need_not_be_explained():
     contours = contours_at(still)
     moving = torch.zeros_like(still)
     moving[:, 80:, 0] = 100.0
-    moving[:, :80, 0] = 20.0
+    moving[:, :80, 0] = 29.0
     matches = matches_at(upright_line(80.0))
-    assert float(explained_ratio(contours, matches, moving, IMAGE_SIZE, ValidationConfig(min_speed_px_s=30.0))) == 1
-    assert float(explained_ratio(contours, matches, moving, IMAGE_SIZE, ValidationConfig(min_speed_px_s=10.0))) == 0.5
+    assert float(explained_ratio(contours, matches, moving, IMAGE_SIZE, TRACKER)) == 1
+    moving[:, :80, 0] = 31.0
+    assert float(explained_ratio(contours, matches, moving, IMAGE_SIZE, TRACKER)) == 0.5
 
 
 def test_only_motion_across_the_contour_counts():

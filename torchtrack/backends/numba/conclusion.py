@@ -12,10 +12,12 @@ from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.backends.numba.filtering import inverse
 from torchtrack.backends.numba.geometry import centre_of, is_finite
 from torchtrack.backends.numba.parameters import ConclusionSettings, filled
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking import update
 from torchtrack.tracking.estimation.rounds import ANYWHERE
+from torchtrack.tracking.motion import model
 from torchtrack.tracking.motion.model import MotionState
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.state import TrackerState
@@ -140,8 +142,8 @@ def _judge(
         status = TOO_FEW_EVENTS
     if measured[IN_VIEW, b] < settings.min_visible_ratio:
         status = OUT_OF_VIEW
-    rotation_ok = np.sqrt(rotated) / gate_scale < settings.max_step_rotation_rad
-    if not (rotation_ok and np.sqrt(moved) / gate_scale < settings.max_step_translation * diameter_m) or not usable[b]:
+    rotation_ok = np.sqrt(rotated) / gate_scale < settings.max_rotation_rad
+    if not (rotation_ok and np.sqrt(moved) / gate_scale < settings.max_translation * diameter_m) or not usable[b]:
         status = DIVERGED
     return status
 
@@ -334,9 +336,8 @@ def _settings(config: TrackerConfig) -> ConclusionSettings:
     return filled(
         ConclusionSettings,
         config.validation,
-        config.relocalization,
         config.solver,
-        config.motion,
+        model,
         status,
         update,
         holds=config.motion.without_events == "hold",
@@ -344,5 +345,6 @@ def _settings(config: TrackerConfig) -> ConclusionSettings:
         smeared=status.SMEARED,
         hidden_observations=status.HIDDEN_TIMES * config.validation.min_observations,
         certain_ratio=update.CERTAIN,
-        certain_count=update.CERTAIN_COUNT if config.relocalization.by_matches else 0.0,
+        certain_count=update.CERTAIN_COUNT if config.uses(Component.MATCH_COUNT) else 0.0,
+        partly_hidden=config.uses(Component.PARTLY_HIDDEN),
     )

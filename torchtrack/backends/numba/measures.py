@@ -10,7 +10,7 @@ from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import across, drift, inverse_depth, lens
 from torchtrack.backends.numba.matching import patch
 from torchtrack.backends.numba.parameters import QualitySettings, filled
-from torchtrack.config.validation import ValidationConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerates
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.tracking.association import polarity, weights
@@ -198,7 +198,7 @@ def sigma_px_numba(prediction: Prediction, contours: Contours) -> Float[Tensor, 
 
 @accelerates(measures.fit_measures)
 def fit_measures_numba(
-    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: ValidationConfig
+    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: TrackerConfig
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """Point by point."""
     explained, inliers, spread = contours.pixels.new_empty(3, len(contours.mask))
@@ -206,7 +206,8 @@ def fit_measures_numba(
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
     matched = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
     height, width = image_size
-    settings = filled(QualitySettings, config, measures, weights, height=height, width=width)
+    least = measures.min_on_contour(config)
+    settings = filled(QualitySettings, config.validation, measures, weights, height=height, width=width, min_on_contour=least)
     measure(*shown, *moving, *matched, settings, explained.numpy(), inliers.numpy(), spread.numpy())
     return explained, inliers, spread
 
@@ -226,9 +227,8 @@ def remembered_numba(
     dark: Float[Tensor, "b n"],
     weights: Float[Tensor, "b n"],
     window_s: Float[Tensor, "b"],
-    memory_s: float,
 ) -> Float[Tensor, "b 8"]:
     """Event by event."""
     after = darker_outside.clone(memory_format=torch.contiguous_format)
-    remember(*as_arrays(after, directions.transpose(1, 2), dark, weights, window_s), memory_s, polarity.LITTLE_EVIDENCE)
+    remember(*as_arrays(after, directions.transpose(1, 2), dark, weights, window_s), polarity.PRIOR_S, polarity.LITTLE_EVIDENCE)
     return after

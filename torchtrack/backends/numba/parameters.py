@@ -253,8 +253,8 @@ class ConclusionSettings(NamedTuple):
     holds_on: bool
     min_observations: int
     min_visible_ratio: float
-    max_step_rotation_rad: float
-    max_step_translation: float
+    max_rotation_rad: float
+    max_translation: float
     observation_px: float
     coast_s: float
     drift_below: float

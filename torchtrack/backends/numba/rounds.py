@@ -32,6 +32,7 @@ from torchtrack.backends.numba.matching import (
 )
 from torchtrack.backends.numba.parameters import Cells, DampingSettings, MatchingSettings, RoundSettings, filled
 from torchtrack.backends.numba.solving import damped_step, damping_settings, move, normal_equations, row_of
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerates
@@ -183,13 +184,14 @@ def align_rounds_numba(
     is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool)
     matches = torch.empty(batch, ROWS, count, dtype=offset.dtype)
     common = {"min_observations": config.validation.min_observations, "common_px2": config.solver.common_px**2}
+    step_px, silhouette_px = weights.dark_shifts_px(config)
     align(
         *as_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
         cells_of(table.index),
         *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, objects.intrinsics, objects.centre_obj),
         *as_arrays(constant(config.association.gates_px, offset.dtype, offset.device), gates.wider, gates.subcell_lookup),
-        filled(MatchingSettings, config.association, config.solver, weights, **common),
-        RoundSettings(config.association.motion_compensation, config.solver.velocity_in_window),
+        filled(MatchingSettings, config.association, config.solver, weights, dark_shift_px=step_px, silhouette_dark_shift_px=silhouette_px, **common),
+        RoundSettings(config.association.motion_compensation, config.uses(Component.VELOCITY_IN_WINDOW)),
         damping_settings(config.solver, information),
         *as_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
     )

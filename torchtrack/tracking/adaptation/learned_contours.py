@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.contours.objects import LearnedPoints
 from torchtrack.tracking.contours.points import Contours
@@ -23,6 +23,14 @@ from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 # The model's share that is assumed at first, how fast it follows, and how much more of it ends the need of learned contours.
 _FIRST_SHARE, _SHARE_GAIN, _MORE_SHARE = 0.7, 0.2, 0.2
+# Learned contours count once the model's own explain less than this share of themselves; where they explain the other one, nothing is learned.
+_BELOW_RATIO, UP_TO_RATIO = 0.6, 0.8
+# Unexplained events that are kept until they make a contour, per object, and evidence from which a learned contour counts: about the windows that
+# confirmed it.
+DRAFTS, TRUSTED_FROM = 4096, 3.0
+# The first windows are all learned from, and after them one of so many, which saves time. None of these numbers was measured alone; without what is
+# learned, errors on the 13 shared sequences are the same to 0.01° and 0.03 mm (docs/results.md): their models have their texture.
+FIRST_WINDOWS, EVERY = 20, 10
 # A start is in motion where contours are faster than this (px/s) in the first windows.
 _CALM_PX_S, _START_WINDOWS = 100.0, 2
 
@@ -52,9 +60,9 @@ class LearnedContours:
     windows: int
 
     @classmethod
-    def none(cls, batch: int, config: AdaptationConfig, like: Tensor) -> "LearnedContours":
-        """Nothing learned yet."""
-        drafts, points = like.new_zeros(batch, config.drafts, 3), like.new_zeros(batch, config.points, 3)
+    def none(cls, batch: int, count: int, like: Tensor) -> "LearnedContours":
+        """Nothing learned yet, with places for ``count`` points of each object."""
+        drafts, points = like.new_zeros(batch, DRAFTS, 3), like.new_zeros(batch, count, 3)
         drafted = torch.zeros(batch, dtype=torch.int64, device=like.device)
         share = like.new_full((batch,), _FIRST_SHARE)
         return cls(drafts, drafted, points, points, points[..., 0], share, drafted == 0, 0)
@@ -71,18 +79,18 @@ class LearnedContours:
         """The learned points with at least that evidence."""
         return LearnedPoints(self.points_obj, self.tangents_obj, self.evidence >= least)
 
-    def that_count(self, config: AdaptationConfig) -> LearnedPoints:
+    def that_count(self) -> LearnedPoints:
         """The points that are confirmed, of objects whose models do not explain their events."""
-        points = self.points(config.trusted_from)
+        points = self.points(TRUSTED_FROM)
         return replace(points, mask=points.mask & self.needed[:, None])
 
-    def wanted(self, on_surfaces: Bool[Tensor, "b"], config: AdaptationConfig) -> Bool[Tensor, "b"] | None:
+    def wanted(self, on_surfaces: Bool[Tensor, "b"]) -> Bool[Tensor, "b"] | None:
         """Objects to learn of in this window: those whose models may lack contours, of ``on_surfaces``; None where it is not due."""
-        return on_surfaces & (self.model_share < config.up_to_ratio) if self.due(config) else None
+        return on_surfaces & (self.model_share < UP_TO_RATIO) if self.due() else None
 
-    def due(self, config: AdaptationConfig) -> bool:
+    def due(self) -> bool:
         """Whether this window may be learned from: all of the first ones, and then some."""
-        return self.windows < config.first_windows or self.windows % config.every == 0
+        return self.windows < FIRST_WINDOWS or self.windows % EVERY == 0
 
 
 def judge_model(
@@ -107,10 +115,10 @@ def judge_model(
     share = _share_of_own(scored, velocity(contours), image_size, config) if any_count else scored.measured_ratio
     known = torch.isfinite(share) & (scored.count > 0)
     share = torch.where(known, torch.lerp(learned.model_share, share, _SHARE_GAIN), learned.model_share)
-    enough = share > config.adaptation.below_ratio + _MORE_SHARE
+    enough = share > _BELOW_RATIO + _MORE_SHARE
     if learned.windows < _START_WINDOWS:
         enough = enough | _in_motion(contours, velocity(contours))
-    return replace(learned, model_share=share, needed=(learned.needed & ~enough) | (share < config.adaptation.below_ratio))
+    return replace(learned, model_share=share, needed=(learned.needed & ~enough) | (share < _BELOW_RATIO))
 
 
 def _share_of_own(scored: ScoredFit, velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: TrackerConfig) -> Float[Tensor, "b"]:
@@ -118,7 +126,7 @@ def _share_of_own(scored: ScoredFit, velocity: Float[Tensor, "b m 2"], image_siz
     contours, matches = scored.fit.contours, scored.fit.matches
     own = contours.kind != int(ContourKind.LEARNED)
     matches = replace(matches, near=matches.near & own.gather(1, matches.contour))
-    return measured_ratio(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config.validation)
+    return measured_ratio(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config)
 
 
 def _in_motion(contours: Contours, velocity: Float[Tensor, "b m 2"]) -> Bool[Tensor, "b"]:

@@ -21,13 +21,15 @@ from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.lie import transform_points
 from torchtrack.core.padded import take_points
 from torchtrack.tracking.adaptation.cell_grid import CellGrid, Lines, cell_of, fit_lines, is_near, point_sums, tallied
-from torchtrack.tracking.adaptation.learned_contours import LearnedContours, judge_model
+from torchtrack.tracking.adaptation.learned_contours import TRUSTED_FROM, LearnedContours, judge_model
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, assemble, joined
 from torchtrack.tracking.contours.surface_rays import surface_points
 from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 
+# Events that are learned from in a window, per object: it bounds time. Not measured.
+_EVENTS = 1000
 # Older events are left out where the object has since moved by more than this (px).
 _LONGEST_WAY_PX = 4.0
 # A contour this near explains an event, and two learned points are no nearer (cells).
@@ -118,7 +120,7 @@ def learn(learned: LearnedContours, around: Surroundings, events: WindowEvents, 
     """What is known after a window: confirmed or doubted, and added to."""
     centre_px = project(around.centre_cam[:, None], around.objects.intrinsics)
     grid = CellGrid.around(centre_px, around.objects.size_px(around.T_cam_obj))
-    sample = _sample(around, grid, events, config.adaptation.events)
+    sample = _sample(around, grid, events, _EVENTS)
     known = learned.points(least=1e-6).contours(around.T_cam_obj, around.objects.intrinsics)
     known = around.objects.visible(known, around.T_cam_obj, config.contours)
     learned = replace(learned, evidence=_weighed(learned.evidence, known, around, grid, sample))
@@ -205,12 +207,12 @@ def _with_lines(
     wanted = wanted & _is_thin(lines) & ~is_near(taken, lines.places, _EXPLAINED_CELLS)
     points_obj, tangents_obj, on_surface = _carried(lines, around, grid)
     wanted = _apart(lines.places, wanted & on_surface)
-    least, emptiest = learned.evidence.topk(min(_CANDIDATES, config.points), largest=False)
+    least, emptiest = learned.evidence.topk(min(_CANDIDATES, config.learned_points), largest=False)
     rank = wanted.cumsum(-1) - 1
     fits = wanted & (rank < least.shape[1])
     rank = rank.clamp(0, least.shape[1] - 1)
-    slot = torch.where(fits & (least.gather(1, rank) <= 0), emptiest.gather(1, rank), config.points)
-    evidence = (_EVIDENCE_PER_DRAFT * lines.count).clamp(1.0, config.trusted_from)
+    slot = torch.where(fits & (least.gather(1, rank) <= 0), emptiest.gather(1, rank), config.learned_points)
+    evidence = (_EVIDENCE_PER_DRAFT * lines.count).clamp(1.0, TRUSTED_FROM)
     return replace(
         learned,
         points_obj=_put(learned.points_obj, slot, points_obj),

@@ -2,7 +2,6 @@
 
 import torch
 
-from torchtrack.config.tracker import AssociationConfig
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.padded import take_points
 from torchtrack.object_model.contour_source import ContourKind
@@ -12,11 +11,11 @@ from torchtrack.tracking.contours.points import Contours
 
 # An edge this parallel to the flow (|n·f| below) is not crossed by it.
 _MIN_CROSSING = 0.3
+# How far beside the line of its flow a corner's contour may lie (px). Set with the first corners, and not measured alone.
+_TOLERANCE_PX = 2.0
 
 
-def match_along_flow(
-    observations: Observations, contours: Contours, objects: MovingObjects, gate_px: float, config: AssociationConfig
-) -> MatchesWithCues:
+def match_along_flow(observations: Observations, contours: Contours, objects: MovingObjects, gate_px: float) -> MatchesWithCues:
     """Match each corner with the contour point nearest to it along the line of its flow, either way (the paper's 3.3).
 
     The paper moves corners along the flow "to locate the edge points"; seen from a pose that is a window old the edge
@@ -29,7 +28,7 @@ def match_along_flow(
     along = (offsets * heading[:, :, None]).sum(-1)
     across = offsets[..., 1] * heading[..., None, 0] - offsets[..., 0] * heading[..., None, 1]
     crossing = (contours.normals[:, None] * heading[:, :, None]).sum(-1).abs()
-    allowed = contours.mask[:, None] & (across.abs() < config.flow_tolerance_px) & (along.abs() < gate_px) & (crossing > _MIN_CROSSING)
+    allowed = contours.mask[:, None] & (across.abs() < _TOLERANCE_PX) & (along.abs() < gate_px) & (crossing > _MIN_CROSSING)
     distance, contour = torch.where(allowed, along.square() + across.square(), torch.inf).min(-1)
     points_obj = take_points(contours.points_obj, contour)
     targets = torch.addcmul(observations.pixels, objects.show(points_obj)[1], observations.age_s[..., None])

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.linalg import vecdot
 
-from torchtrack.config.tracker import AssociationConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.object_model.contour_source import ContourKind
@@ -79,7 +79,7 @@ def match_nearest(
     place: Float[Tensor, "b n 2"],
     objects: MovingObjects,
     gate_px: float,
-    config: AssociationConfig,
+    config: TrackerConfig,
     wider: Float[Tensor, "b"] | None = None,
     subcell_lookup: Bool[Tensor, "b"] | None = None,
 ) -> tuple[MatchesWithCues, Float[Tensor, "b n 2"]]:
@@ -98,7 +98,7 @@ def match_nearest(
     pixels, velocity, change = objects.show(points_obj)
     crossing_px_s = vecdot(normals, velocity)
     dark = observations.polarity * leading_side(crossing_px_s)
-    age_s = without_tail(observations.age_s, observations.into_burst_s, crossing_px_s, config.burst_px)
+    age_s = without_tail(observations.age_s, observations.into_burst_s, crossing_px_s, config.association.burst_px)
     carried = torch.addcmul(observations.pixels, velocity, age_s[..., None])
     if change is not None:
         # It had moved less, or more, when it was slower or faster.
@@ -108,8 +108,8 @@ def match_nearest(
     near = observations.mask & (nearest_index >= 0)
     matched = near & (vecdot(difference, difference) < (gate_px * wider)[:, None].square())
     offsets = vecdot(difference, normals) / wider[:, None]
-    as_expected, dark = agreeing(dark * expected, config), dark * oriented
-    weights, neighbours = match_weights(offsets, targets, near, dark, as_expected, config)
+    as_expected, dark = agreeing(dark * expected), dark * oriented
+    weights, neighbours = match_weights(offsets, targets, near, dark, as_expected, config.association)
     matches = MatchesWithCues(
         contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, as_expected, silhouette, neighbours, edge_ambiguity, dark
     )

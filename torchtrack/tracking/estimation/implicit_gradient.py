@@ -21,6 +21,8 @@ from torchtrack.core.linalg import solve_positive
 from torchtrack.tracking.estimation.levenberg_marquardt import robust_cost
 from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, WindowTerms
 
+# Exact Newton steps from a solution to the optimum next to it, of which the gradient is: each squares the error. Not measured alone.
+NEWTON_STEPS = 1
 # Relative rounding of a cost in float64, with room for the length of its sum.
 _ROUNDING = 1e-12
 
@@ -104,7 +106,7 @@ def _rows_of_hessian(gradient: Callable[[Tensor], Tensor], at: Tensor) -> Float[
 def _optimum(problem: PoseProblem, place: _Place, config: SolverConfig) -> _Place:
     """The optimum near a place: exact Newton steps, of which those that raise an object's cost are undone."""
     nothing = torch.zeros_like(problem.prior_information[..., 0])
-    for _ in range(config.gradient_iterations):
+    for _ in range(NEWTON_STEPS):
         step, _ = newton_step(problem, place.T_cam_obj, place.further, config.loss)
         T_next, from_prior = place.moved(step, problem)
         before = robust_cost(problem, *place.moved(nothing, problem), config.loss)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import AssociationConfig, TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerable
@@ -22,10 +23,18 @@ from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.implicit_gradient import with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 from torchtrack.tracking.estimation.terms import CostTerm, Linearisation, PoseProblem, WindowTerms
+from torchtrack.tracking.frontend.sensors import MAX_GATE_PX
 from torchtrack.tracking.motion.prediction import Prediction
 
 # The index reaches this much beyond the first gate, so that an observation that a round moved is still found (px).
 _INDEX_MARGIN_PX = 2
+# Width of an uncertain object's first gate, in standard deviations of its prediction. Gates that do not open gave 0.30° / 0.71 mm as well
+# (docs/results.md), on sequences where no prediction is uncertain.
+GATE_SIGMAS = 3.0
+# Of objects smaller than this in the image (px), contours are looked up between the cells of the index, if their place is not uncertain. So they are
+# of larger ones of which more is seen than plain faces. By cells for all, errors are 0.31° / 0.72 mm instead of 0.30° / 0.71 mm (docs/results.md),
+# and were a fifth larger on print when that was measured alone.
+FINE_BELOW_PX = 120.0
 # What has to be looked for with a gate this many times wider may be anywhere.
 ANYWHERE = 2.0
 # Standard deviation of a silhouette offset that is switched off (px).
@@ -49,9 +58,9 @@ class Fit:
 
 def gate_scale_of(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[Tensor, "b"]:
     """How many times wider than configured the first gate is, for predictions of that standard deviation: at least 1."""
-    matching = config.association
-    first_px = matching.gates_px[0]
-    return (matching.gate_sigmas * sigma_px / first_px).clamp(1, max(matching.max_gate_px / first_px, 1))
+    first_px = config.association.gates_px[0]
+    widest = max(MAX_GATE_PX / first_px, 1) if config.uses(Component.WIDE_GATES) else 1
+    return (GATE_SIGMAS * sigma_px / first_px).clamp(1, widest)
 
 
 def may_be_anywhere(gate_scale: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
@@ -106,7 +115,7 @@ def align(
     begin = prediction if offset is None else prediction.moved(offset)
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
     table = _table(contours, index, objects, matching)
-    gates = Gates(gate_scale, _narrowing(gate_scale, len(matching.gates_px)), _needs_subcell_lookup(objects, begin, table, gate_scale, matching))
+    gates = Gates(gate_scale, _narrowing(gate_scale, len(matching.gates_px)), _needs_subcell_lookup(objects, begin, table, gate_scale, config))
     start = Start(prediction, begin, offset, information, contours, index, extra_terms)
     solution, matches, contours = align_rounds(start, table, observations, gates, config)
     return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
@@ -169,9 +178,9 @@ def align_rounds(
         moving = begin.moving(compensated=matching.motion_compensation, offset=offset if config.solver.acceleration_in_window else None)
         if matching.search == "along_flow":
             contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
-            matches = match_along_flow(observations, contours, moving, gate_px, matching)
+            matches = match_along_flow(observations, contours, moving, gate_px)
         else:
-            matches, place = match_nearest(observations, table, place, moving, gate_px, matching, wider, gates.subcell_lookup)
+            matches, place = match_nearest(observations, table, place, moving, gate_px, config, wider, gates.subcell_lookup)
         matches = _believed(matches, observations, config)
         problem = _problem(start, matches, offset, gate_px * wider, config)
         solution = solve_pose(problem, begin.T_cam_obj, config.solver, offset)
@@ -180,15 +189,15 @@ def align_rounds(
 
 
 def _needs_subcell_lookup(
-    objects: ObjectBatch, begin: Prediction, table: ContourTable, gate_scale: Float[Tensor, "b"], config: AssociationConfig
+    objects: ObjectBatch, begin: Prediction, table: ContourTable, gate_scale: Float[Tensor, "b"], config: TrackerConfig
 ) -> Bool[Tensor, "b"]:
     """Of which objects contours are looked up between the cells of the index: small ones, and those that show texture or smooth silhouettes.
 
     Others of plain faces are not: their models may lack texture, whose events then find the nearest edge all the more surely.
     """
-    subcell_lookup = objects.size_px(begin.T_cam_obj).detach() < config.fine_below_px
-    if config.fine_unless_plain:
-        subcell_lookup = subcell_lookup | table.not_plain
+    if not config.uses(Component.SUBCELL_LOOKUP):
+        return torch.zeros_like(table.not_plain)
+    subcell_lookup = (objects.size_px(begin.T_cam_obj).detach() < FINE_BELOW_PX) | table.not_plain
     # One that may be far off would settle on the first edges that it is nearest to.
     return subcell_lookup & (gate_scale <= 1)
 
@@ -257,7 +266,7 @@ def _window_terms(prediction: Prediction, rows: MatchesWithCues, offset: Float[T
     age_s, outward = rows.age_s, rows.silhouette
     if config.association.residual != "normal":
         outward = torch.zeros_like(outward)
-    if not config.solver.velocity_in_window:
+    if not config.uses(Component.VELOCITY_IN_WINDOW):
         age_s = torch.zeros_like(age_s)
     velocity = offset[:, 6:12]
     rate_hz = torch.zeros_like(velocity)

@@ -30,6 +30,10 @@ from torchtrack.tracking.motion.prediction import Prediction
 REGION_MARGIN_PX, _ALONG_FLOW_MARGIN_PX = 12, 16
 # Side of all regions on a GPU, which takes one size for all (px): of larger objects, the middle. It bounds memory, and was not measured.
 _MAX_REGION_PX = 256
+# The first gate of an uncertain object opens up to this (px). Not measured alone.
+MAX_GATE_PX = 16.0
+# A search draws poses with at least this standard deviation in the image (px). Not measured alone.
+LEAST_SIGMA_PX = 3.0
 # Poses that a search draws lie within this many of its least standard deviations.
 _DRAWN_SIGMAS = 4.0
 
@@ -44,7 +48,7 @@ def sensor_tables(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "s h w 2"], 
 
 def farthest_event_px(config: TrackerConfig) -> float:
     """How far from an object events can have to do with it (px)."""
-    return max(config.association.max_gate_px, *config.association.gates_px) + _DRAWN_SIGMAS * config.relocalization.least_sigma_px
+    return max(MAX_GATE_PX, *config.association.gates_px) + _DRAWN_SIGMAS * LEAST_SIGMA_PX
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,10 @@ from torchtrack.core.lie import hat
 MOST_UNCERTAIN = 0.5
 
 
+# A motion that no events confirm dies away with this time constant (s). Not measured alone.
+COAST_S = 0.2
+
+
 # How sharply accelerations that count are told from those that do not.
 STEEPNESS = 4
 
@@ -208,7 +212,7 @@ def fade(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], failed: Bool[
     """Velocities where nothing confirmed them: a coasting object must not leave for good."""
     if config.without_events == "hold":
         return torch.where(failed[:, None], 0.0, velocity)
-    return torch.where(failed[:, None], velocity * torch.exp(-dt_s / config.coast_s)[:, None], velocity)
+    return torch.where(failed[:, None], velocity * torch.exp(-dt_s / COAST_S)[:, None], velocity)
 
 
 def expected_velocity(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 6"]:
@@ -237,7 +241,7 @@ def without_spin(
     Args:
         axis_cam: unit axis in the camera's frame; zero for an object that has none.
     """
-    lost = 1 - torch.exp(-dt_s / config.coast_s)
+    lost = 1 - torch.exp(-dt_s / COAST_S)
     keep = torch.eye(3, dtype=axis_cam.dtype, device=axis_cam.device) - lost[:, None, None] * axis_cam[:, :, None] * axis_cam[:, None]
     velocity = torch.cat([(keep @ velocity[:, :3, None])[..., 0], velocity[:, 3:]], -1)
     whole = torch.eye(12, dtype=covariance.dtype, device=covariance.device).repeat(len(covariance), 1, 1)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.tracking.contours.points import Contours
@@ -16,9 +17,15 @@ from torchtrack.tracking.relocalization.line_ends import running_on
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.triggers import DRIFTS, Trigger, has
 from torchtrack.tracking.validation.scored_fit import ScoredFit
+from torchtrack.tracking.validation.status import VALIDATED_FROM
 
 # Ratios that differ by less are the same: which of them is larger is chance.
 AS_MUCH = 0.02
+# By how much the score of another pose must be better while a motion is not known; and where the score dropped, or the pose is not near the
+# prediction. Not measured alone.
+_START_MARGIN, _ELSEWHERE_MARGIN = 0.02, 0.15
+# Share of what an object explains when seen well that is asked of a pose farther away. Not measured alone.
+_DRIFT_MIN_RATIO = 0.65
 # The 99th percentile of the squared distance of a pose, of six dimensions, in standard deviations (chi-square).
 _LIKELY = 16.8
 # What explains so many times as many events as a pose far off in depth is no smaller thing that chance explains.
@@ -76,9 +83,9 @@ class AcceptanceTest:
         config, prediction, offsets = lost.config, hypotheses.prediction, tried.fit.solution.from_prior
         eligible = self.is_passed(tried, config) & is_likely(offsets, hypotheses.covariance)
         score, asked = torch.where(eligible, tried.score, 0), self.asked_score(lost.window.scored, lost.number, config)
-        if config.relocalization.line_ends and hypotheses.is_wide:
+        if config.uses(Component.LINE_ENDS) and hypotheses.is_wide:
             score = less_where_lines_run_on(score, score > asked, tried.fit.contours, hypotheses.places, prediction.objects.image_size)
-        by_events = config.relocalization.by_matches and hypotheses.is_wide
+        by_events = config.uses(Component.MATCH_COUNT) and hypotheses.is_wide
         best = likeliest(less_by_few_events(score, tried.count) if by_events else score, offsets, prediction.covariance[0])
         return Choice(best, score.index_select(0, best) > asked)
 
@@ -104,14 +111,14 @@ def near_prediction(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: 
     a pose that smears the events more than the prediction's own is not better.
     """
     search, starting, reference = config.relocalization, evidence.is_starting, evidence.reference_explained_ratio
-    margin = torch.where(starting, search.start_margin, search.margin)
+    margin = torch.where(starting, _START_MARGIN, search.accept_margin)
     # What is far away has to explain about as much as usual; so has what is reached step by step, while a motion is lost, ever farther away.
-    min_score = torch.where(has(flags, DRIFTS) | starting, search.drift_min_ratio * reference, 0)
+    min_score = torch.where(has(flags, DRIFTS) | starting, _DRIFT_MIN_RATIO * reference, 0)
     # What is partly hidden explains less, too: nothing but the whole object, seen elsewhere by no fewer events, speaks against that.
     # A part of its edges does not.
     slow = has(flags, Trigger.SLOW_DRIFT)
-    margin = torch.where(slow, search.elsewhere_margin, margin)
-    min_score = torch.where(slow, search.elsewhere_min_ratio * reference, min_score)
+    margin = torch.where(slow, _ELSEWHERE_MARGIN, margin)
+    min_score = torch.where(slow, search.accept_ratio * reference, min_score)
     # Of a new object, only what explains nearly all is surely better: edges of what hides it explain half.
     new = has(flags, Trigger.NEW)
     min_score = torch.where(new, search.new_below, min_score)
@@ -123,7 +130,7 @@ def elsewhere(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Scored
     """Of poses that are not around the prediction, or farther away than it allows."""
     reference = evidence.reference_explained_ratio
     nothing = torch.zeros_like(reference)
-    return AcceptanceTest(nothing + config.relocalization.elsewhere_margin, config.relocalization.elsewhere_min_ratio * reference, nothing, nothing)
+    return AcceptanceTest(nothing + _ELSEWHERE_MARGIN, config.relocalization.accept_ratio * reference, nothing, nothing)
 
 
 def as_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
@@ -141,8 +148,8 @@ def around_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored:
     A small thing that is all explained says nothing against a pose of which far more events are explained. What is partly hidden does.
     """
     changed, search = has(flags, Trigger.DEPTH_CHANGED), config.relocalization
-    margin = torch.where(changed, -torch.inf, search.elsewhere_margin)
-    min_score = torch.where(changed, config.validation.validated_from, search.elsewhere_min_ratio) * evidence.reference_explained_ratio
+    margin = torch.where(changed, -torch.inf, _ELSEWHERE_MARGIN)
+    min_score = torch.where(changed, VALIDATED_FROM, search.accept_ratio) * evidence.reference_explained_ratio
     min_matches = torch.where(changed, _FAR_MORE, 1) * _matches(scored)
     return AcceptanceTest(margin, min_score, torch.zeros_like(min_score), min_matches)
 

@@ -31,6 +31,8 @@ SHIFTS, APART = 3, 2
 _TOGETHER = 32
 # What is no shift at all: less than any correlation.
 NONE = -9.0
+# Of the rotations that are tried, the best of so many are pulled onto the events: 512 of 1000 (see :mod:`relocalization.sampling`).
+_KEPT_RATIO = 0.512
 
 
 @dataclass(frozen=True)
@@ -54,10 +56,15 @@ class _Square:
         return cells.scatter_add(1, v * _SIDE + u, inside.to(pixels.dtype)).unflatten(1, (_SIDE, _SIDE))
 
 
+def kept_rotations(config: TrackerConfig) -> int:
+    """How many of the rotations and places that are tried are pulled onto the events."""
+    return max(int(_KEPT_RATIO * config.relocalization.rotations), 1)
+
+
 def shifted(
     prediction: Prediction, steps: Float[Tensor, "n 6"], sigma_m: Float[Tensor, ""], places: tuple[Tensor, Tensor], config: TrackerConfig
 ) -> tuple[Float[Tensor, "k 6"], Contours]:
-    """Offsets of an object's pose with most events on its contours, ``relocalization.kept_rotations`` of them, best first; and its outlines.
+    """Offsets of an object's pose with most events on its contours, as many as :func:`kept_rotations` says, best first; and its outlines.
 
     Args:
         prediction: of the object.
@@ -72,7 +79,7 @@ def shifted(
     square = _Square(ray[:2] * focal + objects.intrinsics[0, 2:], cell_px)
     steps = torch.cat([steps[:, :3], steps[:, 5:] * ray], 1)
     outlines = outlines_by_view(prediction, prediction.poses_at(steps), config)
-    number, shift = _best(square, places, outlines, sigma_px / cell_px, config.relocalization.kept_rotations)
+    number, shift = _best(square, places, outlines, sigma_px / cell_px, kept_rotations(config))
     moved_m = shift * cell_px * ((centre[2] + steps[number, 5:]) / focal)
     return torch.cat([steps[number, :3], steps[number, 3:5] + moved_m, steps[number, 5:]], 1), outlines.rows(number)
 

@@ -13,10 +13,12 @@ from torch import Tensor
 
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.rounds import gate_scale_of
+from torchtrack.tracking.frontend.sensors import LEAST_SIGMA_PX
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.last_seen import less_certain, where_last_seen
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.sampling import sample
+from torchtrack.tracking.relocalization.triggers import SCORE_DROP_SIGMA_PX
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def around_prediction_released(lost: LostObject) -> Hypotheses:
     Held by its prediction, no pose some pixels away is reached, however much it explains. What is accepted goes on as certain as
     if it had been predicted: an object that is not held at all wanders off from a hypothesis to the next.
     """
-    config, sigma_px, slip_px = lost.config, lost.sigma_px, lost.config.relocalization.score_drop_sigma_px
+    config, sigma_px, slip_px = lost.config, lost.sigma_px, SCORE_DROP_SIGMA_PX
     hypotheses = sampled_around(lost, less_certain(lost.predicted(), sigma_px, slip_px), slip_px, lost.contours())
     released = config.solver.observation_px**2 * (1 - (sigma_px / slip_px) ** 2) * lost.widened.information[lost.number]
     return replace(hypotheses, released=released)
@@ -80,7 +82,7 @@ def mirrored(lost: LostObject, plane: int) -> Hypotheses | None:
     other = lost.others.ambiguities.planes.mirrored(lost.number, plane, lost.as_scored())
     if other is None:
         return None
-    slip_px = lost.config.relocalization.score_drop_sigma_px
+    slip_px = SCORE_DROP_SIGMA_PX
     return _sampled_elsewhere(lost, less_certain(other, lost.predicted_sigma_px, slip_px), slip_px)
 
 
@@ -99,7 +101,7 @@ def sampled_around(lost: LostObject, prediction: Prediction, sigma_px: float, ou
         sigma_px: standard deviation of the prediction in the image.
     """
     search = lost.config.relocalization
-    widened_px = max(sigma_px, search.least_sigma_px)
+    widened_px = max(sigma_px, LEAST_SIGMA_PX)
     covariance = less_certain(prediction, sigma_px, widened_px).covariance[0]
     places = prediction.carried(lost.events.pixels, lost.events.age_s), lost.events.mask
     offsets = sample(prediction, outline, covariance, widened_px, places, lost.config)

@@ -6,21 +6,22 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import rim_and_centre
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.state import TrackerState
 
+# How fast an object may have drifted off (px/s), and, if it is small in the image (diameters/s); the slower counts. Not measured alone.
+_DRIFT_PX_S, _DRIFT_DIAMETERS_S = 200.0, 1.5
 # An object is not looked for farther away than it can have drifted in this time (s), nor rotated farther than in this.
 _LONGEST_S, _LONGEST_ROTATION_S = 0.4, 1.0
 
 
-def with_drift(prediction: Prediction, is_adrift: Bool[Tensor, "b"], drift_s: Float[Tensor, "b"], config: RelocalizationConfig) -> Prediction:
+def with_drift(prediction: Prediction, is_adrift: Bool[Tensor, "b"], drift_s: Float[Tensor, "b"]) -> Prediction:
     """The prediction, of objects that drift so uncertain as if they had moved otherwise, at some constant velocity, for that long."""
     objects = prediction.objects
-    speed_m_s = torch.minimum(config.drift_px_s / objects.px_per_m(prediction.T_cam_obj), config.drift_diameters_s * objects.diameter_m).double()
+    speed_m_s = torch.minimum(_DRIFT_PX_S / objects.px_per_m(prediction.T_cam_obj), _DRIFT_DIAMETERS_S * objects.diameter_m).double()
     velocity = rim_and_centre(speed_m_s[:, None], objects.diameter_m.double()[:, None])
     rotated_s, moved_s = (drift_s.clamp(max=longest_s).double()[:, None].expand(-1, 3) for longest_s in (_LONGEST_ROTATION_S, _LONGEST_S))
     # Pose and velocity are off together: such a velocity explains both.

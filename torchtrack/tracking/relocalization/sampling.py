@@ -18,11 +18,17 @@ from torchtrack.core.dispatch import accelerable
 from torchtrack.core.lie import difference_about
 from torchtrack.tracking.contours.points import Contours, assemble
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.correlation import shifted
+from torchtrack.tracking.relocalization.correlation import kept_rotations, shifted
 from torchtrack.tracking.relocalization.edge_search import FAR_PX, NEAR_PX, pulled
 from torchtrack.tracking.relocalization.event_image import event_density, look_up
 from torchtrack.tracking.relocalization.view_sphere import outlines_at, thinned
 
+# Poses sampled near a prediction, at most, and for each of ``relocalization.rotations``. Their score alone is taken, which costs little.
+_MOST_SAMPLES, _SAMPLES_PER_ROTATION = 2000, 5
+# One of so many rotations that are kept is pulled onto the events once more, from nearer. With 1000 rotations, of which 512 are pulled, 64 of these
+# twice, and the best aligned three times, 0.86 of 79 objects put 37° and 50 px off were found in one look, in 0.21 s; with half the rotations, an
+# eighth of those pulled and the best aligned once, 0.56 in 0.15 s.
+_KEPT_PER_PULLED = 8
 # Events around a contour are counted this far from it (px), and more than this many of them in the same place say no more.
 AROUND_PX, ENOUGH_EVENTS = 4.0, 3.0
 
@@ -51,7 +57,8 @@ def sample(
         offsets = difference_about(prediction.T_cam_obj.expand(len(poses), 4, 4), poses, prediction.objects.centre_obj.expand(len(poses), 3))
         offsets = _with_velocity(offsets, covariance)
     else:
-        offsets, outlines = draw_offsets(covariance, settings.samples).to(prediction.velocity.dtype), thinned(outline)
+        count = min(_MOST_SAMPLES, _SAMPLES_PER_ROTATION * settings.rotations)
+        offsets, outlines = draw_offsets(covariance, count).to(prediction.velocity.dtype), thinned(outline)
         poses = prediction.poses_at(offsets[:, :6])
     scores = score_outlines(outlines, poses, prediction.objects.intrinsics, enough)
     chosen = scores.topk(min(settings.hypotheses - 1, len(scores))).indices
@@ -68,7 +75,8 @@ def _anywhere(
     around = avg_pool2d(enough[None], 3, 1, 1)[0]
     onto = (around, covariance[:6, :6])
     poses = pulled(prediction, prediction.poses_at(steps), outlines, *onto, FAR_PX)
-    best = score_outlines(outlines, poses, prediction.objects.intrinsics, enough).topk(min(config.relocalization.pulled, len(poses))).indices
+    count = max(kept_rotations(config) // _KEPT_PER_PULLED, config.relocalization.hypotheses)
+    best = score_outlines(outlines, poses, prediction.objects.intrinsics, enough).topk(min(count, len(poses))).indices
     poses = poses[best]
     # What was seen from near there does not do any more.
     poses = pulled(prediction, poses, outlines_at(prediction, poses, config), *onto, NEAR_PX)

@@ -10,7 +10,7 @@ from torchtrack.core.host_sync import none_of
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import MOST_UNCERTAIN
 from torchtrack.tracking.relocalization.evidence import Schedule
-from torchtrack.tracking.relocalization.triggers import Trigger, flags_of, searches
+from torchtrack.tracking.relocalization.triggers import DRIFT_US, Trigger, flags_of, searches
 from torchtrack.tracking.state import TrackerState
 
 # A prediction that is so uncertain, as a ratio of the most that predictions become, tells nothing any more.
@@ -21,8 +21,7 @@ _DEPTH_FACTOR = 1.25
 
 def schedule(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> Schedule:
     """What the state alone says of the window that ends at ``t_us``: which objects are lost, and which are looked for all around."""
-    search = config.relocalization
-    is_due, is_drift_due = is_time(state.t_us, t_us, search.interval_us, search.drift_us)[:, objects.stream_index]
+    is_due, is_drift_due = is_time(state.t_us, t_us, config.relocalization.interval_us, DRIFT_US)[:, objects.stream_index]
     return Schedule(_not_validated_for_long(state, objects, is_drift_due, config), is_due, is_drift_due)
 
 

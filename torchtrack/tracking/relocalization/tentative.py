@@ -16,7 +16,7 @@ from torchtrack.tracking.estimation.rounds import may_be_anywhere
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.health import TentativeTrack
-from torchtrack.tracking.validation.status import Status
+from torchtrack.tracking.validation.status import VALIDATED_FROM, Status
 
 # A window speaks for a pose by its ratio of what is wanted, as far as it is more than this.
 _NEUTRAL = 0.6
@@ -38,7 +38,7 @@ def confirm_or_take_back(
     if host_sync.none_of(concerned):
         return state, result
     tentative = _begun(before, result, prediction, gate_scale)
-    wanted = config.validation.validated_from * before.health.reference_explained_ratio
+    wanted = VALIDATED_FROM * before.health.reference_explained_ratio
     speaks_for = (result.quality / wanted.clamp(min=1e-3)).clamp(max=1) - _NEUTRAL
     evidence = tentative.evidence + speaks_for
     wrong = tentative.is_tentative & (evidence <= _TAKEN_BACK_AT)

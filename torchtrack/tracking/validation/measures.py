@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.config.validation import ValidationConfig
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.host_sync import none_of
@@ -17,6 +18,12 @@ from torchtrack.tracking.contours.points import Contours
 
 # A patch explains its contours when this ratio of the observations near them is on them.
 LEAST_RATIO = 0.5
+
+
+# Observations on the contours of a patch from which these are explained, unless corners alone are observed, which are few. Not measured alone.
+MIN_ON_CONTOUR = 3
+# Contours slower than this across themselves need not fire (px/s). Not measured alone.
+MIN_SPEED_PX_S = 30.0
 
 
 # Fewer moving contour points than this say nothing.
@@ -36,14 +43,14 @@ AROUND_PX = 5.0
 
 
 def explained_ratio(
-    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: ValidationConfig
+    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: TrackerConfig
 ) -> Float[Tensor, "b"]:
     """:func:`measured_ratio`; where hardly anything moves, nothing speaks against the pose: all is explained."""
     return measured_ratio(contours, matches, contour_velocity, image_size, config).nan_to_num(1.0)
 
 
 def measured_ratio(
-    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: ValidationConfig
+    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: TrackerConfig
 ) -> Float[Tensor, "b"]:
     """Of the visible contour that should fire given its motion, the ratio with observations on it; not a number where hardly any moves.
 
@@ -52,21 +59,26 @@ def measured_ratio(
     """
     counts = patch_sums(patch(matches.targets), on_and_around(matches.offsets, matches.near) * matches.as_expected[:, None])
     on, near = counts.gather(2, patch(contours.pixels)[:, None].expand(-1, 2, -1)).unbind(1)
-    explained = (on >= config.min_on_contour) & (on + 1 > LEAST_RATIO * (near + 2))
+    explained = (on >= min_on_contour(config)) & (on + 1 > LEAST_RATIO * (near + 2))
     speed = (contours.normals * contour_velocity).sum(-1).abs()
-    moving = contours.mask & inside(contours.pixels, image_size) & (speed > config.min_speed_px_s)
+    moving = contours.mask & inside(contours.pixels, image_size) & (speed > MIN_SPEED_PX_S)
     total = moving.sum(-1)
     ratio = (moving & explained).sum(-1).to(contours.pixels.dtype) / total.clamp(min=1)
     return torch.where(total < MIN_MOVING_POINTS, torch.nan, ratio)
 
 
+def min_on_contour(config: TrackerConfig) -> int:
+    """Observations on the contours of a patch from which these are explained."""
+    return MIN_ON_CONTOUR if config.association.max_events else 1
+
+
 @accelerable
 def fit_measures(
-    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: ValidationConfig
+    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: TrackerConfig
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """:func:`measured_ratio` of contours that move with their objects, :func:`inlier_ratio`, and :func:`normal_spread`."""
     velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
-    return measured_ratio(contours, matches, velocity, image_size, config), inlier_ratio(matches, config), normal_spread(matches)
+    return measured_ratio(contours, matches, velocity, image_size, config), inlier_ratio(matches, config.validation), normal_spread(matches)
 
 
 def inlier_ratio(matches: Matches, config: ValidationConfig) -> Float[Tensor, "b"]:

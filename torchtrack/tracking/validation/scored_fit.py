@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import once
@@ -72,9 +73,9 @@ def score_fit(
         required_spread: how far normals have to be spread to count in full; zero, or none at all, for nothing required.
     """
     moving = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).moving(compensated=True)
-    measured, inliers, spread = fit_measures(fit.contours, fit.matches, moving, prediction.objects.image_size, config.validation)
+    measured, inliers, spread = fit_measures(fit.contours, fit.matches, moving, prediction.objects.image_size, config)
     # Of what does not move, events are noise.
-    inliers = torch.where(measured.isnan(), torch.nan, inliers) if config.relocalization.by_inlier_ratio else torch.full_like(measured, torch.nan)
+    inliers = torch.where(measured.isnan(), torch.nan, inliers) if config.uses(Component.INLIER_RATIO) else torch.full_like(measured, torch.nan)
     if required_spread is not None:
         measured = measured * constrained_2d(spread, required_spread)
     nothing = torch.zeros_like(measured)
@@ -108,4 +109,4 @@ def reference_where_known(
 
     They were hidden, as a rule, and the events of what hides them do not gather where they are seen again.
     """
-    return torch.where(sigma_px > config.from_sigma_px, 0, reference_inlier_ratio)
+    return torch.where(sigma_px > config.trigger_sigma_px, 0, reference_inlier_ratio)

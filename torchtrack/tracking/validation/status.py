@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.config.relocalization import RelocalizationConfig
+from torchtrack.config.components import Component
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.config.validation import ValidationConfig
 from torchtrack.core.constants import constant
 
@@ -16,6 +17,14 @@ HIDDEN_FROM, HIDDEN_FULLY = 0.8, 0.95
 
 # It says nothing of objects on which less gathers even then, nor by fewer observations than so many times the least.
 HIDDEN_LEAST, HIDDEN_TIMES = 0.5, 4
+
+
+# Share of the moving contour explained by events from which an uncertain object is found again: at 0.35, occluded ones were no longer passed over.
+REFOUND_ABOVE = 0.35
+# Share of what is explained when seen well, from which the find of an uncertain object counts. Not measured alone.
+VALIDATED_FROM = 0.75
+# An object that explains less than this share of what it does when seen well, by smeared events, drifts. Not measured alone.
+DRIFT_BELOW = 0.6
 
 
 # Events that gather less than this ratio of how far they do when an object is seen well are smeared.
@@ -41,7 +50,7 @@ def needed_ratio(gate_scale: Float[Tensor, "b"], config: ValidationConfig, hidde
     wider = (gate_scale - 1).clamp(0, 1)
     if hidden is not None:
         wider = wider * (1 - hidden)
-    return config.lost_below + (max(config.refound_above, config.lost_below) - config.lost_below) * wider
+    return config.lost_below + (max(REFOUND_ABOVE, config.lost_below) - config.lost_below) * wider
 
 
 def partly_hidden(
@@ -49,7 +58,7 @@ def partly_hidden(
     reference_inlier_ratio: Float[Tensor, "b"],
     count: Int[Tensor, "b"],
     is_relocalized: Bool[Tensor, "b"],
-    config: ValidationConfig,
+    config: TrackerConfig,
 ) -> Float[Tensor, "b"]:
     """How far a pose counts, 0 to 1, by events that gather on its contours as they do when the object is seen well, however few these are.
 
@@ -65,8 +74,8 @@ def partly_hidden(
     """
     ramp = (inlier_ratio / reference_inlier_ratio.clamp(min=1e-6) - HIDDEN_FROM) / (HIDDEN_FULLY - HIDDEN_FROM)
     # Written so that what is not a number counts for nothing.
-    tells = (ramp > 0) & ~is_relocalized & (reference_inlier_ratio > HIDDEN_LEAST) & are_many(count, config)
-    return torch.where(tells & config.partly_hidden, ramp.clamp(max=1), 0)
+    tells = (ramp > 0) & ~is_relocalized & (reference_inlier_ratio > HIDDEN_LEAST) & are_many(count, config.validation)
+    return torch.where(tells & config.uses(Component.PARTLY_HIDDEN), ramp.clamp(max=1), 0)
 
 
 def are_many(count: Int[Tensor, "b"], config: ValidationConfig) -> Bool[Tensor, "b"]:
@@ -95,7 +104,7 @@ def trust(
     """
     full = torch.full_like(explained_ratio, config.uncertain_below)
     if reference_explained_ratio is not None and gate_scale is not None:
-        full = torch.maximum(full, config.validated_from * reference_explained_ratio * (gate_scale - 1).clamp(0, 1))
+        full = torch.maximum(full, VALIDATED_FROM * reference_explained_ratio * (gate_scale - 1).clamp(0, 1))
     return ((explained_ratio - config.lost_below) / (full - config.lost_below).clamp(min=1e-6)).clamp(0, 1)
 
 
@@ -122,7 +131,7 @@ def judge(
         Status.TOO_FEW_EVENTS: observation_count < config.min_observations,
         Status.OUT_OF_VIEW: in_view < config.min_visible_ratio,
         # Written so that what is not a number has diverged.
-        Status.DIVERGED: ~((rotated < config.max_step_rotation_rad) & (moved < config.max_step_translation * diameters_m)),
+        Status.DIVERGED: ~((rotated < config.max_rotation_rad) & (moved < config.max_translation * diameters_m)),
     }
     # Statuses are in the order of their gravity.
     numbers = constant(tuple((int(status),) for status in reasons), torch.int64, quality.device)
@@ -134,10 +143,9 @@ def is_smeared(
     reference_explained_ratio: Float[Tensor, "b"],
     inlier_ratio: Float[Tensor, "b"],
     reference_inlier_ratio: Float[Tensor, "b"],
-    config: RelocalizationConfig,
 ) -> Bool[Tensor, "b"]:
     """Which objects explain so much less than when they are seen well, by smeared events, that they may be elsewhere.
 
     Where less is explained but events gather as ever, an object is right, and partly hidden.
     """
-    return (inlier_ratio < SMEARED * reference_inlier_ratio) & (score < config.drift_below * reference_explained_ratio)
+    return (inlier_ratio < SMEARED * reference_inlier_ratio) & (score < DRIFT_BELOW * reference_explained_ratio)
