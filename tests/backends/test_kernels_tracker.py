@@ -34,7 +34,6 @@ SETTINGS = {
     "corners": {"corners": {"max_corners": 64}},
     "learned trust": {"association": {"weighting_network": "all"}},
     "no velocity": {"disabled": ["velocity_in_window"]},
-    "no acceleration": {"solver": {"acceleration_in_window": False}, "motion": {"acceleration_s": 0.0}},
     "no silhouette offset": {"solver": {"silhouette_offset_px": 0.0, "common_px": 0.0}},
     "damped": {"solver": {"damping": 0.1}},
     "no hidden": {"contours": {"remove_hidden": False, "mid_window": False}},

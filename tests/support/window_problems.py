@@ -46,4 +46,4 @@ def windowed(T_true, *, count=300, faster=FASTER, silhouette_offset_px=0.0, nois
         prior_information=prior * torch.eye(13, dtype=dtype).expand(batch, 13, 13),
     )
     nothing = torch.zeros(batch, 6, dtype=dtype)
-    return replace(problem, window=WindowTerms(ages.to(dtype), nothing, outward.to(dtype), nothing))
+    return replace(problem, window=WindowTerms(ages.to(dtype), nothing, outward.to(dtype)))

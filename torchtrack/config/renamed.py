@@ -63,8 +63,13 @@ REMOVED: dict[str, dict[str, str]] = {
     "window": {},
     "contours": {},
     "association": {},
-    "solver": {},
-    "motion": {},
+    "solver": {
+        "acceleration_in_window": "the velocity is the same all along a window",
+    },
+    "motion": {
+        "acceleration_px": "no acceleration is estimated",
+        "acceleration_s": "no acceleration is estimated",
+    },
     "relocalization": {},
     "validation": {},
 }

@@ -94,9 +94,6 @@ class SolverConfig(Settings):
     common_px: float = Field(
         0.25, ge=0, le=10, description="The same of what observations of a smooth silhouette in one place of the image have in common beside it (px)."
     )
-    acceleration_in_window: bool = Field(
-        True, description="A velocity that is other than predicted became so steadily over the window, as far as it was certain."
-    )
     silhouette_offset_px: float = Field(
         0.2, ge=0, description="Standard deviation of how far smooth silhouettes stand out, in a window (px); 0 for not at all."
     )
@@ -111,12 +108,6 @@ class MotionConfig(Settings):
     speed_from_events: bool = Field(True, description="Few events before an object that has not been found yet: its speed cannot be large.")
     acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
-    acceleration_px: float = Field(
-        0.25, ge=0, le=100, description="Accelerations that are hardly to be expected to move contours by this much in a window are left out (px)."
-    )
-    acceleration_s: float = Field(
-        0.03, ge=0, le=10, description="An acceleration goes on in the windows after, and dies away with this time constant (s); 0 for not at all."
-    )
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
     turn_s: float = Field(
         0.2, ge=0, le=10, description="A turn that events hardly show dies away with this time constant (s), not to run away; 0 for not at all."

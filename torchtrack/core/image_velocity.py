@@ -41,28 +41,22 @@ class MovingObjects:
         velocity: rotation and velocity of the centre (rad/s, m/s).
         centre_cam: centre of each object (m).
         intrinsics: ``[fx, fy, cx, cy]``.
-        acceleration: how the velocity changes (rad/s², m/s²); none where it does not.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]
     velocity: Float[Tensor, "b 6"]
     centre_cam: Float[Tensor, "b 3"]
     intrinsics: Float[Tensor, "b 4"]
-    acceleration: Float[Tensor, "b 6"] | None = None
 
-    def show(self, points_obj: Float[Tensor, "b n 3"]) -> tuple[Float[Tensor, "b n 2"], Float[Tensor, "b n 2"], Float[Tensor, "b n 2"] | None]:
-        """Pixels of points of the objects, their velocities (px/s), and how these change by the objects' acceleration (px/s²)."""
+    def show(self, points_obj: Float[Tensor, "b n 3"]) -> tuple[Float[Tensor, "b n 2"], Float[Tensor, "b n 2"]]:
+        """Pixels of points of the objects, and their velocities (px/s)."""
         turning, drift = _turning_and_drift(self.velocity, self.centre_cam)
         points_cam = transform_points(self.T_cam_obj, points_obj).transpose(1, 2)
         inverse_depth = points_cam[:, 2:].clamp(min=MIN_DEPTH_M).reciprocal()
         ray = points_cam[:, :2] * inverse_depth
         pixels = torch.addcmul(self.intrinsics[:, 2:, None], ray, self.intrinsics[:, :2, None])
         velocity = _across_the_ray(ray, affine(turning, points_cam, drift) * inverse_depth, self.intrinsics)
-        if self.acceleration is None:
-            return pixels.transpose(1, 2), velocity, None
-        turning, drift = _turning_and_drift(self.acceleration, self.centre_cam)
-        change = _across_the_ray(ray, affine(turning, points_cam, drift) * inverse_depth, self.intrinsics)
-        return pixels.transpose(1, 2), velocity, change
+        return pixels.transpose(1, 2), velocity
 
     def plane_velocity(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
         """Image velocity of pixels at the depth of each object's centre (px/s)."""

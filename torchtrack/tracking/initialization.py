@@ -36,7 +36,7 @@ def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us
     learned = LearnedContours.none(len(at_rest), config.adaptation.learned_points, at_rest) if learns else None
     return TrackerState(
         t_us=t_us,
-        motion=MotionState(T_cam_obj.clone(), velocity=at_rest, acceleration=at_rest, covariance=covariance),
+        motion=MotionState(T_cam_obj.clone(), velocity=at_rest, covariance=covariance),
         health=TrackHealth.unknown(T_cam_obj, at_rest.dtype),
         tentative=TentativeTrack.none(T_cam_obj, covariance),
         appearance=Appearance(nothing_remembered(at_rest), unknown_latency(tracked.diameter_m), learned),

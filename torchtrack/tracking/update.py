@@ -16,7 +16,7 @@ from torchtrack.tracking.association.weights import ON_CONTOUR_PX
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.rounds import Fit, may_be_anywhere
 from torchtrack.tracking.frontend.corners import Corners
-from torchtrack.tracking.motion.model import MotionState, fade, found_acceleration, left_covariance, with_dropped
+from torchtrack.tracking.motion.model import MotionState, fade, left_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.health import TrackHealth
@@ -100,9 +100,6 @@ def judged_objects(
     unsure = smeared | (~failed & scored.axis_ambiguous)
     status = torch.where(unsure, status.clamp(min=int(Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, scored, failed, trusted, dt_s, config)
-    # Of an object that is partly hidden too little is seen to tell.
-    seen_well = ~failed & (explained >= VALIDATED_FROM * reference)
-    acceleration = _acceleration(prediction, scored, torch.where(seen_well, trusted, 0), dt_s)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     certain = (explained >= CERTAIN * reference) & (status == int(Status.TRACKING))
     certain &= (scored.count >= CERTAIN_COUNT * health.reference_matches) | (not config.uses(Component.MATCH_COUNT))
@@ -113,7 +110,7 @@ def judged_objects(
         T_last_validated=torch.where(certain[:, None, None], T_cam_obj.detach(), health.T_last_validated),
         time_since_validated_s=torch.where(certain, 0, health.time_since_validated_s + dt_s),
     )
-    return MotionState(T_cam_obj, velocity, acceleration, covariance), health, left_covariance(covariance[:, :6, :6], centre_cam), status
+    return MotionState(T_cam_obj, velocity, covariance), health, left_covariance(covariance[:, :6, :6], centre_cam), status
 
 
 def _darker_outside(
@@ -151,16 +148,6 @@ def _normal_spread(health: TrackHealth, scored: ScoredFit) -> Float[Tensor, "b"]
 def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     """A running mean of when objects are seen well: it rises fast, and falls slowly."""
     return torch.maximum(*(torch.lerp(before, now, gain) for gain in (USUAL_GAIN, FALL_GAIN)))
-
-
-def _acceleration(prediction: Prediction, scored: ScoredFit, trusted: Float[Tensor, "b"], dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 6"]:
-    """Acceleration of a window, as estimated, as far as that is to be trusted."""
-    offset = scored.fit.solution.from_prior
-    if prediction.acceleration is None:
-        return torch.zeros_like(prediction.velocity)
-    acceleration = found_acceleration(prediction.acceleration, prediction.information, offset[:, :12], dt_s)
-    known = trusted * (acceleration.sum(1).abs() < torch.inf)
-    return torch.where(known[:, None] > 0, known[:, None] * acceleration, 0)
 
 
 def _updated_motion(

@@ -16,7 +16,6 @@ from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.camera import project
 from torchtrack.core.lie import difference_about, retract_about, rotation_angle_deg, transform_points
 from torchtrack.object_model.symmetry import symmetry_planes
-from torchtrack.tracking.motion.model import Acceleration
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization import acceptance
 from torchtrack.tracking.relocalization.last_seen import where_last_seen
@@ -32,10 +31,9 @@ def predicted(T_cam_obj=None, seed=0):
     _, prediction, *_ = in_motion(dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed)
     root = torch.randn((12, 12), generator=generator, dtype=torch.float64)
-    acceleration = Acceleration(*torch.rand((3, 1, 6), generator=generator, dtype=torch.float64).unbind(0))
     velocity = torch.randn((1, 6), generator=generator, dtype=torch.float64)
     T_cam_obj = random_pose(1, seed=seed) if T_cam_obj is None else T_cam_obj
-    return replace(prediction, T_cam_obj=T_cam_obj, velocity=velocity, covariance=(root @ root.T)[None], acceleration=acceleration)
+    return replace(prediction, T_cam_obj=T_cam_obj, velocity=velocity, covariance=(root @ root.T)[None])
 
 
 def symmetric_points(count=50):
@@ -67,7 +65,6 @@ def test_mirrored_twice_it_is_as_it_was():
     twice = mirrored(mirrored(prediction, MIDDLE, ACROSS), MIDDLE, ACROSS)
     for name in ("T_cam_obj", "velocity", "covariance"):
         torch.testing.assert_close(getattr(twice, name), getattr(prediction, name))
-    torch.testing.assert_close(twice.acceleration.expected, prediction.acceleration.expected)
 
 
 def test_the_mirrored_pose_turns_so_that_it_stays_mirrored():
@@ -108,8 +105,6 @@ def test_one_prediction_takes_the_place_of_another_where_it_is_taken():
         expected = [own, other if taken else own, own]
         for name in ("T_cam_obj", "velocity", "covariance"):
             assert torch.equal(getattr(now, name), torch.cat([getattr(p, name) for p in expected])), name
-        assert torch.equal(now.acceleration.expected, torch.cat([p.acceleration.expected for p in expected]))
-        assert torch.equal(now.acceleration.variance, three.acceleration.variance)
 
 
 def test_an_object_is_mirrored_in_its_own_planes_alone():

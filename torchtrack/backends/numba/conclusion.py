@@ -45,9 +45,6 @@ def conclude(
     usable: Array,
     velocity: Array,
     covariance: Array,
-    information: Array,
-    expected: Array,
-    variance: Array,
     T_estimated: Array,
     offset: Array,
     hessian: Array,
@@ -63,7 +60,6 @@ def conclude(
     T_last_validated: Array,
     T_cam_obj: Array,
     new_velocity: Array,
-    acceleration: Array,
     posterior: Array,
     left: Array,
     status: Array,
@@ -72,12 +68,12 @@ def conclude(
 
     Args:
         T_before: poses before the window, ``[b, 4, 4]``.
-        T_prior, usable, velocity, covariance, information, expected, variance: of the prediction, and its acceleration.
+        T_prior, usable, velocity, covariance: of the prediction.
         T_estimated, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 13]``, ``[b, 13, 13]``.
         is_relocalized, axis_ambiguous: ``[b]``, of the fits; ``matched [b]``, how many observations they have.
         measured: ``[MEASURED, b]``, what else is known of them.
         remembered, T_last_validated: ``[REMEMBERED, b]`` and ``[b, 4, 4]`` before the window; changed to those after it.
-        T_cam_obj, new_velocity, acceleration, posterior, left, status: after the window, ``left`` being the covariance of poses; filled.
+        T_cam_obj, new_velocity, posterior, left, status: after the window, ``left`` being the covariance of poses; filled.
     """
     inverses, centre = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(3)
     for b in range(len(usable)):
@@ -94,8 +90,6 @@ def conclude(
             status[b] = max(status[b], UNCERTAIN)
         inverse(hessian[b], inverses)
         _update(trusted, failed, dt, velocity[b], covariance[b], offset[b], inverses, settings, new_velocity[b], posterior[b])
-        seen_well = not failed and explained >= settings.validated_from * reference
-        _accelerate(trusted if seen_well else 0.0, dt, information[b], offset[b], expected[b], variance[b], acceleration[b])
         centre_of(T_cam_obj[b], centre_obj[b], centre)
         _to_left(posterior[b], centre, left[b])
         certain = explained >= settings.certain_ratio * reference and status[b] == TRACKING
@@ -223,21 +217,6 @@ def _update(
 
 
 @kernel()
-def _accelerate(trusted: float, dt: float, information: Array, offset: Array, expected: Array, variance: Array, acceleration: Array) -> None:
-    """The likeliest acceleration, as far as it is to be trusted: :func:`torchtrack.tracking.motion.model.found_acceleration`."""
-    total = 0.0
-    for j in range(6):
-        of_pose, of_velocity = 0.0, 0.0
-        for k in range(12):
-            of_pose += information[j, k] * offset[k]
-            of_velocity += information[6 + j, k] * offset[k]
-        acceleration[j] = expected[j] + variance[j] * dt * (of_velocity + 0.5 * dt * of_pose)
-        total += acceleration[j]
-    for j in range(6):
-        acceleration[j] = trusted * acceleration[j] if trusted > 0 and np.isfinite(total) else 0.0
-
-
-@kernel()
 def _to_left(covariance: Array, centre_cam: Array, left: Array) -> None:
     """Covariance of the left perturbation of a pose: :func:`torchtrack.tracking.motion.model.left_covariance`."""
     left[:] = covariance[:6, :6]
@@ -289,19 +268,12 @@ def _seen_well(before: float, now: float, settings: ConclusionSettings) -> float
     return before + (settings.usual_gain if now > before else settings.fall_gain) * (now - before)
 
 
-def _has_motion(state: TrackerState, prediction: Prediction, gate_scale: Tensor, scored: ScoredFit, dt_s: Tensor, config: TrackerConfig) -> bool:
-    """Whether objects are predicted with their motion."""
-    return config.solver.prior and prediction.acceleration is not None
-
-
-@accelerates(update.judged_objects, supports=_has_motion)
+@accelerates(update.judged_objects, supports=lambda state, prediction, gate_scale, scored, dt_s, config: config.solver.prior)
 def judged_objects_numba(
     state: TrackerState, prediction: Prediction, gate_scale: Float[Tensor, "b"], scored: ScoredFit, dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> update.Judgement:
     """Object by object."""
-    objects, solution, batch, expected = prediction.objects, scored.fit.solution, len(dt_s), prediction.acceleration
-    if expected is None:
-        raise ValueError("a kernel needs the prediction's acceleration.")
+    objects, solution, batch = prediction.objects, scored.fit.solution, len(dt_s)
     in_view = visible_ratio(scored.fit.contours, objects.image_size)
     packed = torch.stack([scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, in_view, gate_scale])
     health = state.health
@@ -309,13 +281,13 @@ def judged_objects_numba(
     remembered = torch.stack([health.mean_score, *references, health.drift_s, health.time_since_validated_s])
     T_last_validated = health.T_last_validated.clone(memory_format=torch.contiguous_format)
     T_cam_obj, covariance, left = (T_last_validated.new_empty(batch, size, size) for size in (4, 12, 6))
-    (velocity, acceleration), status_of = dt_s.new_empty(2, batch, 6), scored.count.new_empty(batch)
+    velocity, status_of = dt_s.new_empty(batch, 6), scored.count.new_empty(batch)
     conclude(
-        *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance, prediction.information),
-        *as_arrays(expected.expected, expected.variance, solution.T_cam_obj, solution.from_prior, solution.hessian),
+        *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance),
+        *as_arrays(solution.T_cam_obj, solution.from_prior, solution.hessian),
         *as_arrays(scored.is_relocalized, scored.axis_ambiguous, scored.count, packed, dt_s, objects.centre_obj, objects.diameter_m),
         _settings(config),
-        *as_arrays(remembered, T_last_validated, T_cam_obj, velocity, acceleration, covariance, left, status_of),
+        *as_arrays(remembered, T_last_validated, T_cam_obj, velocity, covariance, left, status_of),
     )
     mean_score, explained_ratio, inlier_ratio, matches, drift_s, time_since_validated_s = remembered.unbind()
     health = replace(
@@ -328,7 +300,7 @@ def judged_objects_numba(
         T_last_validated=T_last_validated,
         time_since_validated_s=time_since_validated_s,
     )
-    return MotionState(T_cam_obj, velocity, acceleration, covariance), health, left, status_of
+    return MotionState(T_cam_obj, velocity, covariance), health, left, status_of
 
 
 def _settings(config: TrackerConfig) -> ConclusionSettings:

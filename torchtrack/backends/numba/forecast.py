@@ -7,50 +7,42 @@ from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
-from torchtrack.backends.numba.geometry import depth_of, inverse_depth, is_finite, turn
+from torchtrack.backends.numba.geometry import depth_of, is_finite, turn
 from torchtrack.backends.numba.parameters import ForecastSettings, filled
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion import model, predict
-from torchtrack.tracking.motion.model import Acceleration, MotionState
+from torchtrack.tracking.motion.model import MotionState
 from torchtrack.tracking.motion.prediction import MAX_DEPTH_M, Prediction
-
-# What is told of each motion: its velocity, and of its acceleration what is expected, its variance, and its rate.
-VELOCITY, EXPECTED, VARIANCE, RATE = range(4)
-OUTCOMES = 4
-# Ways in the image, and variances of velocities, are taken to be no less.
-_LEAST_WAY_PX, _LEAST_VARIANCE = 1e-6, 1e-12
 
 
 @kernel()
 def forecast(
     T_cam_obj: Array,
     velocity: Array,
-    acceleration: Array,
     covariance: Array,
     dt_s: Array,
     centre_obj: Array,
     diameter_m: Array,
-    intrinsics: Array,
     axes_obj: Array,
     far_pose: Array,
     settings: ForecastSettings,
     T_prior: Array,
     usable: Array,
-    outcome: Array,
+    new_velocity: Array,
     predicted: Array,
 ) -> None:
-    """Predict each object's pose, velocity, acceleration and covariance.
+    """Predict each object's pose, velocity and covariance.
 
     Args:
-        T_cam_obj, velocity, acceleration, covariance: of the state: ``[b, 4, 4]``, ``[b, 6]``, ``[b, 6]``, ``[b, 12, 12]``.
+        T_cam_obj, velocity, covariance: of the state: ``[b, 4, 4]``, ``[b, 6]``, ``[b, 12, 12]``.
         axes_obj: ``[b, 3]`` of surfaces of revolution, zero of other objects; or none at all, ``[0, 3]``.
         far_pose: ``[b, 4, 4]``, in the place of a pose that is not usable.
-        T_prior, usable, outcome, predicted: ``[b, 4, 4]``, ``[b]``, ``[OUTCOMES, b, 6]`` and ``[b, 12, 12]``; filled.
+        T_prior, usable, new_velocity, predicted: ``[b, 4, 4]``, ``[b]``, ``[b, 6]`` and ``[b, 12, 12]``; filled.
     """
-    before, start = np.empty(6), np.empty((12, 12))
+    before, moved, start = np.empty(6), np.empty(6), np.empty((12, 12))
     for b in range(len(T_cam_obj)):
         dt = np.float64(dt_s[b])
         start[:] = covariance[b]
@@ -59,21 +51,16 @@ def forecast(
             _without_spin(T_cam_obj[b], axes_obj[b], dt, settings, before, start)
         rotation_sigma, move_sigma = _acceleration_sigma(before, diameter_m[b], settings)
         _predict(start, rotation_sigma, move_sigma, dt, diameter_m[b], settings.most_uncertain, predicted[b])
-        way_px = 0.5 * move_sigma * dt * dt * intrinsics[b, 0] * inverse_depth(depth_of(T_cam_obj[b], centre_obj[b]))
-        counts = 1.0 / (1.0 + (settings.acceleration_px / max(way_px, _LEAST_WAY_PX)) ** settings.steepness)
-        goes_on = counts * np.exp(-dt / settings.acceleration_s) if settings.acceleration_s > 0 and not settings.holds else 0.0
         for k in range(6):
-            variance = (rotation_sigma if k < 3 else move_sigma) ** 2
-            outcome[EXPECTED, b, k], outcome[VARIANCE, b, k] = goes_on * acceleration[b, k], variance
-            outcome[RATE, b, k] = counts * variance * dt / max(predicted[b, 6 + k, 6 + k], _LEAST_VARIANCE)
-        usable[b] = _move(T_cam_obj[b], centre_obj[b], before, outcome[EXPECTED, b], dt, settings, T_prior[b], outcome[VELOCITY, b])
+            new_velocity[b, k], moved[k] = before[k], before[k] * dt
+        usable[b] = _step(T_cam_obj[b], centre_obj[b], moved, settings.least_depth_m, settings.most_depth_m, T_prior[b])
         if not usable[b]:
-            T_prior[b], outcome[VELOCITY, b] = far_pose[b], 0.0
+            T_prior[b], new_velocity[b] = far_pose[b], 0.0
 
 
 @kernel()
 def _expected_velocity(velocity: Array, dt: float, settings: ForecastSettings, before: Array, covariance: Array) -> None:
-    """Velocity before any acceleration: turns die away; none at all where an object is expected to stay, which makes it uncertain."""
+    """Velocity to be expected: turns die away; none at all where an object is expected to stay, which makes it uncertain."""
     kept = np.exp(-dt / settings.turn_s) if settings.turn_s > 0 else 1.0
     for k in range(6):
         before[k] = velocity[k] * (kept if k < 3 else 1.0)
@@ -149,18 +136,6 @@ def _predict(
 
 
 @kernel()
-def _move(
-    T_cam_obj: Array, centre_obj: Array, before: Array, acceleration: Array, dt: float, settings: ForecastSettings, T_prior: Array, velocity: Array
-) -> bool:
-    """Move a pose by its velocity and acceleration, which change the velocity, too; whether it is one before the camera."""
-    moved = np.empty(6)
-    for k in range(6):
-        gained = acceleration[k] * dt
-        moved[k], velocity[k] = (before[k] + 0.5 * gained) * dt, before[k] + gained
-    return _step(T_cam_obj, centre_obj, moved, settings.least_depth_m, settings.most_depth_m, T_prior)
-
-
-@kernel()
 def _step(T_cam_obj: Array, centre_obj: Array, moved: Array, least_depth_m: float, most_depth_m: float, stepped: Array) -> bool:
     """Move a pose a little, about the object's centre; whether it is one before the camera."""
     rotation = np.empty((3, 3))
@@ -204,15 +179,14 @@ def forecast_numba(
     """Object by object."""
     batch, axes = len(dt_s), far_pose.new_empty(0, 3) if axes_obj is None else axes_obj
     T_prior, usable = far_pose.new_empty(batch, 4, 4), torch.empty(batch, dtype=torch.bool)
-    outcome, covariance = far_pose.new_empty(OUTCOMES, batch, 6), state.covariance.new_empty(batch, 12, 12)
-    known = as_arrays(state.T_cam_obj, state.velocity, state.acceleration, state.covariance, dt_s)
-    of_objects = as_arrays(objects.centre_obj, objects.diameter_m, objects.intrinsics, axes, far_pose)
+    velocity, covariance = far_pose.new_empty(batch, 6), state.covariance.new_empty(batch, 12, 12)
+    known = as_arrays(state.T_cam_obj, state.velocity, state.covariance, dt_s)
+    of_objects = as_arrays(objects.centre_obj, objects.diameter_m, axes, far_pose)
     settings = filled(
         ForecastSettings, config.motion, model, holds=config.motion.model == "hold", least_depth_m=MIN_DEPTH_M, most_depth_m=MAX_DEPTH_M
     )
-    forecast(*known, *of_objects, settings, *as_arrays(T_prior, usable, outcome, covariance))
-    velocity, *of_acceleration = outcome.unbind()
-    return Prediction(objects, T_prior, usable, velocity, covariance, Acceleration(*of_acceleration) if config.solver.prior else None)
+    forecast(*known, *of_objects, settings, *as_arrays(T_prior, usable, velocity, covariance))
+    return Prediction(objects, T_prior, usable, velocity, covariance)
 
 
 @accelerates(Prediction.in_mid_window)

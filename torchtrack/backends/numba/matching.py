@@ -43,7 +43,6 @@ def match(
     cells: Cells,
     pose: Numbers,
     motion: Numbers,
-    change: Numbers,
     intrinsics: Numbers,
     gate_px: float,
     wider: float,
@@ -61,7 +60,7 @@ def match(
         seen: ``[6, n]``, and which of them exist.
         place: ``[n, 2]``.
         table: ``[m, COLUMNS]``.
-        pose, intrinsics: of the object, from :mod:`torchtrack.backends.numba.geometry`; so are its ``motion``, and its ``change`` by an acceleration.
+        pose, intrinsics: of the object, from :mod:`torchtrack.backends.numba.geometry`; so is its ``motion``.
         contour, is_near, is_matched, matches: filled; ``[n]``, and ``[ROWS, n]``. Weights are those of ``match_nearest``.
         votes: room for ``[patches², 3]``.
     """
@@ -79,9 +78,7 @@ def match(
             for k in range(ROWS):
                 matches[k, i] = 0.0
         else:
-            is_matched[i] = _match_one(
-                i, nearest_index, seen, place, table, pose, motion, change, intrinsics, gate_px, wider, settings, matches, votes
-            )
+            is_matched[i] = _match_one(i, nearest_index, seen, place, table, pose, motion, intrinsics, gate_px, wider, settings, matches, votes)
     _weigh(is_near, matches, votes, settings)
 
 
@@ -95,7 +92,6 @@ def _match_one(
     table: Array,
     pose: Numbers,
     motion: Numbers,
-    change: Numbers,
     intrinsics: Numbers,
     gate_px: float,
     wider: float,
@@ -109,13 +105,11 @@ def _match_one(
     inverse = inverse_depth(z)
     u, v = intrinsics[2] + x * inverse * intrinsics[0], intrinsics[3] + y * inverse * intrinsics[1]
     speed_u, speed_v = across(motion, x, y, z, inverse, intrinsics)
-    change_u, change_v = across(change, x, y, z, inverse, intrinsics)
     nu, nv = table[nearest_index, NORMAL_U], table[nearest_index, NORMAL_V]
     crossing = nu * speed_u + nv * speed_v
     dark = seen[POLARITY, i] * crossing / (abs(crossing) + settings.slow_px_s)
     age = seen[AGE, i] + max(seen[INTO_BURST, i] - settings.burst_px / max(abs(crossing), 1e-3), 0.0)
-    carried_u = seen[U, i] + age * (speed_u - 0.5 * age * change_u)
-    carried_v = seen[V, i] + age * (speed_v - 0.5 * age * change_v)
+    carried_u, carried_v = seen[U, i] + age * speed_u, seen[V, i] + age * speed_v
     shift = dark * (settings.dark_shift_px + table[nearest_index, SMOOTH] * (settings.silhouette_dark_shift_px - settings.dark_shift_px))
     target_u, target_v = carried_u - nu * shift, carried_v - nv * shift
     du, dv = u - target_u, v - target_v

@@ -208,7 +208,7 @@ class ForecastSettings(NamedTuple):
 
     Args:
         holds: whether objects are expected to stay where they are.
-        turn_s, acceleration_s: time constants; 0 for what does not die away, and for accelerations that do not go on.
+        turn_s: time constant; 0 for what does not die away.
         most_uncertain: what would be less certain (rad, and diameters) is left as it is.
         least_depth_m, most_depth_m: between these a pose is usable.
     """
@@ -218,10 +218,7 @@ class ForecastSettings(NamedTuple):
     coast_s: float
     acceleration_rate_hz: float
     acceleration_floor_m_s2: float
-    acceleration_px: float
-    acceleration_s: float
     most_uncertain: float
-    steepness: int
     least_depth_m: float
     most_depth_m: float
 

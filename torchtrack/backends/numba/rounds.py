@@ -44,7 +44,6 @@ from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation import rounds
 from torchtrack.tracking.estimation.rounds import Gates, Start
 from torchtrack.tracking.estimation.terms import Linearisation
-from torchtrack.tracking.motion.prediction import Prediction
 
 # Pose, velocity and silhouette offset; and their residual, in the rows of a Jacobian.
 UNKNOWNS, _RESIDUAL = 13, 13
@@ -59,8 +58,6 @@ def align(
     first: Array,
     cells: Cells,
     velocity: Array,
-    acceleration: Array,
-    rate_hz: Array,
     information: Array,
     intrinsics: Array,
     centre_obj: Array,
@@ -84,7 +81,7 @@ def align(
     Args:
         seen: ``[b, 6, n]``, and which of them exist.
         table: ``[b, m, COLUMNS]`` of contour points; ``nearest_of_cell [b, p]`` and ``first [b, 2]`` are their index.
-        velocity, acceleration, rate_hz: ``[b, 6]`` as predicted.
+        velocity: ``[b, 6]`` as predicted.
         information: ``[b, 13, 13]`` of the prior.
         gates_px: ``[r]``, and by how much each is ``wider [r, b]``.
         subcell_lookup: ``[b]``, whether contours are looked up between the cells of the index.
@@ -101,14 +98,13 @@ def align(
         for r in range(len(gates_px)):
             centre_of(T_cam_obj[b], centre_obj[b], centre)
             moving = drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre)
-            change = drift(rounds.compensated * (acceleration[b] + rate_hz[b] * offset[b, 6:12]), centre)
             match(
-                seen[b], exists[b], place, table[b], nearest_of_cell[b], first[b], cells, entries(T_cam_obj[b]), moving, change, of_lens,
+                seen[b], exists[b], place, table[b], nearest_of_cell[b], first[b], cells, entries(T_cam_obj[b]), moving, of_lens,
                 gates_px[r], wider[r, b], subcell_lookup[b], matching, contour[b], is_near[b], is_matched[b], matches[b], votes,
             )  # fmt: skip
             believe(seen[b], is_matched[b], matches[b], matching)
             pose, scale_px = entries(T_cam_obj[b]), gates_px[r] * wider[r, b]
-            used = _linearise(matches[b], pose, centre_obj[b], centre, rate_hz[b], of_lens, scale_px, offset[b], rounds, rows, weights)
+            used = _linearise(matches[b], pose, centre_obj[b], centre, of_lens, scale_px, offset[b], rounds, rows, weights)
             normal_equations(rows, weights, used, information[b], offset[b], gradient[b], hessian[b])
             damped_step(gradient[b], hessian[b], damping.damping, damping, step)
             move(T_cam_obj[b], centre_obj[b], offset[b], step)
@@ -129,7 +125,6 @@ def _linearise(
     pose: Numbers,
     centre_obj: Array,
     centre: Array,
-    rate_hz: Array,
     intrinsics: Numbers,
     scale_px: float,
     offset: Array,
@@ -156,7 +151,7 @@ def _linearise(
         for k in range(6):
             rows[k, used] = row[k]
             # How far it was from where it is at the pose, for each unit of velocity beyond the predicted one.
-            rows[6 + k, used] = row[k] * age * (0.5 * age * rate_hz[k] - 1.0)
+            rows[6 + k, used] = -row[k] * age
         rows[12, used], rows[_RESIDUAL, used] = outward, residual
         weights[used] = weight * robust * robust
         used += 1
@@ -188,7 +183,7 @@ def align_rounds_numba(
     align(
         *as_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
         cells_of(table.index),
-        *as_arrays(prediction.velocity, *_acceleration(prediction, config), information, objects.intrinsics, objects.centre_obj),
+        *as_arrays(prediction.velocity, information, objects.intrinsics, objects.centre_obj),
         *as_arrays(constant(config.association.gates_px, offset.dtype, offset.device), gates.wider, gates.subcell_lookup),
         filled(MatchingSettings, config.association, config.solver, weights, dark_shift_px=step_px, silhouette_dark_shift_px=silhouette_px, **common),
         RoundSettings(config.association.motion_compensation, config.uses(Component.VELOCITY_IN_WINDOW)),
@@ -202,13 +197,6 @@ def _seen(observations: Observations) -> Float[Tensor, "b 6 n"]:
     """Rows of what was observed."""
     trust = torch.ones_like(observations.age_s) if observations.trust is None else observations.trust
     return torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.into_burst_s, observations.polarity, trust], 1)
-
-
-def _acceleration(prediction: Prediction, config: TrackerConfig) -> tuple[Tensor, Tensor]:
-    """The acceleration that is expected, and how much of it goes with velocities that were not; none where these do not change."""
-    if prediction.acceleration is None or not config.solver.acceleration_in_window:
-        return torch.zeros_like(prediction.velocity), torch.zeros_like(prediction.velocity)
-    return prediction.acceleration.expected, prediction.acceleration.rate_hz
 
 
 def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 15 n"]) -> MatchesWithCues:

@@ -31,7 +31,6 @@ def solve_poses(
     age_s: Array,
     outward: Array,
     velocity: Array,
-    rate_hz: Array,
     intrinsics: Array,
     centre_obj: Array,
     scale_px: Array,
@@ -46,7 +45,7 @@ def solve_poses(
     """Solve each problem: :class:`torchtrack.tracking.estimation.terms.PoseProblem` by its fields.
 
     Args:
-        age_s, outward, velocity, rate_hz: of what is unknown beside the pose; not read where there is nothing.
+        age_s, outward, velocity: of what is unknown beside the pose; not read where there is nothing.
         T_cam_obj, offset: ``[b, 4, 4]`` and ``[b, k]`` from the prior, where the search starts; changed to where it ends.
         gradient, hessian: ``[b, k]`` and ``[b, k, k]``, of the last linearisation; filled.
     """
@@ -56,7 +55,7 @@ def solve_poses(
     step, next_gradient, next_hessian = np.empty(unknowns), np.empty(unknowns), np.empty((unknowns, unknowns))
     for b in range(len(offset)):
         pose[:], offset_of[:] = T_cam_obj[b], offset[b]
-        problem = (points_obj[b], targets[b], directions[b], weights[b], age_s[b], outward[b], velocity[b], rate_hz[b])
+        problem = (points_obj[b], targets[b], directions[b], weights[b], age_s[b], outward[b], velocity[b])
         of_object = (lens(intrinsics[b]), centre_obj[b], scale_px[b], information[b])
         cost = _look(problem, of_object, pose, offset_of, solving.loss, rows, robust, gradient[b], hessian[b])
         damped = damping.damping
@@ -89,7 +88,7 @@ def _look(
     hessian: Array,
 ) -> float:
     """Gradient and Hessian at a pose and an offset from the prior, filled, and the cost there."""
-    points, targets, directions, weights, age_s, outward, velocity, rate_hz = problem
+    points, targets, directions, weights, age_s, outward, velocity = problem
     intrinsics, centre_obj, scale_px, information = of_object
     unknowns, centre, cost, used, velocity_offset = len(offset), np.empty(3), 0.0, 0, np.zeros(_POSE)
     centre_of(pose, centre_obj, centre)
@@ -107,7 +106,7 @@ def _look(
         if unknowns > _POSE:
             # Linear in all that is unknown beside the pose; the targets have been moved with one velocity already.
             for k in range(_POSE):
-                rows[_POSE + k, used] = row[k] * age_s[i] * (0.5 * age_s[i] * rate_hz[k] - 1.0)
+                rows[_POSE + k, used] = -row[k] * age_s[i]
                 residual += rows[_POSE + k, used] * velocity_offset[k]
             rows[2 * _POSE, used] = outward[i]
             residual += outward[i] * offset[2 * _POSE]
@@ -231,7 +230,7 @@ def solve_pose_numba(
     T_cam_obj, offset = (value.detach().clone(memory_format=torch.contiguous_format) for value in (T_start, from_prior))
     gradient, hessian = torch.empty_like(offset), torch.empty_like(problem.prior_information, memory_format=torch.contiguous_format)
     observed = problem.points_obj, problem.targets, problem.directions, problem.weights, window.age_s, window.outward
-    of_objects = window.velocity, window.rate_hz, problem.intrinsics, problem.centre_obj, problem.scale_px, problem.prior_information
+    of_objects = window.velocity, problem.intrinsics, problem.centre_obj, problem.scale_px, problem.prior_information
     rounding = lm.ROUNDINGS * torch.finfo(T_start.dtype).eps
     solve_poses(
         *as_arrays(*(value.detach() for value in (*observed, *of_objects))),
@@ -245,4 +244,4 @@ def solve_pose_numba(
 def _no_window(problem: PoseProblem) -> WindowTerms:
     """What stands for terms that a problem has not."""
     nothing, no_motion = problem.weights.new_empty(len(problem.weights), 0), problem.weights.new_empty(len(problem.weights), 6)
-    return WindowTerms(nothing, no_motion, nothing, no_motion)
+    return WindowTerms(nothing, no_motion, nothing)

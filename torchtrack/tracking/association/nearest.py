@@ -95,14 +95,11 @@ def match_nearest(
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
     nearest_index = table.index.look_up(place, subcell_lookup)
     points_obj, normals, indexed, silhouette, oriented, expected, edge_ambiguity = table.take(contour := nearest_index.clamp(min=0))
-    pixels, velocity, change = objects.show(points_obj)
+    pixels, velocity = objects.show(points_obj)
     crossing_px_s = vecdot(normals, velocity)
     dark = observations.polarity * leading_side(crossing_px_s)
     age_s = without_tail(observations.age_s, observations.into_burst_s, crossing_px_s, config.association.burst_px)
     carried = torch.addcmul(observations.pixels, velocity, age_s[..., None])
-    if change is not None:
-        # It had moved less, or more, when it was slower or faster.
-        carried = torch.addcmul(carried, change, age_s[..., None].square(), value=-0.5)
     targets = torch.addcmul(carried, normals, (dark * dark_shift_px(silhouette, config))[..., None], value=-1)
     difference = pixels - targets
     near = observations.mask & (nearest_index >= 0)

@@ -175,7 +175,7 @@ def align_rounds(
             index = index_for(contours, objects.image_size, config, gates.gate_scale, start.index.radius_px)
             table = _table(contours, index, objects, matching)
             place = _first_place(begin, observations, config)
-        moving = begin.moving(compensated=matching.motion_compensation, offset=offset if config.solver.acceleration_in_window else None)
+        moving = begin.moving(compensated=matching.motion_compensation)
         if matching.search == "along_flow":
             contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
             matches = match_along_flow(observations, contours, moving, gate_px)
@@ -256,20 +256,16 @@ def _problem(start: Start, matches: MatchesWithCues, offset: Float[Tensor, "b k"
         scale_px=gate_px,
         T_prior=prediction.T_cam_obj,
         prior_information=start.information,
-        window=_window_terms(prediction, rows, offset, config) if config.solver.prior else None,
+        window=_window_terms(rows, offset, config) if config.solver.prior else None,
         extra_terms=start.extra_terms,
     )
 
 
-def _window_terms(prediction: Prediction, rows: MatchesWithCues, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
+def _window_terms(rows: MatchesWithCues, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
     """What observations tell beside the pose: of the velocity by their ages, and of how far silhouettes stand out."""
     age_s, outward = rows.age_s, rows.silhouette
     if config.association.residual != "normal":
         outward = torch.zeros_like(outward)
     if not config.uses(Component.VELOCITY_IN_WINDOW):
         age_s = torch.zeros_like(age_s)
-    velocity = offset[:, 6:12]
-    rate_hz = torch.zeros_like(velocity)
-    if prediction.acceleration is not None and config.solver.acceleration_in_window:
-        rate_hz = prediction.acceleration.rate_hz
-    return WindowTerms(age_s, velocity, outward, rate_hz)
+    return WindowTerms(age_s, offset[:, 6:12], outward)

@@ -88,13 +88,11 @@ class WindowTerms:
         age_s: time from each observation to the pose (s).
         velocity: offset from the predicted velocity that the targets were moved with (rad/s, m/s).
         outward: 1 where the silhouette's offset counts along the direction, 0 where not.
-        rate_hz: acceleration in the window for each unit of velocity beyond the predicted one (1/s); zero where it is the same all along.
     """
 
     age_s: Float[Tensor, "b n"]
     velocity: Float[Tensor, "b 6"]
     outward: Float[Tensor, "b n"]
-    rate_hz: Float[Tensor, "b 6"]
 
 
 @dataclass(frozen=True)
@@ -176,16 +174,10 @@ class ContourDistance:
         if self.window is None:
             return LinearisedTerm(residuals, jacobian, self.weights, self.scale_px)
         # Linear in all that is unknown beside the pose; the targets have been moved with one velocity already.
-        further = torch.cat([jacobian * _ways_s(self.window), self.window.outward[:, None]], 1)
+        further = torch.cat([jacobian * -self.window.age_s[:, None], self.window.outward[:, None]], 1)
         unexpected = place.from_prior[:, None, 6:] - pad(self.window.velocity, (0, 1))[:, None]
         residuals = torch.baddbmm(residuals[:, None], unexpected, further)[:, 0]
         return LinearisedTerm(residuals, torch.cat([jacobian, further], 1), self.weights, self.scale_px)
-
-
-def _ways_s(window: WindowTerms) -> Float[Tensor, "b 6 n"]:
-    """How far an observation was from where it is at the pose, for each unit of velocity beyond the predicted one (s)."""
-    age_s = window.age_s[:, None]
-    return torch.addcmul(-age_s, age_s.square(), window.rate_hz[..., None], value=0.5)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ filter: what a window's events say is weighed against it direction by direction,
 them, and what they hardly see (an edge that moves along itself, depth) goes on as it moved before.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -24,10 +23,6 @@ MOST_UNCERTAIN = 0.5
 COAST_S = 0.2
 
 
-# How sharply accelerations that count are told from those that do not.
-STEEPNESS = 4
-
-
 @dataclass(frozen=True)
 class MotionState:
     """Pose and motion of each object at its stream's time, and how certain they are.
@@ -35,13 +30,11 @@ class MotionState:
     Args:
         T_cam_obj: poses (float64).
         velocity: rotation of each object and velocity of its centre, in the camera's axes (rad/s, m/s).
-        acceleration: how they changed in the last window (rad/s², m/s²).
         covariance: of pose and velocity (float64), in the chart that this file describes.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]
     velocity: Float[Tensor, "b 6"]
-    acceleration: Float[Tensor, "b 6"]
     covariance: Float[Tensor, "b 12 12"]
 
     def at_rest(self, chosen: Bool[Tensor, "b"], T_cam_obj: Float[Tensor, "b 4 4"], covariance: Float[Tensor, "b 12 12"]) -> "MotionState":
@@ -49,110 +42,8 @@ class MotionState:
         return MotionState(
             T_cam_obj=torch.where(chosen[:, None, None], T_cam_obj, self.T_cam_obj),
             velocity=torch.where(chosen[:, None], 0, self.velocity),
-            acceleration=torch.where(chosen[:, None], 0, self.acceleration),
             covariance=torch.where(chosen[:, None, None], covariance, self.covariance),
         )
-
-
-@dataclass(frozen=True)
-class Acceleration:
-    """How velocities come to be what they are at a window's end: by an acceleration that is constant over the window.
-
-    Args:
-        expected: acceleration that the prediction was made with (rad/s², m/s²).
-        variance: of the true one from it (rad²/s⁴, m²/s⁴).
-        rate_hz: acceleration beyond the expected one that goes with each unit of velocity beyond the predicted one (1/s).
-    """
-
-    expected: Float[Tensor, "b 6"]
-    variance: Float[Tensor, "b 6"]
-    rate_hz: Float[Tensor, "b 6"]
-
-    def at(self, velocity_offset: Float[Tensor, "b 6"]) -> Float[Tensor, "b 6"]:
-        """The acceleration of objects with that velocity beyond the predicted one (rad/s², m/s²)."""
-        return torch.addcmul(self.expected, self.rate_hz, velocity_offset)
-
-    def each(self, change: Callable[[Tensor], Tensor]) -> "Acceleration":
-        """The same with each of its tensors changed."""
-        return Acceleration(change(self.expected), change(self.variance), change(self.rate_hz))
-
-
-def acceleration_counts(
-    sigma: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], px_per_m: Float[Tensor, "b"], config: MotionConfig
-) -> Float[Tensor, "b 1"]:
-    """How far accelerations are taken into account, 0 to 1: little where they hardly move contours within a window.
-
-    Of slow objects, what is found of an acceleration is noise, which would come into their velocity.
-
-    Args:
-        sigma: standard deviation of the acceleration (rad/s², m/s²).
-        px_per_m: how far objects move in the image when they move by a metre across it.
-    """
-    way_px = 0.5 * sigma[:, 3:4] * (dt_s.square() * px_per_m)[:, None]
-    return (1 + (config.acceleration_px / way_px.clamp(min=1e-6)) ** STEEPNESS).reciprocal()
-
-
-def carried_on(acceleration: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 6"]:
-    """What is expected of an acceleration in the window after it (rad/s², m/s²)."""
-    if not config.acceleration_s or config.model == "hold":
-        return torch.zeros_like(acceleration)
-    return acceleration * torch.exp(-dt_s / config.acceleration_s)[:, None]
-
-
-def window_acceleration(
-    expected: Float[Tensor, "b 6"],
-    sigma: Float[Tensor, "b 6"],
-    counts: Float[Tensor, "b 1"],
-    covariance: Float[Tensor, "b 12 12"],
-    dt_s: Float[Tensor, "b"],
-) -> Acceleration:
-    """The acceleration of a window.
-
-    Args:
-        expected, sigma: of it, with its standard deviation from that.
-        counts: from :func:`acceleration_counts`.
-        covariance: of pose and velocity at the window's end, as predicted.
-    """
-    variance, velocity_variance = sigma.square(), covariance.diagonal(dim1=-2, dim2=-1)[:, 6:].to(sigma.dtype)
-    return Acceleration(expected, variance, counts * variance * dt_s[:, None] / velocity_variance.clamp(min=1e-12))
-
-
-def next_acceleration(
-    last: Float[Tensor, "b 6"],
-    velocity: Float[Tensor, "b 6"],
-    covariance: Float[Tensor, "b 12 12"],
-    dt_s: Float[Tensor, "b"],
-    diameter_m: Float[Tensor, "b"],
-    px_per_m: Float[Tensor, "b"],
-    config: MotionConfig,
-) -> Acceleration:
-    """The acceleration of the window after one in which it was ``last`` (rad/s², m/s²), as far as accelerations count.
-
-    Args:
-        velocity: at the window's start.
-        covariance: of pose and velocity at its end, as predicted.
-        px_per_m: as for :func:`acceleration_counts`.
-    """
-    sigma = acceleration_sigma(velocity, diameter_m[:, None], config)
-    counts = acceleration_counts(sigma, dt_s, px_per_m, config)
-    return window_acceleration(counts * carried_on(last, dt_s, config), sigma, counts, covariance, dt_s)
-
-
-def found_acceleration(
-    acceleration: Acceleration, information: Float[Tensor, "b 12 12"], offset: Float[Tensor, "b 12"], dt_s: Float[Tensor, "b"]
-) -> Float[Tensor, "b 6"]:
-    """The likeliest acceleration of objects whose pose and velocity turned out to be off the prediction (rad/s², m/s²).
-
-    It has no covariance of its own: what a window tells of it is weighed against what is to be expected of any window. With
-    one, accelerations that events hardly show would run away.
-
-    Args:
-        information: inverse of the prediction's covariance.
-        offset: of pose and velocity from the prediction.
-    """
-    pull = (information @ offset.to(information.dtype)[..., None])[..., 0].to(offset.dtype)
-    dt_s = dt_s[:, None]
-    return acceleration.expected + acceleration.variance * dt_s * torch.addcmul(pull[:, 6:], dt_s, pull[:, :6], value=0.5)
 
 
 def initial_covariance(diameter_m: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 12 12"]:
@@ -193,7 +84,7 @@ def predict_covariance(
 
 
 def acceleration_sigma(velocity: Float[Tensor, "b 6"], diameter_m: Float[Tensor, "b 1"], config: MotionConfig) -> Float[Tensor, "b 6"]:
-    """Standard deviation of an acceleration from the expected one (rad/s², m/s²)."""
+    """Standard deviation of the acceleration to be expected (rad/s², m/s²)."""
     rim_m_s = velocity[:, 3:].norm(dim=-1, keepdim=True) + 0.5 * diameter_m * velocity[:, :3].norm(dim=-1, keepdim=True)
     return rim_and_centre(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m)
 

@@ -8,14 +8,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import lie
 from torchtrack.core.dispatch import accelerable
 from torchtrack.tracking.contours.objects import ObjectBatch
-from torchtrack.tracking.motion.model import (
-    MotionState,
-    expected_velocity,
-    next_acceleration,
-    predict_covariance,
-    with_dropped,
-    without_spin,
-)
+from torchtrack.tracking.motion.model import MotionState, expected_velocity, predict_covariance, with_dropped, without_spin
 from torchtrack.tracking.motion.prediction import Prediction, before_camera
 
 
@@ -44,12 +37,7 @@ def forecast(
     if axes_obj is not None:
         axes_cam = (state.T_cam_obj[:, :3, :3].to(velocity.dtype) @ axes_obj[..., None])[..., 0]
         velocity, covariance = without_spin(velocity, covariance, axes_cam, dt_s, motion)
-    before, px_per_m = velocity.detach(), objects.px_per_m(state.T_cam_obj.detach().to(velocity.dtype)).detach()
-    covariance = predict_covariance(covariance.detach(), before, dt_s, objects.diameter_m, motion)
-    acceleration = next_acceleration(state.acceleration, before, covariance, dt_s, objects.diameter_m, px_per_m, motion)
-    gained = acceleration.expected * dt_s[:, None]
-    moved, velocity = torch.add(velocity, gained, alpha=0.5) * dt_s[:, None], velocity + gained
-    T_prior = lie.step_about(state.T_cam_obj.to(velocity.dtype), moved, objects.centre_obj)
+    covariance = predict_covariance(covariance.detach(), velocity.detach(), dt_s, objects.diameter_m, motion)
+    T_prior = lie.step_about(state.T_cam_obj.to(velocity.dtype), velocity * dt_s[:, None], objects.centre_obj)
     T_prior, usable = before_camera(T_prior, objects.centre_obj, far_pose)
-    expected_acceleration = acceleration if config.solver.prior else None
-    return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance, expected_acceleration)
+    return Prediction(objects, T_prior, usable, torch.where(usable[:, None], velocity, 0), covariance)

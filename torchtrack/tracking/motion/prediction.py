@@ -1,6 +1,6 @@
 """Where objects are expected at a window's end, how they move, and how certain that is."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,7 +16,6 @@ from torchtrack.core.linalg import inverse
 from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.tracking.contours.objects import ObjectBatch, repeat_row
 from torchtrack.tracking.contours.points import Contours, assemble
-from torchtrack.tracking.motion.model import Acceleration
 
 # Nothing that is tracked is farther away (m).
 MAX_DEPTH_M = 1e4
@@ -34,7 +33,6 @@ class Prediction:
         usable: which predictions are finite poses before the camera.
         velocity: rotation and velocity of the centre (rad/s, m/s).
         covariance: of pose and velocity (float64), in the chart of :mod:`torchtrack.tracking.motion.model`.
-        acceleration: how the velocity, which is that at the window's end, comes about; none where it is taken to be the same all along.
     """
 
     objects: ObjectBatch
@@ -42,7 +40,6 @@ class Prediction:
     usable: Bool[Tensor, "b"]
     velocity: Float[Tensor, "b 6"]
     covariance: Float[Tensor, "b 12 12"]
-    acceleration: Acceleration | None = None
 
     @once
     def centre_cam(self) -> Float[Tensor, "b 3"]:
@@ -53,25 +50,17 @@ class Prediction:
         """The same prediction as a constant, to look for matches from; itself where no gradients are recorded."""
         if not torch.is_grad_enabled():
             return self
-        acceleration = None if self.acceleration is None else self.acceleration.each(Tensor.detach)
-        return Prediction(self.objects, self.T_cam_obj.detach(), self.usable, self.velocity.detach(), self.covariance.detach(), acceleration)
+        return Prediction(self.objects, self.T_cam_obj.detach(), self.usable, self.velocity.detach(), self.covariance.detach())
 
     @once
     def information(self) -> Float[Tensor, "b 12 12"]:
         """Inverse of the covariance."""
         return inverse(self.covariance)
 
-    def moving(self, *, compensated: bool, offset: Float[Tensor, "b k"] | None = None) -> MovingObjects:
-        """The objects as predicted; standing still where their motion is not to be compensated for.
-
-        Args:
-            offset: of the prediction from the one that ``acceleration`` is of, as :meth:`at` has it; then their velocity changes.
-        """
+    def moving(self, *, compensated: bool) -> MovingObjects:
+        """The objects as predicted; standing still where their motion is not to be compensated for."""
         velocity = self.velocity if compensated else torch.zeros_like(self.velocity)
-        acceleration = None
-        if compensated and self.acceleration is not None and offset is not None:
-            acceleration = self.acceleration.at(offset[:, 6:12])
-        return MovingObjects(self.T_cam_obj, velocity, self.centre_cam, self.objects.intrinsics, acceleration)
+        return MovingObjects(self.T_cam_obj, velocity, self.centre_cam, self.objects.intrinsics)
 
     def plane_velocity(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
         """Image velocity of pixels at the depth of the object's centre (px/s)."""
@@ -111,7 +100,7 @@ class Prediction:
     def at(self, T_cam_obj: Float[Tensor, "b 4 4"], offset: Float[Tensor, "b k"]) -> "Prediction":
         """The prediction with another pose, and its velocity moved by what ``offset`` has beside the pose's part."""
         velocity = self.velocity + offset[:, 6:12] if offset.shape[1] > 6 else self.velocity
-        return Prediction(self.objects, T_cam_obj, self.usable, velocity, self.covariance, self.acceleration)
+        return Prediction(self.objects, T_cam_obj, self.usable, velocity, self.covariance)
 
     def poses_at(self, offsets: Float[Tensor, "n 6"]) -> Float[Tensor, "n 4 4"]:
         """Poses of the one object that this is of, some way from the predicted one."""
@@ -123,8 +112,7 @@ class Prediction:
         T_cam_obj, usable, velocity, covariance = (
             repeat_row(value, number, count) for value in (self.T_cam_obj, self.usable, self.velocity, self.covariance)
         )
-        acceleration = None if self.acceleration is None else self.acceleration.each(lambda value: repeat_row(value, number, count))
-        return Prediction(self.objects.copies(number, count), T_cam_obj, usable, velocity, covariance, acceleration)
+        return Prediction(self.objects.copies(number, count), T_cam_obj, usable, velocity, covariance)
 
     def exchanged(self, number: int, other: "Prediction", taken: Bool[Tensor, ""]) -> "Prediction":
         """The prediction with that of one object, ``other``, in the place of its own, where that is ``taken``."""
@@ -134,11 +122,8 @@ class Prediction:
             value[number] = torch.where(taken, theirs[0], mine[number])
             return value
 
-        acceleration = self.acceleration
-        if acceleration is not None and other.acceleration is not None:
-            acceleration = replace(acceleration, expected=put(acceleration.expected, other.acceleration.expected))
         T_cam_obj, velocity, covariance = (put(getattr(self, name), getattr(other, name)) for name in ("T_cam_obj", "velocity", "covariance"))
-        return Prediction(self.objects, T_cam_obj, self.usable, velocity, covariance, acceleration)
+        return Prediction(self.objects, T_cam_obj, self.usable, velocity, covariance)
 
     @accelerable
     def sigma_px(self, contours: Contours) -> Float[Tensor, "b"]:

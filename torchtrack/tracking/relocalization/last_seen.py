@@ -88,9 +88,8 @@ class LastSeen:
     def prediction(self, number: int, prediction: Prediction) -> Prediction:
         """The prediction of an object alone, at rest there."""
         alone, own = prediction.copies(number, 1), slice(number, number + 1)
-        acceleration = alone.acceleration and replace(alone.acceleration, expected=torch.zeros_like(alone.acceleration.expected))
         T_cam_obj, velocity = self.T_cam_obj[own].to(alone.T_cam_obj.dtype), torch.zeros_like(alone.velocity)
-        return Prediction(alone.objects, T_cam_obj, torch.ones_like(alone.usable), velocity, self.covariance[own], acceleration)
+        return Prediction(alone.objects, T_cam_obj, torch.ones_like(alone.usable), velocity, self.covariance[own])
 
 
 def anywhere(covariance: Float[Tensor, "b 12 12"], chosen: Bool[Tensor, "b"]) -> Float[Tensor, "b 12 12"]:

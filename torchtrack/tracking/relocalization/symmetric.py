@@ -105,11 +105,8 @@ def mirrored(prediction: Prediction, point_obj: Float[Tensor, "3"], normal_obj: 
     other[:3, 3] = middle_cam - other[:3, :3] @ point_obj
     change = torch.block_diag(-in_depth, torch.eye(3, dtype=in_depth.dtype, device=in_depth.device))
     of_both = torch.block_diag(change, change).to(prediction.covariance.dtype)
-    acceleration = prediction.acceleration
-    if acceleration is not None:
-        acceleration = replace(acceleration, expected=acceleration.expected @ change.T)
     covariance = of_both @ prediction.covariance @ of_both.T
-    return Prediction(prediction.objects, other[None], prediction.usable, prediction.velocity @ change.T, covariance, acceleration)
+    return Prediction(prediction.objects, other[None], prediction.usable, prediction.velocity @ change.T, covariance)
 
 
 def _reflection(normal: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
