@@ -126,9 +126,9 @@ def random_find(tracker, prediction, dtype):
     """A solution beside the prediction, and what is said for it: of some objects so little that they have failed."""
     # As likely as what is found.
     likely = torch.linalg.cholesky(prediction.covariance) @ torch.randn(OBJECTS, 12, 1, generator=generator(21), dtype=torch.float64)
-    offset = torch.cat([likely[..., 0], 0.1 * uniform(OBJECTS, 1, seed=20)], 1)
+    offset = likely[..., 0]
     T_cam_obj = retract_about(prediction.T_cam_obj.double(), offset[:, :6], tracker.centre_obj.double()).to(dtype)
-    hessian = random_covariances(OBJECTS, 13, seed=22) * 1e3 + 10 * torch.eye(13).double()
+    hessian = random_covariances(OBJECTS, seed=22) * 1e3 + 10 * torch.eye(12).double()
     contours = tracker.objects.contours(T_cam_obj, tracker.config.contours)
     count = torch.tensor([400, 300, 500, 3, 400, 600, 700])
     nothing = torch.zeros(OBJECTS, 50, dtype=dtype)

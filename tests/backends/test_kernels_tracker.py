@@ -34,7 +34,7 @@ SETTINGS = {
     "corners": {"corners": {"max_corners": 64}},
     "learned trust": {"association": {"weighting_network": "all"}},
     "no velocity": {"disabled": ["velocity_in_window"]},
-    "no silhouette offset": {"solver": {"silhouette_offset_px": 0.0, "common_px": 0.0}},
+    "nothing common": {"solver": {"common_px": 0.0}},
     "damped": {"solver": {"damping": 0.1}},
     "no hidden": {"contours": {"remove_hidden": False, "mid_window": False}},
     "no gathering": {"disabled": ["inlier_ratio"]},

@@ -22,7 +22,6 @@ from torchtrack.errors import ConfigError
         ("relocalization.doubt_us", "renamed to 'relocalization.drift_us', which is a component now: 'disabled: .drift.' switches it off"),
         ("quality.certain_at", "quality.*: renamed to 'validation', 'certain_at' is fixed at 0.75 now"),
         ("matching.min_observations", "matching.*: renamed to 'association'$"),
-        ("solver.swelling_px", "solver.swelling_px .*: renamed to 'solver.silhouette_offset_px'"),
     ],
 )
 def test_a_name_that_a_setting_had_before_is_refused_with_the_name_it_has(old, message):

@@ -16,8 +16,8 @@ WINDOW_S = 0.01
 FASTER = torch.tensor([0.6, -0.4, 0.8, 0.1, -0.08, 0.06], dtype=torch.float64)
 
 
-def windowed(T_true, *, count=300, faster=FASTER, silhouette_offset_px=0.0, noise_px=0.0, prior=1e-6, age_s=None, seed=0, dtype=torch.float64):
-    """A body that moves by ``faster`` more than predicted, seen at random times of a window; every other point is of the smooth silhouette."""
+def windowed(T_true, *, count=300, faster=FASTER, noise_px=0.0, prior=1e-6, age_s=None, seed=0, dtype=torch.float64):
+    """A body that moves by ``faster`` more than predicted, seen at random times of a window."""
     rng = generator(seed)
     batch = len(T_true)
     points = 0.05 * torch.randn((batch, count, 3), generator=rng, dtype=torch.float64)
@@ -26,14 +26,11 @@ def windowed(T_true, *, count=300, faster=FASTER, silhouette_offset_px=0.0, nois
     directions = torch.stack([angle.cos(), angle.sin()], -1)
     intrinsics = SMALL_CAMERA.intrinsics(torch.float64).expand(batch, 4)
     centre = torch.tensor([0.01, -0.02, 0.005], dtype=torch.float64).expand(batch, 3)
-    outward = (torch.arange(count) % 2).double().expand(batch, count)
     # Where each point was at its own time, by the part of the motion that the prediction left out.
     T_then = retract_about(T_true[:, None].expand(batch, count, 4, 4), -ages[..., None] * faster, centre[:, None].expand(batch, count, 3))
     then = transform_points(T_then.flatten(0, 1), points.flatten(0, 1)[:, None])
     targets = project(then, intrinsics.repeat_interleave(count, 0))[:, 0].unflatten(0, (batch, count))
-    targets = (
-        targets + silhouette_offset_px * outward[..., None] * directions + noise_px * torch.randn(targets.shape, generator=rng, dtype=torch.float64)
-    )
+    targets = targets + noise_px * torch.randn(targets.shape, generator=rng, dtype=torch.float64)
     problem = PoseProblem(
         points_obj=points.to(dtype),
         targets=targets.to(dtype),
@@ -43,7 +40,6 @@ def windowed(T_true, *, count=300, faster=FASTER, silhouette_offset_px=0.0, nois
         centre_obj=centre.to(dtype),
         scale_px=torch.full((batch,), 10.0, dtype=dtype),
         T_prior=T_true.to(dtype),
-        prior_information=prior * torch.eye(13, dtype=dtype).expand(batch, 13, 13),
+        prior_information=prior * torch.eye(12, dtype=dtype).expand(batch, 12, 12),
     )
-    nothing = torch.zeros(batch, 6, dtype=dtype)
-    return replace(problem, window=WindowTerms(ages.to(dtype), nothing, outward.to(dtype)))
+    return replace(problem, window=WindowTerms(ages.to(dtype), torch.zeros(batch, 6, dtype=dtype)))

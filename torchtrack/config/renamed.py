@@ -53,9 +53,6 @@ KEYS = {
     "adaptation": {"points": "learned_points"},
     "validation": {"max_step_rotation_rad": "max_rotation_rad", "max_step_translation": "max_translation"},
     "relocalization": {"from_sigma_px": "trigger_sigma_px", "margin": "accept_margin", "elsewhere_min_ratio": "accept_ratio"},
-    "solver": {
-        "swelling_px": "silhouette_offset_px",
-    },
 }
 
 # Settings that were removed, by their sections: what is done in their place, or why nothing is.
@@ -65,6 +62,7 @@ REMOVED: dict[str, dict[str, str]] = {
     "association": {},
     "solver": {
         "acceleration_in_window": "the velocity is the same all along a window",
+        "silhouette_offset_px": "smooth silhouettes lie where their model has them",
     },
     "motion": {
         "acceleration_px": "no acceleration is estimated",

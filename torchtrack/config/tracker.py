@@ -94,9 +94,6 @@ class SolverConfig(Settings):
     common_px: float = Field(
         0.25, ge=0, le=10, description="The same of what observations of a smooth silhouette in one place of the image have in common beside it (px)."
     )
-    silhouette_offset_px: float = Field(
-        0.2, ge=0, description="Standard deviation of how far smooth silhouettes stand out, in a window (px); 0 for not at all."
-    )
 
 
 class MotionConfig(Settings):

@@ -157,10 +157,10 @@ def _updated_motion(
     predicted, solution = prediction.covariance, scored.fit.solution
     if not config.solver.prior:
         return torch.zeros_like(prediction.velocity), predicted
-    posterior = config.solver.observation_px**2 * inverse(solution.hessian.double())[:, :12, :12]
+    posterior = config.solver.observation_px**2 * inverse(solution.hessian.double())
     # A sum is finite only where every entry is.
     trusted = trusted * (posterior.sum((1, 2)).abs() < torch.inf)
-    velocity = prediction.velocity + trusted[:, None] * solution.from_prior[:, 6:12]
+    velocity = prediction.velocity + trusted[:, None] * solution.from_prior[:, 6:]
     covariance = torch.where(trusted[:, None, None] > 0, torch.lerp(predicted, posterior, trusted[:, None, None].double()), predicted)
     faded = fade(velocity, dt_s, failed, config.motion)
     if config.motion.without_events == "hold":

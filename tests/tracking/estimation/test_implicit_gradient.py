@@ -28,7 +28,7 @@ def noisy(loss="tukey", *, window=False, batch=1, seed=0, count=40, T_true=None)
     T_true = random_pose(batch, seed=seed) if T_true is None else T_true
     if window:
         problem = windowed(T_true, count=count, noise_px=2.0, seed=seed, faster=0.3 * torch.ones(6, dtype=torch.float64))
-        information = [30.0] * 3 + [3e3] * 3 + [1e-2] * 3 + [1.0] * 3 + [25.0]
+        information = [30.0] * 3 + [3e3] * 3 + [1e-2] * 3 + [1.0] * 3
     else:
         problem = problem_at(T_true, count, noise_px=2.0, seed=seed)
         information = [30.0] * 3 + [3e3] * 3

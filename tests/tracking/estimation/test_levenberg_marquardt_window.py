@@ -1,4 +1,4 @@
-"""What the solver finds beside the pose: a velocity from the ages of observations, and how far silhouettes stand out."""
+"""What the solver finds beside the pose: a velocity, from the ages of observations."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def test_a_velocity_that_was_predicted_wrong_is_found_with_the_pose(dtype):
     problem = windowed(T_true, dtype=dtype)
     actual = solve_pose(problem, T_true.to(dtype), THOROUGH)
     degrees, millimetres = pose_errors(actual.T_cam_obj.double(), T_true)
-    error = (actual.from_prior[:, 6:12].double() - FASTER).abs()
+    error = (actual.from_prior[:, 6:].double() - FASTER).abs()
     # What is left is the motion's curvature within the window.
     assert float(degrees.max()) < 0.005
     assert float(millimetres.max()) < 0.01
@@ -53,29 +53,18 @@ def test_noise_leaves_pose_and_velocity_unbiased():
     """The mean over many windows is far nearer to the truth than one is."""
     T_true = random_pose(1, seed=2).expand(200, 4, 4)
     actual = solve_pose(windowed(T_true, noise_px=0.5), T_true, SolverConfig(iterations=4))
-    velocity = actual.from_prior[:, 6:12] - FASTER
+    velocity = actual.from_prior[:, 6:] - FASTER
     centre = actual.from_prior[:, :6]
     for error in (velocity, centre):
         assert (error.mean(0).abs() < 4 * error.std(0) / 200**0.5 + 2e-3 * error.std(0)).all()
-
-
-@pytest.mark.parametrize("silhouette_offset_px", [-0.7, 0.4])
-def test_the_silhouette_offset_is_found(silhouette_offset_px, dtype):
-    T_true = random_pose(3, seed=3)
-    problem = windowed(T_true, faster=torch.zeros(6, dtype=torch.float64), silhouette_offset_px=silhouette_offset_px, dtype=dtype)
-    actual = solve_pose(problem, T_true.to(dtype), THOROUGH)
-    torch.testing.assert_close(actual.from_prior[:, 12], torch.full((3,), silhouette_offset_px, dtype=dtype), rtol=0, atol=2e-3)
-    degrees, millimetres = pose_errors(actual.T_cam_obj.double(), T_true)
-    assert float(degrees.max()) < 0.01
-    assert float(millimetres.max()) < 0.01
 
 
 def test_observations_of_one_time_say_nothing_of_the_velocity():
     """With age zero the predicted velocity stays, and its prior is all that is known of it."""
     T_true = random_pose(2, seed=4)
     actual = solve_pose(windowed(T_true, age_s=0.0, noise_px=0.3, prior=1.0), T_true, THOROUGH)
-    assert float(actual.from_prior[:, 6:12].abs().max()) < 1e-9
-    torch.testing.assert_close(actual.hessian[:, 6:12, 6:12], torch.eye(6, dtype=torch.float64).expand(2, 6, 6), rtol=0, atol=1e-9)
+    assert float(actual.from_prior[:, 6:].abs().max()) < 1e-9
+    torch.testing.assert_close(actual.hessian[:, 6:, 6:], torch.eye(6, dtype=torch.float64).expand(2, 6, 6), rtol=0, atol=1e-9)
 
 
 def test_a_prior_weighs_velocities_against_the_ages():
@@ -85,7 +74,7 @@ def test_a_prior_weighs_velocities_against_the_ages():
     for prior in (1e-3, 1e2, 1e7):
         problem = windowed(T_true, noise_px=0.2)
         information = problem.prior_information.clone()
-        information[:, 6:12, 6:12] = prior * torch.eye(6, dtype=torch.float64)
+        information[:, 6:, 6:] = prior * torch.eye(6, dtype=torch.float64)
         actual = solve_pose(replace(problem, prior_information=information), T_true, THOROUGH)
         taken.append(float(actual.from_prior[:, 6:9].norm(dim=-1).mean() / FASTER[:3].norm()))
     assert taken[0] == pytest.approx(1, abs=0.2)
@@ -97,38 +86,36 @@ def test_a_prior_weighs_velocities_against_the_ages():
 
 
 @pytest.mark.parametrize("loss", ["tukey", "huber", "none"])
-def test_six_and_thirteen_unknowns_agree_where_the_further_ones_are_held(loss, dtype):
+def test_six_and_twelve_unknowns_agree_where_the_further_ones_are_held(loss, dtype):
     T_true = random_pose(4, seed=6)
     problem = windowed(T_true, noise_px=0.8, age_s=0.0, prior=10.0, dtype=dtype)
-    problem = replace(problem, window=replace(problem.window, outward=torch.zeros_like(problem.window.outward)))
     config = SolverConfig(iterations=5, loss=loss)
     start = retract_about(T_true, torch.full((4, 6), 2e-3, dtype=torch.float64), problem.centre_obj.double()).to(dtype)
-    six, thirteen = solve_pose(without_window(problem), start, config), solve_pose(problem, start, config)
+    six, twelve = solve_pose(without_window(problem), start, config), solve_pose(problem, start, config)
     tolerance = 1e-5 if dtype == torch.float32 else 1e-9
-    torch.testing.assert_close(thirteen.T_cam_obj, six.T_cam_obj, rtol=0, atol=tolerance)
-    torch.testing.assert_close(thirteen.from_prior[:, :6], six.from_prior, rtol=0, atol=tolerance)
-    costs = [robust_cost(part, actual.T_cam_obj, actual.from_prior, loss) for part, actual in ((problem, thirteen), (without_window(problem), six))]
+    torch.testing.assert_close(twelve.T_cam_obj, six.T_cam_obj, rtol=0, atol=tolerance)
+    torch.testing.assert_close(twelve.from_prior[:, :6], six.from_prior, rtol=0, atol=tolerance)
+    costs = [robust_cost(part, actual.T_cam_obj, actual.from_prior, loss) for part, actual in ((problem, twelve), (without_window(problem), six))]
     torch.testing.assert_close(*costs, rtol=1e-4 if dtype == torch.float32 else 1e-10, atol=tolerance)
-    assert (thirteen.from_prior[:, 6:] == 0).all()
+    assert (twelve.from_prior[:, 6:] == 0).all()
 
 
 def cost_with(problem, T_cam_obj, further):
-    """Cost at a pose, with an offset of velocity and silhouette ``[b, 7]``, by the solver itself."""
-    shift = replace(problem.window, velocity=problem.window.velocity - further[:, :6])
-    targets = problem.targets - (further[:, 6:] * problem.window.outward)[..., None] * problem.directions
-    moved = replace(problem, targets=targets, window=shift, prior_information=torch.zeros_like(problem.prior_information))
+    """Cost at a pose, with an offset of the velocity ``[b, 6]``, by the solver itself."""
+    shift = replace(problem.window, velocity=problem.window.velocity - further)
+    moved = replace(problem, window=shift, prior_information=torch.zeros_like(problem.prior_information))
     return robust_cost(moved, T_cam_obj, torch.zeros_like(moved.prior_information[:, 0]), "tukey")
 
 
 def test_the_gradient_by_all_unknowns_is_that_of_the_cost():
     T = random_pose(2, seed=7)
-    problem = windowed(T, noise_px=0.8, silhouette_offset_px=0.3, prior=0.0)
+    problem = windowed(T, noise_px=0.8, prior=0.0)
     at = solve_pose(problem, T, SolverConfig(iterations=1, loss="tukey"))
-    for axis in range(13):
+    for axis in range(12):
         step = 1e-6 if axis < 6 else 1e-4
         costs = []
         for sign in (1, -1):
-            offset = torch.zeros(2, 13, dtype=torch.float64)
+            offset = torch.zeros(2, 12, dtype=torch.float64)
             offset[:, axis] = sign * step
             costs.append(cost_with(problem, retract_about(T, offset[:, :6], problem.centre_obj), offset[:, 6:]))
         numeric = (costs[0] - costs[1]) / (2 * step)
@@ -142,8 +129,8 @@ def test_the_hessian_by_all_unknowns_is_that_of_residuals_near_zero():
     problem = windowed(T, faster=torch.zeros(6, dtype=torch.float64), count=40, prior=3.0)
     hessian = solve_pose(problem, T, SolverConfig(iterations=1, loss="none")).hessian[0]
     torch.testing.assert_close(hessian, hessian.T)
-    for axis in range(13):
-        offset = torch.zeros(1, 13, dtype=torch.float64)
+    for axis in range(12):
+        offset = torch.zeros(1, 12, dtype=torch.float64)
         offset[0, axis] = 1e-7 if axis < 6 else 1e-4
         start = retract_about(T, offset[:, :6], problem.centre_obj)
         at = solve_pose(problem, start, SolverConfig(iterations=1, loss="none", damping=0), offset)
@@ -155,7 +142,7 @@ def test_the_hessian_by_all_unknowns_is_that_of_residuals_near_zero():
 
 def test_a_batch_is_its_elements(dtype):
     T_true = random_pose(3, seed=9)
-    problem = windowed(T_true, noise_px=0.5, silhouette_offset_px=0.2, prior=0.1, dtype=dtype)
+    problem = windowed(T_true, noise_px=0.5, prior=0.1, dtype=dtype)
     together = solve_pose(problem, T_true.to(dtype), THOROUGH)
     for row in range(3):
         part = slice(row, row + 1)
@@ -165,7 +152,7 @@ def test_a_batch_is_its_elements(dtype):
         torch.testing.assert_close(together.T_cam_obj[part], alone.T_cam_obj, rtol=0, atol=5e-5 if dtype == torch.float32 else 1e-10)
 
 
-@pytest.mark.parametrize("where", ["age_s", "velocity", "outward"])
+@pytest.mark.parametrize("where", ["age_s", "velocity"])
 def test_a_bad_element_harms_no_neighbour(where, dtype):
     T_true = random_pose(3, seed=10)
     problem = windowed(T_true, noise_px=0.3, prior=1.0, dtype=dtype)

@@ -119,7 +119,7 @@ def test_objects_are_predicted_each_for_itself():
 # ---- inverses
 
 
-@pytest.mark.parametrize("size", [6, 12, 13])
+@pytest.mark.parametrize("size", [6, 12])
 def test_the_inverse_is_the_inverse(size):
     matrices = random_covariance(size, batch=4)
     eye = torch.eye(size, dtype=torch.float64).expand(4, -1, -1)

@@ -81,15 +81,15 @@ def test_velocities_are_those_of_the_centre():
 
 def test_a_moved_prediction_has_pose_and_velocity_moved(dtype):
     prediction = boxes(torch.stack([pose(), pose((0.1, 0.2, 0.3))]), random_covariance(2), torch.ones(2, 6), dtype)
-    offset = 0.01 * torch.randn((2, 13), generator=generator(), dtype=torch.float64).to(dtype)
+    offset = 0.01 * torch.randn((2, 12), generator=generator(), dtype=torch.float64).to(dtype)
     moved = prediction.moved(offset)
     expected = retract_about(prediction.T_cam_obj, offset[:, :6], prediction.objects.centre_obj)
     torch.testing.assert_close(moved.T_cam_obj, expected)
-    torch.testing.assert_close(moved.velocity, prediction.velocity + offset[:, 6:12])
+    torch.testing.assert_close(moved.velocity, prediction.velocity + offset[:, 6:])
     assert moved.covariance is prediction.covariance
     assert moved.objects is prediction.objects
     # A pose alone may be moved too, where the solver has no further unknowns; and no move is none.
-    torch.testing.assert_close(prediction.moved(torch.zeros(2, 13, dtype=dtype)).T_cam_obj, prediction.T_cam_obj)
+    torch.testing.assert_close(prediction.moved(torch.zeros(2, 12, dtype=dtype)).T_cam_obj, prediction.T_cam_obj)
 
 
 def test_copies_are_of_one_object():

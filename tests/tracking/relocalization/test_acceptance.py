@@ -50,7 +50,7 @@ def test_a_row_is_the_test_of_a_single_object():
 
 def test_of_poses_that_explain_as_much_the_most_expected_is_taken():
     """Turns of a vase about its axis all explain the same: the best of them by a hair is chance."""
-    from_prior = torch.zeros(4, 13)
+    from_prior = torch.zeros(4, 12)
     from_prior[:, 1] = torch.tensor([0.5, 0.01, 0.0, 0.3])
     share, covariance = torch.tensor([0.9, 0.89, 0.6, 0.885]), 1e-2 * torch.eye(12, dtype=torch.float64)
     assert likeliest(share, from_prior, covariance).tolist() == [1]
@@ -60,10 +60,10 @@ def test_of_poses_that_explain_as_much_the_most_expected_is_taken():
 
 def test_what_a_prediction_does_not_allow_is_not_likely():
     """In standard deviations; what is not a number is none."""
-    offsets = torch.zeros(5, 13)
+    offsets = torch.zeros(5, 12)
     offsets[1, 0], offsets[2, 0], offsets[3, :6], offsets[4, 2] = 0.4, 0.42, 0.18, torch.nan
     assert is_likely(offsets, 1e-2 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True, False, False, False]
-    wide = torch.full((1, 13), 5.0)
+    wide = torch.full((1, 12), 5.0)
     assert is_likely(torch.cat([offsets[:1], wide]), 25.0 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True]
 
 

@@ -27,9 +27,8 @@ def random_covariance(seed=0, scale=1e-4):
 def test_offsets_are_drawn_with_the_covariance():
     covariance = random_covariance()
     offsets = draw_offsets(covariance, 8000)
-    assert offsets.shape == (8000, 13)
+    assert offsets.shape == (8000, 12)
     assert (offsets[0] == 0).all()
-    assert (offsets[:, 12] == 0).all()
     sampled = offsets[:, :6].T @ offsets[:, :6] / len(offsets)
     scale = covariance[:6, :6].diagonal().sqrt()
     assert float(((sampled - covariance[:6, :6]) / (scale[:, None] * scale)).abs().max()) < 0.03
@@ -42,7 +41,7 @@ def test_the_velocity_of_an_offset_is_what_its_pose_implies():
     covariance = random_covariance()
     offsets = draw_offsets(covariance, 100)
     gain = covariance[6:, :6] @ torch.linalg.inv(covariance[:6, :6])
-    torch.testing.assert_close(offsets[:, 6:12], offsets[:, :6] @ gain.T)
+    torch.testing.assert_close(offsets[:, 6:], offsets[:, :6] @ gain.T)
     unrelated = covariance.clone()
     unrelated[6:, :6] = unrelated[:6, 6:] = 0
     assert float(draw_offsets(unrelated, 100)[:, 6:].abs().max()) == 0
@@ -81,7 +80,7 @@ def scores_at(prediction, outlines, offsets, image):
 def test_the_true_pose_is_scored_best(dtype):
     _, prediction, seen, scored, _ = in_motion(dtype=dtype)
     density = event_density(seen.pixels + prediction.plane_velocity(seen.pixels) * seen.age_s[..., None], seen.mask, IMAGE_SIZE)
-    away = torch.zeros(13, 13, dtype=dtype)
+    away = torch.zeros(13, 12, dtype=dtype)
     for axis in range(6):
         away[2 * axis + 1, axis], away[2 * axis + 2, axis] = (0.15, -0.15) if axis < 3 else (0.015, -0.015)
     # Depth moves contours least.
@@ -93,7 +92,7 @@ def test_the_true_pose_is_scored_best(dtype):
 
 def test_scores_of_poses_behind_the_camera_are_numbers():
     _, prediction, seen, scored, _ = in_motion()
-    offsets = torch.zeros(2, 13)
+    offsets = torch.zeros(2, 12)
     offsets[1, 5] = -2.0
     density = event_density(seen.pixels, seen.mask, IMAGE_SIZE)
     for outlines in (thinned(scored.fit.contours), outlines_at(prediction, prediction.poses_at(offsets[:, :6]), TrackerConfig())):
@@ -121,7 +120,7 @@ def test_a_pose_near_the_true_one_is_among_the_sample(rotation_rad, dtype):
     once = TrackerConfig(relocalization=RelocalizationConfig(wide_sigma_px=100.0))
     places, covariance = places_of(prediction, seen), torch.diag(sigma.square())
     shifted, drawn = (sample(prediction, scored.fit.contours, covariance, 30.0, places, config) for config in (tracker.config, once))
-    assert shifted.shape == drawn.shape == (24, 13)
+    assert shifted.shape == drawn.shape == (24, 12)
     assert shifted.dtype == dtype
     assert not shifted[0].any()
     assert nearest(shifted, prediction, T_true) < min(10, 0.7 * nearest(drawn, prediction, T_true))

@@ -33,7 +33,7 @@ REMEMBERED = 6
 # What was measured of it.
 EXPLAINED_RATIO, SCORE, INLIER_RATIO, REFERENCE, IN_VIEW, GATE_SCALE = range(6)
 MEASURED = 6
-_UNKNOWNS = 13
+_UNKNOWNS = 12
 # As torchtrack.tracking.validation.status.trust has it.
 _LEAST_RANGE = 1e-6
 
@@ -69,7 +69,7 @@ def conclude(
     Args:
         T_before: poses before the window, ``[b, 4, 4]``.
         T_prior, usable, velocity, covariance: of the prediction.
-        T_estimated, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 13]``, ``[b, 13, 13]``.
+        T_estimated, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 12]``, ``[b, 12, 12]``.
         is_relocalized, axis_ambiguous: ``[b]``, of the fits; ``matched [b]``, how many observations they have.
         measured: ``[MEASURED, b]``, what else is known of them.
         remembered, T_last_validated: ``[REMEMBERED, b]`` and ``[b, 4, 4]`` before the window; changed to those after it.

@@ -16,7 +16,6 @@ from torchtrack.backends.numba.matching import (
     AGE,
     DIRECTION_U,
     DIRECTION_V,
-    IS_SMOOTH,
     MATCH_AGE,
     POINT_X,
     POINT_Y,
@@ -45,8 +44,8 @@ from torchtrack.tracking.estimation import rounds
 from torchtrack.tracking.estimation.rounds import Gates, Start
 from torchtrack.tracking.estimation.terms import Linearisation
 
-# Pose, velocity and silhouette offset; and their residual, in the rows of a Jacobian.
-UNKNOWNS, _RESIDUAL = 13, 13
+# Pose and velocity; and their residual, in the rows of a Jacobian.
+UNKNOWNS, _RESIDUAL = 12, 12
 
 
 @kernel()
@@ -82,10 +81,10 @@ def align(
         seen: ``[b, 6, n]``, and which of them exist.
         table: ``[b, m, COLUMNS]`` of contour points; ``nearest_of_cell [b, p]`` and ``first [b, 2]`` are their index.
         velocity: ``[b, 6]`` as predicted.
-        information: ``[b, 13, 13]`` of the prior.
+        information: ``[b, 12, 12]`` of the prior.
         gates_px: ``[r]``, and by how much each is ``wider [r, b]``.
         subcell_lookup: ``[b]``, whether contours are looked up between the cells of the index.
-        T_cam_obj, offset: ``[b, 4, 4]`` and ``[b, 13]`` from the prior, where the rounds begin; changed to where they end.
+        T_cam_obj, offset: ``[b, 4, 4]`` and ``[b, 12]`` from the prior, where the rounds begin; changed to where they end.
         gradient, hessian, contour, is_near, is_matched, matches: of the last round; filled.
     """
     count = seen.shape[2]
@@ -93,18 +92,18 @@ def align(
     votes, centre, step = np.empty((matching.patches**2, 3)), np.empty(3), np.empty(UNKNOWNS)
     for b in range(len(seen)):
         centre_of(T_cam_obj[b], centre_obj[b], centre)
-        moving, of_lens = drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre), lens(intrinsics[b])
+        moving, of_lens = drift(rounds.compensated * (velocity[b] + offset[b, 6:]), centre), lens(intrinsics[b])
         _first_place(seen[b], moving, centre, of_lens, place)
         for r in range(len(gates_px)):
             centre_of(T_cam_obj[b], centre_obj[b], centre)
-            moving = drift(rounds.compensated * (velocity[b] + offset[b, 6:12]), centre)
+            moving = drift(rounds.compensated * (velocity[b] + offset[b, 6:]), centre)
             match(
                 seen[b], exists[b], place, table[b], nearest_of_cell[b], first[b], cells, entries(T_cam_obj[b]), moving, of_lens,
                 gates_px[r], wider[r, b], subcell_lookup[b], matching, contour[b], is_near[b], is_matched[b], matches[b], votes,
             )  # fmt: skip
             believe(seen[b], is_matched[b], matches[b], matching)
             pose, scale_px = entries(T_cam_obj[b]), gates_px[r] * wider[r, b]
-            used = _linearise(matches[b], pose, centre_obj[b], centre, of_lens, scale_px, offset[b], rounds, rows, weights)
+            used = _linearise(matches[b], pose, centre_obj[b], centre, of_lens, scale_px, rounds, rows, weights)
             normal_equations(rows, weights, used, information[b], offset[b], gradient[b], hessian[b])
             damped_step(gradient[b], hessian[b], damping.damping, damping, step)
             move(T_cam_obj[b], centre_obj[b], offset[b], step)
@@ -127,22 +126,20 @@ def _linearise(
     centre: Array,
     intrinsics: Numbers,
     scale_px: float,
-    offset: Array,
     rounds: RoundSettings,
     rows: Array,
     weights: Array,
 ) -> int:
     """Fill rows of the Jacobian, with residuals, and weights of those that count; how many these are."""
-    used, silhouette_offset, middle = 0, offset[UNKNOWNS - 1], (centre[0], centre[1], centre[2])
+    used, middle = 0, (centre[0], centre[1], centre[2])
     for i in range(matches.shape[1]):
         weight = matches[WEIGHT, i]
         if not weight > 0:
             continue
         px, py, pz = matches[POINT_X, i] - centre_obj[0], matches[POINT_Y, i] - centre_obj[1], matches[POINT_Z, i] - centre_obj[2]
-        nu, nv, outward = matches[DIRECTION_U, i], matches[DIRECTION_V, i], matches[IS_SMOOTH, i]
+        nu, nv = matches[DIRECTION_U, i], matches[DIRECTION_V, i]
         there = (matches[TARGET_U, i] - intrinsics[2]) * nu + (matches[TARGET_V, i] - intrinsics[3]) * nv
         row, residual = row_of(pose, px, py, pz, middle, intrinsics, nu, nv, there)
-        residual += outward * silhouette_offset
         relative = residual / scale_px
         robust = max(1.0 - relative * relative, 0.0)
         if robust == 0.0:
@@ -152,8 +149,7 @@ def _linearise(
             rows[k, used] = row[k]
             # How far it was from where it is at the pose, for each unit of velocity beyond the predicted one.
             rows[6 + k, used] = -row[k] * age
-        rows[12, used], rows[_RESIDUAL, used] = outward, residual
-        weights[used] = weight * robust * robust
+        rows[_RESIDUAL, used], weights[used] = residual, weight * robust * robust
         used += 1
     return used
 

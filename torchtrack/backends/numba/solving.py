@@ -18,7 +18,7 @@ from torchtrack.tracking.estimation.terms import Linearisation, PoseProblem, Win
 
 # Sums of products run along as many observations at a time: what they need stays in the fastest memory.
 _ALONG = FAST | {"reassoc"}
-# Unknowns of a pose; beside it there may be as many of its velocity, and a silhouette offset.
+# Unknowns of a pose; beside it there may be as many of its velocity.
 _POSE = 6
 
 
@@ -29,7 +29,6 @@ def solve_poses(
     directions: Array,
     weights: Array,
     age_s: Array,
-    outward: Array,
     velocity: Array,
     intrinsics: Array,
     centre_obj: Array,
@@ -45,7 +44,7 @@ def solve_poses(
     """Solve each problem: :class:`torchtrack.tracking.estimation.terms.PoseProblem` by its fields.
 
     Args:
-        age_s, outward, velocity: of what is unknown beside the pose; not read where there is nothing.
+        age_s, velocity: of what is unknown beside the pose; not read where there is nothing.
         T_cam_obj, offset: ``[b, 4, 4]`` and ``[b, k]`` from the prior, where the search starts; changed to where it ends.
         gradient, hessian: ``[b, k]`` and ``[b, k, k]``, of the last linearisation; filled.
     """
@@ -55,7 +54,7 @@ def solve_poses(
     step, next_gradient, next_hessian = np.empty(unknowns), np.empty(unknowns), np.empty((unknowns, unknowns))
     for b in range(len(offset)):
         pose[:], offset_of[:] = T_cam_obj[b], offset[b]
-        problem = (points_obj[b], targets[b], directions[b], weights[b], age_s[b], outward[b], velocity[b])
+        problem = (points_obj[b], targets[b], directions[b], weights[b], age_s[b], velocity[b])
         of_object = (lens(intrinsics[b]), centre_obj[b], scale_px[b], information[b])
         cost = _look(problem, of_object, pose, offset_of, solving.loss, rows, robust, gradient[b], hessian[b])
         damped = damping.damping
@@ -88,13 +87,13 @@ def _look(
     hessian: Array,
 ) -> float:
     """Gradient and Hessian at a pose and an offset from the prior, filled, and the cost there."""
-    points, targets, directions, weights, age_s, outward, velocity = problem
+    points, targets, directions, weights, age_s, velocity = problem
     intrinsics, centre_obj, scale_px, information = of_object
     unknowns, centre, cost, used, velocity_offset = len(offset), np.empty(3), 0.0, 0, np.zeros(_POSE)
     centre_of(pose, centre_obj, centre)
     numbers, c, middle = entries(pose), (centre_obj[0], centre_obj[1], centre_obj[2]), (centre[0], centre[1], centre[2])
     if unknowns > _POSE:
-        velocity_offset[:] = offset[_POSE : 2 * _POSE] - velocity
+        velocity_offset[:] = offset[_POSE:] - velocity
     for i in range(len(weights)):
         if not weights[i] > 0:
             continue
@@ -108,8 +107,6 @@ def _look(
             for k in range(_POSE):
                 rows[_POSE + k, used] = -row[k] * age_s[i]
                 residual += rows[_POSE + k, used] * velocity_offset[k]
-            rows[2 * _POSE, used] = outward[i]
-            residual += outward[i] * offset[2 * _POSE]
         weight, lost = robustly(residual, scale_px, loss)
         cost += weights[i] * lost
         rows[unknowns, used], robust[used] = residual, weights[i] * weight
@@ -229,7 +226,7 @@ def solve_pose_numba(
     window = problem.window or _no_window(problem)
     T_cam_obj, offset = (value.detach().clone(memory_format=torch.contiguous_format) for value in (T_start, from_prior))
     gradient, hessian = torch.empty_like(offset), torch.empty_like(problem.prior_information, memory_format=torch.contiguous_format)
-    observed = problem.points_obj, problem.targets, problem.directions, problem.weights, window.age_s, window.outward
+    observed = problem.points_obj, problem.targets, problem.directions, problem.weights, window.age_s
     of_objects = window.velocity, problem.intrinsics, problem.centre_obj, problem.scale_px, problem.prior_information
     rounding = lm.ROUNDINGS * torch.finfo(T_start.dtype).eps
     solve_poses(
@@ -244,4 +241,4 @@ def solve_pose_numba(
 def _no_window(problem: PoseProblem) -> WindowTerms:
     """What stands for terms that a problem has not."""
     nothing, no_motion = problem.weights.new_empty(len(problem.weights), 0), problem.weights.new_empty(len(problem.weights), 6)
-    return WindowTerms(nothing, no_motion, nothing)
+    return WindowTerms(nothing, no_motion)

@@ -152,5 +152,5 @@ def _counted(problem: PoseProblem) -> PoseProblem:
         values = {name: getattr(part, name) for name in names}
         return {name: torch.take_along_dim(value, rows if value.dim() == 2 else rows[..., None], 1) for name, value in values.items()}
 
-    window = None if problem.window is None else replace(problem.window, **of_rows(problem.window, ("age_s", "outward")))
+    window = None if problem.window is None else replace(problem.window, **of_rows(problem.window, ("age_s",)))
     return replace(problem, **of_rows(problem, ("points_obj", "targets", "directions", "weights")), window=window)

@@ -29,7 +29,7 @@ DAMPING_START, DAMPING_GROWTH, DAMPING_DECAY = 1e-4, 10.0, 0.1
 LEAST_DIAGONAL, _LEAST_SHARE = 1e-12, 1e-9
 
 
-# Unknowns of a pose alone. With those of a window and the residual there are 14 rows: a CPU takes half the time for products of 16.
+# Unknowns of a pose alone. With those of a window and the residual there are 13 rows: a CPU takes half the time for products of 16.
 _POSE, _PADDED_ROWS = 6, 16
 
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import AssociationConfig, TrackerConfig
@@ -37,8 +36,6 @@ GATE_SIGMAS = 3.0
 FINE_BELOW_PX = 120.0
 # What has to be looked for with a gate this many times wider may be anywhere.
 ANYWHERE = 2.0
-# Standard deviation of a silhouette offset that is switched off (px).
-_NO_SILHOUETTE_OFFSET_PX = 1e-3
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,7 @@ def align(
     gate_scale: Float[Tensor, "b"],
     observations: Observations,
     config: TrackerConfig,
-    offset: Float[Tensor, "b 13"] | None = None,
+    offset: Float[Tensor, "b 12"] | None = None,
     extra_terms: tuple[CostTerm, ...] = (),
 ) -> Fit:
     """Match and solve, one round per gate.
@@ -107,7 +104,7 @@ def align(
         prediction: what the prior draws to.
         contours: visible contours where the rounds begin, and ``index`` of them.
         gate_scale: of each object's first gate; it is taken back by the last.
-        offset: of the beginning from the prediction: pose, velocity and silhouette offset; none when not given.
+        offset: of the beginning from the prediction: pose and velocity; none when not given.
         extra_terms: of the cost, beside contour distances and prior.
     """
     objects, matching = prediction.objects, config.association
@@ -221,13 +218,10 @@ def _first_place(begin: Prediction, observations: Observations, config: TrackerC
 
 
 def _information(prediction: Prediction, config: TrackerConfig) -> Tensor:
-    """Information of the prediction in the solver's chart, for observations of unit weight: 13 of them, or none for the pose."""
+    """Information of the prediction in the solver's chart, for observations of unit weight: of pose and velocity, or none of the pose."""
     if not config.solver.prior:
         return prediction.velocity.new_zeros(len(prediction.velocity), 6, 6)
-    silhouette_offset_px = config.solver.silhouette_offset_px or _NO_SILHOUETTE_OFFSET_PX
-    information = pad((config.solver.observation_px**2 * prediction.information).to(prediction.velocity.dtype), (0, 1, 0, 1))
-    information[:, 12, 12] = config.solver.observation_px**2 * silhouette_offset_px**-2
-    return information
+    return (config.solver.observation_px**2 * prediction.information).to(prediction.velocity.dtype)
 
 
 def _believed(matches: MatchesWithCues, observations: Observations, config: TrackerConfig) -> MatchesWithCues:
@@ -261,11 +255,6 @@ def _problem(start: Start, matches: MatchesWithCues, offset: Float[Tensor, "b k"
     )
 
 
-def _window_terms(rows: MatchesWithCues, offset: Float[Tensor, "b 13"], config: TrackerConfig) -> WindowTerms:
-    """What observations tell beside the pose: of the velocity by their ages, and of how far silhouettes stand out."""
-    age_s, outward = rows.age_s, rows.silhouette
-    if config.association.residual != "normal":
-        outward = torch.zeros_like(outward)
-    if not config.uses(Component.VELOCITY_IN_WINDOW):
-        age_s = torch.zeros_like(age_s)
-    return WindowTerms(age_s, offset[:, 6:12], outward)
+def _window_terms(rows: MatchesWithCues, offset: Float[Tensor, "b 12"], config: TrackerConfig) -> WindowTerms:
+    """What observations tell beside the pose: of the velocity, by their ages."""
+    return WindowTerms(rows.age_s if config.uses(Component.VELOCITY_IN_WINDOW) else torch.zeros_like(rows.age_s), offset[:, 6:])

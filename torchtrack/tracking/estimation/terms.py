@@ -11,7 +11,6 @@ from typing import Protocol, runtime_checkable
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.image_velocity import pose_jacobian
@@ -80,19 +79,15 @@ class WindowTerms:
     """What observations tell of beside the pose, which the solver then finds with it.
 
     An observation that is older than the pose tells of the velocity: the two are found together, so that a velocity
-    that was predicted wrong neither biases the pose nor is learned one window late. And all silhouettes of an object may stand
-    out of its outline, or within it, by one unknown way, as smooth shading makes them: without it, depth would be
-    believed to be seen far better than it is.
+    that was predicted wrong neither biases the pose nor is learned one window late.
 
     Args:
         age_s: time from each observation to the pose (s).
         velocity: offset from the predicted velocity that the targets were moved with (rad/s, m/s).
-        outward: 1 where the silhouette's offset counts along the direction, 0 where not.
     """
 
     age_s: Float[Tensor, "b n"]
     velocity: Float[Tensor, "b 6"]
-    outward: Float[Tensor, "b n"]
 
 
 @dataclass(frozen=True)
@@ -109,7 +104,7 @@ class PoseProblem:
         scale_px: scale of the robust loss, per object.
         T_prior: pose the prior draws to.
         prior_information: information of the prior in the solver's chart; zero for no prior.
-        window: further unknowns; then the chart is ``[pose 6, velocity 6, silhouette offset (px) 1]`` instead of the pose alone.
+        window: further unknowns; then the chart is ``[pose 6, velocity 6]`` instead of the pose alone.
         extra_terms: of the cost, beside contour distances and prior.
     """
 
@@ -174,8 +169,8 @@ class ContourDistance:
         if self.window is None:
             return LinearisedTerm(residuals, jacobian, self.weights, self.scale_px)
         # Linear in all that is unknown beside the pose; the targets have been moved with one velocity already.
-        further = torch.cat([jacobian * -self.window.age_s[:, None], self.window.outward[:, None]], 1)
-        unexpected = place.from_prior[:, None, 6:] - pad(self.window.velocity, (0, 1))[:, None]
+        further = jacobian * -self.window.age_s[:, None]
+        unexpected = (place.from_prior[:, 6:] - self.window.velocity)[:, None]
         residuals = torch.baddbmm(residuals[:, None], unexpected, further)[:, 0]
         return LinearisedTerm(residuals, torch.cat([jacobian, further], 1), self.weights, self.scale_px)
 

@@ -99,7 +99,7 @@ class Prediction:
 
     def at(self, T_cam_obj: Float[Tensor, "b 4 4"], offset: Float[Tensor, "b k"]) -> "Prediction":
         """The prediction with another pose, and its velocity moved by what ``offset`` has beside the pose's part."""
-        velocity = self.velocity + offset[:, 6:12] if offset.shape[1] > 6 else self.velocity
+        velocity = self.velocity + offset[:, 6:] if offset.shape[1] > 6 else self.velocity
         return Prediction(self.objects, T_cam_obj, self.usable, velocity, self.covariance)
 
     def poses_at(self, offsets: Float[Tensor, "n 6"]) -> Float[Tensor, "n 4 4"]:

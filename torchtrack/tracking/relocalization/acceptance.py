@@ -194,5 +194,5 @@ def less_by_few_events(score: Float[Tensor, "n"], count: Int[Tensor, "n"]) -> Fl
 
 def likeliest(score: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Int[Tensor, "1"]:
     """Of the poses that explain as much as the best does, the one that the prediction expects most: a rotation of a vase explains nothing."""
-    away = _squared_deviations(from_prior[:, :12], covariance)
+    away = _squared_deviations(from_prior, covariance)
     return torch.where(score >= score.max() - AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]

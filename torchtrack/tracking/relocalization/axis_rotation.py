@@ -74,7 +74,7 @@ def rotated(lost: LostObject) -> Rotations:
     chosen, exists = _peaks(score, within)
     return Rotations(
         prediction=prediction,
-        offsets=prediction.velocity.new_zeros(len(chosen), 13),
+        offsets=prediction.velocity.new_zeros(len(chosen), 12),
         covariance=prediction.covariance[0],
         places=(lost.events.pixels, lost.events.mask),
         is_wide=False,

@@ -37,7 +37,7 @@ class Hypotheses:
     """
 
     prediction: Prediction
-    offsets: Float[Tensor, "n 13"]
+    offsets: Float[Tensor, "n 12"]
     covariance: Float[Tensor, "12 12"]
     places: tuple[Float[Tensor, "1 e 2"], Bool[Tensor, "1 e"]]
     is_wide: bool

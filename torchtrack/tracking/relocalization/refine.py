@@ -32,7 +32,7 @@ def refined(hypotheses: Hypotheses, lost: LostObject) -> ScoredFit:
     return tried
 
 
-def align_and_score(rows: Prediction, offsets: Float[Tensor, "n 13"], lost: LostObject) -> ScoredFit:
+def align_and_score(rows: Prediction, offsets: Float[Tensor, "n 12"], lost: LostObject) -> ScoredFit:
     """Align predictions of an object, each from its own offset, on the events of the object, and score them."""
     config, scored, number = lost.config, lost.window.scored, lost.number
     begin = rows.moved(offsets)
@@ -59,7 +59,7 @@ def exchanged(lost: LostObject, hypotheses: Hypotheses, tried: ScoredFit, choice
         scored = replace(scored, axis_ambiguous=unclear)
     if hypotheses.released is not None:
         hessian = scored.fit.solution.hessian.clone()
-        hessian[number, :12, :12] += (hypotheses.released * accepted).to(hessian.dtype)
+        hessian[number] += (hypotheses.released * accepted).to(hessian.dtype)
         scored = replace(scored, fit=replace(scored.fit, solution=replace(scored.fit.solution, hessian=hessian)))
     if hypotheses.replaces_prediction:
         prediction = prediction.exchanged(number, hypotheses.prediction_at(choice.row), accepted[0])

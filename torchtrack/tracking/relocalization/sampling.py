@@ -11,7 +11,7 @@ from functools import lru_cache
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from torch.nn.functional import avg_pool2d
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerable
@@ -40,7 +40,7 @@ def sample(
     sigma_px: float,
     places: tuple[Float[Tensor, "1 e 2"], Bool[Tensor, "1 e"]],
     config: TrackerConfig,
-) -> Float[Tensor, "n 13"]:
+) -> Float[Tensor, "n 12"]:
     """Offsets of pose and velocity that are worth aligning, ``search.hypotheses`` of them; the first, the prediction itself, is none.
 
     Args:
@@ -83,8 +83,8 @@ def _anywhere(
     return poses, outlines_at(prediction, poses, config)
 
 
-def draw_offsets(covariance: Float[Tensor, "12 12"], count: int) -> Float[Tensor, "n 13"]:
-    """Offsets of pose and velocity, drawn evenly from a covariance; the first is none. The silhouette offset, last, is not drawn.
+def draw_offsets(covariance: Float[Tensor, "12 12"], count: int) -> Float[Tensor, "n 12"]:
+    """Offsets of pose and velocity, drawn evenly from a covariance; the first is none.
 
     The sequence is the same every time: a search can be repeated.
     """
@@ -95,10 +95,10 @@ def _root(covariance: Tensor) -> Tensor:
     return torch.linalg.cholesky_ex(covariance[:6, :6]).L
 
 
-def _with_velocity(pose: Float[Tensor, "n 6"], covariance: Float[Tensor, "12 12"]) -> Float[Tensor, "n 13"]:
+def _with_velocity(pose: Float[Tensor, "n 6"], covariance: Float[Tensor, "12 12"]) -> Float[Tensor, "n 12"]:
     """Offsets of poses with those of the velocity: a pose that is off implies a velocity that was."""
     gain = torch.linalg.solve_ex(covariance[:6, :6], covariance[:6, 6:]).result
-    return pad(torch.cat([pose, pose @ gain.to(pose.dtype)], -1), (0, 1))
+    return torch.cat([pose, pose @ gain.to(pose.dtype)], -1)
 
 
 @lru_cache(maxsize=8)
