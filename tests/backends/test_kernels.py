@@ -8,7 +8,6 @@ import trimesh
 from both_ways import assert_as_close, both_ways
 from close_edges import two_depths
 from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_events, random_pose, random_twist
-from predicted_boxes import boxes
 from solid_models import ball, l_prism
 
 from torchtrack.config.tracker import ContourConfig, TrackerConfig
@@ -120,17 +119,6 @@ def test_hidden_contours_of_objects_before_one_another(streams, depth_m, seed):
     by_kernels, plain = both_ways(lambda: remove_hidden(contours, scene))
     assert torch.equal(by_kernels.mask, plain.mask)
     assert 0 < int(plain.mask.sum()) < int(contours.mask.sum())
-
-
-def test_poses_in_the_middle_of_a_window(dtype):
-    T_cam_obj, velocity = random_pose(5).to(dtype), 4.0 * random_twist(5).to(dtype)
-    # One was behind the camera then, and one is nowhere.
-    velocity[1, 5], T_cam_obj[2, 0, 0] = 1e3, torch.nan
-    prediction, dt_s = boxes(T_cam_obj, velocity=velocity, dtype=dtype), uniform(5, low=0.005, high=0.05, dtype=dtype)
-    by_kernels, plain = both_ways(lambda: prediction.in_mid_window(dt_s))
-    assert_as_close(by_kernels, plain, tolerance=TOLERANCE[dtype])
-    assert torch.equal(plain[1:3].nan_to_num(9.0), T_cam_obj[1:3].nan_to_num(9.0))
-    assert not torch.equal(plain[0], T_cam_obj[0])
 
 
 # ---- index, table and choice of events

@@ -81,7 +81,7 @@ def test_of_shared_events_those_are_chosen_that_would_be_of_rows(count):
     tracker, _, prediction, seen = window_of(3, 6000, 5000)
     with torch.inference_mode():
         events, _ = seen()
-        contours = prediction.contours(torch.full((3,), 5e-3).double(), tracker.config.contours)
+        contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
         index, moving = index_contours(contours, tracker.image_size, 7, 2), prediction.moving(compensated=True)
         shared, rows = (select_events(each, index, moving, count) for each in (events, events.rows()))
     assert int(shared.mask.sum()) > 0

@@ -36,7 +36,7 @@ SETTINGS = {
     "no velocity": {"disabled": ["velocity_in_window"]},
     "nothing common": {"solver": {"common_px": 0.0}},
     "damped": {"solver": {"damping": 0.1}},
-    "no hidden": {"contours": {"remove_hidden": False, "mid_window": False}},
+    "no hidden": {"contours": {"remove_hidden": False}},
     "no gathering": {"disabled": ["inlier_ratio"]},
     "hold": {"motion": {"model": "hold", "without_events": "hold"}},
     "steps": {"solver": {"iterations": 3, "loss": "huber"}},

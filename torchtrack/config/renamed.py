@@ -58,7 +58,9 @@ KEYS = {
 # Settings that were removed, by their sections: what is done in their place, or why nothing is.
 REMOVED: dict[str, dict[str, str]] = {
     "window": {},
-    "contours": {},
+    "contours": {
+        "mid_window": "contours are those that show at the window's end",
+    },
     "association": {},
     "solver": {
         "acceleration_in_window": "the velocity is the same all along a window",

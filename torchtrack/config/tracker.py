@@ -51,9 +51,6 @@ class ContourConfig(Settings):
     texture: bool = Field(True, description="Edges of the texture.")
     max_edge_points: int = Field(800, ge=16, le=10_000, description="Points sampled on occluding contours, creases and segments.")
     remove_hidden: bool = Field(True, description="Remove contours behind a surface of any object of the stream.")
-    mid_window: bool = Field(
-        True, description="Contours are those that show in the middle of a window: what comes into sight at its end has not fired."
-    )
 
 
 class AssociationConfig(Settings):

@@ -105,7 +105,7 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     config, sensors, maps, t_us = tracked.config, tracked.sensors, state.maps, given.t_us
     prediction, nearby = expected.prediction.detached(), near_objects(tracked, expected, given.events)
     events, burst_age_us = sensors.window_events(nearby, maps.burst_age_us, t_us, t_us - state.t_us, config.association.burst_us)
-    contours = prediction.contours(expected.dt_s, config.contours)
+    contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
     sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(tracked.diameter_m)
     gate_scale = gate_scale_of(sigma_px, config)
     # Asked for here: a GPU answers while corners are looked for.

@@ -1,11 +1,8 @@
 """Predictions: how uncertain contours are in the image, copies and moves, and how wide that opens the first gate."""
 
-import math
-from dataclasses import replace
-
 import pytest
 import torch
-from helpers import SMALL_CAMERA, box_model, generator, pose
+from helpers import SMALL_CAMERA, generator, pose
 from predicted_boxes import CENTRE_OBJ, CONTOURS, boxes
 from tracked_boxes import started
 
@@ -100,68 +97,6 @@ def test_copies_are_of_one_object():
         assert ours.shape == (5, *given.shape[1:])
         assert all(torch.equal(row, given[1]) for row in ours)
         assert ours.data_ptr() == given[1].data_ptr()
-
-
-# ---- contours of a window
-
-
-def turning_box(rate_rad_s, beyond_edge_on_rad, dtype):
-    """A box whose right side comes into sight, turning at that rate, and is that far beyond edge-on."""
-    extents_m = box_model().edge_points.flatten(0, 1).amax(0)
-    # Turned by this much, the camera, half a metre away, lies in the plane of the side.
-    edge_on = math.asin(float(extents_m[0]) / 0.5)
-    T_cam_obj = pose(rotation=(0.0, edge_on + beyond_edge_on_rad, 0.0))
-    prediction = boxes(T_cam_obj[None], velocity=torch.tensor([[0.0, rate_rad_s, 0.0, 0.0, 0.0, 0.0]]), dtype=dtype)
-    return replace(prediction, objects=replace(prediction.objects, centre_obj=torch.zeros(1, 3, dtype=dtype)))
-
-
-def far_points(contours):
-    """How many contour points are on the edges of the right side that lie away from the camera."""
-    points = contours.points_obj[0][contours.mask[0]]
-    extents_m = box_model().edge_points.flatten(0, 1).amax(0).to(points.dtype)
-    return int((((points[:, 0] - extents_m[0]).abs() < 1e-5) & ((points[:, 2] - extents_m[2]).abs() < 1e-5)).sum())
-
-
-def test_what_comes_into_sight_at_the_end_of_a_window_is_no_contour_yet(dtype):
-    rate_rad_s, dt_s = 4.0, torch.tensor([0.01], dtype=dtype)
-    for beyond_rad, shows in ((0.01, False), (0.03, True)):
-        prediction = turning_box(rate_rad_s, beyond_rad, dtype)
-        at_end = prediction.contours(dt_s, ContourConfig(mid_window=False))
-        assert far_points(at_end) > 0
-        assert (far_points(prediction.contours(dt_s, CONTOURS)) > 0) == shows
-
-
-def test_contours_of_a_window_are_placed_as_at_its_end(dtype):
-    prediction = turning_box(4.0, 0.01, dtype)
-    contours = prediction.contours(torch.tensor([0.01], dtype=dtype), CONTOURS)
-    expected = project(transform_points(prediction.T_cam_obj, contours.points_obj), prediction.objects.intrinsics)
-    torch.testing.assert_close(contours.pixels, expected)
-    assert int(contours.mask.sum()) > 50
-
-
-def test_contours_of_what_stands_still_are_those_at_its_pose(dtype):
-    prediction = boxes(pose()[None], dtype=dtype)
-    of_window, at_end = (prediction.contours(torch.tensor([0.01], dtype=dtype), ContourConfig(mid_window=choice)) for choice in (True, False))
-    torch.testing.assert_close(of_window.pixels, at_end.pixels)
-    assert torch.equal(of_window.mask, at_end.mask)
-
-
-def test_what_was_behind_the_camera_half_a_window_before_has_the_contours_of_its_end():
-    velocity = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 300.0]])
-    prediction = boxes(pose()[None], velocity=velocity)
-    of_window, at_end = (prediction.contours(torch.tensor([0.01], dtype=torch.float64), ContourConfig(mid_window=mid)) for mid in (True, False))
-    torch.testing.assert_close(of_window.pixels, at_end.pixels)
-
-
-def test_contours_of_a_window_are_the_same_for_each_of_a_batch(dtype):
-    poses = torch.stack([pose(), pose((0.1, 0.7, -0.3)), pose((1.0, 0.2, 0.4))])
-    velocity, dt_s = torch.randn((3, 6), generator=generator(3)), torch.tensor([0.01, 0.005, 0.02], dtype=dtype)
-    together = boxes(poses, velocity=velocity, dtype=dtype).contours(dt_s, CONTOURS)
-    for number in range(3):
-        single = slice(number, number + 1)
-        alone = boxes(poses[single], velocity=velocity[single], dtype=dtype).contours(dt_s[single], CONTOURS)
-        pixels = together.pixels[number][together.mask[number]]
-        torch.testing.assert_close(pixels, alone.pixels[0][alone.mask[0]])
 
 
 # ---- the first gate

@@ -149,24 +149,6 @@ def _step(T_cam_obj: Array, centre_obj: Array, moved: Array, least_depth_m: floa
     return is_finite(stepped) and least_depth_m < depth_of(stepped, centre_obj) < most_depth_m
 
 
-@kernel()
-def in_mid_window(
-    T_cam_obj: Array, velocity: Array, dt_s: Array, centre_obj: Array, least_depth_m: float, most_depth_m: float, middle: Array
-) -> None:
-    """Where objects were half a window earlier: :meth:`torchtrack.tracking.motion.prediction.Prediction.in_mid_window`, object by object.
-
-    Args:
-        T_cam_obj, velocity, dt_s, centre_obj: ``[b, 4, 4]``, ``[b, 6]``, ``[b]`` and ``[b, 3]``.
-        middle: ``[b, 4, 4]``, filled.
-    """
-    moved = np.empty(6)
-    for b in range(len(T_cam_obj)):
-        for k in range(6):
-            moved[k] = -0.5 * dt_s[b] * velocity[b, k]
-        if not _step(T_cam_obj[b], centre_obj[b], moved, least_depth_m, most_depth_m, middle[b]):
-            middle[b] = T_cam_obj[b]
-
-
 @accelerates(predict.forecast)
 def forecast_numba(
     state: MotionState,
@@ -187,12 +169,3 @@ def forecast_numba(
     )
     forecast(*known, *of_objects, settings, *as_arrays(T_prior, usable, velocity, covariance))
     return Prediction(objects, T_prior, usable, velocity, covariance)
-
-
-@accelerates(Prediction.in_mid_window)
-def in_mid_window_numba(prediction: Prediction, dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 4 4"]:
-    """Object by object."""
-    middle = torch.empty_like(prediction.T_cam_obj, memory_format=torch.contiguous_format)
-    given = as_arrays(prediction.T_cam_obj, prediction.velocity, dt_s, prediction.objects.centre_obj)
-    in_mid_window(*given, MIN_DEPTH_M, MAX_DEPTH_M, middle.numpy())
-    return middle

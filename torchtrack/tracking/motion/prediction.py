@@ -6,16 +6,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.constants import once
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.image_velocity import MovingObjects, pixel_velocity, pose_jacobian
-from torchtrack.core.lie import retract_about, step_about, transform_points
+from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.core.linalg import inverse
 from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.tracking.contours.objects import ObjectBatch, repeat_row
-from torchtrack.tracking.contours.points import Contours, assemble
+from torchtrack.tracking.contours.points import Contours
 
 # Nothing that is tracked is farther away (m).
 MAX_DEPTH_M = 1e4
@@ -73,25 +72,6 @@ class Prediction:
     def contour_velocity(self, contours: Contours) -> Float[Tensor, "b m 2"]:
         """Image velocity of contour points (px/s)."""
         return pixel_velocity(contours.points_cam, self.velocity, self.centre_cam, self.objects.intrinsics)
-
-    def contours(self, dt_s: Float[Tensor, "b"], config: ContourConfig) -> Contours:
-        """The contours that show within a window of length ``dt_s``, placed as at its end, where the prediction is.
-
-        They are those that show in its middle: an edge that has just come before another has hardly fired, and draws the events
-        of that one; what has turned out of sight has. And the smooth silhouette, which moves on over it, is then half a
-        window's motion off at most.
-        """
-        if config.source == "splat" or not config.mid_window:
-            return self.objects.contours(self.T_cam_obj, config)
-        seen = self.objects.contours(self.in_mid_window(dt_s), config)
-        return assemble(seen.points_obj, seen.tangents_obj, seen.kind, seen.mask, self.T_cam_obj, self.objects.intrinsics)
-
-    @accelerable
-    def in_mid_window(self, dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 4 4"]:
-        """Poses half a window of length ``dt_s`` earlier; those at its end where they would not be before the camera."""
-        back = self.velocity * (-0.5 * dt_s)[:, None]
-        middle = step_about(self.T_cam_obj, back, self.objects.centre_obj)
-        return before_camera(middle, self.objects.centre_obj, self.T_cam_obj)[0]
 
     def moved(self, offset: Float[Tensor, "b k"]) -> "Prediction":
         """The prediction with its pose and velocity moved; the covariance stays."""
