@@ -27,7 +27,7 @@ SETTINGS = {
     "default": {},
     "no subcell lookup": {"disabled": ["subcell_lookup"]},
     "no concentration": {"association": {"concentration": False}},
-    "no polarity": {"association": {"polarity": False, "texture_polarity": False}},
+    "no polarity": {"association": {"polarity": False}},
     "no compensation": {"association": {"motion_compensation": False}},
     "one gate": {"association": {"gates_px": (5.0,)}},
     "no close edges": {"association": {"edge_ambiguity_px": 0.0}, "disabled": ["dark_shift"]},

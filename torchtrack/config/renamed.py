@@ -38,7 +38,6 @@ KEYS = {
         "min_visible_share": "min_visible_ratio",
     },
     "matching": {
-        "print_polarity": "texture_polarity",
         "limb_dark_shift_px": "silhouette_dark_shift_px",
         "adaptive_bursts": "pixel_latency",
         "learned_trust": "weighting_network",
@@ -61,7 +60,9 @@ REMOVED: dict[str, dict[str, str]] = {
     "contours": {
         "mid_window": "contours are those that show at the window's end",
     },
-    "association": {},
+    "association": {
+        "texture_polarity": "no polarity is expected of texture",
+    },
     "solver": {
         "acceleration_in_window": "the velocity is the same all along a window",
         "silhouette_offset_px": "smooth silhouettes lie where their model has them",

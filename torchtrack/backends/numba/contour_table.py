@@ -78,7 +78,6 @@ def _fill_one(
         is_oriented = is_smooth or kind[i] == settings.crease
         table[i, SMOOTH], table[i, ORIENTED] = is_smooth, is_oriented
         not_plain = not_plain or is_smooth or kind[i] == settings.texture
-        table[i, EXPECTED] = settings.of_texture and kind[i] == settings.texture
         if is_oriented and len(polarity):
             table[i, EXPECTED] = polarity[octant(normals[0, i], normals[1, i])]
     return not_plain
@@ -129,11 +128,11 @@ def _range(values: Array, mask: Array) -> float:
 
 @accelerates(nearest_contours.contour_table)
 def contour_table_numba(
-    contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_texture: bool = True, close_px: float = 0.0
+    contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, close_px: float = 0.0
 ) -> ContourTable:
     """Point by point."""
     silhouette, crease, texture = (int(kind) for kind in (ContourKind.SMOOTH, ContourKind.CREASE, ContourKind.TEXTURE))
-    settings = filled(TableSettings, weights, silhouette=silhouette, crease=crease, texture=texture, of_texture=of_texture, close_px=close_px)
+    settings = filled(TableSettings, weights, silhouette=silhouette, crease=crease, texture=texture, close_px=close_px)
     table, not_plain = contours.points_obj.new_empty(*contours.mask.shape, COLUMNS), torch.empty_like(contours.mask[:, 0])
     points, pixels, normals, indexed = (value.transpose(1, 2) for value in (contours.points_obj, contours.pixels, contours.normals, index.pixels))
     expected = pixels.new_empty(len(table), 0) if polarity is None else polarity

@@ -108,7 +108,6 @@ class TableSettings(NamedTuple):
 
     Args:
         silhouette, crease, texture: numbers of kinds of contours.
-        of_texture: whether anything is expected of texture.
         close_px: distance from which parallel edges are told apart; 0 for always.
         aside_px: where an edge is looked for beside another.
         parallel, apart_px: contours this parallel and this far apart are two edges.
@@ -118,7 +117,6 @@ class TableSettings(NamedTuple):
     silhouette: int
     crease: int
     texture: int
-    of_texture: bool
     close_px: float
     aside_px: float
     parallel: float

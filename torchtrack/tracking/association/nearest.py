@@ -51,20 +51,17 @@ class ContourTable:
 
 
 @accelerable
-def contour_table(
-    contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_texture: bool = True, close_px: float = 0.0
-) -> ContourTable:
+def contour_table(contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, close_px: float = 0.0) -> ContourTable:
     """The table of contours and their index.
 
-    The normals of the mesh's own edges are oriented: they point outwards. Those of texture point to its darker side.
+    The normals of the mesh's own edges are oriented: they point outwards.
 
     Args:
         polarity: expected of the mesh's own edges, by the octant that they face (:func:`torchtrack.tracking.association.polarity.expected_polarity`).
-        of_texture: whether anything is expected of texture.
         close_px: distance from which parallel edges are told apart; 0 for always.
     """
     silhouette, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.SMOOTH, ContourKind.CREASE, ContourKind.TEXTURE))
-    oriented, expected = silhouette | crease, (texture & of_texture).to(contours.pixels.dtype)
+    oriented, expected = silhouette | crease, torch.zeros_like(contours.pixels[..., 0])
     if polarity is not None:
         expected = torch.where(oriented, polarity.gather(1, octant(contours.normals)), expected)
     edge_ambiguity = edge_ambiguity_px2(contours, index, oriented, crease, close_px) if close_px else torch.zeros_like(expected)

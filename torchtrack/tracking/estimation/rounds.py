@@ -201,7 +201,7 @@ def _needs_subcell_lookup(
 
 def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config: AssociationConfig) -> ContourTable:
     """What observations take from their contours, with the polarity that is expected of them."""
-    return contour_table(contours, index, objects.polarity, of_texture=config.texture_polarity, close_px=config.edge_ambiguity_px)
+    return contour_table(contours, index, objects.polarity, close_px=config.edge_ambiguity_px)
 
 
 def _narrowing(gate_scale: Float[Tensor, "b"], rounds: int) -> Float[Tensor, "r b"]:
