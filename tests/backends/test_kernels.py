@@ -178,7 +178,7 @@ def test_which_events_are_chosen(count, kind):
     index, objects = index_contours(contours, IMAGE_SIZE, 7, 2), moving_objects((300.0, -200.0), 3)
     ours, theirs = both_ways(lambda: select_events(events, index, objects, count))
     assert torch.equal(ours.mask, theirs.mask)
-    for name in ("pixels", "age_s", "into_burst_s", "polarity"):
+    for name in ("pixels", "age_s", "polarity"):
         assert torch.equal(getattr(ours, name)[ours.mask], getattr(theirs, name)[ours.mask])
 
 

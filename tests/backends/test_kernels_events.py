@@ -13,7 +13,7 @@ from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.expectation import predicted_after
-from torchtrack.tracking.frontend.bursts import LONG_AGO_US
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US, LONGEST_US
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.window_events import SharedEvents, WindowEvents
 from torchtrack.tracking.initialization import first_state
@@ -37,7 +37,7 @@ def window_of(objects: int, count: int, window_us: int, camera: Camera = SMALL_C
 
     def seen():
         nearby = sensors.near_objects(NearbyEvents(events), prediction, dt_s, tracker.config)
-        return sensors.window_events(nearby, ages, t_us, t_us, tracker.config.association.burst_us)
+        return sensors.window_events(nearby, ages, t_us, t_us, LONGEST_US)
 
     return tracker, events, prediction, seen
 
@@ -86,7 +86,7 @@ def test_of_shared_events_those_are_chosen_that_would_be_of_rows(count):
         shared, rows = (select_events(each, index, moving, count) for each in (events, events.rows()))
     assert int(shared.mask.sum()) > 0
     assert torch.equal(shared.mask, rows.mask)
-    for name in ("pixels", "age_s", "into_burst_s", "polarity"):
+    for name in ("pixels", "age_s", "polarity"):
         assert torch.equal(getattr(shared, name)[shared.mask], getattr(rows, name)[rows.mask])
 
 

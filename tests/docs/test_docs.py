@@ -180,8 +180,8 @@ def test_example_of_a_config_is_one(text, tmp_path):
 def test_example_of_an_evaluation_is_one(text, tmp_path):
     path = tmp_path / "trial.yaml"
     path.write_text(text)
-    group = load(EvaluateConfig, path).methods["bursts_and_latency"].tracker.association
-    assert (group.burst_us, group.pixel_latency) == (0, False)
+    group = load(EvaluateConfig, path).methods["drift_and_drop"].tracker.relocalization
+    assert (group.drift_us, group.score_drop_below) == (0, 0)
 
 
 @pytest.mark.parametrize("text", blocks("yaml simulate"))

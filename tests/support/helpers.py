@@ -190,10 +190,10 @@ def upright_line(u, dtype=torch.float64, **kwargs):
     return contours_at(torch.stack([torch.full_like(v, u), v], -1)[None], dtype=dtype, **kwargs)
 
 
-def seen(pixels, *, age_s=0.0, into_burst_s=0.0, polarity=0.0, flow=None, mask=None, dtype=torch.float64):
+def seen(pixels, *, age_s=0.0, polarity=0.0, flow=None, mask=None, dtype=torch.float64):
     """Observations ``[b, n]``."""
     pixels = torch.as_tensor(pixels, dtype=dtype)
     mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
     flow = torch.zeros_like(pixels) if flow is None else torch.as_tensor(flow, dtype=dtype).expand_as(pixels)
-    age, into, polarity = (torch.as_tensor(value, dtype=dtype).expand(mask.shape) for value in (age_s, into_burst_s, polarity))
-    return Observations(pixels, age, into, polarity, mask, flow, flow.norm(dim=-1) > 0)
+    age, polarity = (torch.as_tensor(value, dtype=dtype).expand(mask.shape) for value in (age_s, polarity))
+    return Observations(pixels, age, polarity, mask, flow, flow.norm(dim=-1) > 0)

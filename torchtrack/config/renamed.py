@@ -39,7 +39,6 @@ KEYS = {
     },
     "matching": {
         "limb_dark_shift_px": "silhouette_dark_shift_px",
-        "adaptive_bursts": "pixel_latency",
         "learned_trust": "weighting_network",
         "polarity_memory_s": "polarity_prior_s",
         "close_edges_px": "edge_ambiguity_px",
@@ -62,6 +61,9 @@ REMOVED: dict[str, dict[str, str]] = {
     },
     "association": {
         "texture_polarity": "no polarity is expected of texture",
+        "burst_px": "events count at their own times, however late in a burst",
+        "burst_us": "events count at their own times, however late in a burst",
+        "pixel_latency": "events count at their own times, however late in a burst",
     },
     "solver": {
         "acceleration_in_window": "the velocity is the same all along a window",

@@ -65,13 +65,6 @@ class AssociationConfig(Settings):
     edge_ambiguity_px: float = Field(
         1.7, ge=0, le=10, description="Parallel edges closer than about this may be taken for each other, and tell less (px); 0 for never."
     )
-    burst_px: float = Field(
-        1.0, gt=0, description="Late events of a pixel's burst are dated back to when their edge had moved on this far: slow pixels fire on (px)."
-    )
-    pixel_latency: bool = Field(
-        True, description="Date them back less far, the fewer are seen to come late: in good light the circuits of a sensor are fast."
-    )
-    burst_us: int = Field(10_000, ge=0, le=30_000, description="A burst is what a pixel fires of one polarity in this time (µs); 0 for no bursts.")
     weighting_network: Literal["none", "silhouettes", "all"] = Field(
         "silhouettes",
         description="Which observations to trust as a small network has learned from the events around them: those of smooth silhouettes, or all.",

@@ -2,20 +2,16 @@
 
 from dataclasses import dataclass, replace
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
-from torchtrack.tracking.adaptation.pixel_latency import LOOK_US, late_share_after
 from torchtrack.tracking.adaptation.surface_learning import Surroundings, learn_after
-from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.polarity import expected_polarity, is_asked, remembers_polarity
 from torchtrack.tracking.contours.objects import ObjectBatch
-from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.schedule import is_time
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import Status
@@ -53,8 +49,6 @@ class Lesson:
         window_s: its duration, for each object.
         sigma_px: standard deviation of each object's prediction in the image: of an uncertain one nothing is learned.
         on_surfaces: on which objects contours can be learned; None where on none.
-        observations: of the window, and ``contours`` that they were matched with.
-        t_us: its end, of each stream; the state after it does not have that yet.
         learns: whether anything is learned, and not only looked whether there is need to.
     """
 
@@ -62,9 +56,6 @@ class Lesson:
     window_s: Float[Tensor, "b"]
     sigma_px: Float[Tensor, "b"]
     on_surfaces: Bool[Tensor, "b"] | None
-    observations: Observations
-    contours: Contours
-    t_us: Int[Tensor, "s"]
     learns: bool = True
 
 
@@ -95,18 +86,3 @@ def learns_next(state: TrackerState, on_surfaces: Bool[Tensor, "b"] | None, conf
         return False
     wanted = learned.wanted(on_surfaces)
     return wanted is not None and host_sync.AsyncValue.to(wanted).any()
-
-
-def with_late_share(
-    state: TrackerState, result: StepResult, prediction: Prediction, scored: ScoredFit, lesson: Lesson, config: TrackerConfig
-) -> TrackerState:
-    """The state after a window with how many events on contours came late in their bursts; arguments as those of :func:`learned_after`.
-
-    Matches are of the alignment: where an object was relocalized, they tell nothing of its pose.
-    """
-    if not config.association.pixel_latency or host_sync.none_of(due := is_time(state.t_us, lesson.t_us, LOOK_US)):
-        return state
-    known = due[0, prediction.objects.stream_index] & (result.status == int(Status.TRACKING)) & ~scored.is_relocalized
-    matched = lesson.observations, lesson.contours, scored.fit.matches
-    late_share = late_share_after(state.appearance.late_share, *matched, prediction, known, config.association)
-    return replace(state, appearance=replace(state.appearance, late_share=late_share))

@@ -31,7 +31,7 @@ from torchtrack.errors import ConfigError
 from torchtrack.tracking.adapt import learns_next
 from torchtrack.tracking.cuda_graphs import CudaGraphs
 from torchtrack.tracking.expectation import near_tiles
-from torchtrack.tracking.frontend.bursts import update_bursts
+from torchtrack.tracking.frontend.bursts import LONGEST_US, update_bursts
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.state import S, StepResult, TrackerState, each_tensor
@@ -131,7 +131,7 @@ class CompiledStep:
         """What the graph makes of a window, and whether that does not hold."""
         filled = _filled(nearby, len(t_us))
         if t_us.device.type == "cpu":
-            before, filled = _in_bursts(before, filled, t_us, self._tracker.config.association.burst_us)
+            before, filled = _in_bursts(before, filled, t_us, LONGEST_US)
         kind = filled.events.most_of_one, learns
         if kind not in self._graphs:
             self._graphs[kind] = self._graph(t_us.device, learns=learns)

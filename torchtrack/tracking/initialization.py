@@ -16,7 +16,6 @@ from torchtrack.core.lie import transform_points
 from torchtrack.errors import PoseError
 from torchtrack.tracking.adaptation.appearance import Appearance
 from torchtrack.tracking.adaptation.learned_contours import LearnedContours
-from torchtrack.tracking.adaptation.pixel_latency import unknown_latency
 from torchtrack.tracking.association.polarity import nothing_remembered
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
@@ -39,7 +38,7 @@ def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us
         motion=MotionState(T_cam_obj.clone(), velocity=at_rest, covariance=covariance),
         health=TrackHealth.unknown(T_cam_obj, at_rest.dtype),
         tentative=TentativeTrack.none(T_cam_obj, covariance),
-        appearance=Appearance(nothing_remembered(at_rest), unknown_latency(tracked.diameter_m), learned),
+        appearance=Appearance(nothing_remembered(at_rest), learned),
         maps=SensorMaps.empty(tracked.streams, tracked.image_size, T_cam_obj.device),
     )
 

@@ -9,8 +9,7 @@ from torch import Tensor
 from torchtrack.config.components import Component
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch
-from torchtrack.tracking.adapt import Lesson, learned_after, with_late_share
-from torchtrack.tracking.adaptation.pixel_latency import dated
+from torchtrack.tracking.adapt import Lesson, learned_after
 from torchtrack.tracking.association.observations import Observations, corner_observations, join, select_events
 from torchtrack.tracking.association.weighting_features import WeightingInputs, judged
 from torchtrack.tracking.contours.index import ContourIndex
@@ -18,6 +17,7 @@ from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.rounds import Fit, align, gate_scale_of, index_for, index_radius, usual_index_radius
 from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import Expected, expect, near_objects
+from torchtrack.tracking.frontend.bursts import LONGEST_US
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.time_surface import update_last_event
@@ -93,8 +93,7 @@ def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> t
     """
     expected = expect(tracked, state, given.events.events, given.t_us, given.reads)
     seen = observe(tracked, state, expected, given)
-    as_late = dated(seen.observations, state.appearance.late_share, state.health.time_since_validated_s, tracked.config.association)
-    fit = align(expected.prediction, seen.contours, seen.index, seen.gate_scale, as_late, tracked.config, extra_terms=given.extra_terms)
+    fit = align(expected.prediction, seen.contours, seen.index, seen.gate_scale, seen.observations, tracked.config, extra_terms=given.extra_terms)
     scored = validate(tracked, state, expected, seen, fit)
     located = relocalized(tracked, state, expected, seen, scored, given)
     return update(tracked, state, expected, seen, located, given)
@@ -104,7 +103,7 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     """Stage 2: events, corners and flow near the objects, and the contours that they are matched with."""
     config, sensors, maps, t_us = tracked.config, tracked.sensors, state.maps, given.t_us
     prediction, nearby = expected.prediction.detached(), near_objects(tracked, expected, given.events)
-    events, burst_age_us = sensors.window_events(nearby, maps.burst_age_us, t_us, t_us - state.t_us, config.association.burst_us)
+    events, burst_age_us = sensors.window_events(nearby, maps.burst_age_us, t_us, t_us - state.t_us, LONGEST_US)
     contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
     sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(tracked.diameter_m)
     gate_scale = gate_scale_of(sigma_px, config)
@@ -154,9 +153,8 @@ def update(
     next_state, result = conclude(state, located.prediction, located.gate_scale, scored, seen.corners, expected.dt_s, config)
     if config.uses(Component.TENTATIVE):
         next_state, result = confirm_or_take_back(state, next_state, result, prediction, located.gate_scale, config)
-    lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, seen.observations, seen.contours, given.t_us, learns=given.learns)
+    lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, learns=given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
-    next_state = with_late_share(next_state, result, prediction, scored, lesson, config)
     maps = replace(next_state.maps, burst_age_us=seen.burst_age_us)
     return replace(next_state, t_us=given.t_us, maps=maps), replace(result, t_us=given.t_us)
 

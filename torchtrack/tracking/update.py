@@ -23,7 +23,6 @@ from torchtrack.tracking.validation.health import TrackHealth
 from torchtrack.tracking.validation.measures import visible_ratio
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import (
-    VALIDATED_FROM,
     Status,
     holding_on,
     is_smeared,

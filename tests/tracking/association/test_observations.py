@@ -36,7 +36,7 @@ def random_near(seed=0, total=NEAR):
 def choose(pixels, contours, *, age_s=0.0, velocity=(0.0, 0.0), count=100, mask=None):
     observations = seen(pixels, age_s=age_s, mask=mask, polarity=1.0)
     index = index_contours(contours, IMAGE_SIZE, 5, 1)
-    events = WindowEvents(observations.pixels, observations.age_s, observations.into_burst_s, observations.polarity, observations.mask)
+    events = WindowEvents(observations.pixels, observations.age_s, observations.age_s, observations.polarity, observations.mask)
     return select_events(events, index, moving_objects(velocity, len(observations.pixels)), count)
 
 
@@ -127,7 +127,7 @@ def test_values_go_with_their_events(dtype):
     chosen = select_events(events, index, moving_objects((0.0, 0.0), dtype=dtype), 50)
     number = ((chosen.pixels[0, :, 1] - 20) / 99 * 399).round().long()[chosen.mask[0]]
     assert len(number) > 40
-    pairs = ((chosen.pixels, place), (chosen.age_s, age_s), (chosen.into_burst_s, 2 * age_s), (chosen.polarity, polarity))
+    pairs = ((chosen.pixels, place), (chosen.age_s, age_s), (chosen.polarity, polarity))
     for actual, given in pairs:
         assert torch.equal(actual[0][chosen.mask[0]], given[0][number])
     assert chosen.pixels.dtype == chosen.flow.dtype == dtype

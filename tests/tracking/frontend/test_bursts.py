@@ -1,14 +1,11 @@
-"""Bursts: which events belong to one, how far into it each comes, and what that does to their ages."""
+"""Bursts: which events belong to one, and how far into it each comes."""
 
 import pytest
 import torch
-from helpers import generator, seen, upright_line
-from nearest_cases import nearest
+from helpers import generator
 
 from torchtrack.core.events import EventBatch, PaddedEvents, concatenate, pad_streams
-from torchtrack.tracking.frontend.bursts import LONG_AGO_US, no_bursts, update_bursts, without_tail
-
-LONGEST_US = 10_000
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US, LONGEST_US, no_bursts, update_bursts
 
 
 def batch(*events, stream=0):
@@ -100,23 +97,6 @@ def test_where_bursts_have_no_length_there_are_none():
     events = pad_streams(batch((1000, 0, 0, 0), (2000, 0, 0, 0), (4000, 0, 0, 0)), 1, torch.tensor([5000]))
     _, into = update_bursts(no_bursts(1, 2, 2), torch.tensor([5000]), events, 0)
     assert not into.any()
-
-
-def test_only_late_events_are_dated_back():
-    age, into = torch.full((1, 4), 2e-3), torch.tensor([[0.0, 1e-3, 2e-3, 5e-3]])
-    ages = without_tail(age, into, torch.tensor([[500.0, 500.0, -1000.0, 1000.0]]), 1.0)
-    torch.testing.assert_close(ages, torch.tensor([[2e-3, 2e-3, 3e-3, 6e-3]]))
-    assert torch.equal(without_tail(age, into, torch.zeros(1, 4), 1.0), age)
-
-
-def test_the_tail_of_a_slow_pixel_is_matched_where_its_edge_has_gone():
-    line = upright_line(80.0)
-    speed_px_s, into_s = 500.0, 6e-3
-    # An event now, 3 px behind the edge, of a burst that began when the edge came.
-    late = seen([[[80.0 - speed_px_s * into_s, 60.0]]], into_burst_s=into_s)
-    actual, _ = nearest(late, line, velocity=(speed_px_s, 0.0))
-    assert abs(float(actual.offsets)) == pytest.approx(1.0, abs=0.3)
-    assert float(actual.age_s) == pytest.approx(into_s - 1.0 / speed_px_s)
 
 
 def test_padded_events_of_nothing():

@@ -7,7 +7,7 @@ from predicted_boxes import CENTRE_OBJ, CONTOURS, boxes
 from tracked_boxes import started
 
 from torchtrack.config.components import Component
-from torchtrack.config.tracker import AssociationConfig, ContourConfig, TrackerConfig
+from torchtrack.config.tracker import AssociationConfig, TrackerConfig
 from torchtrack.core.camera import project
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.lie import retract_about, transform_points

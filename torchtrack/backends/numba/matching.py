@@ -8,7 +8,7 @@ from torchtrack.backends.numba.look_up import nearest, nearest_of_four
 from torchtrack.backends.numba.parameters import Cells, MatchingSettings
 
 # Rows of what was observed.
-U, V, AGE, INTO_BURST, POLARITY, TRUST = range(6)
+U, V, AGE, POLARITY, TRUST = range(5)
 # Columns of a contour point: its place on the object, its normal, where it was indexed, and marks.
 X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, SMOOTH, ORIENTED, EXPECTED, EDGE_AMBIGUITY = range(11)
 COLUMNS = 11
@@ -57,7 +57,7 @@ def match(
     """Match each observation with the contour point that is nearest to its place; ``place`` is moved on.
 
     Args:
-        seen: ``[6, n]``, and which of them exist.
+        seen: ``[5, n]``, and which of them exist.
         place: ``[n, 2]``.
         table: ``[m, COLUMNS]``.
         pose, intrinsics: of the object, from :mod:`torchtrack.backends.numba.geometry`; so is its ``motion``.
@@ -108,7 +108,7 @@ def _match_one(
     nu, nv = table[nearest_index, NORMAL_U], table[nearest_index, NORMAL_V]
     crossing = nu * speed_u + nv * speed_v
     dark = seen[POLARITY, i] * crossing / (abs(crossing) + settings.slow_px_s)
-    age = seen[AGE, i] + max(seen[INTO_BURST, i] - settings.burst_px / max(abs(crossing), 1e-3), 0.0)
+    age = seen[AGE, i]
     carried_u, carried_v = seen[U, i] + age * speed_u, seen[V, i] + age * speed_v
     shift = dark * (settings.dark_shift_px + table[nearest_index, SMOOTH] * (settings.silhouette_dark_shift_px - settings.dark_shift_px))
     target_u, target_v = carried_u - nu * shift, carried_v - nv * shift

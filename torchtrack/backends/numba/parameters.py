@@ -25,7 +25,6 @@ class Cells(NamedTuple):
 class MatchingSettings(NamedTuple):
     """What :mod:`torchtrack.backends.numba.matching` goes by: settings, and constants of :mod:`torchtrack.tracking.association.weights`."""
 
-    burst_px: float
     dark_shift_px: float
     silhouette_dark_shift_px: float
     polarity_gain: float

@@ -78,7 +78,7 @@ def align(
     """Match and solve, one round per gate, for each object.
 
     Args:
-        seen: ``[b, 6, n]``, and which of them exist.
+        seen: ``[b, 5, n]``, and which of them exist.
         table: ``[b, m, COLUMNS]`` of contour points; ``nearest_of_cell [b, p]`` and ``first [b, 2]`` are their index.
         velocity: ``[b, 6]`` as predicted.
         information: ``[b, 12, 12]`` of the prior.
@@ -189,10 +189,10 @@ def align_rounds_numba(
     return Linearisation(T_cam_obj, gradient, hessian, offset), _matches(contour, is_near, is_matched, matches), start.contours
 
 
-def _seen(observations: Observations) -> Float[Tensor, "b 6 n"]:
+def _seen(observations: Observations) -> Float[Tensor, "b 5 n"]:
     """Rows of what was observed."""
     trust = torch.ones_like(observations.age_s) if observations.trust is None else observations.trust
-    return torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.into_burst_s, observations.polarity, trust], 1)
+    return torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.polarity, trust], 1)
 
 
 def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 15 n"]) -> MatchesWithCues:

@@ -22,7 +22,6 @@ def select(
     u: Array,
     v: Array,
     age_s: Array,
-    into_burst_s: Array,
     polarity: Array,
     mask: Array,
     number: Array,
@@ -42,11 +41,10 @@ def select(
     """Take events near each object's contours once moved to the window's end, spread evenly in time.
 
     Args:
-        u, v, age_s, into_burst_s, polarity, mask: ``[e, n]``: events of each object, or one row for all.
+        u, v, age_s, polarity, mask: ``[e, n]``: events of each object, or one row for all.
         number: ``[e, n]`` of each among all of the window, by which lots are drawn.
         own, counts: ``[b, n]`` of the one row, those of each object, and how many these are: ``[b]``; ``[0, 0]`` for all.
-        chosen: ``[b, 5, c]`` pixels, ages, times into the burst, and polarities; filled as far as there are any, as ``exists [b, c]``
-            says, and else zero.
+        chosen: ``[b, 4, c]`` pixels, ages and polarities; filled as far as there are any, as ``exists [b, c]`` says, and else zero.
     """
     near = np.empty(mask.shape[1] + 1, np.int64)
     chosen[:] = 0.0
@@ -65,8 +63,7 @@ def select(
             exists[b, j] = rank < drawn
             if exists[b, j]:
                 i = near[rank]
-                chosen[b, 0, j], chosen[b, 1, j], chosen[b, 2, j] = u[e, i], v[e, i], age_s[e, i]
-                chosen[b, 3, j], chosen[b, 4, j] = into_burst_s[e, i], polarity[e, i]
+                chosen[b, 0, j], chosen[b, 1, j], chosen[b, 2, j], chosen[b, 3, j] = u[e, i], v[e, i], age_s[e, i], polarity[e, i]
 
 
 @kernel(fastmath=FAST)
@@ -115,8 +112,8 @@ def select_events_numba(events: ObjectEvents, index: ContourIndex, objects: Movi
     rows, own, counts = laid_out(events)
     number = torch.arange(rows.mask.shape[1]).expand(len(rows.mask), -1) if rows.number is None else rows.number
     batch = len(objects.velocity)
-    chosen, exists = rows.pixels.new_empty(batch, 5, count), torch.empty(batch, count, dtype=torch.bool)
-    seen = as_arrays(*rows.pixels.unbind(-1), rows.age_s, rows.into_burst_s, rows.polarity, rows.mask, number, own, counts)
+    chosen, exists = rows.pixels.new_empty(batch, 4, count), torch.empty(batch, count, dtype=torch.bool)
+    seen = as_arrays(*rows.pixels.unbind(-1), rows.age_s, rows.polarity, rows.mask, number, own, counts)
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics, index.nearest, index.first)
     select(*seen, *moving, cells_of(index), observations.FILL, GOLDEN_RATIO, chosen.numpy(), exists.numpy())
     return observations.event_observations(chosen.transpose(1, 2), exists)

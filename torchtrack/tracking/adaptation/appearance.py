@@ -15,10 +15,8 @@ class Appearance:
     Args:
         darker_outside: which side of each object's contours is the darker one, by the octant that they face:
             :mod:`torchtrack.tracking.association.polarity`.
-        late_share: how many of the events on its moving contours come late in their bursts: :mod:`torchtrack.tracking.adaptation.pixel_latency`.
         learned: contours learned on the objects; none where that is switched off.
     """
 
     darker_outside: Float[Tensor, "b 8"]
-    late_share: Float[Tensor, "b"]
     learned: LearnedContours | None = None

@@ -26,7 +26,6 @@ from torchtrack.tracking.association.weights import (
 )
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.frontend.bursts import without_tail
 
 
 @dataclass(frozen=True)
@@ -93,10 +92,8 @@ def match_nearest(
     nearest_index = table.index.look_up(place, subcell_lookup)
     points_obj, normals, indexed, silhouette, oriented, expected, edge_ambiguity = table.take(contour := nearest_index.clamp(min=0))
     pixels, velocity = objects.show(points_obj)
-    crossing_px_s = vecdot(normals, velocity)
-    dark = observations.polarity * leading_side(crossing_px_s)
-    age_s = without_tail(observations.age_s, observations.into_burst_s, crossing_px_s, config.association.burst_px)
-    carried = torch.addcmul(observations.pixels, velocity, age_s[..., None])
+    dark = observations.polarity * leading_side(vecdot(normals, velocity))
+    carried = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
     targets = torch.addcmul(carried, normals, (dark * dark_shift_px(silhouette, config))[..., None], value=-1)
     difference = pixels - targets
     near = observations.mask & (nearest_index >= 0)
@@ -104,8 +101,7 @@ def match_nearest(
     offsets = vecdot(difference, normals) / wider[:, None]
     as_expected, dark = agreeing(dark * expected), dark * oriented
     weights, neighbours = match_weights(offsets, targets, near, dark, as_expected, config.association)
-    matches = MatchesWithCues(
-        contour, matched, weights, age_s, points_obj, targets, normals, offsets, near, as_expected, silhouette, neighbours, edge_ambiguity, dark
-    )
+    geometry = observations.age_s, points_obj, targets, normals, offsets
+    matches = MatchesWithCues(contour, matched, weights, *geometry, near, as_expected, silhouette, neighbours, edge_ambiguity, dark)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)

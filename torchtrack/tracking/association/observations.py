@@ -24,7 +24,6 @@ class Observations:
     Args:
         pixels: ideal pixels at the time of the event.
         age_s: time from the event to the window's end (s).
-        into_burst_s: time from the first event of its burst to the event (s); zero where there is none.
         polarity: +1 where the pixel got brighter, -1 where darker, 0 where unknown.
         mask: which entries exist.
         flow: velocity (px/s); zero where there is none.
@@ -34,7 +33,6 @@ class Observations:
 
     pixels: Float[Tensor, "b n 2"]
     age_s: Float[Tensor, "b n"]
-    into_burst_s: Float[Tensor, "b n"]
     polarity: Float[Tensor, "b n"]
     mask: Bool[Tensor, "b n"]
     flow: Float[Tensor, "b n 2"]
@@ -45,7 +43,7 @@ class Observations:
 def corner_observations(corners: Corners) -> Observations:
     """The corners as observations; their polarity is not known."""
     unknown = torch.zeros_like(corners.age_s)
-    return Observations(corners.pixels, corners.age_s, unknown, unknown, corners.mask, corners.flow, corners.has_flow)
+    return Observations(corners.pixels, corners.age_s, unknown, corners.mask, corners.flow, corners.has_flow)
 
 
 @accelerable
@@ -61,14 +59,14 @@ def select_events(events: ObjectEvents, index: ContourIndex, objects: MovingObje
     total = near.sum(-1, keepdim=True)
     share = torch.where(total > count, FILL * count / total, 1.0)
     chosen, exists = events.draw(near, share, count)
-    rows = [pixels.transpose(1, 2), events.age_s[:, None], events.into_burst_s[:, None], events.polarity[:, None]]
+    rows = [pixels.transpose(1, 2), events.age_s[:, None], events.polarity[:, None]]
     return event_observations(take_points(torch.cat(rows, 1).transpose(1, 2), chosen), exists)
 
 
-def event_observations(values: Float[Tensor, "b c 5"], exists: Bool[Tensor, "b c"]) -> Observations:
-    """Observations of events: columns of pixels, ages, times into their bursts, and polarities."""
+def event_observations(values: Float[Tensor, "b c 4"], exists: Bool[Tensor, "b c"]) -> Observations:
+    """Observations of events: columns of pixels, ages and polarities."""
     flow = torch.zeros_like(values[..., :2])
-    return Observations(values[..., :2], values[..., 2], values[..., 3], values[..., 4], exists, flow, torch.zeros_like(exists))
+    return Observations(values[..., :2], values[..., 2], values[..., 3], exists, flow, torch.zeros_like(exists))
 
 
 def join(first: Observations, second: Observations) -> Observations:

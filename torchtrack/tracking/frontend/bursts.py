@@ -5,13 +5,14 @@ after that, above all where it got dark. How far into its burst an event comes t
 """
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
-from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.events import PaddedEvents
 
+# What a pixel fires of one polarity in this time is one burst (µs).
+LONGEST_US = 10_000
 # Ages (µs) are kept in 16 bits; it does not matter by how much longer ago a burst began.
 LONG_AGO_US = 32_000
 
@@ -57,15 +58,3 @@ def update_bursts(
     flat.scatter_reduce_(1, place, torch.where(begins, age_us, -1), "amax")
     into_us = torch.where(begins, flat.gather(1, place), before_us) - age_us
     return ages, torch.where(into_us < longest_us, into_us, 0)
-
-
-def without_tail(
-    age_s: Float[Tensor, "b n"], into_burst_s: Float[Tensor, "b n"], crossing_px_s: Float[Tensor, "b n"], longest_px: float
-) -> Float[Tensor, "b n"]:
-    """Ages of events (s), the late ones of a burst counted from when their edge had moved on by ``longest_px``.
-
-    Args:
-        crossing_px_s: how fast the edge moves across itself.
-    """
-    longest = constant((longest_px,), age_s.dtype, age_s.device)
-    return age_s + torch.addcdiv(into_burst_s, longest, crossing_px_s.abs().clamp_(min=1e-3), value=-1).clamp_(min=0)
