@@ -11,7 +11,8 @@ from torchtrack import Tracker, preset
 from torchtrack.baselines import LeastSquaresTracker, LineTracker, tracker_class, unsuitable
 from torchtrack.baselines.event_lines import nearest_lines
 from torchtrack.baselines.line import corrected, predicted_covariance
-from torchtrack.errors import ModelError, PoseError
+from torchtrack.core import dispatch
+from torchtrack.errors import EventDataError, ModelError, PoseError
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.terms import Linearisation
@@ -59,6 +60,30 @@ def test_a_step_is_pure(name):
     tracker = tracker_for(name, [box_model()])
     state = tracker.init(pose()[None], 0)
     assert_same(tracker.step(state, events, WINDOW_US), tracker.step(state, events, WINDOW_US))
+
+
+@pytest.mark.parametrize("name", ["line", "ls"])
+def test_events_out_of_order_are_refused(name):
+    _, events = moving_box(pose(), 1)
+    tracker = tracker_for(name, [box_model()])
+    with pytest.raises(EventDataError, match="time goes back"):
+        tracker.step(tracker.init(pose()[None], 0), events[torch.arange(len(events)).flip(0)], WINDOW_US)
+
+
+@pytest.mark.parametrize("name", ["line", "ls"])
+def test_no_kernels_means_none(name, monkeypatch):
+    _, events = moving_box(pose(), 1)
+    taken, trackers = [], [tracker_for(name, [box_model()], kernels=kernels) for kernels in (True, False)]
+    state = trackers[0].init(pose()[None], 0)
+    with torch.inference_mode():
+        # The first step loads the kernels.
+        trackers[0].step(state, events, WINDOW_US)
+        for operation in dispatch.OPERATIONS.values():
+            monkeypatch.setattr(operation, "supports", lambda *_, **__: taken.append(1))
+        trackers[1].step(state, events, WINDOW_US)
+        assert not taken
+        trackers[0].step(state, events, WINDOW_US)
+        assert bool(taken) == dispatch.backend_is_installed()
 
 
 @pytest.mark.parametrize("name", ["line", "ls"])

@@ -4,6 +4,7 @@ A projected line is the straight contour points of a model (:mod:`torchtrack.bas
 normals: the distance of an event from the line is that from its nearest point, along the normal.
 """
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,9 +14,9 @@ from torch import Tensor
 
 from torchtrack.baselines.straight_edges import straight_edges_only, too_curved
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core import lie
+from torchtrack.core import dispatch, lie
 from torchtrack.core.camera import MIN_DEPTH_M, Camera
-from torchtrack.core.events import EventBatch, pad_streams
+from torchtrack.core.events import EventBatch, ForeignEvents, as_batch, pad_streams
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.errors import ModelError
@@ -29,6 +30,7 @@ from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.motion.model import left_covariance
 from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.step_check import check_step
 from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.measures import explained_ratio, visible_ratio
 from torchtrack.tracking.validation.status import Status, judge
@@ -122,9 +124,28 @@ class EventLineTracker(Tracker):
     def prepare(self, state: TrackerState) -> None:
         """Nothing is to be compiled."""
 
-    def _open(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None, velocity: Float[Tensor, "b 6"]) -> Window:
-        """The window's times, and each object carried on with ``velocity``."""
+    def step(
+        self,
+        state: TrackerState,
+        events: EventBatch | ForeignEvents,
+        t_end_us: int | Int[Tensor, "s"] | None = None,
+        extra_terms: tuple[CostTerm, ...] = (),
+    ) -> tuple[TrackerState, StepResult]:
+        """Advance every object by one window; see :meth:`torchtrack.tracking.tracker.Tracker.step`."""
+        events = as_batch(events)
         t_us = self._window_end(state, events, t_end_us)
+        check_step(state.t_us, events, t_us)
+        with torch.autocast(t_us.device.type, enabled=False), dispatch.backend(wanted=self.kernels, values=self.intrinsics):
+            return self._tracked(state, events, t_us, extra_terms)
+
+    @abstractmethod
+    def _tracked(
+        self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...]
+    ) -> tuple[TrackerState, StepResult]:
+        """The state and result after the window that ends at ``t_us``."""
+
+    def _open(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], velocity: Float[Tensor, "b 6"]) -> Window:
+        """The window's times, and each object carried on with ``velocity``."""
         duration_s = ((t_us - state.t_us).to(velocity.dtype) * 1e-6)[self.stream_index]
         T_last = state.T_cam_obj.to(velocity.dtype)
         T_start = lie.retract_about(T_last, velocity * duration_s[:, None], self.centre_obj)

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.baselines.event_lines import EventLineTracker
-from torchtrack.core.events import EventBatch, ForeignEvents, as_batch
+from torchtrack.core.events import EventBatch
 from torchtrack.core.linalg import solve_positive
 from torchtrack.tracking.estimation.terms import CostTerm, Linearisation
 from torchtrack.tracking.state import StepResult, TrackerState
@@ -44,16 +44,10 @@ class LineTracker(EventLineTracker):
         covariance = torch.diag(deviations.square()).repeat(len(state.T_cam_obj), 1, 1)
         return replace(state, motion=replace(state.motion, covariance=covariance))
 
-    def step(
-        self,
-        state: TrackerState,
-        events: EventBatch | ForeignEvents,
-        t_end_us: int | Int[Tensor, "s"] | None = None,
-        extra_terms: tuple[CostTerm, ...] = (),
+    def _tracked(
+        self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...]
     ) -> tuple[TrackerState, StepResult]:
-        """Advance every object by one window; see :meth:`torchtrack.tracking.tracker.Tracker.step`."""
-        events = as_batch(events)
-        window = self._open(state, events, t_end_us, state.velocity)
+        window = self._open(state, events, t_us, state.velocity)
         predicted = predicted_covariance(state.motion.covariance, window.duration_s.double())
         eye = torch.eye(6, dtype=predicted.dtype, device=predicted.device).expand(len(predicted), 6, 6)
         information = solve_positive(predicted[:, :6, :6], eye)[0]

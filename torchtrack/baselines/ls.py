@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.core import lie
-from torchtrack.core.events import EventBatch, ForeignEvents, as_batch
+from torchtrack.core.events import EventBatch
 from torchtrack.core.linalg import inverse
 from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.state import StepResult, TrackerState
@@ -23,16 +23,10 @@ class LeastSquaresTracker(EventLineTracker):
     window's end with the line's own velocity, and the gate around the lines narrows from round to round.
     """
 
-    def step(
-        self,
-        state: TrackerState,
-        events: EventBatch | ForeignEvents,
-        t_end_us: int | Int[Tensor, "s"] | None = None,
-        extra_terms: tuple[CostTerm, ...] = (),
+    def _tracked(
+        self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...]
     ) -> tuple[TrackerState, StepResult]:
-        """Advance every object by one window; see :meth:`torchtrack.tracking.tracker.Tracker.step`."""
-        events = as_batch(events)
-        window = self._open(state, events, t_end_us, state.velocity)
+        window = self._open(state, events, t_us, state.velocity)
         nothing = torch.zeros(len(state.velocity), 6, 6, dtype=state.velocity.dtype, device=state.velocity.device)
         solved = self._solve_rounds(window, events, nothing, weight=1.0, apart_px=0.0, extra_terms=extra_terms)
         judged = self._judge(window, *solved)
