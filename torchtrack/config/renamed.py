@@ -68,6 +68,7 @@ REMOVED: dict[str, dict[str, str]] = {
     "solver": {
         "acceleration_in_window": "the velocity is the same all along a window",
         "silhouette_offset_px": "smooth silhouettes lie where their model has them",
+        "swelling_px": "smooth silhouettes lie where their model has them",
     },
     "motion": {
         "acceleration_px": "no acceleration is estimated",
