@@ -77,14 +77,20 @@ def test_splatted_contours_need_a_surface(others):
         (lambda T: T * torch.nan, "NaN"),
         (lambda T: torch.cat([T[..., :3, :], torch.ones_like(T[..., 3:, :])], -2), "last row"),
         (lambda T: T[:, :3], "shape"),
-        (lambda T: T[0], "one initial pose per object"),
         (lambda T: T.repeat(2, 1, 1), r"\[1, 4, 4\], got \[2, 4, 4\]"),
     ],
-    ids=["scaled", "sheared", "reflected", "nan", "last_row", "3x4", "no_batch", "two_for_one"],
+    ids=["scaled", "sheared", "reflected", "nan", "last_row", "3x4", "two_for_one"],
 )
 def test_what_is_no_pose_is_refused(break_pose, message):
     with pytest.raises(PoseError, match=message):
         tracker_of().init(break_pose(pose()[None]), 0)
+
+
+def test_one_pose_is_that_of_the_only_object():
+    one = tracker_of().init(pose(), 0)
+    assert torch.equal(one.T_cam_obj, tracker_of().init(pose()[None], 0).T_cam_obj)
+    with pytest.raises(PoseError, match="one initial pose per object"):
+        tracker_of(2).init(pose(), 0)
 
 
 @pytest.mark.parametrize("depth_m", [-0.5, 0.0])

@@ -53,7 +53,7 @@ class Operation:
         """What takes a call with these arguments."""
         used = _USED.get()
         if used is None:
-            used = _are_on_cpu(args) and backend_is_installed()
+            used = host_sync.read_at_once(_a_tensor_of(args)) and backend_is_installed()
         if not used or torch.is_grad_enabled():
             return self.reference
         _load()
@@ -69,14 +69,14 @@ OPERATIONS: dict[str, Operation] = {}
 def accelerable(reference: Callable[P, R]) -> Callable[P, R]:
     """Decorator: a backend may take this function's place."""
     name = f"{reference.__module__.removeprefix('torchtrack.')}.{reference.__qualname__}"
-    operation = OPERATIONS[name] = Operation(name, reference)
+    OPERATIONS[name] = Operation(name, reference)
 
     @wraps(reference)
     def chosen(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling():
             # Here, not further down: a compiler follows whatever it comes by, and knows plain functions and texts alone.
             return reference(*args, **kwargs)
-        result: R = operation.body(args, kwargs)(*args, **kwargs)
+        result: R = OPERATIONS[name].body(args, kwargs)(*args, **kwargs)
         return result
 
     chosen.operation = name  # type: ignore[attr-defined]
@@ -111,7 +111,7 @@ def backend(*, wanted: bool, values: Tensor | None = None) -> Iterator[None]:
     Args:
         values: a tensor on the device of all that is computed within: then no call looks for one among its arguments.
     """
-    used = _USED.get() if values is None else values.is_cpu
+    used = _USED.get() if values is None else host_sync.read_at_once(values)
     token = _USED.set(used if wanted and _USED.get() is not False and backend_is_installed() else False)
     try:
         yield
@@ -131,15 +131,15 @@ def _load() -> None:
     import_module(_BACKEND)
 
 
-def _are_on_cpu(args: tuple[Any, ...]) -> bool:
-    """Whether the arguments are: of the first tensor among them, or of a dataclass among them, or within that. All are on one device."""
+def _a_tensor_of(args: tuple[Any, ...]) -> Tensor:
+    """A tensor among the arguments, or of a dataclass among them, or within that: all are on one device."""
     for value in args:
-        if (is_cpu := getattr(value, "is_cpu", None)) is not None:
-            return bool(is_cpu)
+        if isinstance(value, Tensor):
+            return value
         for inner in getattr(value, "__dict__", {}).values():
-            if (is_cpu := getattr(inner, "is_cpu", None)) is not None:
-                return bool(is_cpu)
+            if isinstance(inner, Tensor):
+                return inner
             for innermost in getattr(inner, "__dict__", {}).values():
-                if (is_cpu := getattr(innermost, "is_cpu", None)) is not None:
-                    return bool(is_cpu)
+                if isinstance(innermost, Tensor):
+                    return innermost
     raise TypeError("an accelerable function needs a tensor among its positional arguments, or a dataclass that holds one")
