@@ -11,7 +11,7 @@ from tracked_boxes import follow, moving_box, windows
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core import host_sync
+from torchtrack.core import dispatch, host_sync
 from torchtrack.core.events import concatenate
 from torchtrack.tracking import cuda_graphs, graphs
 from torchtrack.tracking.adaptation import learned_contours
@@ -127,7 +127,7 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
         if by_graphs:
             # As on a GPU: there is a graph, and nothing is read back within it.
             def advance_as_there(*args, tracker=tracker, learns):
-                with pytest.MonkeyPatch.context() as patch:
+                with pytest.MonkeyPatch.context() as patch, dispatch.backend(wanted=False):
                     patch.setattr(host_sync, "read_at_once", lambda values: False)
                     return graphs.steady_advance(tracker, *args, learns=learns)
 
