@@ -22,7 +22,6 @@ from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.main import _Command, split_overrides
 from torchtrack.cli.settings import as_markdown
 from torchtrack.config.components import Component
-from torchtrack.config.components import Component
 from torchtrack.config.demo import DemoConfig
 from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.config.events import is_live
