@@ -87,8 +87,8 @@ def test_what_is_no_pose_is_refused(break_pose, message):
 
 
 def test_one_pose_is_that_of_the_only_object():
-    one = tracker_of().init(pose(), 0)
-    assert torch.equal(one.T_cam_obj, tracker_of().init(pose()[None], 0).T_cam_obj)
+    state = tracker_of().init(pose(), 0)
+    assert torch.equal(state.T_cam_obj, tracker_of().init(pose()[None], 0).T_cam_obj)
     with pytest.raises(PoseError, match="one initial pose per object"):
         tracker_of(2).init(pose(), 0)
 
