@@ -6,30 +6,25 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from torchtrack.cli.option import option
 from torchtrack.cli.options_files import refuse_settings
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.settings import CommandLineText
 from torchtrack.errors import ConfigError
 
-
-def _option(metavar: str, *aliases: str) -> Any:
-    """An option that may be left out: the config file decides then, and the defaults last."""
-    return arg(metavar=metavar, aliases=aliases, help_behavior_hint="")
+_Output = Annotated[str | None, option("DIR", "-o")]
 
 
-_Output = Annotated[str | None, _option("DIR", "-o")]
+_Preset = Annotated[str | None, option("NAME")]
 
 
-_Preset = Annotated[str | None, _option("NAME")]
+_Models = Annotated[Literal["textured", "geometry"] | None, option("textured|geometry")]
 
 
-_Models = Annotated[Literal["textured", "geometry"] | None, _option("textured|geometry")]
+_Number = Annotated[int | None, option("N")]
 
 
-_Number = Annotated[int | None, _option("N")]
-
-
-_Executor = Annotated[ExecutorName | None, _option("local|ray")]
+_Executor = Annotated[ExecutorName | None, option("local|ray")]
 
 
 # Options that say how several sources are shared out.
@@ -52,13 +47,13 @@ class Track:
     """Time of the initial pose, in stream time (µs)."""
     end_us: _Number = None
     """Tracking ends here, in stream time (µs)."""
-    device: Annotated[str | None, _option("NAME")] = None
+    device: Annotated[str | None, option("NAME")] = None
     """Where the tracker runs: cpu, cuda or cuda:N."""
     threads: _Number = None
     """Threads of the tracker on the CPU."""
     streams: _Number = None
     """Of several sources, so many are tracked at once, as one batch."""
-    jobs: Annotated[int | None, _option("N", "-j")] = None
+    jobs: Annotated[int | None, option("N", "-j")] = None
     """Processes for several sources."""
     executor: _Executor = None
     """Where these are: on this machine, or Ray's (the cluster at RAY_ADDRESS)."""
@@ -66,9 +61,9 @@ class Track:
     """Compile the tracker: a step takes half the time, the first start some minutes."""
     resume: bool = False
     """Go on with a run in the same folder that ended early, from its last pose; of several, leave out those that are complete."""
-    poses: Annotated[str | None, _option("-|FILE")] = None
+    poses: Annotated[str | None, option("-|FILE")] = None
     """Also write a line of JSON per window and object as soon as it is tracked; to - (standard output, which has nothing else then)."""
-    rerun: Annotated[str | None, _option("FILE|live")] = None
+    rerun: Annotated[str | None, option("FILE|live")] = None
     """Show all of it in the Rerun viewer: live, or later from a file (.rrd)."""
     quiet: bool = False
     """No progress bar."""
@@ -94,27 +89,27 @@ class Track:
 class Evaluate:
     """Track sequences with known ground truth under one or more methods and compare the errors."""
 
-    paths: Positional[Annotated[tuple[str, ...], arg(metavar="[PATH ...]", help_behavior_hint="")]] = ()
+    paths: Positional[Annotated[tuple[str, ...], option("[PATH ...]")]] = ()
     """Sequences (.npz), or folders of them."""
     output: _Output = None
     """Folder for metrics.json, errors.csv and the report's tables."""
-    methods: Annotated[str | None, _option("A,B,...")] = None
+    methods: Annotated[str | None, option("A,B,...")] = None
     """Comma-separated: labels of methods in the config file, or presets: default, paper, line, ls, nns."""
-    config: Annotated[str | None, _option("FILE")] = None
+    config: Annotated[str | None, option("FILE")] = None
     """A YAML config file with paths and methods."""
     models: _Models = None
     """Use a sequence's textured models where it has them, or geometry alone."""
-    jobs: Annotated[int | None, _option("N", "-j")] = None
+    jobs: Annotated[int | None, option("N", "-j")] = None
     """Processes, of one thread each."""
     executor: _Executor = None
     """Where these are: on this machine, or Ray's (the cluster at RAY_ADDRESS)."""
     streams: _Number = None
     """Sequences that each tracks at once, as one batch."""
-    report: Annotated[Literal["sequences", "compact", "trial"] | None, _option("sequences|compact|trial")] = None
+    report: Annotated[Literal["sequences", "compact", "trial"] | None, option("sequences|compact|trial")] = None
     """A row per sequence, object and method; one per method; or what each method's left out components are worth."""
     runs: _Number = None
     """Of a trial: runs of each method, which differ by roundings alone."""
-    table: Annotated[str | None, _option("FILE")] = None
+    table: Annotated[str | None, option("FILE")] = None
     """Of a trial: a Markdown file that gets its table, between <!-- TRIAL --> and <!-- /TRIAL -->."""
     resume: bool = False
     """Take up an evaluation into the same folder that was broken off: what it measured with the same settings is kept."""
@@ -145,11 +140,11 @@ class Evaluate:
 class Simulate:
     """Simulate an event camera before moving objects, or make events of a video; write sequences with their ground truth."""
 
-    config: Positional[Annotated[str, arg(metavar="[CONFIG]", help_behavior_hint="")]] = ""
+    config: Positional[Annotated[str, option("[CONFIG]")]] = ""
     """A YAML file of a scene or a suite, or a folder of them."""
-    output: Annotated[str, arg(aliases=["-o"], metavar="FILE|DIR", help_behavior_hint="")] = ""
+    output: Annotated[str, option("FILE|DIR", "-o")] = ""
     """The sequence to write (.npz with its meshes beside it, or .h5 with all in one); of a suite, the folder."""
-    variant: Annotated[str | None, _option("NAME")] = None
+    variant: Annotated[str | None, option("NAME")] = None
     """One variant of a scene that has several; all of them when not given."""
     jobs: Annotated[int, arg(aliases=["-j"], metavar="N")] = 2
     """Processes of a suite, of one thread each."""
@@ -157,13 +152,13 @@ class Simulate:
     """Where these are: on this machine, or Ray's (the cluster at RAY_ADDRESS)."""
     preview: bool = False
     """Also write a video of each scene, with events and true contours."""
-    video: Annotated[str | None, _option("FILE|DIR")] = None
+    video: Annotated[str | None, option("FILE|DIR")] = None
     """In place of a scene: a video, or a folder of images."""
-    frames_per_second: Annotated[float | None, _option("N", "--fps")] = None
+    frames_per_second: Annotated[float | None, option("N", "--fps")] = None
     """Of the video, where it does not say it."""
-    timestamps: Annotated[str | None, _option("FILE")] = None
+    timestamps: Annotated[str | None, option("FILE")] = None
     """Times of the video's frames (s), one a line."""
-    noise: Annotated[Literal["ideal", "default", "realistic"] | None, _option("NAME")] = None
+    noise: Annotated[Literal["ideal", "default", "realistic"] | None, option("NAME")] = None
     """Event camera profile."""
     quiet: bool = False
     """No progress bar."""
@@ -238,9 +233,9 @@ class Model:
 
     file: Positional[Annotated[str, arg(metavar="FILE")]]
     """A mesh (PLY, OBJ, STL, GLB, glTF, OFF), or polylines (JSON, or OBJ with lines)."""
-    output: Annotated[str | None, _option("FILE", "-o")] = None
+    output: Annotated[str | None, option("FILE", "-o")] = None
     """The picture of six views to write (.png)."""
-    unit: Annotated[Literal["m", "cm", "mm", "inch"] | None, _option("UNIT")] = None
+    unit: Annotated[Literal["m", "cm", "mm", "inch"] | None, option("UNIT")] = None
     """Unit of the file's numbers; the likeliest when not given."""
     scale: float = 1.0
     """Enlargement."""

@@ -7,14 +7,15 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from torchtrack.bench.parts import Part
+from torchtrack.cli.option import option
 from torchtrack.config.events import ReadingConfig, TimeUnit
 from torchtrack.config.formats import OutputFormat
 from torchtrack.errors import ConfigError
 
-_TimeUnit = Annotated[TimeUnit | None, arg(metavar="UNIT", help_behavior_hint="")]
-_Text = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
+_TimeUnit = Annotated[TimeUnit | None, option("UNIT")]
+_Text = Annotated[str | None, option("NAME")]
 _Polarity = Annotated[str, arg(metavar="CODE")]
-_Size = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
+_Size = Annotated[int | None, option("N")]
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Convert:
     """The file to read; its format is told by its content."""
     target: Positional[Annotated[str, arg(metavar="OUT")]]
     """The file to write: .raw (EVT3), .aedat4, .h5, .npz or .csv."""
-    format: Annotated[OutputFormat | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    format: Annotated[OutputFormat | None, option("NAME")] = None
     """Its format: evt2, evt3, aedat4, dsec, npz, csv or sequence; by default as its suffix says."""
     width: _Size = None
     """Sensor width (px), where the file does not say it."""
@@ -92,7 +93,7 @@ class Bench:
     """Folder for the results."""
     repeats: Annotated[int, arg(metavar="N")] = 7
     """How often everything is measured."""
-    compare: Annotated[str | None, arg(metavar="OLD.json", help_behavior_hint="")] = None
+    compare: Annotated[str | None, option("OLD.json")] = None
     """Earlier results of the same part, or the folder with them: tells how many times faster each figure is now."""
     device: Annotated[str, arg(metavar="NAME")] = "cpu"
     """Where to measure: cpu, cuda or cuda:N; io and sim are always on the CPU."""
@@ -100,7 +101,7 @@ class Bench:
     """Threads of PyTorch on the CPU."""
     events: Annotated[int, arg(metavar="N")] = 5_000_000
     """Of io: events of each file."""
-    sequence: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    sequence: Annotated[str | None, option("FILE")] = None
     """Of pipeline and stages: a sequence (.npz), in place of simulated scenes."""
     compiled: bool = False
     """Of pipeline: one object, on a GPU many too, also by compiled graphs; compiling takes some minutes."""

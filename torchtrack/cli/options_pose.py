@@ -6,10 +6,11 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from torchtrack.cli.option import option
 from torchtrack.config.settings import CommandLineText
 from torchtrack.errors import ConfigError
 
-_File = Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")]
+_File = Annotated[str | None, option("FILE")]
 
 
 @dataclass(frozen=True)
@@ -28,19 +29,19 @@ class Pose:
     """Look near the pose in this file: one that this command wrote, or a config."""
     search: bool = False
     """Look for the object in all rotations."""
-    box: Annotated[str | None, arg(metavar="u0,v0,u1,v1", help_behavior_hint="")] = None
+    box: Annotated[str | None, option("u0,v0,u1,v1")] = None
     """Where it is in the image (px); by default around what moves most."""
-    at_us: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    at_us: Annotated[int | None, option("N")] = None
     """Time of the pose, in stream time (µs); by default the start."""
-    unit: Annotated[Literal["m", "cm", "mm", "inch"] | None, arg(metavar="UNIT", help_behavior_hint="")] = None
+    unit: Annotated[Literal["m", "cm", "mm", "inch"] | None, option("UNIT")] = None
     """Unit of the mesh file's numbers; m when not given."""
-    scale: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
+    scale: Annotated[float | None, option("N")] = None
     """Enlargement of the mesh."""
     centre: bool = False
     """Have the middle of the mesh as the origin that poses are of."""
-    label: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    label: Annotated[str | None, option("NAME")] = None
     """Which object of a config."""
-    output: Annotated[str | None, arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = None
+    output: Annotated[str | None, option("FILE", "-o")] = None
     """The file to write (.yaml); by default the terminal."""
 
     def run(self, overrides: dict[str, Any]) -> int:

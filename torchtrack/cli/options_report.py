@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from torchtrack.cli.option import option
 from torchtrack.cli.options_files import refuse_settings
 
 
@@ -15,7 +16,7 @@ class Report:
 
     runs: Positional[Annotated[tuple[Path, ...], arg(metavar="DIR ...")]]
     """Output folders of runs."""
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = None
+    output: Annotated[Path | None, option("FILE", "-o")] = None
     """The page to write (.html); by default report.html in the first folder."""
 
     def run(self, overrides: dict[str, Any]) -> int:
