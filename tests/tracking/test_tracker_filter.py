@@ -16,9 +16,10 @@ from torchtrack.config.components import Component
 from torchtrack.config.tracker import MotionConfig, SolverConfig, TrackerConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import difference_about, retract_about, transform_points
+from torchtrack.core.pose_covariance import left_covariance
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.expectation import predicted_after
-from torchtrack.tracking.motion.model import COAST_S, initial_covariance, left_covariance
+from torchtrack.tracking.motion.model import COAST_S, initial_covariance
 from torchtrack.tracking.validation.status import Status
 
 

@@ -4,7 +4,6 @@ A projected line is the straight contour points of a model (:mod:`torchtrack.bas
 normals: the distance of an event from the line is that from its nearest point, along the normal.
 """
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,11 +13,12 @@ from torch import Tensor
 
 from torchtrack.baselines.straight_edges import straight_edges_only, too_curved
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core import dispatch, lie
+from torchtrack.core import lie
 from torchtrack.core.camera import MIN_DEPTH_M, Camera
-from torchtrack.core.events import EventBatch, ForeignEvents, as_batch, pad_streams
+from torchtrack.core.events import EventBatch, pad_streams
 from torchtrack.core.image_velocity import object_plane_velocity, pixel_velocity
 from torchtrack.core.padded import select_ranked, take_points
+from torchtrack.core.pose_covariance import left_covariance
 from torchtrack.errors import ModelError
 from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.association.matches import Matches
@@ -28,9 +28,7 @@ from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 from torchtrack.tracking.estimation.terms import CostTerm, Linearisation, PoseProblem
 from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.frontend.time_surface import update_last_event
-from torchtrack.tracking.motion.model import left_covariance
 from torchtrack.tracking.state import StepResult, TrackerState
-from torchtrack.tracking.step_check import check_step
 from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.measures import explained_ratio, visible_ratio
 from torchtrack.tracking.validation.status import Status, judge
@@ -123,26 +121,6 @@ class EventLineTracker(Tracker):
 
     def prepare(self, state: TrackerState) -> None:
         """Nothing is to be compiled."""
-
-    def step(
-        self,
-        state: TrackerState,
-        events: EventBatch | ForeignEvents,
-        t_end_us: int | Int[Tensor, "s"] | None = None,
-        extra_terms: tuple[CostTerm, ...] = (),
-    ) -> tuple[TrackerState, StepResult]:
-        """Advance every object by one window; see :meth:`torchtrack.tracking.tracker.Tracker.step`."""
-        events = as_batch(events)
-        t_us = self._window_end(state, events, t_end_us)
-        check_step(state.t_us, events, t_us)
-        with torch.autocast(t_us.device.type, enabled=False), dispatch.backend(wanted=self.kernels, values=self.intrinsics):
-            return self._tracked(state, events, t_us, extra_terms)
-
-    @abstractmethod
-    def _tracked(
-        self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...]
-    ) -> tuple[TrackerState, StepResult]:
-        """The state and result after the window that ends at ``t_us``."""
 
     def _open(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], velocity: Float[Tensor, "b 6"]) -> Window:
         """The window's times, and each object carried on with ``velocity``."""

@@ -55,7 +55,6 @@ KEYS = {
 
 # Settings that were removed, by their sections: what is done in their place, or why nothing is.
 REMOVED: dict[str, dict[str, str]] = {
-    "window": {},
     "contours": {
         "mid_window": "contours are those that show at the window's end",
     },
@@ -74,8 +73,6 @@ REMOVED: dict[str, dict[str, str]] = {
         "acceleration_px": "no acceleration is estimated",
         "acceleration_s": "no acceleration is estimated",
     },
-    "relocalization": {},
-    "validation": {},
 }
 
 

@@ -29,7 +29,7 @@ _MOST_POINTS = 1000
 
 def model_points(model: ObjectModel) -> Float[Tensor, "n 3"]:
     """Points that stand for an object's surface (float64): its uniform samples, or the ends of its lines; at most 1,000."""
-    points = model.surface_points if len(model.surface_points) else model.segments.reshape(-1, 3)
+    points = model.extent_points
     return points[:: -(-len(points) // _MOST_POINTS)].double()
 
 

@@ -8,11 +8,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.core.lie import hat
+from torchtrack.core.pose_covariance import origin_covariance
 
 POSE, TRANSFORMS = "geometry_msgs/msg/PoseWithCovarianceStamped", "tf2_msgs/msg/TFMessage"
 TF_TOPIC = "/tf"
@@ -40,15 +39,10 @@ def pose_topic(label: str) -> str:
 def position_rotation_covariance(covariance: Float[Tensor, "6 6"], T_cam_obj: Float[Tensor, "4 4"]) -> Float[Tensor, "6 6"]:
     """Covariance of position and of rotation about the fixed axes of the camera, in this order, as ROS has it.
 
-    Ours is of ``[φ, ρ]`` in ``exp(ξ) T``: a rotation about the camera's own origin, which also moves the object. So the position moves by
-    ``ρ + φ × t``, and the rotation by ``φ``.
+    Ours is of ``[φ, ρ]`` in ``exp(ξ) T``, a rotation about the camera's own origin; see :func:`origin_covariance`.
     """
-    covariance = covariance.double()
-    eye = torch.eye(3, dtype=torch.float64, device=covariance.device)
-    moved_by = torch.cat([-hat(T_cam_obj[:3, 3].double()), eye], 1)
-    turned_by = torch.cat([eye, torch.zeros_like(eye)], 1)
-    jacobian = torch.cat([moved_by, turned_by])
-    return jacobian @ covariance @ jacobian.mT
+    rotation_first = origin_covariance(covariance.double()[None], T_cam_obj.double()[None])[0]
+    return rotation_first.roll((3, 3), (0, 1))
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,11 @@ class ObjectModel:
     triangles: Float[Tensor, "f 3 3"]
     mesh: trimesh.Trimesh | None
 
+    @property
+    def extent_points(self) -> Float[Tensor, "n 3"]:
+        """Points all over it: the samples of its surface, or the ends of its segments where it has none."""
+        return self.surface_points if len(self.surface_points) else self.segments.reshape(-1, 3)
+
     def __repr__(self) -> str:
         counted = {"edges": self.edge_points, "texture points": self.texture_points, "segments": self.segments, "faces": self.triangles}
         parts = ", ".join(f"{len(values)} {name}" for name, values in counted.items() if len(values))

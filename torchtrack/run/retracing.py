@@ -58,7 +58,8 @@ def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> li
         alone: a tracker of this object alone.
     """
     changed, since_us = list(steps), steps[gap.seen].window.t_end_us
-    for at, state, result in _followed_back(steps[: gap.seen + 1], number, alone):
+    back = followed_back(steps[gap.seen].state, number, [step.window for step in steps[1 : gap.seen + 1]], alone)
+    for at, (state, result) in zip(reversed(range(gap.seen)), back, strict=True):
         before = steps[at]
         if int(result.status[0]) >= int(Status.LOST):
             if since_us - before.window.t_end_us > 1e6 * _HIDDEN_S:
@@ -72,15 +73,21 @@ def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> li
     return changed
 
 
-def _followed_back(steps: Sequence[Step], number: int, alone: Tracker) -> Iterator[tuple[int, TrackerState, StepResult]]:
-    """The states and results of an object at the end of each step but the last, the latest first, from what comes after it."""
-    about_us = steps[-1].window.t_end_us
-    state = turned_back(steps[-1].state, number, alone)
-    for at in reversed(range(len(steps) - 1)):
-        window = steps[at + 1].window
+def followed_back(state: TrackerState, number: int, windows: Sequence[EventWindow], alone: Tracker) -> Iterator[tuple[TrackerState, StepResult]]:
+    """The states and results of an object at the start of each window, the latest first, from what is known at the end of the last one.
+
+    Args:
+        state: then.
+        number: of the object, in it.
+        windows: one after the other.
+        alone: a tracker of this object alone.
+    """
+    state = _turned_back(state, number, alone)
+    for window in reversed(windows):
+        about_us = windows[-1].t_end_us
         events = in_reverse(window, about_us).to(state.T_cam_obj.device)
         state, result = alone.step(state, events, 2 * about_us - window.t_start_us)
-        yield at, state, result
+        yield state, result
 
 
 def in_reverse(window: EventWindow, about_us: int) -> EventBatch:
@@ -91,7 +98,7 @@ def in_reverse(window: EventWindow, about_us: int) -> EventBatch:
     return EventBatch(x, y, 2 * about_us + 1 - t_us, ~polarity, stream)
 
 
-def turned_back(state: TrackerState, number: int, alone: Tracker) -> TrackerState:
+def _turned_back(state: TrackerState, number: int, alone: Tracker) -> TrackerState:
     """What is known of one object, as the state of a tracker of it alone for which time runs backwards."""
     known = take_part(state, slice(number, number + 1), slice(0, 1))
     fresh = first_state(alone, known.T_cam_obj, known.t_us)

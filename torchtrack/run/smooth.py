@@ -11,10 +11,10 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import Camera
 from torchtrack.core.lie import orthonormalise, transform_points
+from torchtrack.core.pose_covariance import left_covariance
 from torchtrack.object_model import ObjectModel
 from torchtrack.run.stepping import Step
 from torchtrack.tracking.contours.points import reproject
-from torchtrack.tracking.motion.model import left_covariance
 from torchtrack.tracking.motion.smoother import Filtered, smoothed
 from torchtrack.tracking.state import TrackerState
 

@@ -113,7 +113,7 @@ def _doubts(T: Float[Tensor, "4 4"], model: ObjectModel, view: _View, across_px:
         doubts.append(f"{across_px:.2g} px across")
     if across_px > _LARGE_IMAGES * max(view.camera.width, view.camera.height):
         doubts.append(f"{across_px:.3g} px across, in an image of {view.size}")
-    points_obj = model.surface_points if len(model.surface_points) else model.segments.reshape(-1, 3)
+    points_obj = model.extent_points
     seen = view.share_within(transform_points(T, points_obj[:: max(1, len(points_obj) // _LOOKED_AT)].double()))
     if seen < _LEAST_SEEN:
         doubts.append(f"mostly outside the image ({100 * seen:.0f} % of it within)")

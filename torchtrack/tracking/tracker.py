@@ -149,17 +149,7 @@ class Tracker(TrackedObjects):
         t_us = self._window_end(state, events, t_end_us)
         check_step(state.t_us, events, t_us)
         with torch.autocast(t_us.device.type, enabled=False), dispatch.backend(wanted=self.kernels, values=self.intrinsics):
-            steady = None if extra_terms else self._steady(state, events, t_us)
-            if steady is not None:
-                return _counted(steady)
-            in_parts = to_be_parted(state, events, t_us, self.objects, self.config)
-            parted = host_sync.AsyncValue.to(in_parts)
-            if host_sync.read_at_once(in_parts) and bool(in_parts.all()):
-                return _counted(self._advance_in_parts(state, events, t_us, in_parts, extra_terms))
-            done = self._advance(state, events, t_us, extra_terms=extra_terms)
-            if not parted.any():
-                return _counted(done)
-            return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us, in_parts, extra_terms), done))
+            return self._tracked(state, events, t_us, extra_terms)
 
     def steady_step(
         self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"]
@@ -192,6 +182,22 @@ class Tracker(TrackedObjects):
                 self._advance(state, EventBatch.empty(), state.t_us + 1)
                 if searches(self.config):
                     rehearse(predicted_after(self, state, torch.full_like(self.diameter_m, 1e-6)), self.config)
+
+    def _tracked(
+        self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...]
+    ) -> tuple[TrackerState, StepResult]:
+        """The state and result after the window that ends at ``t_us``, whose events are checked."""
+        steady = None if extra_terms else self._steady(state, events, t_us)
+        if steady is not None:
+            return _counted(steady)
+        in_parts = to_be_parted(state, events, t_us, self.objects, self.config)
+        parted = host_sync.AsyncValue.to(in_parts)
+        if host_sync.read_at_once(in_parts) and bool(in_parts.all()):
+            return _counted(self._advance_in_parts(state, events, t_us, in_parts, extra_terms))
+        done = self._advance(state, events, t_us, extra_terms=extra_terms)
+        if not parted.any():
+            return _counted(done)
+        return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us, in_parts, extra_terms), done))
 
     def _steady(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult] | None:
         """A window by a graph, where there is one and it holds."""

@@ -11,12 +11,13 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync, lie
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.linalg import inverse
+from torchtrack.core.pose_covariance import left_covariance
 from torchtrack.tracking.association.polarity import is_seen_well, remembered, remembers_polarity
 from torchtrack.tracking.association.weights import ON_CONTOUR_PX
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.rounds import Fit, may_be_anywhere
 from torchtrack.tracking.frontend.corners import Corners
-from torchtrack.tracking.motion.model import MotionState, fade, left_covariance, with_dropped
+from torchtrack.tracking.motion.model import MotionState, fade, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.health import TrackHealth

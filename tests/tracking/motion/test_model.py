@@ -9,11 +9,11 @@ from helpers import generator, pose
 from torchtrack.config.tracker import MotionConfig
 from torchtrack.core.lie import retract_about, se3_inverse, se3_log, transform_points
 from torchtrack.core.linalg import inverse
+from torchtrack.core.pose_covariance import left_covariance
 from torchtrack.tracking.motion.model import (
     expected_velocity,
     fade,
     initial_covariance,
-    left_covariance,
     predict_covariance,
     with_dropped,
     without_spin,

@@ -218,7 +218,7 @@ def _update(
 
 @kernel()
 def _to_left(covariance: Array, centre_cam: Array, left: Array) -> None:
-    """Covariance of the left perturbation of a pose: :func:`torchtrack.tracking.motion.model.left_covariance`."""
+    """Covariance of the left perturbation of a pose: :func:`torchtrack.core.pose_covariance.left_covariance`."""
     left[:] = covariance[:6, :6]
     if not is_finite(left):
         return

@@ -14,7 +14,7 @@ from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.edge_search import pulled
-from torchtrack.tracking.relocalization.view_sphere import moved_to, outlines_at, outlines_from, view_directions
+from torchtrack.tracking.relocalization.view_sphere import moved_to, nearest_view, outlines_at, outlines_from, view_directions
 
 _VIEWS = 500
 _TOGETHER = 512
@@ -64,8 +64,7 @@ class ViewedObject:
         ahead = self.placed(rotations, torch.tensor([0.0, 0.0, depth_m]).expand(len(rotations), 3))
         views = outlines_from(self._prediction(ahead[:1]), towards, self.config)
         for T in ahead.split(_TOGETHER):
-            camera_obj = -(T[:, :3, :3].mT @ T[:, :3, 3:])[..., 0] - self.centre_obj
-            yield T[:, :3, :3], moved_to(views, (camera_obj @ towards.T).argmax(1), T, self.intrinsics)
+            yield T[:, :3, :3], moved_to(views, nearest_view(T, self.tracked.centre_obj, towards), T, self.intrinsics)
 
     def at(self, T_view_obj: Float[Tensor, "n 4 4"]) -> Contours:
         """The outlines at poses, as they are seen there."""

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from torchtrack.core.camera import Camera, undistort
+from torchtrack.core.camera import Camera, project, undistort
 from torchtrack.errors import PoseError, TorchtrackWarning
 from torchtrack.io.whole_text import read_text_file
 
@@ -99,7 +99,7 @@ def pose_of_picks(picks: Picks, camera: Camera) -> Float[Tensor, "4 4"]:
     points_cam = picks.points @ T[:3, :3].T + T[:3, 3]
     if (points_cam[:, 2] <= 0).any():
         raise PoseError(f"{picks.name}: the pose that fits these points best has some behind the camera. {_LOOK}")
-    off_px = np.linalg.norm(points_cam @ camera.matrix.T / points_cam[:, 2:] - np.pad(ideal, ((0, 0), (0, 1)), constant_values=1.0), axis=1)
+    off_px = np.linalg.norm(project(torch.from_numpy(points_cam), camera.intrinsics(torch.float64)).numpy() - ideal, axis=1)
     if off_px.max() > _DOUBTFUL_PX:
         worst = int(off_px.argmax())
         message = f"{picks.name}: pick {worst + 1} is {off_px[worst]:.0f} px off the pose that fits all best. Look whether it is the right point."

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.core.lie import so3_exp
-from torchtrack.tracking.relocalization.view_sphere import view_directions
+from torchtrack.tracking.relocalization.view_sphere import rotations_from, view_directions
 
 # Directions that the camera sees an object from, and rotations about the line of sight: about nine degrees apart.
 _VIEWS, _ROLLS = 500, 36
@@ -15,13 +15,9 @@ _VIEWS, _ROLLS = 500, 36
 
 def all_rotations() -> Float[Tensor, "n 3 3"]:
     """Rotations ``R_cam_obj`` all around, evenly spread (float64)."""
-    towards = view_directions(_VIEWS)
-    other = torch.where(towards[:, 2:].abs() < 0.9, torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0]])).double()
-    right = torch.nn.functional.normalize(torch.linalg.cross(other, towards, dim=-1), dim=-1)
-    ahead = torch.stack([right, torch.linalg.cross(right, towards, dim=-1), -towards], 1)
     angles = torch.arange(_ROLLS, dtype=torch.float64) * (2 * math.pi / _ROLLS)
     about_sight = so3_exp(torch.stack([torch.zeros_like(angles), torch.zeros_like(angles), angles], -1))
-    return torch.einsum("rij,vjk->vrik", about_sight, ahead).flatten(0, 1)
+    return torch.einsum("rij,vjk->vrik", about_sight, rotations_from(view_directions(_VIEWS))).flatten(0, 1)
 
 
 def rotations_around(rotation: Float[Tensor, "3 3"], radius_deg: float, step_deg: float) -> Float[Tensor, "n 3 3"]:

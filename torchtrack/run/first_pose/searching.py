@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.core.camera import project
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import EventDataError, PoseError
 from torchtrack.object_model.rotational_symmetry import rotation_group
@@ -60,8 +61,7 @@ def _around(start: Start, T_cam_obj: Float[Tensor, "4 4"], turn_deg: tuple[float
     viewed = ViewedObject.of_model(start.model, view.camera)
     T_view_obj = view.from_camera(T_cam_obj[None])[0]
     centre = transform_points(T_view_obj, start.model.centre.double()[None])
-    own = viewed.intrinsics[0].double()
-    centre_px = (centre[0, :2] / centre[0, 2] * own[:2] + own[2:]).float()
+    centre_px = project(centre, viewed.intrinsics[0].double())[0].float()
     rotations = rotations_around(T_view_obj[:3, :3], *turn_deg)
     trials = Trials(rotations, float(centre[0, 2]), scales, torch.cartesian_prod(steps, steps), centre_px, view.box)
     return _searched(start, box.grown(0.1), view, viewed, trials)
@@ -73,12 +73,10 @@ def projected_box(start: Start, T_cam_obj: Float[Tensor, "4 4"]) -> Box:
     Raises:
         PoseError: if it reaches behind the camera.
     """
-    points = start.model.surface_points if len(start.model.surface_points) else start.model.segments.flatten(0, 1)
-    points_cam = transform_points(T_cam_obj.double(), points.double())
+    points_cam = transform_points(T_cam_obj.double(), start.model.extent_points.double())
     if float(points_cam[:, 2].min()) <= 0:
         raise PoseError(f"'{start.model.name}' reaches behind the camera at the given pose. Is its translation in metres?")
-    fx, fy, cx, cy = start.camera.intrinsics(torch.float64)
-    return Box.around(points_cam[:, :2] / points_cam[:, 2:] * torch.stack([fx, fy]) + torch.stack([cx, cy]))
+    return Box.around(project(points_cam, start.camera.intrinsics(torch.float64)))
 
 
 def _searched(start: Start, box: Box, view: SearchView, viewed: ViewedObject, trials: Trials) -> FirstPose:

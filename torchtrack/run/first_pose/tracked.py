@@ -4,7 +4,6 @@ All are tracked as one batch, each in a stream of its own. The best is then foll
 (:mod:`torchtrack.run.retracing`), and so the pose is of the time that was asked for.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,11 +13,11 @@ from torch import Tensor
 from torchtrack.config.presets import preset
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import EventBatch, concatenate
-from torchtrack.core.windows import EventWindow, windows_by_time
+from torchtrack.core.windows import windows_by_time
 from torchtrack.run.first_pose.start import Start
-from torchtrack.run.retracing import in_reverse, turned_back
+from torchtrack.run.retracing import followed_back
 from torchtrack.tracking.initialization import first_state
-from torchtrack.tracking.state import TrackerState, take_part
+from torchtrack.tracking.state import take_part
 from torchtrack.tracking.tracker import Tracker
 
 # How long poses are followed (µs); what is explained at the end of it, for the last part of the windows, is compared.
@@ -60,8 +59,9 @@ def best_followed(start: Start, T_cam_obj: Float[Tensor, "n 4 4"]) -> FirstPose:
         compared = torch.stack(scores[-max(1, round(_COMPARED * len(scores))) :]).mean(0)
         best = int(compared.argmax())
         alone = Tracker([start.model], start.camera, config)
-        T_start = _followed_back(take_part(state, slice(best, best + 1), slice(best, best + 1)), windows, alone)
-    return FirstPose(T_start, start.at_us, float(compared[best]))
+        of_best = take_part(state, slice(best, best + 1), slice(best, best + 1))
+        *_, (at_start, _) = followed_back(of_best, 0, windows, alone)
+    return FirstPose(at_start.T_cam_obj[0].clone(), start.at_us, float(compared[best]))
 
 
 def _alone_config() -> TrackerConfig:
@@ -72,12 +72,3 @@ def _alone_config() -> TrackerConfig:
 
 def _for_all(events: EventBatch, count: int) -> EventBatch:
     return concatenate([events.of_stream(stream) for stream in range(count)])
-
-
-def _followed_back(state: TrackerState, windows: Sequence[EventWindow], alone: Tracker) -> Float[Tensor, "4 4"]:
-    """The pose at the start of the windows, of an object whose state at their end is known."""
-    about_us = windows[-1].t_end_us
-    state = turned_back(state, 0, alone)
-    for window in reversed(windows):
-        state, _ = alone.step(state, in_reverse(window, about_us), 2 * about_us - window.t_start_us)
-    return state.T_cam_obj[0].clone()

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchtrack.core.lie import quaternion_from_rotation, with_signs_of
 from torchtrack.run.sinks.summary import finite
@@ -41,9 +43,7 @@ class PoseLines:
     def add(self, step: Step) -> None:
         """Write one line per object."""
         self._quaternions = with_signs_of(quaternion_from_rotation(step.result.T_cam_obj[:, :3, :3].cpu()), self._quaternions)
-        rows = [
-            pose_of(step.result, index, label) | {"quaternion_xyzw": self._quaternions[index].tolist()} for index, label in enumerate(self._labels)
-        ]
+        rows = [_pose_of(step.result, index, label, self._quaternions[index]) for index, label in enumerate(self._labels)]
         self._lines.write("".join(f"{json.dumps(finite(row), ensure_ascii=False, allow_nan=False)}\n" for row in rows))
 
     def close(self) -> None:
@@ -51,14 +51,13 @@ class PoseLines:
         self._lines.close()
 
 
-def pose_of(result: StepResult, index: int, label: str) -> dict[str, Any]:
+def _pose_of(result: StepResult, index: int, label: str, quaternion_xyzw: Float[Tensor, "4"]) -> dict[str, Any]:
     """What a step says of one object, as JSON has it; the covariance has the order of :class:`StepResult`."""
-    T = result.T_cam_obj[index].cpu()
     return {
         "t_us": int(result.t_us[0]),
         "label": label,
-        "translation_m": T[:3, 3].tolist(),
-        "quaternion_xyzw": quaternion_from_rotation(T[:3, :3]).tolist(),
+        "translation_m": result.T_cam_obj[index, :3, 3].tolist(),
+        "quaternion_xyzw": quaternion_xyzw.tolist(),
         "covariance": [[float(f"{value:.6g}") for value in row] for row in result.covariance[index].tolist()],
         "status": Status(int(result.status[index])).name,
         "quality": float(f"{float(result.quality[index]):.4g}"),

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.core.lie import hat, quaternion_from_rotation, with_signs_of
+from torchtrack.core.lie import quaternion_from_rotation, with_signs_of
+from torchtrack.core.pose_covariance import origin_covariance
 from torchtrack.io.line_file import LineFile
 from torchtrack.io.seconds import format_seconds
 from torchtrack.run.sinks.folder import POSES
@@ -79,15 +80,12 @@ def standard_deviations(covariance: Float[Tensor, "b 6 6"], T_cam_obj: Float[Ten
     """Standard deviations of rotation (°) and position (cm) of the object's origin, each over all three axes.
 
     Args:
-        covariance: of the left perturbation ``[φ, ρ]``, which moves the origin ``t`` by ``φ × t + ρ``.
+        covariance: of the left perturbation ``[φ, ρ]``.
         T_cam_obj: the poses.
     """
-    lever = -hat(T_cam_obj[:, :3, 3])
-    to_origin = torch.cat([lever, torch.eye(3, dtype=lever.dtype).expand_as(lever)], -1)
-    of_position = to_origin @ covariance.to(lever.dtype) @ to_origin.mT
-    variances = [covariance[:, :3, :3], of_position]
-    rotation, position = (part.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=0).sqrt() for part in variances)
-    return torch.stack([rotation.to(lever.dtype).rad2deg(), 100 * position], -1)
+    variances = origin_covariance(covariance.to(T_cam_obj.dtype), T_cam_obj).diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 3)).sum(-1)
+    rotation, position = variances.clamp(min=0).sqrt().unbind(-1)
+    return torch.stack([rotation.rad2deg(), 100 * position], -1)
 
 
 def tum_path(folder: Path, label: str) -> Path:

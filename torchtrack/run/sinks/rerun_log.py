@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from torchtrack.core.atomic import check_writable, writing
-from torchtrack.core.camera import distort, undistortion_table
+from torchtrack.core.camera import distort, project, undistortion_table
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import transform_points
 from torchtrack.errors import ConfigError
@@ -146,10 +146,9 @@ class RerunLog:
     def _log_true_contours(self, step: Step, index: int, label: str, true: torch.Tensor) -> None:
         contours, camera = step.result.contours, self._session.camera
         seen = contours.mask[index].cpu()
-        points = transform_points(true, contours.points_obj[index].cpu().double()[seen]).numpy()
+        points_cam = transform_points(true, contours.points_obj[index].cpu().double()[seen])
         links = contour_links(contours.pixels[index].cpu().double()[seen].numpy(), contours.normals[index].cpu().double()[seen].numpy())
-        rays = points / np.maximum(points[:, 2:], 1e-6)
-        lines = distort(rays[:, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy], camera)[links]
+        lines = distort(project(points_cam, camera.intrinsics(torch.float64)).numpy(), camera)[links]
         self._log(f"camera/truth/{label}", self._rr.LineStrips2D(lines, colors=[_GREEN], radii=[0.4]))
 
     def _log_contours(self, step: Step, index: int, label: str, events: Float[np.ndarray, "e 2"]) -> None:

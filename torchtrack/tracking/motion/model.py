@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import MotionConfig
-from torchtrack.core.lie import hat
 
 # A prediction is not let grow less certain than this (rad, and diameters).
 MOST_UNCERTAIN = 0.5
@@ -87,16 +86,6 @@ def acceleration_sigma(velocity: Float[Tensor, "b 6"], diameter_m: Float[Tensor,
     """Standard deviation of the acceleration to be expected (rad/s², m/s²)."""
     rim_m_s = velocity[:, 3:].norm(dim=-1, keepdim=True) + 0.5 * diameter_m * velocity[:, :3].norm(dim=-1, keepdim=True)
     return rim_and_centre(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m)
-
-
-def left_covariance(covariance: Float[Tensor, "b 6 6"], centre_cam: Float[Tensor, "b 3"]) -> Float[Tensor, "b 6 6"]:
-    """Covariance of the left perturbation ``[φ, ρ]`` of a pose, from that of a turn about its centre: ``ρ_left = ρ - φ × c``."""
-    # A sum is finite only where every entry is.
-    unknown = ~(covariance.sum((1, 2)).abs() < torch.inf)[:, None, None]
-    to_left = torch.eye(6, dtype=covariance.dtype, device=covariance.device).repeat(len(covariance), 1, 1)
-    to_left[:, 3:, :3] = hat(centre_cam)
-    known = to_left @ torch.where(unknown, 0.0, covariance) @ to_left.transpose(1, 2)
-    return torch.where(unknown, covariance, known)
 
 
 def fade(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], failed: Bool[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 6"]:

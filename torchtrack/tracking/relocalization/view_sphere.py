@@ -38,14 +38,19 @@ def outlines_by_view(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], 
     """
     objects = prediction.objects
     towards = view_directions(_VIEWS, T_cam_obj.device).to(T_cam_obj.dtype)
-    camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])[..., 0] - objects.centre_obj
-    # The longer a vector, the larger its products, which changes nothing of which of them is the largest.
-    view = (camera_obj @ towards.T).argmax(1)
+    view = nearest_view(T_cam_obj, objects.centre_obj, towards)
     if host_sync.read_at_once(view):
         used, view = view.unique(return_inverse=True)
         towards = towards[used]
     outlines = outlines_from(prediction, towards, config)
     return moved_to(outlines, view, T_cam_obj, objects.intrinsics)
+
+
+def nearest_view(T_cam_obj: Float[Tensor, "n 4 4"], centre_obj: Float[Tensor, "#n 3"], towards: Float[Tensor, "v 3"]) -> Int[Tensor, "n"]:
+    """Which of some directions is nearest to the one that the camera is in, as the object at each pose has it."""
+    camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])[..., 0] - centre_obj
+    # The longer a vector, the larger its products, which changes nothing of which of them is the largest.
+    return (camera_obj @ towards.T).argmax(1)
 
 
 def thinned(contours: Contours) -> Contours:
@@ -63,13 +68,18 @@ def outlines_at(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], confi
     return thinned(prediction.objects.copies(0, len(T_cam_obj)).contours(T_cam_obj, config.contours))
 
 
-def outlines_from(prediction: Prediction, towards: Float[Tensor, "v 3"], config: TrackerConfig) -> Contours:
-    """The outlines of an object straight before the camera, which it sees from some directions."""
+def rotations_from(towards: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 3"]:
+    """Rotations ``R_cam_obj`` of an object straight before the camera, which it sees from some directions."""
     up, other_up = (constant(axis, towards.dtype, towards.device) for axis in (_UP, _OTHER_UP))
     right = torch.linalg.cross(torch.where(towards[:, 2:].abs() < _ALONG, up, other_up), towards, dim=-1)
     right = torch.nn.functional.normalize(right, dim=-1)
     # The camera's axes, right, down and forward, as the object has them: a matrix that takes vectors to the camera.
-    rotation = torch.stack([right, torch.linalg.cross(right, towards, dim=-1), -towards], 1)
+    return torch.stack([right, torch.linalg.cross(right, towards, dim=-1), -towards], 1)
+
+
+def outlines_from(prediction: Prediction, towards: Float[Tensor, "v 3"], config: TrackerConfig) -> Contours:
+    """The outlines of an object straight before the camera, which it sees from some directions."""
+    rotation = rotations_from(towards)
     ahead = torch.nn.functional.pad(prediction.centre_cam[:, 2:], (2, 0))
     translation = ahead - (rotation @ prediction.objects.centre_obj[0])
     poses = torch.eye(4, dtype=towards.dtype, device=towards.device).repeat(len(towards), 1, 1)
