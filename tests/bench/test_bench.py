@@ -108,6 +108,8 @@ def test_solver(tiny, tmp_path):
     content = written(tmp_path, "solver")
     assert [(entry["name"], entry["target"], entry["lower_is_better"]) for entry in content["results"]] == [("B=1", 2.0, True), ("B=3", None, True)]
     assert (tmp_path / "bench_solver_throughput.png").is_file()
+    yardstick = content["yardstick"]["quartiles"][1]
+    assert [entry["over_yardstick"] for entry in content["results"]] == [entry["quartiles"][1] / yardstick for entry in content["results"]]
 
 
 def test_surface(tiny, tmp_path):
@@ -225,7 +227,16 @@ def test_what_cannot_be_compared_with_is_refused(tmp_path):
 def test_the_table_says_what_it_was_measured_on():
     text = as_markdown(Report("solver", "Title", (time_result("B=1", [0.003], 2.0),), ("a note",)), machine(CPU), {"B=1": 6.0})
     assert "# Title" in text and "- a note" in text and "processor" in text
-    assert "| B=1 | 3.00 ms | 3.00 … 3.00 | ≤ 2 | missed | 2.00x |" in text
+    assert "| B=1 | 3.00 ms | 3.00 … 3.00 |  | ≤ 2 | missed | 2.00x |" in text
+
+
+def test_times_are_told_as_multiples_of_the_yardstick_too():
+    results = (time_result("B=1", [0.003], 2.0), Result("rate", "Mev/s", (5.0,)))
+    report = Report("solver", "Title", results, yardstick=time_result("fixed work", [0.002, 0.0015, 0.001]))
+    text = as_markdown(report, machine(CPU))
+    assert "| B=1 | 3.00 ms | 3.00 … 3.00 | 2.00 | ≤ 2 | missed |" in text
+    assert "| rate | 5.00 Mev/s | 5.00 … 5.00 |  | – |  |" in text
+    assert "- The yardstick took 1.50 ms (1.25 … 1.75): fixed work" in text
 
 
 # ---- what is refused

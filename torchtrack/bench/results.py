@@ -4,7 +4,7 @@ import json
 import os
 import platform
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -79,6 +79,7 @@ class Report:
         results: the figures.
         notes: what else there is to know: what is missing here, and whether what was timed did its work.
         plots: pictures of the figures.
+        yardstick: time of the fixed work (:mod:`torchtrack.bench.yardstick`) in the same run; None where it was not measured.
     """
 
     part: str
@@ -86,6 +87,13 @@ class Report:
     results: tuple[Result, ...]
     notes: tuple[str, ...] = ()
     plots: tuple[Plot, ...] = ()
+    yardstick: Result | None = None
+
+    def over_yardstick(self, result: Result) -> float | None:
+        """A time as a multiple of the yardstick's; None for what is no time, or without a yardstick."""
+        if self.yardstick is None or result.unit != self.yardstick.unit:
+            return None
+        return result.median / self.yardstick.median
 
 
 def machine(device: torch.device | None = None) -> dict[str, Any]:
@@ -115,22 +123,34 @@ def as_markdown(report: Report, setup: Mapping[str, Any], older: Mapping[str, fl
         setup: what they depend on, as of :func:`machine`.
         older: medians by name that the figures are compared with.
     """
-    further = (" against before |", "---|") if older is not None else ("", "")
-    lines = [f"# {report.title}", "", f"| what | median | quartiles | target | |{further[0]}", f"|---|---|---|---|---|{further[1]}"]
-    lines += [_row(result, older) for result in report.results]
-    lines += ["", *(f"- {note}" for note in report.notes), *([""] if report.notes else [])]
+    columns = ["what", "median", "quartiles", "yardsticks", "target", "", *(["against before"] if older is not None else [])]
+    lines = [f"# {report.title}", "", _cells(columns), "|" + "---|" * len(columns)]
+    lines += [_row(report, result, older) for result in report.results]
+    notes = [*report.notes, *([_yardstick(report.yardstick)] if report.yardstick is not None else [])]
+    lines += ["", *(f"- {note}" for note in notes), *([""] if notes else [])]
     lines += [f"![{plot.title}]({plot_name(report, plot)})\n" for plot in report.plots]
     return "\n".join([*lines, ", ".join(f"{key} {value}" for key, value in setup.items()), ""])
 
 
-def _row(result: Result, older: Mapping[str, float] | None) -> str:
+def _row(report: Report, result: Result, older: Mapping[str, float] | None) -> str:
     lower, median, upper = (plain(value) for value in result.quartiles)
     target = "–" if result.target is None else f"{'≤' if result.lower_is_better else '≥'} {result.target:g}"
     verdict = {None: "", True: "reached", False: "missed"}[result.reached]
-    row = f"| {result.name} | {median} {result.unit} | {lower} … {upper} | {target} | {verdict} |"
-    if older is None:
-        return row
-    return row + (f" {result.speed_up(older[result.name]):.2f}x |" if result.name in older else " new |")
+    ratio = report.over_yardstick(result)
+    cells = [result.name, f"{median} {result.unit}", f"{lower} … {upper}", "" if ratio is None else plain(ratio), target, verdict]
+    if older is not None:
+        cells.append(f"{result.speed_up(older[result.name]):.2f}x" if result.name in older else "new")
+    return _cells(cells)
+
+
+def _cells(values: Sequence[str]) -> str:
+    """A row of a table."""
+    return "| " + " | ".join(values) + " |"
+
+
+def _yardstick(measured: Result) -> str:
+    lower, median, upper = (plain(value) for value in measured.quartiles)
+    return f"The yardstick took {median} {measured.unit} ({lower} … {upper}): {measured.name}"
 
 
 def plot_name(report: Report, plot: Plot) -> str:
@@ -164,11 +184,16 @@ def older_medians(path: Path, part: str) -> dict[str, float]:
 
 def write_results(folder: Path, report: Report, setup: Mapping[str, Any], older: Mapping[str, float] | None = None) -> None:
     """Write ``bench_PART.json``, ``bench_PART.md`` and the plots."""
-    results = [{**asdict(result), "quartiles": result.quartiles, "reached": result.reached} for result in report.results]
+    results = [
+        {**asdict(result), "quartiles": result.quartiles, "reached": result.reached, "over_yardstick": report.over_yardstick(result)}
+        for result in report.results
+    ]
     if older is not None:
         for entry, result in zip(results, report.results, strict=True):
             entry["speed_up"] = result.speed_up(older[result.name]) if result.name in older else None
-    content = {"part": report.part, "title": report.title, "machine": dict(setup), "results": results, "notes": report.notes}
+    content: dict[str, Any] = {"part": report.part, "title": report.title, "machine": dict(setup), "results": results, "notes": report.notes}
+    if report.yardstick is not None:
+        content["yardstick"] = {**asdict(report.yardstick), "quartiles": report.yardstick.quartiles}
     texts = (("json", json.dumps(content, indent=2, ensure_ascii=False) + "\n"), ("md", as_markdown(report, setup, older)))
     for suffix, text in texts:
         with atomic_path(folder / f"bench_{report.part}.{suffix}") as temporary:

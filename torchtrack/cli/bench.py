@@ -11,6 +11,7 @@ from rich.console import Console
 from torchtrack.bench.parts import Part
 from torchtrack.bench.results import Report, as_markdown, machine, older_medians, write_results
 from torchtrack.bench.setup import Setup
+from torchtrack.bench.yardstick import Yardstick
 from torchtrack.cli.console import output_console
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.core.atomic import check_writable
@@ -77,12 +78,15 @@ def _check(compare: Path | None, part: str, setup: Setup) -> None:
 
 
 def _measured(part: str, setup: Setup) -> Report:
-    """The report of a part."""
+    """The report of a part, with the yardstick before and after it: a machine that others use may get slower meanwhile."""
     with Console(stderr=True).status(f"measuring {part}") as status:
         setup_of_part = replace(setup, show=lambda name: status.update(f"measuring {part}: {name}"))
+        yardstick = Yardstick()
+        before = yardstick.time(setup.repeats)
         # Only what is measured is loaded.
         report: Report = import_module(f"torchtrack.bench.{part}").measure(setup_of_part)
-    return report
+        after = yardstick.time(setup.repeats)
+    return replace(report, yardstick=replace(before, figures=before.figures + after.figures))
 
 
 def _tell(report: Report, output: Path, setup: Setup, older: dict[str, float] | None) -> None:
