@@ -2,4 +2,4 @@
 
 from typing import Literal
 
-Part = Literal["pipeline", "stages", "solver", "surface", "flow", "io", "sim", "scaling", "peers"]
+Part = Literal["pipeline", "lost", "stages", "solver", "surface", "flow", "io", "sim", "scaling", "peers"]

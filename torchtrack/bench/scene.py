@@ -17,7 +17,6 @@ from torch import Tensor
 
 from torchtrack.bench.clock import Clock
 from torchtrack.config.run import RunConfig
-from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import Camera, project
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.core.lie import rotation_angle_deg, transform_points
@@ -217,6 +216,14 @@ class Run:
                     on_step(result)
         return seconds
 
+    def after(self, count: int) -> "Run":
+        """The same tracker, ``count`` windows later."""
+        state = self.state
+        with torch.inference_mode():
+            for events, end_us in self.windows[:count]:
+                state, _ = self.tracker.step(state, events, end_us)
+        return replace(self, state=state, windows=self.windows[count:])
+
     def quality(self, clock: Clock) -> str:
         """How well it tracked, in words."""
         results: list[StepResult] = []
@@ -240,7 +247,13 @@ class Run:
 
 
 def started(
-    scene: Scene, device: torch.device, streams: int = 1, config: TrackerConfig | None = None, *, compiled: bool = False, kernels: bool = True
+    scene: Scene,
+    device: torch.device,
+    streams: int = 1,
+    *,
+    compiled: bool = False,
+    kernels: bool = True,
+    first_streams: Sequence[EventBatch] = (),
 ) -> Run:
     """A tracker that follows the scene, after its first windows.
 
@@ -248,21 +261,23 @@ def started(
         scene: the scene.
         device: where the tracker runs.
         streams: how many cameras see the same scene, each in a stream of its own.
-        config: settings; those of the preset ``default`` when not given.
         compiled: whether steady windows are taken by compiled graphs.
         kernels: whether Numba's kernels are used where they apply.
+        first_streams: events of the first streams, where they are not those of the scene.
 
     Raises:
         ConfigError: if the scene ends with its first windows.
     """
     count = len(scene.models)
     index = [stream for stream in range(streams) for _ in range(count)]
-    tracker = Tracker(scene.models * streams, [scene.camera] * streams, config, index, compiled=compiled, kernels=kernels).to(device)
+    tracker = Tracker(scene.models * streams, [scene.camera] * streams, None, index, compiled=compiled, kernels=kernels).to(device)
     state = tracker.init(scene.T_cam_obj.repeat(streams, 1, 1), scene.start_us)
     tracker.prepare(state)
+    seen = [*(replace(scene, events=events) for events in first_streams), *[scene] * (streams - len(first_streams))]
     windows = []
-    for events, end_us in scene.windows(tracker.config.window.duration_us):
-        windows.append((concatenate([events.of_stream(stream) for stream in range(streams)]).to(device), end_us))
+    for of_streams in zip(*(one.windows(tracker.config.window.duration_us) for one in seen), strict=True):
+        together = concatenate([events.of_stream(stream) for stream, (events, _) in enumerate(of_streams)])
+        windows.append((together.to(device), of_streams[0][1]))
     if len(windows) <= WARM_UP_WINDOWS:
         needed = f"more than {WARM_UP_WINDOWS} windows of {tracker.config.window.duration_us} µs"
         raise ConfigError(f"there is nothing to measure: {needed} are needed, and the scene lasts {scene.end_us - scene.start_us} µs.")
