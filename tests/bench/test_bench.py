@@ -7,7 +7,7 @@ import pytest
 import torch
 from tiny_sequence import write_tiny_sequence
 
-from torchtrack.bench import flow, io, peers, pipeline, scaling, scene, sim, solver, stages, surface
+from torchtrack.bench import flow, io, lost, peers, pipeline, scaling, scene, sim, solver, stages, surface
 from torchtrack.bench.clock import Clock
 from torchtrack.bench.plots import Plot, draw
 from torchtrack.bench.results import Report, Result, as_markdown, machine, older_medians, plain, time_result
@@ -41,6 +41,7 @@ def tiny(monkeypatch):
             "HD": (320, 240),
             "HD_MEV_S": 4.0,
         },
+        lost: {"SHAPES": ("lbracket", "cube"), "COLUMNS": 2, "LOST": ("lbracket",), "DURATION_S": 0.06, "HIDDEN_FROM_US": 30_000, "KNOWN_AFTER": 3},
         stages: {"SHAPES": ("lbracket",), "MANY": ((2, 2),)},
         solver: {"TARGETS_MS": {1: 2.0, 3: None}},
         surface: {"WINDOWS": ((64, 48, 500),)},
@@ -84,6 +85,18 @@ def test_pipeline(tiny, simulator, tmp_path, capsys):
     assert content["machine"]["kernels"].startswith("numba")
     assert content["machine"]["threads"] == 1 and content["machine"]["device"] == "cpu"
     assert "1 object (lbracket), median" in capsys.readouterr().out
+
+
+def test_lost(tiny, simulator, tmp_path):
+    assert bench("lost", tmp_path) == ExitCode.DONE
+    content = written(tmp_path, "lost")
+    figures = {entry["name"]: entry["figures"][0] for entry in content["results"]}
+    for what, most in (("median", 1.5), ("95 %", 2.0)):
+        none, hidden = (f"2 objects, none lost (beside lbracket), {what}", f"2 objects, lbracket lost, {what}")
+        ratio = next(entry for entry in content["results"] if entry["name"] == f"{hidden} over none lost")
+        assert ratio["figures"][0] == pytest.approx(figures[hidden] / figures[none])
+        assert ratio["target"] == most and ratio["lower_is_better"]
+    assert "in 100% of its windows" in content["notes"][0]
 
 
 def test_a_sequence_in_place_of_simulated_scenes(tiny, tmp_path, capsys):
@@ -145,7 +158,7 @@ def test_all_parts_but_those_whose_libraries_are_missing(tiny, simulator, tmp_pa
     def without(setup):
         raise MissingExtraError("numba", "sim", "the simulator")
 
-    for part in (pipeline, scaling, peers):
+    for part in (pipeline, lost, scaling, peers):
         monkeypatch.setattr(part, "measure", without)
     assert bench("all", tmp_path) == ExitCode.DONE
     assert {path.name for path in tmp_path.glob("*.json")} == {f"bench_{part}.json" for part in ("stages", "solver", "surface", "flow", "io", "sim")}

@@ -58,10 +58,10 @@ def _case(setup: Setup, scene: Scene, shape: str) -> tuple[list[Result], str]:
 def _results(none: str, lost: str, times: np.ndarray) -> Iterator[Result]:
     """Results of times ``[repeats, 2, windows]`` (s) with none lost and with one."""
     for what, share, most in zip(("median", "95 %"), (0.5, 0.95), MOST_OVER_NONE, strict=True):
-        without, with_one = np.quantile(times, share, axis=2).T.tolist()
+        without, with_lost = np.quantile(times, share, axis=2).T.tolist()
         yield time_result(f"{none}, {what}", without)
-        yield time_result(f"{lost}, {what}", with_one)
-        ratios = tuple(longer / shorter for longer, shorter in zip(with_one, without, strict=True))
+        yield time_result(f"{lost}, {what}", with_lost)
+        ratios = tuple(longer / shorter for longer, shorter in zip(with_lost, without, strict=True))
         yield Result(f"{lost}, {what} over none lost", "times", ratios, most, lower_is_better=True)
 
 

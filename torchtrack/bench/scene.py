@@ -275,9 +275,9 @@ def started(
     tracker.prepare(state)
     seen = [*(replace(scene, events=events) for events in first_streams), *[scene] * (streams - len(first_streams))]
     windows = []
-    for of_streams in zip(*(one.windows(tracker.config.window.duration_us) for one in seen), strict=True):
-        together = concatenate([events.of_stream(stream) for stream, (events, _) in enumerate(of_streams)])
-        windows.append((together.to(device), of_streams[0][1]))
+    for together in zip(*(of_stream.windows(tracker.config.window.duration_us) for of_stream in seen), strict=True):
+        events = concatenate([own.of_stream(stream) for stream, (own, _) in enumerate(together)])
+        windows.append((events.to(device), together[0][1]))
     if len(windows) <= WARM_UP_WINDOWS:
         needed = f"more than {WARM_UP_WINDOWS} windows of {tracker.config.window.duration_us} µs"
         raise ConfigError(f"there is nothing to measure: {needed} are needed, and the scene lasts {scene.end_us - scene.start_us} µs.")
