@@ -2,12 +2,12 @@
 
 import warnings
 
-import numpy as np
 import pytest
 import torch
 import yaml
+from moving_bracket import AT_US, error_deg, write_bracket
 from solid_models import l_prism
-from tiny_sequence import CAMERA, box_events, true_poses
+from tiny_sequence import CAMERA
 
 from torchtrack.cli.main import main
 from torchtrack.config.load import load
@@ -15,27 +15,15 @@ from torchtrack.config.run import RunConfig
 from torchtrack.core.camera import project
 from torchtrack.core.lie import rotation_angle_deg, so3_exp, transform_points
 from torchtrack.errors import TorchtrackWarning
-from torchtrack.io import write_sequence
-from torchtrack.object_model import ObjectModel
-from torchtrack.object_model.rotational_symmetry import rotation_group
 from torchtrack.run.first_pose.request import PoseFile, as_block
 from torchtrack.run.initial_pose import configured_pose
-
-AT_US = 20_000
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A sequence of a bracket whose edges fire, its mesh in mm, and the pose at ``AT_US``."""
-    folder, mesh, trajectory = tmp_path_factory.mktemp("scene"), l_prism(), true_poses(120_000, step_us=250)
-    x, y, t_us = box_events(mesh, trajectory)
-    polarity = np.arange(len(t_us)) % 2
-    path = folder / "bracket.npz"
-    write_sequence(
-        path, x=x, y=y, t_us=t_us, polarity=polarity, camera=CAMERA, labels=("bracket",), meshes=[mesh], trajectories=[trajectory], meta={}
-    )
-    mesh.copy().apply_scale(1000).export(folder / "in_mm.stl")
-    return folder, trajectory.at(torch.tensor([AT_US]))[0]
+    folder = tmp_path_factory.mktemp("scene")
+    return folder, write_bracket(folder)
 
 
 def command(*arguments):
@@ -45,11 +33,6 @@ def command(*arguments):
 def written_pose(path):
     pose = load(PoseFile, path).initial_pose
     return configured_pose(pose, 0)
-
-
-def error_deg(T, truth):
-    group = rotation_group(ObjectModel.from_mesh(l_prism()))
-    return float(group.angles_deg(T[None, :3, :3], truth[None, :3, :3]))
 
 
 def rough(truth, angle_deg, farther):
@@ -111,7 +94,9 @@ def test_a_block_goes_into_a_config(scene, tmp_path):
 @pytest.mark.parametrize(
     ("more", "code", "message"),
     [
-        ((), 2, "pose needs one of --points FILE, --near FILE or --search [--box u0,v0,u1,v1], got none of them"),
+        ((), 2, "pose needs one of --points FILE, --near FILE, --search [--box u0,v0,u1,v1] or --browser, got none of them"),
+        (("--search", "--browser"), 2, "got --search and --browser"),
+        (("--search", "--port", "8080"), 2, "--port is where the page of --browser is"),
         (("--search", "--near", "a.yaml"), 2, "got --near and --search"),
         (("--near", "a.yaml", "--box", "1,2,3,4"), 2, "--box is where to --search"),
         (("--search", "--box", "1,2,3"), 2, "expected left, top, right and bottom side in pixels"),

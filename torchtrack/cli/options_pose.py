@@ -31,6 +31,10 @@ class Pose:
     """Look for the object in all rotations."""
     box: Annotated[str | None, option("u0,v0,u1,v1")] = None
     """Where it is in the image (px); by default around what moves most."""
+    browser: bool = False
+    """Make the pose by hand on a page in the browser, with the object, its contours and the events (extra `viz`)."""
+    port: Annotated[int | None, option("N")] = None
+    """Where that page is; by default 8080, or the next free one."""
     at_us: Annotated[int | None, option("N")] = None
     """Time of the pose, in stream time (µs); by default the start."""
     unit: Annotated[Literal["m", "cm", "mm", "inch"] | None, option("UNIT")] = None
@@ -48,7 +52,7 @@ class Pose:
         """Carry the command out; returns the exit code."""
         from torchtrack.cli.pose import Ways, write_pose
 
-        ways = Ways(_path(self.points), _path(self.near), self.search, self.box)
+        ways = Ways(_path(self.points), _path(self.near), self.search, self.box, self.browser, self.port)
         return write_pose(self.recording, self._settings() | overrides, ways, self.label, _path(self.output))
 
     def _settings(self) -> dict[str, Any]:

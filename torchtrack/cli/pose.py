@@ -1,5 +1,6 @@
 """``torchtrack pose``: the first pose of an object in a recording, as the block of a config."""
 
+import math
 import time
 import warnings
 from dataclasses import dataclass
@@ -17,16 +18,20 @@ from torchtrack.config.settings import CommandLineText
 from torchtrack.core.atomic import atomic_path, check_other_file, check_writable
 from torchtrack.core.files import naming
 from torchtrack.errors import ConfigError, EventDataError, TorchtrackWarning
+from torchtrack.run.first_pose.in_browser import pose_in_browser
 from torchtrack.run.first_pose.picks import pose_of_picks, read_picks
-from torchtrack.run.first_pose.request import as_block, object_of, opened_start, parsed_box, placed_picks, read_near
+from torchtrack.run.first_pose.request import as_block, known_pose, object_of, opened, parsed_box, placed_picks, read_near
 from torchtrack.run.first_pose.searching import pose_in_box, pose_near, refined_pose
 from torchtrack.run.first_pose.start import Start
 from torchtrack.run.first_pose.tracked import FirstPose
 from torchtrack.run.runner import threads
+from torchtrack.run.session import Session
 from torchtrack.tracking.start_check import check_in_view
 
 # A pose whose contours explain less than this may be a wrong one.
 _DOUBTFUL_QUALITY = 0.5
+# Where the page is served, if nothing else is asked for; viser's own.
+_PORT = 8080
 
 
 @dataclass(frozen=True)
@@ -38,12 +43,15 @@ class Ways:
         near: a file with a rough pose.
         search: whether it is looked for, in the ``box`` where that is given.
         box: as typed.
+        browser: whether somebody makes it by hand, on a page that is served at the ``port``.
     """
 
     points: Path | None = None
     near: Path | None = None
     search: bool = False
     box: str | None = None
+    browser: bool = False
+    port: int | None = None
 
     def check(self) -> None:
         """Refuse none, or several of them.
@@ -51,12 +59,15 @@ class Ways:
         Raises:
             ConfigError: then.
         """
-        given = [name for name, value in (("--points", self.points), ("--near", self.near), ("--search", self.search)) if value]
+        ways = {"--points": self.points, "--near": self.near, "--search": self.search, "--browser": self.browser}
+        given = [name for name, value in ways.items() if value]
         if len(given) != 1:
             got = " and ".join(given) or "none of them"
-            raise ConfigError(f"command line: pose needs one of --points FILE, --near FILE or --search [--box u0,v0,u1,v1], got {got}.")
+            raise ConfigError(f"command line: pose needs one of --points FILE, --near FILE, --search [--box u0,v0,u1,v1] or --browser, got {got}.")
         if self.box is not None and not self.search:
             raise ConfigError("command line: --box is where to --search, and of no use otherwise.")
+        if self.port is not None and not self.browser:
+            raise ConfigError("command line: --port is where the page of --browser is, and of no use otherwise.")
 
 
 def write_pose(source: str, settings: dict[str, Any], ways: Ways, label: str | None, output: Path | None) -> int:
@@ -76,11 +87,11 @@ def write_pose(source: str, settings: dict[str, Any], ways: Ways, label: str | N
         check_writable(output)
     obj, begun = object_of(config, label), time.perf_counter()
     with threads(config.threads), naming(Path(source)):
-        start = opened_start(config, obj)
-        pose = _pose(ways, start, obj)
-        check_in_view(pose.T_cam_obj[None], [start.model], [start.camera])
+        session = opened(config, obj)
+        pose = _pose(ways, session, obj)
+        check_in_view(pose.T_cam_obj[None], session.models, [session.camera])
     _tell(pose, obj.label, time.perf_counter() - begun)
-    _show(as_block(pose.T_cam_obj, obj.label, start.at_us), output)
+    _show(as_block(pose.T_cam_obj, obj.label, pose.at_us), output)
     return ExitCode.DONE
 
 
@@ -90,7 +101,10 @@ def _run_config(source: str, settings: dict[str, Any]) -> RunConfig:
     return load(RunConfig, None, {"source": CommandLineText(source), **settings})
 
 
-def _pose(ways: Ways, start: Start, obj: ObjectConfig) -> FirstPose:
+def _pose(ways: Ways, session: Session, obj: ObjectConfig) -> FirstPose:
+    if ways.browser:
+        return pose_in_browser(session, known_pose(obj, session.start_us), _PORT if ways.port is None else ways.port, _tell_address)
+    start = Start.from_session(session)
     if ways.points is not None:
         return _pose_of_picks(ways.points, start, obj)
     if ways.near is not None:
@@ -107,17 +121,26 @@ def _pose_of_picks(path: Path, start: Start, obj: ObjectConfig) -> FirstPose:
         return FirstPose(T_cam_obj, start.at_us, torch.nan)
 
 
+def _tell_address(url: str) -> None:
+    port = url.rpartition(":")[2]
+    _say(f"Make the pose at {url} and press Save there. From another machine: ssh -L {port}:localhost:{port} THIS_MACHINE, then the same address.")
+
+
 def _tell(pose: FirstPose, label: str, seconds: float) -> None:
-    """Say on stderr how good the pose is: the terminal's output is the block."""
-    Console(stderr=True, highlight=False, soft_wrap=True).print(
-        f"'{label}': events explain {100 * pose.quality:.0f} % of its moving contour; {seconds:.1f} s", markup=False
-    )
+    """Say how good the pose is."""
+    explained = "it was not refined on the events" if math.isnan(pose.quality) else f"events explain {100 * pose.quality:.0f} % of its moving contour"
+    _say(f"'{label}': {explained}; {seconds:.1f} s")
     if pose.quality < _DOUBTFUL_QUALITY:
         message = (
             f"the events explain {100 * pose.quality:.0f} % of the contour of '{label}': the pose may be wrong. Look at the first still of "
             "`torchtrack track`, check the model and its unit, or give a box, more points, or another time (--at-us)."
         )
         warnings.warn(message, TorchtrackWarning, stacklevel=2)
+
+
+def _say(text: str) -> None:
+    """On stderr: the terminal's output is the block."""
+    Console(stderr=True, highlight=False, soft_wrap=True).print(text, markup=False)
 
 
 def _show(block: str, output: Path | None) -> None:

@@ -16,9 +16,9 @@ from torchtrack.errors import ConfigError
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.settings import METRES_PER_UNIT
 from torchtrack.run.first_pose.picks import Picks
-from torchtrack.run.first_pose.start import Box, Start
+from torchtrack.run.first_pose.start import Box
 from torchtrack.run.initial_pose import configured_pose
-from torchtrack.run.session import open_session
+from torchtrack.run.session import Session, open_session
 
 # Stands for the pose that is asked for while everything else of a run is opened; nothing looks at it.
 _NOT_KNOWN = PoseConfig(translation_m=(0.0, 0.0, 1.0))
@@ -45,14 +45,27 @@ def object_of(config: RunConfig, label: str | None) -> ObjectConfig:
     return config.objects[labels.index(label) if label is not None else 0]
 
 
-def opened_start(config: RunConfig, obj: ObjectConfig) -> Start:
-    """Events, camera and model at the start of a run, for one of its objects.
+def opened(config: RunConfig, obj: ObjectConfig) -> Session:
+    """Events, camera and model of a run, for one of its objects.
 
     Raises:
         TorchtrackError: of the kind that fits, if a file, model or camera is missing or wrong, or there are no events.
     """
     alone = obj.model_copy(update={"initial_pose": _NOT_KNOWN})
-    return Start.from_session(open_session(config.model_copy(update={"objects": (alone,)})))
+    return open_session(config.model_copy(update={"objects": (alone,)}))
+
+
+def known_pose(obj: ObjectConfig, start_us: int) -> Float[Tensor, "4 4"] | None:
+    """The pose (float64) that an object is configured with; None where it has none.
+
+    Raises:
+        PoseError: if it is no rigid motion.
+    """
+    if obj.initial_pose is None:
+        return None
+    T = configured_pose(obj.initial_pose, start_us)
+    check_pose(T, f"initial_pose of '{obj.label}'")
+    return T
 
 
 def read_near(path: Path, label: str | None, start_us: int) -> Float[Tensor, "4 4"]:

@@ -127,7 +127,7 @@ def box_of_events(start: Start, count: int) -> Box:
     if len(stats) < 2:
         raise EventDataError("the events are scattered all over the image. Say where the object is, with --box u0,v0,u1,v1.")
     number = 1 + int(np.argmax(np.bincount(labels[labels > 0], weights=cells[labels > 0], minlength=len(stats))[1:]))
-    left, top, width, height = (int(value) * _CELL_PX for value in stats[number, :4])
+    left, top, width, height = (float(value * _CELL_PX) for value in stats[number, :4])
     return Box(left, top, left + width, top + height)
 
 
