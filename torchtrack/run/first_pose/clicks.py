@@ -76,7 +76,7 @@ def _nearest_on_lines(ray: Ray, segments: Float[ndarray, "l 2 3"], near_m: float
     flat, offset = (values - (values @ towards)[:, None] * towards for values in (along, ray.origin - start))
     share = ((flat * offset).sum(1) / np.maximum((flat**2).sum(1), 1e-18)).clip(0, 1)
     points = start + share[:, None] * along
-    beside = points - ray.origin
-    distance = np.linalg.norm(beside - (beside @ towards)[:, None] * towards, axis=1)
+    arms = points - ray.origin
+    distance = np.linalg.norm(arms - (arms @ towards)[:, None] * towards, axis=1)
     nearest = int(distance.argmin())
     return points[nearest] if distance[nearest] <= near_m else None

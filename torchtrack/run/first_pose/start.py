@@ -123,12 +123,14 @@ def box_of_events(start: Start, count: int) -> Box:
     full = np.quantile(cells[cells > 0], 0.9) if cells.any() else 0.0
     busy = (cells > max(_SHARE * full, 1.0)).astype(np.uint8)
     joined = cv2.morphologyEx(busy, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
-    if len(stats) < 2:
+    number_of_labels, labels = cv2.connectedComponents(joined)
+    if number_of_labels < 2:
         raise EventDataError("the events are scattered all over the image. Say where the object is, with --box u0,v0,u1,v1.")
-    number = 1 + int(np.argmax(np.bincount(labels[labels > 0], weights=cells[labels > 0], minlength=len(stats))[1:]))
-    left, top, width, height = (float(value * _CELL_PX) for value in stats[number, :4])
-    return Box(left, top, left + width, top + height)
+    number = 1 + int(np.argmax(np.bincount(labels[labels > 0], weights=cells[labels > 0], minlength=number_of_labels)[1:]))
+    # Closing fills what lies between a patch and a border of the image nearby, too.
+    rows, columns = np.nonzero((labels == number) & (busy > 0))
+    left, top, right, bottom = (float(cell * _CELL_PX) for cell in (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1))
+    return Box(left, top, right, bottom)
 
 
 def _counts(start: Start, count: int) -> Int[ndarray, "h w"]:
