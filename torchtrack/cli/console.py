@@ -4,6 +4,8 @@ import contextlib
 import io
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
@@ -100,6 +102,17 @@ def output_console() -> Console:
     """Standard output, as wide as the terminal, or as tables need in a file or a pipe."""
     console = OutputConsole(highlight=False, soft_wrap=True)
     return console if console.is_terminal else OutputConsole(highlight=False, soft_wrap=True, width=_FILE_WIDTH)
+
+
+@contextmanager
+def starting(*, quiet: bool = False) -> Iterator[None]:
+    """A sign of life on a terminal while the libraries of a command are imported, which takes some seconds on a slow disk."""
+    console = Console(stderr=True)
+    if quiet or not console.is_terminal:
+        yield
+        return
+    with console.status("starting"):
+        yield
 
 
 def tell_failure(text: str) -> None:

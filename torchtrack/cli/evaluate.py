@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from torchtrack.cli.console import output_console, tell_failure
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.progress import progress_shown
 from torchtrack.config.evaluate import EvaluateConfig
 from torchtrack.config.load import load, read_yaml
 from torchtrack.config.run import RunConfig
@@ -32,7 +32,7 @@ def evaluate(config_file: str | None, given: Mapping[str, Any], overrides: Mappi
     if chosen is not None:
         config = config.model_copy(update={"methods": {label: config.methods[label] for label in chosen}})
     # What is wrong is told with the file that asks for it.
-    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress, naming(path):
+    with progress_shown(quiet=quiet) as progress, naming(path):
         planned = plan(config, _scene_progress(progress))
         bar = progress.add_task("sequences", total=len(planned.jobs))
         evaluation = evaluate_all(config, lambda job: progress.advance(bar), planned)

@@ -9,6 +9,7 @@ from rich.table import Table
 
 from torchtrack.cli.console import OutputConsole, output_console
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.progress import progress_shown, share_of
 from torchtrack.config.events import ReadingConfig
 from torchtrack.config.formats import OutputFormat
 from torchtrack.errors import TorchtrackWarning
@@ -32,13 +33,13 @@ class Input:
     choices: ReadingConfig = DEFAULT_CHOICES
 
 
-def info(file: Input, max_events: int | None, *, as_json: bool) -> int:
+def info(file: Input, max_events: int | None, *, as_json: bool, quiet: bool = False) -> int:
     """Show facts about a file of events; returns the exit code."""
     source = open_events(file.path, file.width, file.height, file.strict, file.choices)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), progress_shown(quiet=quiet, kernels=False) as progress:
         # What is wrong is part of the facts.
         warnings.simplefilter("ignore", TorchtrackWarning)
-        facts = source.info(max_events)
+        facts = source.info(max_events, share_of(progress, f"reading {file.path.name}"))
     if as_json:
         # Plain text: a console would break lines and colour them.
         OutputConsole(soft_wrap=True, highlight=False, markup=False).print(json.dumps({"format": format_name(source), **as_plain(facts)}, indent=2))
@@ -80,12 +81,13 @@ def _faults(facts: EventInfo) -> list[tuple[str, str]]:
     return [("left out or mended", f"{count:,} {problem}") for problem, count in facts.problems.items()] or [("left out", "nothing")]
 
 
-def convert_file(source: Input, target: str, format: OutputFormat | None) -> int:
+def convert_file(source: Input, target: str, format: OutputFormat | None, *, quiet: bool = False) -> int:
     """Write the events of one file into another, say how many; returns the exit code."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), progress_shown(quiet=quiet, kernels=False) as progress:
         # Said below, with the counts.
         warnings.filterwarnings("ignore", ".*(some of it was left out|it was mended)", TorchtrackWarning)
-        done = convert(source.path, target, format, source.width, source.height, source.strict, source.choices)
+        shown = share_of(progress, f"converting {source.path.name}")
+        done = convert(source.path, target, format, source.width, source.height, source.strict, source.choices, shown)
     console = output_console()
     console.print(f"{done.count:,} events are in {target} ({done.format})")
     if done.problems is not None and done.problems.counts:

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from torchtrack.cli.console import starting
 from torchtrack.cli.option import option
 from torchtrack.cli.options_files import refuse_settings
 from torchtrack.config.executor import ExecutorName
@@ -70,7 +71,8 @@ class Track:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.cli.track import ExtraOutputs, track, track_many
+        with starting(quiet=self.quiet):
+            from torchtrack.cli.track import ExtraOutputs, track, track_many
 
         if not self.configs:
             raise ConfigError("command line: track needs a config file or a source.")
@@ -122,7 +124,8 @@ class Evaluate:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.cli.evaluate import evaluate, show_latency
+        with starting(quiet=self.quiet):
+            from torchtrack.cli.evaluate import evaluate, show_latency
 
         if self.estimate_latency:
             refuse_settings(overrides)
@@ -165,7 +168,8 @@ class Simulate:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.cli.simulate import simulate, simulate_video
+        with starting(quiet=self.quiet):
+            from torchtrack.cli.simulate import simulate, simulate_video
 
         if not self.output:
             raise ConfigError("command line: simulate needs an output, as in -o sequence.npz.")
@@ -175,7 +179,7 @@ class Simulate:
         if self.video:
             if self.executor != "local":
                 raise ConfigError("command line: executor is for several scenes, not for --video.")
-            return simulate_video(given, self.output, overrides)
+            return simulate_video(given, self.output, overrides, quiet=self.quiet)
         scene_only = {name: value for name, value in given.items() if name in ("variant", "noise")}
         if len(scene_only) != len(given):
             raise ConfigError("command line: frames_per_second and timestamps are for --video.")
@@ -197,7 +201,8 @@ class Demo:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.cli.demo import demo
+        with starting(quiet=self.quiet):
+            from torchtrack.cli.demo import demo
 
         return demo(self.config, _given(self, ("config", "quiet")) | overrides, quiet=self.quiet)
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from torchtrack.bench.parts import Part
+from torchtrack.cli.console import starting
 from torchtrack.cli.option import option
 from torchtrack.config.events import ReadingConfig, TimeUnit
 from torchtrack.config.formats import OutputFormat
@@ -40,14 +41,17 @@ class Info:
     """What is wrong is an error."""
     json: bool = False
     """Print JSON."""
+    quiet: bool = False
+    """No progress bar."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.cli.files import Input, info
+        with starting(quiet=self.quiet):
+            from torchtrack.cli.files import Input, info
 
         refuse_settings(overrides)
         choices = _choices(self.time_unit, self.polarity, self.topic)
-        return info(Input(Path(self.file), self.width, self.height, self.strict, choices), self.max_events, as_json=self.json)
+        return info(Input(Path(self.file), self.width, self.height, self.strict, choices), self.max_events, as_json=self.json, quiet=self.quiet)
 
 
 @dataclass(frozen=True)
@@ -72,14 +76,17 @@ class Convert:
     """Of a file with several streams of events, the one to read."""
     strict: bool = False
     """What is wrong is an error."""
+    quiet: bool = False
+    """No progress bar."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.cli.files import Input, convert_file
+        with starting(quiet=self.quiet):
+            from torchtrack.cli.files import Input, convert_file
 
         refuse_settings(overrides)
         choices = _choices(self.time_unit, self.polarity, self.topic)
-        return convert_file(Input(Path(self.source), self.width, self.height, self.strict, choices), self.target, self.format)
+        return convert_file(Input(Path(self.source), self.width, self.height, self.strict, choices), self.target, self.format, quiet=self.quiet)
 
 
 @dataclass(frozen=True)

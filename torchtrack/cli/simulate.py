@@ -4,11 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import Progress
-
 from torchtrack.cli.console import output_console, tell_failure
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.progress import progress_shown, share_of
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load
 from torchtrack.core.files import naming
@@ -32,7 +30,7 @@ def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, job
     if target.suffix:
         raise ConfigError(f"'{file}' holds several scenes: give a folder in place of '{target}', or choose one with --variant.")
     scenes = scenes_of(file, overrides)
-    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
+    with progress_shown(quiet=quiet) as progress:
         bars = {scene.name: progress.add_task(scene.name, total=1.0) for scene in scenes}
         failures = run_suite(
             scenes, target, jobs, lambda name, share: progress.update(bars[name], completed=share), preview=preview, executor=executor
@@ -43,16 +41,16 @@ def simulate(config_file: str, output: str, overrides: Mapping[str, Any], *, job
     return ExitCode.FAILED if failures else ExitCode.DONE
 
 
-def simulate_video(given: Mapping[str, Any], output: str, overrides: Mapping[str, Any]) -> int:
+def simulate_video(given: Mapping[str, Any], output: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
     """Turn a video, or a folder of images, into events; returns the exit code."""
     config = load(VideoConfig, None, {**given, **overrides})
-    count = write_video_events(config, Path(output))
+    with progress_shown(quiet=quiet) as progress:
+        count = write_video_events(config, Path(output), share_of(progress, f"events of {config.video.name}"))
     output_console().print(f"{count} events are in {output}")
     return ExitCode.DONE
 
 
 def simulated_to(scene: SceneConfig, path: Path, quiet: bool, preview: bool = False) -> Path:
     """Simulate a scene into a file, with a progress bar."""
-    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
-        bar = progress.add_task(f"simulating {scene.name}", total=1.0)
-        return simulate_to_file(scene, path, lambda share: progress.update(bar, completed=share), preview=preview)
+    with progress_shown(quiet=quiet) as progress:
+        return simulate_to_file(scene, path, share_of(progress, f"simulating {scene.name}"), preview=preview)

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress
 
 from torchtrack.cli.console import OutputLines, output_console, tell_failure
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.progress import progress_shown
 from torchtrack.config.executor import ExecutorName
 from torchtrack.config.load import load
 from torchtrack.config.run import RunConfig
@@ -70,7 +70,7 @@ def track_many(
     console, codes = output_console(), [ExitCode.DONE]
     for text in (text for text, config in zip(configs_or_sources, configs, strict=True) if resume and is_complete(config.output)):
         console.print(f"{text}: complete already, left out", markup=False)
-    with Progress(console=Console(stderr=True), transient=True, disable=quiet) as progress:
+    with progress_shown(quiet=quiet) as progress:
         bar = progress.add_task("sources", total=len(configs))
         for number, outcome in run_many(configs, streams=streams, jobs=jobs, executor=executor, resume=resume):
             progress.advance(bar)
@@ -102,17 +102,23 @@ def run_and_show(config: RunConfig, quiet: bool, resume: bool = False, extra: Ex
     check_folder(config.output)
     if extra.rerun is not None:
         check_target(extra.rerun)
-    session = open_session(config)
-    if config.compiled and not quiet:
-        Console(stderr=True).print("compiling the tracker, which takes a minute or two for the first time")
-    sinks: list[Sink] = [] if quiet or only_poses else [ProgressBar(Console(stderr=True), session.name, session.known_duration_s)]
+    sinks: list[Sink] = []
     with ExitStack() as stack:
+        progress = stack.enter_context(progress_shown(quiet=quiet or only_poses))
+        opening = progress.add_task(f"opening {config.source}", total=None)
+        session = open_session(config)
+        progress.remove_task(opening)
+        if config.compiled and not quiet:
+            progress.console.print("compiling the tracker, which takes a minute or two for the first time")
+        if not (quiet or only_poses):
+            sinks.append(ProgressBar(progress, session))
         if extra.poses is not None:
             lines = stack.enter_context(closing(OutputLines() if only_poses else LineFile(Path(extra.poses))))
             sinks.append(PoseLines(lines, session.labels))
         if extra.rerun is not None:
             sinks.append(RerunLog(extra.rerun, session))
-        return _show_run(console, run(config, sinks, session, resume=resume), config.output)
+        summary = run(config, sinks, session, resume=resume)
+    return _show_run(console, summary, config.output)
 
 
 def _show_run(console: Console, summary: RunSummary, output: Path) -> ExitCode:

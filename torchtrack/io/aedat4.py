@@ -85,7 +85,7 @@ class Aedat4File(EventFile):
     def _read(self, max_events: int) -> Iterator[Columns]:
         decompress = _decompressor(self.compression, self.path)
         waiting: list[bytes] = []
-        with self.path.open("rb") as stream:
+        with self._bytes() as stream:
             stream.seek(self.offset)
             for packet in self._packets(stream):
                 try:

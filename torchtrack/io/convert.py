@@ -13,6 +13,7 @@ import numpy as np
 from torchtrack.config.events import ReadingConfig
 from torchtrack.config.formats import OutputFormat
 from torchtrack.core.atomic import check_other_file, temporary_folder, writing
+from torchtrack.core.events import EventBatch
 from torchtrack.errors import UnknownFormatError
 from torchtrack.io.container import ContainerWriter, is_container, read_source
 from torchtrack.io.event_file import DEFAULT_CHOICES
@@ -20,6 +21,7 @@ from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, EventSource
 from torchtrack.io.formats import open_events
 from torchtrack.io.npz import keys_of, open_archive, stream_array
 from torchtrack.io.problems import Problems
+from torchtrack.io.reading import Progress, Reading
 from torchtrack.io.sequence import is_sequence, read_sequence
 from torchtrack.io.sequence_arrays import sequence_arrays
 from torchtrack.io.sequence_types import Sequence
@@ -60,6 +62,7 @@ def convert(
     height: int | None = None,
     strict: bool = False,
     choices: ReadingConfig = DEFAULT_CHOICES,
+    progress: Progress | None = None,
 ) -> Conversion:
     """Write the events of one file into another, and all else of a sequence where both are sequences.
 
@@ -72,6 +75,7 @@ def convert(
         format: its format; by default as its suffix says: ``.raw`` is EVT3, ``.h5`` a sequence if the source is one, else
             the layout of DSEC.
         width, height, strict, choices: as :func:`torchtrack.io.open_events` takes them.
+        progress: called with the share of the input that is done.
 
     Raises:
         UnknownFormatError: if the format is not known, or cannot hold what it should.
@@ -84,13 +88,14 @@ def convert(
     sequence = read_sequence(source, strict=True, choices=choices) if is_sequence(source) else None
     chosen = _format(target, format, sequence is not None)
     events: EventSource = sequence.events if sequence else open_events(source, width, height, strict, choices)
+    chunks = _shown(events, progress)
     with temporary_folder(target) as folder, writing(target):
         written = folder / target.name
         if sequence is not None and chosen in ("npz", "sequence"):
-            count = _write_sequence(sequence, source, written, chosen)
+            count = _write_sequence(sequence, chunks, source, written, chosen)
         else:
             with closing(WRITERS[chosen](written, events.width, events.height)) as writer:
-                count = _copy(events, writer.write)
+                count = _copy(chunks, writer.write)
         # The file that names the others comes last: whoever sees it finds them.
         for file in sorted((file for file in written.parent.iterdir() if file.is_file()), key=lambda file: file == written):
             file.replace(target.parent / file.name)
@@ -110,27 +115,36 @@ def _format(target: Path, given: OutputFormat | None, is_whole: bool) -> OutputF
     return "sequence" if given is None and chosen == "dsec" and is_whole else chosen
 
 
-def _copy(events: EventSource, write: Callable[[Any], None]) -> int:
-    count = 0
+def _shown(events: EventSource, progress: Progress | None) -> Iterator[EventBatch]:
+    """All events, with word of how far they are read."""
+    reading: Reading | None = getattr(events, "reading", None)
     for chunk in events.chunks():
+        yield chunk
+        if progress is not None and reading is not None and reading.share is not None:
+            progress(reading.share)
+
+
+def _copy(chunks: Iterable[EventBatch], write: Callable[[Any], None]) -> int:
+    count = 0
+    for chunk in chunks:
         write(chunk)
         count += len(chunk)
     return count
 
 
-def _write_sequence(sequence: Sequence, source: Path, target: Path, chosen: OutputFormat) -> int:
+def _write_sequence(sequence: Sequence, chunks: Iterable[EventBatch], source: Path, target: Path, chosen: OutputFormat) -> int:
     """Write a whole sequence; its models are put beside an ``.npz``."""
     origins = _origins(source)
     first = next(origins, None)
     if chosen == "sequence":
         container = ContainerWriter(target, sequence.camera, sequence.objects, sequence.meta, sequence.extra)
         with closing(container):
-            return _copy_annotated(sequence.events, container.write, container.annotate, first, origins)
+            return _copy_annotated(chunks, container.write, container.annotate, first, origins)
     arrays = sequence_arrays(sequence, target.stem)
     columns = {} if first is None else {"source": _SOURCE_TYPE}
     npz = NpzWriter(target, sequence.camera.width, sequence.camera.height, arrays, columns)
     with closing(npz):
-        count = _copy_annotated(sequence.events, npz.write, lambda values: npz.annotate("source", values), first, origins)
+        count = _copy_annotated(chunks, npz.write, lambda values: npz.annotate("source", values), first, origins)
     for obj, mesh_file in zip(sequence.objects, arrays["mesh_files"].tolist(), strict=True):
         shutil.copyfile(obj.mesh_path, target.with_name(mesh_file))
         if obj.textured_path is not None:
@@ -139,11 +153,15 @@ def _write_sequence(sequence: Sequence, source: Path, target: Path, chosen: Outp
 
 
 def _copy_annotated(
-    events: EventSource, write: Callable[[Any], None], annotate: Callable[[np.ndarray], None], first: np.ndarray | None, rest: Iterable[np.ndarray]
+    chunks: Iterable[EventBatch],
+    write: Callable[[Any], None],
+    annotate: Callable[[np.ndarray], None],
+    first: np.ndarray | None,
+    rest: Iterable[np.ndarray],
 ) -> int:
     """Copy events, and with each batch where its events are from."""
     count, waiting, more = 0, first, iter(rest)
-    for chunk in events.chunks():
+    for chunk in chunks:
         write(chunk)
         count += len(chunk)
         while waiting is not None and len(waiting) < len(chunk) and (part := next(more, None)) is not None:

@@ -60,7 +60,7 @@ class DatFile(EventFile):
         self._settle_size(*header.size, default=_DEFAULT_SIZE)
 
     def _read(self, max_events: int) -> Iterator[Columns]:
-        with self.path.open("rb") as stream:
+        with self._bytes() as stream:
             stream.seek(self.offset)
             for words in words_of(stream, np.dtype("<u8"), self.problems):
                 shown, address = words.view("<u4")[0::2], words.view("<u4")[1::2]

@@ -51,7 +51,7 @@ class EsFile(EventFile):
 
     def _read(self, max_events: int) -> Iterator[Columns]:
         reached_us, rest = 0, b""
-        with self.path.open("rb") as stream:
+        with self._bytes() as stream:
             stream.seek(_HEADER_BYTES)
             while data := stream.read(_BLOCK_BYTES):
                 data = rest + data

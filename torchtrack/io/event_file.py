@@ -2,9 +2,10 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import BinaryIO, ClassVar
 
 from torchtrack.config.events import ReadingConfig
 from torchtrack.core.events import EventBatch
@@ -16,6 +17,7 @@ from torchtrack.io.event_stream import EventStream
 from torchtrack.io.mending import Mender, all_of
 from torchtrack.io.polarity_code import PolarityCode
 from torchtrack.io.problems import Problem, Problems
+from torchtrack.io.reading import Reading
 from torchtrack.io.soundness import inside
 
 DEFAULT_CHOICES = ReadingConfig()
@@ -32,6 +34,9 @@ class EventFile(EventStream):
             :attr:`problems` and reported by a warning at the end.
         start_us: events before this time are passed over; where the clock changes, it is the time after mending.
         choices: how what the file does not say is read: unit of times, code of polarity, which of several streams.
+
+    Attributes:
+        reading: how far the newest pass has come.
 
     Raises:
         MissingFileError: if there is no such file.
@@ -51,6 +56,7 @@ class EventFile(EventStream):
     choices: ReadingConfig = DEFAULT_CHOICES
     streams: tuple[str, ...] = field(init=False, default=(), compare=False)
     problems: Problems = field(init=False, repr=False, compare=False)
+    reading: Reading = field(init=False, repr=False, compare=False, default_factory=Reading)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
@@ -92,16 +98,30 @@ class EventFile(EventStream):
     def _read(self, max_events: int) -> Iterator[Columns]:
         """The events as they are in the file, in parts of about ``max_events``; it may leave out those before ``start_us``."""
 
+    @contextmanager
+    def _bytes(self) -> Iterator[BinaryIO]:
+        """The file, opened for a pass over its bytes."""
+        with self.path.open("rb") as stream:
+            self.reading.stream, self.reading.size_bytes = stream, self.path.stat().st_size
+            yield stream
+
     def _checked(self, max_events: int) -> Iterator[EventBatch]:
         self.problems.clear()
+        self.reading.begin()
         mender, count = Mender(self.problems, waits=True, counter_bits=self.counter_bits), 0
         with naming(self.path):
             for part in self._with_polarity(self._readable(max_events)):
                 events = inside(part, self.width, self.height, self.problems, count)
                 count += len(part)
-                yield from all_of(map(self._started, mender.add(events)), max_events)
-            yield from all_of(map(self._started, mender.rest()), max_events)
+                yield from self._noted(all_of(map(self._started, mender.add(events)), max_events))
+            yield from self._noted(all_of(map(self._started, mender.rest()), max_events))
+        self.reading.end()
         self.problems.warn()
+
+    def _noted(self, batches: Iterator[EventBatch]) -> Iterator[EventBatch]:
+        for batch in batches:
+            self.reading.add(batch)
+            yield batch
 
     def _readable(self, max_events: int) -> Iterator[Columns]:
         """What can be read: where it breaks off, the rest counts as damaged."""

@@ -9,6 +9,7 @@ from torchtrack.core.windows import EventWindow, windows_by_count, windows_by_ti
 from torchtrack.errors import EventDataError
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, EventSource
 from torchtrack.io.info import EventInfo, summarise
+from torchtrack.io.reading import Progress
 
 
 class EventStream(ABC):
@@ -40,9 +41,9 @@ class EventStream(ABC):
         """The same stream from the first event with ``t >= t_us`` on; what comes before is not decoded where that can be avoided."""
         return LaterStream(self, t_us)
 
-    def info(self, max_events: int | None = None) -> EventInfo:
+    def info(self, max_events: int | None = None, progress: Progress | None = None) -> EventInfo:
         """Facts about the stream: counts, times, rates, gaps. Reads all of it, or the first ``max_events`` events."""
-        return summarise(self, max_events)
+        return summarise(self, max_events, progress)
 
 
 @dataclass(frozen=True)

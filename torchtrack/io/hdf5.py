@@ -122,6 +122,7 @@ class Hdf5Events(EventFile):
         return settled_unit(times[:ENOUGH_TIMES], "us" if times.dtype.kind in "iu" else "s", stated, f"'{self.path}'")
 
     def _read(self, max_events: int) -> Iterator[Columns]:
+        self.reading.total = self.count
         with open_hdf5(self.path) as file:
             offset_us = _time_offset(file, self.stream.group)
             arrays = _arrays(file, self.stream)

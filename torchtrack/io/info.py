@@ -7,6 +7,7 @@ import torch
 
 from torchtrack.core.events import EventBatch
 from torchtrack.io.event_source import EventSource
+from torchtrack.io.reading import Progress, Reading
 
 _PEAK_SPAN_US = 10_000
 _GAP_US = 10_000
@@ -56,15 +57,18 @@ class EventInfo:
         return self.last_us - self.first_us if self.first_us is not None and self.last_us is not None else 0
 
 
-def summarise(source: EventSource, max_events: int | None = None) -> EventInfo:
-    """Read a stream, or its first ``max_events`` events, and say what is in it."""
+def summarise(source: EventSource, max_events: int | None = None, progress: Progress | None = None) -> EventInfo:
+    """Read a stream, or its first ``max_events`` events, and say what is in it; ``progress`` is called where it is known."""
     tally = _Tally()
+    reading: Reading | None = getattr(source, "reading", None)
     complete = True
     for chunk in source.chunks():
         if max_events is not None and tally.count + len(chunk) > max_events:
             chunk, complete = chunk[: max_events - tally.count], False
         if len(chunk):
             tally.add(chunk)
+        if progress is not None and reading is not None and reading.share is not None:
+            progress(max(reading.share, tally.count / max_events if max_events else 0.0))
         if not complete:
             break
     problems = getattr(source, "problems", None)

@@ -178,6 +178,7 @@ class NpzEvents(EventFile):
         return sets[chosen_stream(self.streams, self.choices.topic, f"'{self.path}'")]
 
     def _read(self, max_events: int) -> Iterator[Columns]:
+        self.reading.total = self.count
         with ExitStack() as stack:
             archive = stack.enter_context(open_archive(self.path))
             members = [_open_member(archive, key, self.path) for key in self.keys]

@@ -73,7 +73,7 @@ class RawFile(EventFile):
 
     def _read(self, max_events: int) -> Iterator[Columns]:
         decoder = self.decoder(self.problems)
-        with self.path.open("rb") as stream:
+        with self._bytes() as stream:
             stream.seek(self.offset)
             if self.start_us is not None:
                 decoder = _skip_to(stream, decoder, self.start_us - self.base_us, self.problems)

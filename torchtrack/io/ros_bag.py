@@ -67,6 +67,7 @@ class RosBag(EventFile):
     has_streams: ClassVar[bool] = True
 
     topic: str = field(init=False, default="")
+    message_count: int = field(init=False, default=0)
 
     def _open(self) -> None:
         with self._messages() as (connection, messages):
@@ -81,7 +82,8 @@ class RosBag(EventFile):
         size = 0
         with self._messages() as (connection, messages):
             decoder = self._decoder(connection, self.problems)
-            for message in messages:
+            for number, message in enumerate(messages, 1):
+                self.reading.share = min(number / self.message_count, 1.0) if self.message_count else None
                 waiting.append(message)
                 size += len(message)
                 if size >= _FEWEST_BYTES:
@@ -106,6 +108,7 @@ class RosBag(EventFile):
                 unpack = [take_over_messages(reader) for reader in readers]
                 chosen = [self._of_topic(reader.connections) for reader in readers]
                 first = next(connections[0] for connections in chosen if connections)
+                object.__setattr__(self, "message_count", sum(connection.msgcount for same in chosen for connection in same))
                 read = zip(readers, unpack, chosen, strict=True)
                 yield first, (undo(data) for reader, undo, same in read if same for _, _, data in reader.messages(connections=same))
         except TorchtrackError:

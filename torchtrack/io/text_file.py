@@ -35,14 +35,15 @@ class TextFile(EventFile):
     def _stream(self) -> Iterator[Readable]:
         """The text as UTF-8, out of its archive where it lies in one."""
         if not is_zip(self.path):
-            with self.path.open("rb") as stream:
-                yield as_utf8(stream)
+            with self._bytes() as stream:
+                yield as_utf8(cast(BufferedIOBase, stream))
             return
         with open_archive(self.path) as archive:
             member = text_member(archive)
             if member is None:
                 raise EventDataError(f"'{self.path}' is a zip archive without a text file of events.")
             with damage_reported(self.path), archive.open(member) as text:
+                self.reading.stream, self.reading.size_bytes = text, archive.getinfo(member).file_size
                 yield as_utf8(cast(BufferedIOBase, text))
 
     def _head(self) -> bytes:

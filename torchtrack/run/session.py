@@ -26,6 +26,7 @@ from torchtrack.io.live import open_live
 from torchtrack.io.live_source import LiveSource
 from torchtrack.io.polarity_code import with_one_polarity_reported
 from torchtrack.io.problems import Problems
+from torchtrack.io.reading import Reading
 from torchtrack.object_model import ObjectModel
 from torchtrack.run.initial_pose import initial_pose
 
@@ -48,6 +49,7 @@ class Session:
         live: the live source that the events are from, or None for a file.
         live_windows: how many windows of a live source may wait.
         problems: what was wrong with the events that were read, where their source counts it.
+        reading: how far the file was read, where it is one.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Session:
     live: LiveSource | None = None
     live_windows: int = 64
     problems: Problems | None = None
+    reading: Reading | None = None
 
     def chunks(self) -> Iterator[EventBatch]:
         """The events after the start and up to the end."""
@@ -82,11 +85,12 @@ class Session:
         return None if self.live is None else KeepUp(windows, self.live_windows, self.live.stop)
 
     @property
-    def known_duration_s(self) -> float | None:
-        """How long tracking will last, where the end or the truth says it."""
+    def expected_end_us(self) -> int | None:
+        """Where tracking will end: as the settings or the truth say, else as what was read of the file lets expect; None of a live source."""
+        if self.end_us is not None:
+            return self.end_us
         ends = [int(truth.t_us[-1]) for truth in self.ground_truth if truth is not None]
-        end_us = self.end_us if self.end_us is not None else max(ends, default=None)
-        return 1e-6 * (end_us - self.start_us) if end_us is not None else None
+        return max(ends) if ends else self.reading and self.reading.expected_end_us
 
 
 @dataclass(frozen=True)
@@ -154,6 +158,7 @@ def _opened(config: RunConfig) -> Session:
         live=source if isinstance(source, LiveSource) else None,
         live_windows=config.events.live_windows,
         problems=getattr(source, "problems", None),
+        reading=getattr(source, "reading", None),
     )
 
 

@@ -1,6 +1,6 @@
 """From a scene's settings to a sequence: frames that adapt to the motion, events, exact poses."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, concatenate
+from torchtrack.io.reading import Progress
 from torchtrack.io.trajectory import Trajectory
 from torchtrack.sim.drawing import merge_regions
 from torchtrack.sim.event_camera import EventCamera
@@ -24,8 +25,6 @@ from torchtrack.sim.scenes import Model, SceneConfig
 from torchtrack.sim.surface import RenderObject
 from torchtrack.sim.trajectory import truth_times, velocity
 from torchtrack.sim.world import World, make_world
-
-Progress = Callable[[float], None]
 
 BACKGROUND, NOISE = -1, -2
 """Sources of events beside the objects."""

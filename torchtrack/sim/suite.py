@@ -22,12 +22,13 @@ from torchtrack.config.settings import Settings
 from torchtrack.core.atomic import check_writable
 from torchtrack.core.limits import limits
 from torchtrack.errors import ConfigError, MissingFileError, TorchtrackError
+from torchtrack.io.reading import Progress
 from torchtrack.io.sequence import read_sequence
 from torchtrack.run.executor import TaskFailure, Tell, run_tasks
 from torchtrack.run.runner import threads
 from torchtrack.sim.output import check_output, write
 from torchtrack.sim.scenes import SceneConfig
-from torchtrack.sim.simulation import Progress, simulate
+from torchtrack.sim.simulation import simulate
 
 # Progress of a scene is told in steps of this share.
 _PROGRESS_STEP = 0.02

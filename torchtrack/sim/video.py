@@ -22,6 +22,7 @@ from torchtrack.core.atomic import atomic_path, check_writable
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.core.files import read_bytes
 from torchtrack.errors import EventDataError, MissingFileError, UnknownFormatError
+from torchtrack.io.reading import Progress
 from torchtrack.sim.event_camera import EventCamera
 from torchtrack.sim.sensor_profiles import EVENT_CAMERA_PROFILES, EventCameraConfig
 from torchtrack.sim.surface import grey_reflectance
@@ -82,7 +83,7 @@ def video_frames(config: VideoConfig) -> Iterator[Timed]:
 def _images(path: Path) -> Iterator[ndarray]:
     """BGR images of a folder, or of a video file."""
     if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix.lower() in _IMAGES)
+        files = _image_files(path)
         if not files:
             raise MissingFileError(f"the folder '{path}' holds no images ({', '.join(_IMAGES)}).")
         for file in files:
@@ -97,6 +98,10 @@ def _images(path: Path) -> Iterator[ndarray]:
             yield frame[1]
     finally:
         video.release()
+
+
+def _image_files(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGES)
 
 
 def _open_video(path: Path) -> cv2.VideoCapture:
@@ -186,8 +191,23 @@ def events_of_video(config: VideoConfig) -> Iterator[tuple[int, tuple[int, int],
         yield end_us, (width, height), concatenate(batches)
 
 
-def write_video_events(config: VideoConfig, path: Path) -> int:
+def frame_count(config: VideoConfig) -> int | None:
+    """How many frames a video has, as its file or the files of its folder say; None where they do not."""
+    if config.video.is_dir():
+        return len(_image_files(config.video))
+    video = _open_video(config.video)
+    count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    video.release()
+    return count if count > 0 else None
+
+
+def write_video_events(config: VideoConfig, path: Path, progress: Progress | None = None) -> int:
     """Write the events of a video as ``.npz`` (``t x y p width height``); returns how many there are.
+
+    Args:
+        config: the video, and how it is seen.
+        path: of the file to write.
+        progress: called with the share of the frames that is done, where their number is known.
 
     Raises:
         MissingFileError, UnknownFormatError, EventDataError: as :func:`video_frames`; also if ``path`` is not a ``.npz`` file.
@@ -196,7 +216,12 @@ def write_video_events(config: VideoConfig, path: Path) -> int:
     if path.suffix != ".npz":
         raise EventDataError(f"events of a video are written to a .npz file, got '{path}'.")
     check_writable(path)
-    parts = list(events_of_video(config))
+    frames = frame_count(config) if progress is not None else None
+    parts: list[tuple[int, tuple[int, int], EventBatch]] = []
+    for part in events_of_video(config):
+        parts.append(part)
+        if progress is not None and frames is not None:
+            progress(min((len(parts) + 1) / frames, 1.0))
     if not parts:
         raise EventDataError(f"'{config.video}' holds fewer than two frames.")
     events = concatenate([batch for _, _, batch in parts])

@@ -1,28 +1,24 @@
-"""A progress bar with event rate and real-time factor."""
+"""A task of a progress bar that follows a run: how far it is, events and stream time for a second of wall time."""
 
 import time
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TextColumn, TimeElapsedColumn
-from rich.text import Text
+from rich.progress import Progress
 
+from torchtrack.run.session import Session
 from torchtrack.run.stepping import Step
 
 
-class _Rates(ProgressColumn):
-    """Events and stream time handled per second of wall time."""
-
-    def render(self, task: Task) -> Text:
-        return Text(f"{task.fields['events_per_s'] / 1e6:.2f} Mev/s  {task.fields['real_time']:.2f}x real time")
-
-
 class ProgressBar:
-    """Shows how far a run is; ``duration_s`` is the length of the stream, None where it is not known."""
+    """Shows how far a run is, by stream time: up to its end, or where the file will end by what was read of it.
 
-    def __init__(self, console: Console, name: str, duration_s: float | None = None) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), _Rates())
-        self._progress = Progress(*columns, console=console, transient=True)
-        self._task = self._progress.add_task(name, total=duration_s, events_per_s=0.0, real_time=0.0)
+    Args:
+        progress: where the task is shown.
+        session: what is tracked.
+    """
+
+    def __init__(self, progress: Progress, session: Session) -> None:
+        self._progress, self._session = progress, session
+        self._task = progress.add_task(f"starting {session.name}", total=None)
         self._begun: float | None = None
         self._events = 0
         self._first_us = 0
@@ -30,12 +26,15 @@ class ProgressBar:
     def add(self, step: Step) -> None:
         """Take one step."""
         if self._begun is None:
-            self._progress.start()
+            self._progress.reset(self._task, description=self._session.name)
             self._begun, self._first_us = time.perf_counter() - step.seconds, step.window.t_start_us
         self._events += len(step.window.events)
         wall_s, stream_s = time.perf_counter() - self._begun, 1e-6 * (step.window.t_end_us - self._first_us)
-        self._progress.update(self._task, completed=stream_s, events_per_s=self._events / wall_s, real_time=stream_s / wall_s)
+        end_us = self._session.expected_end_us
+        total_s = None if end_us is None else max(1e-6 * (end_us - self._first_us), stream_s)
+        rates = f"{1e-6 * self._events / wall_s:.2f} Mev/s  {stream_s / wall_s:.2f}x real time"
+        self._progress.update(self._task, total=total_s, completed=stream_s, rates=rates)
 
     def close(self) -> None:
-        """Take the bar away."""
-        self._progress.stop()
+        """Take the task away."""
+        self._progress.remove_task(self._task)
