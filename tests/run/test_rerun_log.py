@@ -24,7 +24,7 @@ def test_a_file_has_all_that_the_viewer_shows(tmp_path):
     assert main(arguments) == ExitCode.DONE
     done = subprocess.run([sys.executable, "-m", "rerun", "rrd", "print", tmp_path / "run.rrd"], capture_output=True, text=True, check=True)
     text = done.stdout + done.stderr
-    paths = ["camera", "camera/events", "plots/time/step_ms"]
+    paths = ["camera", "camera/events", "plots/time/step_ms", "plots/stages/rounds_ms", "plots/stages/prediction_ms"]
     for label in ("left", "right"):
         paths += [f"{place}/{label}" for place in ("objects", "truth", "paths", "status", "camera/contours", "camera/observations", "camera/truth")]
         paths += [

@@ -1,11 +1,12 @@
 """``torchtrack track``: settings in, one run or many, tables out."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.console import Console
 
 from torchtrack.cli.console import OutputLines, output_console, tell_failure
@@ -28,6 +29,7 @@ from torchtrack.run.sinks.progress import ProgressBar
 from torchtrack.run.sinks.rerun_log import RerunLog, check_target
 from torchtrack.run.sinks.resume import check_resumable, is_complete
 from torchtrack.run.sinks.summary import RunSummary
+from torchtrack.run.stage_times import stages_timed
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,8 @@ def run_and_show(config: RunConfig, quiet: bool, resume: bool = False, extra: Ex
             lines = stack.enter_context(closing(OutputLines() if only_poses else LineFile(Path(extra.poses))))
             sinks.append(PoseLines(lines, session.labels))
         if extra.rerun is not None:
+            # What is compiled as a whole has no stages to time.
+            stack.enter_context(nullcontext() if config.compiled else stages_timed(torch.device(config.device)))
             sinks.append(RerunLog(extra.rerun, session))
         summary = run(config, sinks, session, resume=resume)
     return _show_run(console, summary, config.output)

@@ -1,8 +1,8 @@
 """The loop itself: a stream cut into windows, one tracker step each, in constant memory."""
 
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Int
@@ -11,6 +11,7 @@ from torch import Tensor
 from torchtrack.config.tracker import WindowConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.windows import CountWindows, EventWindow, TimeWindows, cut
+from torchtrack.run.stage_times import stages_of_step
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US
 from torchtrack.tracking.motion.model import initial_covariance
 from torchtrack.tracking.state import StepResult, TrackerState
@@ -24,13 +25,26 @@ _MAX_AGE_US = 20_000
 class Step:
     """One window, what the tracker made of it, and how long that took (s); of streams that are tracked together, an equal part.
 
-    States of smoothed steps have no maps of events.
+    States of smoothed steps have no maps of events. ``stages``: how long each stage took (s), where :func:`stages_timed` asks for it.
     """
 
     window: EventWindow
     state: TrackerState
     result: StepResult
     seconds: float
+    stages: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class StepTime:
+    """How long a tracker's step took (s), and each of its stages, where that is asked for."""
+
+    seconds: float
+    stages: Mapping[str, float]
+
+    def part(self, streams: int) -> "StepTime":
+        """That of one of so many streams."""
+        return StepTime(self.seconds / streams, {name: seconds / streams for name, seconds in self.stages.items()})
 
 
 def cut_windows(chunks: Iterable[EventBatch], t_start_us: int, config: WindowConfig) -> Iterator[EventWindow]:
@@ -50,8 +64,8 @@ def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState)
     for window in windows:
         if window.after_gap:
             state = passed_over(tracker, state, torch.full_like(state.t_us, window.t_start_us))
-        state, result, seconds = timed_step(tracker, state, window.events, window.t_end_us)
-        yield Step(window, state, result, seconds)
+        state, result, taken = timed_step(tracker, state, window.events, window.t_end_us)
+        yield Step(window, state, result, taken.seconds, taken.stages)
 
 
 def passed_over(tracker: Tracker, state: TrackerState, t_us: Int[Tensor, "s"]) -> TrackerState:
@@ -70,13 +84,15 @@ def passed_over(tracker: Tracker, state: TrackerState, t_us: Int[Tensor, "s"]) -
     )
 
 
-def timed_step(tracker: Tracker, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"]) -> tuple[TrackerState, StepResult, float]:
-    """State and result of one window, and how long that took (s)."""
+def timed_step(
+    tracker: Tracker, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"]
+) -> tuple[TrackerState, StepResult, StepTime]:
+    """State and result of one window, and how long that took."""
     device = state.T_cam_obj.device
     begun = time.perf_counter()
-    with torch.inference_mode():
+    with stages_of_step() as stages, torch.inference_mode():
         next_state, result = tracker.step(state, events.to(device), t_end_us)
         if device.type == "cuda":
             # Work on the GPU is queued: without waiting, the time measured is that of queueing.
             torch.cuda.synchronize(device)
-    return next_state, result, time.perf_counter() - begun
+    return next_state, result, StepTime(time.perf_counter() - begun, stages)

@@ -237,10 +237,11 @@ def _one_batch(streams: Sequence[_Stream], config: TrackingConfig) -> Iterator[t
             starts_us = [window.t_start_us if window.after_gap else 0 for _, window in due]
             state = passed_over(tracker, state, torch.tensor(starts_us, device=config.device))
         taker = pace.tracker([window for _, window in due], result)
-        state, result, seconds = timed_step(taker, state, events, t_end_us)
+        state, result, taken = timed_step(taker, state, events, t_end_us)
+        share = taken.part(len(due))
         for (stream, window), own in zip(due, rows, strict=True):
             stream.state = take_part(state, *own)
-            yield stream.number, Step(window, stream.state, take_part(result, *own), seconds / len(due))
+            yield stream.number, Step(window, stream.state, take_part(result, *own), share.seconds, share.stages)
 
 
 def _together(streams: Sequence[_Stream], config: TrackingConfig) -> tuple[Tracker, TrackerState, list[tuple[slice, slice]]]:

@@ -2,9 +2,10 @@
 
 The world is the camera's frame. Logged per window: the events as an image; of each object its contours, the events near them with their
 distance to the contour, its pose and recent path, the true pose where it is known, status, quality, standard deviations and errors; and how
-long the tracker's step and all else took.
+long the tracker's step, each of its stages and all else took.
 """
 
+import re
 import time
 from collections import deque
 from pathlib import Path
@@ -25,7 +26,7 @@ from torchtrack.io.extras import optional
 from torchtrack.object_model.symmetry import revolution_axis
 from torchtrack.run.metrics import pose_errors
 from torchtrack.run.session import Session
-from torchtrack.run.sinks.poses import standard_deviations
+from torchtrack.run.sinks.moment import Moment, ObjectMoment, VisibleContour, moment_of
 from torchtrack.run.stepping import Step
 from torchtrack.tracking.validation.status import Status
 from torchtrack.viz.contour_lines import contour_links
@@ -84,7 +85,9 @@ class RerunLog:
     def _blueprint(self) -> Any:
         """Camera and scene above, curves and status below."""
         views = optional("rerun.blueprint", *_PACKAGE)
-        curves = [views.TimeSeriesView(origin=f"plots/{name}", name=name) for name in ("quality", "error", "std", "time", "residual")]
+        curves = [
+            views.TimeSeriesView(origin=f"plots/{name}", name=name) for name in ("quality", "status", "error", "std", "residual", "time", "stages")
+        ]
         above = views.Horizontal(views.Spatial2DView(origin="camera", name="camera"), views.Spatial3DView(origin="/", name="scene"))
         return views.Blueprint(views.Vertical(above, views.Horizontal(*curves, views.TextLogView(origin="status", name="status")), row_shares=[3, 1]))
 
@@ -105,57 +108,57 @@ class RerunLog:
         self._recording.log(path, what, static=static)
 
     def add(self, step: Step) -> None:
-        """Log one step."""
-        rr, events = self._rr, step.window.events
+        """Log one step of a run."""
         now_s = time.perf_counter()
-        self._recording.set_time("time", duration=1e-6 * step.window.t_end_us)
-        image = event_png(events, self._session.camera.width, self._session.camera.height)
-        self._log("camera/events", rr.EncodedImage(contents=image, media_type="image/png"))
-        self._log("plots/time/step_ms", rr.Scalars(1e3 * step.seconds))
-        self._log("plots/time/all_else_ms", rr.Scalars(max(1e3 * (now_s - self._newest_s - step.seconds), 0.0)))
-        seen = self._table[events.y.cpu().numpy(), events.x.cpu().numpy()]
-        stds = standard_deviations(step.result.covariance.cpu(), step.result.T_cam_obj.cpu()).tolist()
-        for index, label in enumerate(self._session.labels):
-            self._log_pose(step, index, label)
-            self._log_contours(step, index, label, seen)
-            self._log_scalars(label, "std", dict(zip(("rotation_deg", "position_cm"), stds[index], strict=True)))
+        times_ms = {"time/step": 1e3 * step.seconds, "time/all_else": max(1e3 * (now_s - self._newest_s - step.seconds), 0.0)}
+        times_ms |= {f"stages/{path_of(stage)}": 1e3 * seconds for stage, seconds in step.stages.items()}
+        self.show(moment_of(step, times_ms))
         self._newest_s = time.perf_counter()
 
-    def _log_pose(self, step: Step, index: int, label: str) -> None:
-        rr, result = self._rr, step.result
-        T = result.T_cam_obj[index].cpu()
+    def show(self, moment: Moment) -> None:
+        """Log what is to be shown of one window."""
+        rr, events = self._rr, moment.events
+        self._recording.set_time("time", duration=1e-6 * moment.t_us)
+        image = event_png(events, self._session.camera.width, self._session.camera.height)
+        self._log("camera/events", rr.EncodedImage(contents=image, media_type="image/png"))
+        for name, value_ms in moment.times_ms.items():
+            self._log(f"plots/{name}_ms", rr.Scalars(value_ms))
+        seen = self._table[events.y.cpu().numpy(), events.x.cpu().numpy()]
+        for index, (label, of_object) in enumerate(zip(self._session.labels, moment.objects, strict=True)):
+            self._log_pose(label, index, of_object)
+            self._log_truth(moment.t_us, index, of_object)
+            self._log_contour(label, of_object.contour, seen)
+            self._log_scalars(label, "std", dict(zip(("rotation_deg", "position_cm"), of_object.std, strict=True)))
+
+    def _log_pose(self, label: str, index: int, of_object: ObjectMoment) -> None:
+        rr, T, status = self._rr, of_object.T_cam_obj, of_object.status
         self._log(f"objects/{label}", rr.Transform3D(translation=T[:3, 3].numpy(), mat3x3=T[:3, :3].numpy()))
         self._paths[index].append(T[:3, 3].tolist())
         self._log(f"paths/{label}", rr.LineStrips3D([list(self._paths[index])], colors=[_RED]))
-        status = int(result.status[index])
         if self._status.get(label) != status:
             self._status[label] = status
             level = rr.TextLogLevel.INFO if status == Status.TRACKING else rr.TextLogLevel.WARN
             self._log(f"status/{label}", rr.TextLog(f"{label}: {Status(status).name}", level=level))
         self._log(f"plots/status/{label}", rr.Scalars(status))
-        self._log(f"plots/quality/{label}", rr.Scalars(float(result.quality[index])))
-        truth = self._session.ground_truth[index]
-        if truth is None or not bool(truth.covers(result.t_us[:1].cpu())[0]):
+        self._log(f"plots/quality/{label}", rr.Scalars(of_object.quality))
+
+    def _log_truth(self, t_us: int, index: int, of_object: ObjectMoment) -> None:
+        """The true pose, its contour and the errors, where it is known."""
+        rr, label, truth, at_us = self._rr, self._session.labels[index], self._session.ground_truth[index], torch.tensor([t_us])
+        if truth is None or not bool(truth.covers(at_us)[0]):
             return
-        true = truth.at(result.t_us[:1].cpu())[0]
+        true, camera, contour = truth.at(at_us)[0], self._session.camera, of_object.contour
         self._log(f"truth/{label}", rr.Transform3D(translation=true[:3, 3].numpy(), mat3x3=true[:3, :3].numpy()))
-        errors = pose_errors(result.t_us[:1].cpu(), T[None], truth, self._axes[index])
+        errors = pose_errors(at_us, of_object.T_cam_obj[None], truth, self._axes[index])
         self._log_scalars(label, "error", {"rotation_deg": float(errors.rotation_deg[0]), "position_cm": float(errors.translation_cm[0])})
-        self._log_true_contours(step, index, label, true)
-
-    def _log_true_contours(self, step: Step, index: int, label: str, true: torch.Tensor) -> None:
-        contours, camera = step.result.contours, self._session.camera
-        seen = contours.mask[index].cpu()
-        points_cam = transform_points(true, contours.points_obj[index].cpu().double()[seen])
-        links = contour_links(contours.pixels[index].cpu().double()[seen].numpy(), contours.normals[index].cpu().double()[seen].numpy())
+        points_cam = transform_points(true, torch.from_numpy(contour.points_obj))
+        links = contour_links(contour.pixels, contour.normals)
         lines = distort(project(points_cam, camera.intrinsics(torch.float64)).numpy(), camera)[links]
-        self._log(f"camera/truth/{label}", self._rr.LineStrips2D(lines, colors=[_GREEN], radii=[0.4]))
+        self._log(f"camera/truth/{label}", rr.LineStrips2D(lines, colors=[_GREEN], radii=[0.4]))
 
-    def _log_contours(self, step: Step, index: int, label: str, events: Float[np.ndarray, "e 2"]) -> None:
-        """The contours, and the events near them, each with a line to its contour point."""
-        rr, camera, contours = self._rr, self._session.camera, step.result.contours
-        seen = contours.mask[index].cpu()
-        pixels, normals = (values[index].cpu().double()[seen].numpy() for values in (contours.pixels, contours.normals))
+    def _log_contour(self, label: str, contour: VisibleContour, events: Float[np.ndarray, "e 2"]) -> None:
+        """The contour, and the events near it, each with a line to its contour point."""
+        rr, camera, pixels, normals = self._rr, self._session.camera, contour.pixels, contour.normals
         self._log(f"camera/contours/{label}", rr.LineStrips2D(distort(pixels, camera)[contour_links(pixels, normals)], colors=[_RED], radii=[0.6]))
         near, feet, residual_px = observed_near(events, pixels, normals)
         chosen = slice(None, None, max(-(-len(near) // _MOST_SHOWN), 1))
@@ -172,6 +175,11 @@ class RerunLog:
         """Hand over what is left."""
         self._recording.flush()
         self._recording.disconnect()
+
+
+def path_of(name: str) -> str:
+    """A name as a part of a path in the viewer."""
+    return re.sub(r"\W+", "_", name)
 
 
 def observed_near(

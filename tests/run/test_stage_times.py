@@ -1,27 +1,24 @@
 """Stages that are timed from outside: their own times, and all as it was afterwards."""
 
+import time
+
 import pytest
 import torch
 from tracked_boxes import started
 
-from torchtrack.bench.clock import Clock
-from torchtrack.bench.stages import STAGES, StageTimes, owner_of, timed
 from torchtrack.config.tracker import AssociationConfig, CornerConfig, TrackerConfig
+from torchtrack.run.stage_times import STAGES, StageTimes, owner_of, stages_timed, timed
+from torchtrack.run.stepping import timed_step
 
 # Corners and their flow are stages, too.
 ALONG_FLOW = TrackerConfig(corners=CornerConfig(max_corners=32), association=AssociationConfig(search="along_flow"))
 PLACES = [place for places in STAGES.values() for place in places]
 
 
-class Ticks(Clock):
+def ticks():
     """A clock that goes on by one at every look."""
-
-    def __init__(self):
-        super().__init__(torch.device("cpu"))
-        object.__setattr__(self, "looks", iter(range(1000)))
-
-    def now(self):
-        return float(next(self.looks))
+    looks = iter(range(1000))
+    return lambda: float(next(looks))
 
 
 def functions():
@@ -30,20 +27,20 @@ def functions():
 
 def test_afterwards_all_is_as_it_was():
     before = functions()
-    with timed(StageTimes(Clock(torch.device("cpu")))):
+    with timed(StageTimes(time.perf_counter)):
         assert all(now is not then for now, then in zip(functions(), before, strict=True))
     assert all(now is then for now, then in zip(functions(), before, strict=True))
 
 
 def test_afterwards_all_is_as_it_was_after_an_error_too():
     before = functions()
-    with pytest.raises(KeyError), timed(StageTimes(Clock(torch.device("cpu")))):
+    with pytest.raises(KeyError), timed(StageTimes(time.perf_counter)):
         raise KeyError
     assert all(now is then for now, then in zip(functions(), before, strict=True))
 
 
 def test_a_stage_counts_its_own_time_alone():
-    times = StageTimes(Ticks())
+    times = StageTimes(ticks())
     inner = times.timing("inner", lambda value: value + 1)
     outer = times.timing("outer", lambda value: inner(inner(value)))
     assert outer(1) == 3
@@ -55,7 +52,7 @@ def test_a_stage_that_fails_is_counted_too():
     def fails():
         raise KeyError
 
-    times = StageTimes(Ticks())
+    times = StageTimes(ticks())
     with pytest.raises(KeyError):
         times.timing("fails", fails)()
     assert dict(times.seconds) == {"fails": 1.0}
@@ -64,7 +61,7 @@ def test_a_stage_that_fails_is_counted_too():
 def test_every_stage_of_a_step_is_timed_and_the_step_is_the_same():
     tracker, state, _, (events, end_us), _ = started(config=ALONG_FLOW)
     expected = tracker.step(state, events, end_us)[1]
-    times = StageTimes(Clock(torch.device("cpu")))
+    times = StageTimes(time.perf_counter)
     with timed(times):
         result = tracker.step(state, events, end_us)[1]
         with torch.inference_mode():
@@ -73,3 +70,22 @@ def test_every_stage_of_a_step_is_timed_and_the_step_is_the_same():
     assert torch.equal(result.T_cam_obj, expected.T_cam_obj)
     assert set(times.seconds) == set(STAGES)
     assert all(value > 0 for value in times.seconds.values())
+
+
+def test_a_step_says_how_long_its_stages_took_where_that_is_asked_for():
+    tracker, state, _, (events, end_us), _ = started()
+    with stages_timed(torch.device("cpu")):
+        taken = timed_step(tracker, state, events, end_us)[2]
+    assert {"prediction", "rounds", "conclusion", "rest"} <= set(taken.stages) <= set(STAGES)
+    # Each second is of one stage.
+    assert sum(taken.stages.values()) <= taken.seconds
+    assert taken.part(4).stages["rest"] == taken.stages["rest"] / 4
+
+
+def test_nothing_is_timed_where_nobody_asks():
+    before = functions()
+    tracker, state, _, (events, end_us), _ = started()
+    with stages_timed(torch.device("cpu")):
+        pass
+    assert timed_step(tracker, state, events, end_us)[2].stages == {}
+    assert all(now is then for now, then in zip(functions(), before, strict=True))
