@@ -44,9 +44,9 @@ PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted((REPOSIT
 # All but what is generated.
 README = "\n\n".join([FRONT, *(text for name, text in PAGES.items() if name != "settings.md")])
 SETTINGS = {"track": RunConfig, "evaluate": EvaluateConfig, "demo": DemoConfig, "simulate": SceneConfig}
-COMMANDS = ("track", "evaluate", "simulate", "demo", "outline", "model", "pose", "report", "info", "convert", "bench", "settings")
+COMMANDS = ("track", "evaluate", "simulate", "demo", "outline", "model", "pose", "report", "view", "info", "convert", "bench", "settings")
 BLOCKS = ("ACCURACY", "ABLATION", "TRIAL", "PAPER TABLES", "SPEED")
-FILE_SUFFIXES = ("py", "yaml", "txt", "npz", "json", "csv", "tum", "mp4", "png", "obj", "glb", "md", "mcap", "html")
+FILE_SUFFIXES = ("py", "yaml", "txt", "npz", "json", "csv", "tum", "mp4", "png", "obj", "glb", "md", "mcap", "html", "rrd")
 
 
 def blocks(language):

@@ -485,12 +485,14 @@ def test_a_damaged_archive(tmp_path):
         open_session(RunConfig(source=tmp_path / "bad.npz"))
 
 
-def test_the_duration_is_known_from_the_truth_or_the_end(sequence_path, tmp_path):
-    assert open_session(RunConfig(source=sequence_path)).known_duration_s == pytest.approx(0.040 - 0.000499)
-    assert open_session(RunConfig(source=sequence_path, end_us=10_499)).known_duration_s == pytest.approx(0.01)
+def test_the_end_is_expected_by_the_truth_or_the_settings_or_what_was_read(sequence_path, tmp_path):
+    assert open_session(RunConfig(source=sequence_path)).expected_end_us == 40_000
+    assert open_session(RunConfig(source=sequence_path, end_us=10_499)).expected_end_us == 10_499
     obj = {"label": "box", "mesh": sequence_path.with_name("tiny_box.ply"), "initial_pose": pose_settings(sequence_path)}
     config = RunConfig(source=text_source(sequence_path, tmp_path), camera=camera_settings(), objects=[obj])
-    assert open_session(config).known_duration_s is None
+    session = open_session(config)
+    ends_us = [(session.expected_end_us, int(chunk.t_us[-1])) for chunk in session.chunks()]
+    assert ends_us[-1][0] == pytest.approx(ends_us[-1][1], rel=0.1)
 
 
 def test_missing_source_and_missing_device(sequence_path, tmp_path):

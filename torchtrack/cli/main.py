@@ -19,7 +19,7 @@ from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.options import Demo, Evaluate, Model, Outline, Settings, Simulate, Track
 from torchtrack.cli.options_files import Bench, Convert, Info
 from torchtrack.cli.options_pose import Pose
-from torchtrack.cli.options_report import Report
+from torchtrack.cli.options_report import Report, View
 from torchtrack.config.load import load, typed
 from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import ConfigError, TorchtrackError
@@ -41,6 +41,7 @@ _Command = (
     | Annotated[Model, subcommand("model")]
     | Annotated[Pose, subcommand("pose")]
     | Annotated[Report, subcommand("report")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Convert, subcommand("convert")]
     | Annotated[Bench, subcommand("bench")]

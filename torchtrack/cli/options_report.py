@@ -1,4 +1,4 @@
-"""The options of the command about finished runs."""
+"""The options of the commands about finished runs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from torchtrack.cli.console import starting
 from torchtrack.cli.option import option
 from torchtrack.cli.options_files import refuse_settings
 
@@ -25,3 +26,27 @@ class Report:
 
         refuse_settings(overrides)
         return report(self.runs, self.output)
+
+
+@dataclass(frozen=True)
+class View:
+    """Show a finished run in the Rerun viewer: events, contours, meshes, trajectories, status and quality on one time line; or plot it."""
+
+    folder: Positional[Annotated[Path, arg(metavar="DIR")]]
+    """Output folder of a run."""
+    output: Annotated[Path | None, option("FILE", "-o")] = None
+    """Write a file for the viewer (.rrd), and do not open it."""
+    source: Annotated[Path | None, option("FILE")] = None
+    """The recording, if it is no longer where it was tracked from."""
+    plots: Annotated[Path | None, option("DIR")] = None
+    """Write plots (.png) of status, accuracy and trajectory into this folder; no viewer is opened."""
+    quiet: bool = False
+    """No progress bar."""
+
+    def run(self, overrides: dict[str, Any]) -> int:
+        """Carry the command out; returns the exit code."""
+        refuse_settings(overrides)
+        with starting(quiet=self.quiet):
+            from torchtrack.cli.view import view
+
+        return view(self.folder, self.output, self.source, self.plots, quiet=self.quiet)

@@ -1,7 +1,7 @@
 """The base of all readers of event files: checks, faults, and where to start."""
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -113,15 +113,17 @@ class EventFile(EventStream):
             for part in self._with_polarity(self._readable(max_events)):
                 events = inside(part, self.width, self.height, self.problems, count)
                 count += len(part)
-                yield from self._noted(all_of(map(self._started, mender.add(events)), max_events))
-            yield from self._noted(all_of(map(self._started, mender.rest()), max_events))
+                yield from all_of(self._noted(mender.add(events)), max_events)
+            yield from all_of(self._noted(mender.rest()), max_events)
         self.reading.end()
         self.problems.warn()
 
-    def _noted(self, batches: Iterator[EventBatch]) -> Iterator[EventBatch]:
-        for batch in batches:
-            self.reading.add(batch)
-            yield batch
+    def _noted(self, pieces: Iterable[Columns]) -> list[Columns]:
+        """What was read last from the start on, in which the pass has come so far."""
+        noted = list(map(self._started, pieces))
+        for piece in noted:
+            self.reading.add(piece)
+        return noted
 
     def _readable(self, max_events: int) -> Iterator[Columns]:
         """What can be read: where it breaks off, the rest counts as damaged."""

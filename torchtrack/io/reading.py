@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-from torchtrack.core.events import EventBatch
+from torchtrack.io.columns import Columns
 
 Progress = Callable[[float], None]
 """Called with the share of the work that is done, 0 to 1."""
@@ -49,8 +49,10 @@ class Reading:
         self.share, self.total, self.stream = None, None, None
         self.count, self.first_us, self.last_us = 0, None, None
 
-    def add(self, events: EventBatch) -> None:
-        """Note events that were read, at least one."""
+    def add(self, events: Columns) -> None:
+        """Note events that were read."""
+        if len(events) == 0:
+            return
         self.count += len(events)
         self.first_us = int(events.t_us[0]) if self.first_us is None else self.first_us
         self.last_us = int(events.t_us[-1])

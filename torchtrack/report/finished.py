@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
+from torchtrack.core.lie import rotation_from_quaternion
 from torchtrack.errors import MissingFileError, UnknownFormatError
 from torchtrack.run.sinks.folder import CONFIG, POSES, SUMMARY
 from torchtrack.run.sinks.poses import COLUMNS
@@ -23,7 +25,7 @@ class ObjectTrack:
     Args:
         label: of the object.
         t_us: ends of the windows.
-        position_m: of the object's origin, in the camera's frame.
+        T_cam_obj: poses.
         status: :class:`torchtrack.tracking.validation.status.Status` of each.
         quality: of each.
         error: rotation (°) and translation (cm) against the truth; NaN where it is not known.
@@ -32,11 +34,21 @@ class ObjectTrack:
 
     label: str
     t_us: Int[np.ndarray, "n"]
-    position_m: Float[np.ndarray, "n 3"]
+    T_cam_obj: Float[np.ndarray, "n 4 4"]
     status: Int[np.ndarray, "n"]
     quality: Float[np.ndarray, "n"]
     error: Float[np.ndarray, "n 2"]
     std: Float[np.ndarray, "n 2"]
+
+    @property
+    def position_m(self) -> Float[np.ndarray, "n 3"]:
+        """Of the object's origin, in the camera's frame."""
+        return self.T_cam_obj[:, :3, 3]
+
+    def first(self, count: int) -> "ObjectTrack":
+        """The first windows of it."""
+        values = (self.t_us, self.T_cam_obj, self.status, self.quality, self.error, self.std)
+        return ObjectTrack(self.label, *(value[:count] for value in values))
 
 
 @dataclass(frozen=True)
@@ -110,9 +122,16 @@ def _track(label: str, rows: Sequence[Sequence[str]]) -> ObjectTrack:
     return ObjectTrack(
         label=label,
         t_us=np.array([int(row[0]) for row in rows], dtype=np.int64),
-        position_m=columns("tx", "ty", "tz"),
+        T_cam_obj=_poses(columns("tx", "ty", "tz"), columns("qx", "qy", "qz", "qw")),
         status=np.array([int(Status[row[COLUMNS.index("status")]]) for row in rows], dtype=np.int64),
         quality=columns("quality")[:, 0],
         error=columns("rotation_error_deg", "translation_error_cm"),
         std=columns("rotation_std_deg", "translation_std_cm"),
     )
+
+
+def _poses(position_m: Float[np.ndarray, "n 3"], quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4 4"]:
+    poses = np.tile(np.eye(4), (len(position_m), 1, 1))
+    poses[:, :3, :3] = rotation_from_quaternion(torch.from_numpy(quaternion)).numpy()
+    poses[:, :3, 3] = position_m
+    return poses

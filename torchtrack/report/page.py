@@ -15,7 +15,7 @@ from markupsafe import Markup
 from torchtrack.core.atomic import atomic_path
 from torchtrack.errors import ConfigError
 from torchtrack.report.finished import FinishedRun, read_run
-from torchtrack.report.plots import Limits, error_plot, shared_limits, status_plot, trajectory_plot
+from torchtrack.report.plots import Limits, as_svg, error_plot, shared_limits, status_plot, trajectory_plot
 
 # A larger video is linked, where it is: the page would take long to open.
 MOST_EMBEDDED_BYTES = 12_000_000
@@ -72,7 +72,7 @@ def _of_run(run: FinishedRun, limits: Limits, output: Path) -> dict[str, Any]:
         "name": run.name,
         "ended": run.summary["ended"],
         "message": run.summary.get("message", ""),
-        "plots": [Plot(title, Markup(svg)) for title, svg in plots] if run.tracks else [],
+        "plots": [Plot(title, Markup(as_svg(figure))) for title, figure in plots] if run.tracks else [],
         "stills": [{"name": path.name, "address": _embedded(path, "image/png")} for path in run.stills[:_MOST_STILLS]],
         "videos": [_video(path, output) for path in run.videos],
         "config": run.config,

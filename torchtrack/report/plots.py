@@ -1,4 +1,4 @@
-"""Plots of runs over time, as SVG: status and quality, errors or standard deviations, position and path.
+"""Plots of runs over time: status and quality, errors or standard deviations, position and path.
 
 The axes of several runs reach as far, so that they can be compared side by side.
 """
@@ -6,6 +6,7 @@ The axes of several runs reach as far, so that they can be compared side by side
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -13,6 +14,8 @@ from jaxtyping import Float, Shaped
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from torchtrack.core.atomic import atomic_path
+from torchtrack.errors import ConfigError
 from torchtrack.report.finished import FinishedRun, ObjectTrack
 from torchtrack.tracking.validation.status import Status
 
@@ -24,7 +27,7 @@ STATUS_COLOURS = {
     Status.OUT_OF_VIEW: "#6f5fb5",
     Status.DIVERGED: "#7a1f1c",
 }
-_WIDTH_INCH, _ROW_INCH = 6.4, 1.9
+_WIDTH_INCH, _ROW_INCH, _FILE_DPI = 6.4, 1.9, 150
 # More points than a picture has pixels show nothing more; of so many windows at once, the largest value is shown.
 _MOST_POINTS = 1500
 
@@ -59,7 +62,7 @@ def _reach(values: Sequence[np.ndarray]) -> float:
     return float(1.15 * min(every.max(), 5 * np.percentile(every, 99)) or 1.0)
 
 
-def status_plot(run: FinishedRun) -> str:
+def status_plot(run: FinishedRun) -> Figure:
     """The status of each object as a band, and its quality below."""
     figure = _figure(1 + 0.35 * len(run.tracks))
     band, quality = figure.subplots(2, 1, sharex=True, height_ratios=[0.3 * len(run.tracks) + 0.2, 1])
@@ -71,7 +74,7 @@ def status_plot(run: FinishedRun) -> str:
     handles = [mpl.patches.Patch(color=STATUS_COLOURS[status], label=status.name) for status in shown]
     band.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, fontsize="x-small", frameon=False)
     quality.set(ylabel="quality", ylim=(0, 1.03), xlabel="time (s)")
-    return _svg(figure)
+    return _finished(figure)
 
 
 def _draw_band(axes: Axes, row: int, track: ObjectTrack) -> None:
@@ -83,7 +86,7 @@ def _draw_band(axes: Axes, row: int, track: ObjectTrack) -> None:
         axes.barh(row, end - begin, left=begin, height=0.7, color=STATUS_COLOURS[Status(int(status))], linewidth=0)
 
 
-def error_plot(run: FinishedRun, limits: Limits) -> str:
+def error_plot(run: FinishedRun, limits: Limits) -> Figure:
     """Errors over time, with what the tracker expects of them dotted; standard deviations alone where no truth is known."""
     figure = _figure(2.0)
     of_what = "error" if limits.has_truth else "standard deviation"
@@ -100,10 +103,10 @@ def error_plot(run: FinishedRun, limits: Limits) -> str:
     rows[0].set_title(f"{of_what}; dotted: standard deviation as estimated" if limits.has_truth else of_what, fontsize="small", loc="left")
     rows[1].set_xlabel("time (s)")
     _legend(rows[0])
-    return _svg(figure)
+    return _finished(figure)
 
 
-def trajectory_plot(run: FinishedRun) -> str:
+def trajectory_plot(run: FinishedRun) -> Figure:
     """The position of each object in the camera's frame over time, and its path from above."""
     figure = _figure(2.2)
     over_time, path = figure.subplots(1, 2, width_ratios=[1.5, 1])
@@ -119,7 +122,7 @@ def trajectory_plot(run: FinishedRun) -> str:
     path.set(xlabel="x (m)", ylabel="z (m), away from the camera")
     path.set_aspect("equal", adjustable="datalim")
     _legend(path)
-    return _svg(figure)
+    return _finished(figure)
 
 
 def _thinned(
@@ -143,13 +146,32 @@ def _legend(axes: Axes) -> None:
         axes.legend(fontsize="x-small")
 
 
-def _svg(figure: Figure) -> str:
-    """The picture as an SVG element, letters as outlines: it needs no font and no network."""
+def _finished(figure: Figure) -> Figure:
     for axes in figure.axes:
         axes.grid(alpha=0.25, linewidth=0.5)
         axes.tick_params(labelsize="x-small")
+    return figure
+
+
+def as_svg(figure: Figure) -> str:
+    """The picture as an SVG element, letters as outlines: it needs no font and no network."""
     stream = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "path"}):
         figure.savefig(stream, format="svg", metadata={"Date": None})
     text = stream.getvalue()
     return text[text.index("<svg") :]
+
+
+def write_plots(run: FinishedRun, folder: Path) -> None:
+    """Write ``status.png``, ``accuracy.png`` and ``trajectory.png`` of a run into a folder.
+
+    Raises:
+        ConfigError: if the run has no window.
+        OutputError: if they cannot be written.
+    """
+    if not run.tracks:
+        raise ConfigError(f"'{run.folder}' has no poses to plot. Track again.")
+    figures = {"status": status_plot(run), "accuracy": error_plot(run, shared_limits([run])), "trajectory": trajectory_plot(run)}
+    for name, figure in figures.items():
+        with atomic_path(folder / f"{name}.png") as temporary:
+            figure.savefig(temporary, format="png", dpi=_FILE_DPI)
