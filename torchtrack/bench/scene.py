@@ -147,8 +147,9 @@ def read(path: Path) -> Scene:
         TorchtrackError: of the kind that fits, if the sequence cannot be read.
     """
     session = open_session(RunConfig(source=path))
-    duration_s = min(DURATION_S, session.known_duration_s or DURATION_S)
-    end_us = session.start_us + round(1e6 * duration_s)
+    end_us = session.start_us + round(1e6 * DURATION_S)
+    if session.expected_end_us is not None:
+        end_us = min(end_us, session.expected_end_us)
     events = concatenate(clipped(session.events.chunks(), session.start_us, end_us))
     return Scene(events, None, session.camera, session.models, session.ground_truth, session.T_cam_obj, session.start_us, end_us)
 
