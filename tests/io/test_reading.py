@@ -28,7 +28,7 @@ def assert_even(looks):
     """The share grows up to the end, which is known from the first part on: events are as dense everywhere."""
     shares = [share for share, _ in looks]
     assert shares == sorted(shares) and shares[-1] > 0.9
-    # Some milliseconds are held back to be sorted, and text grows with its numbers.
+    # Text grows with its numbers.
     assert [end_us for _, end_us in looks] == pytest.approx([DURATION_US] * len(looks), rel=0.15)
 
 

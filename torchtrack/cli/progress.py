@@ -71,7 +71,7 @@ def _compilation_shown(progress: Progress) -> Iterator[None]:
                 total = _kernels_left()
                 progress.start_task(task)
             depth += 1
-            progress.update(task, total=max(total, compiled + 1), visible=True)
+            progress.update(task, total=max(total, compiled + 1), visible=True, refresh=compiled == 0)
 
         def on_end(self, event: Any) -> None:
             nonlocal depth, compiled

@@ -113,6 +113,7 @@ class EventFile(EventStream):
             for part in self._with_polarity(self._readable(max_events)):
                 events = inside(part, self.width, self.height, self.problems, count)
                 count += len(part)
+                self.reading.advance(len(part))
                 yield from all_of(self._noted(mender.add(events)), max_events)
             yield from all_of(self._noted(mender.rest()), max_events)
         self.reading.end()

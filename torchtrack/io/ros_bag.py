@@ -83,7 +83,7 @@ class RosBag(EventFile):
         with self._messages() as (connection, messages):
             decoder = self._decoder(connection, self.problems)
             for number, message in enumerate(messages, 1):
-                self.reading.share = min(number / self.message_count, 1.0) if self.message_count else None
+                self.reading.position = number / self.message_count if self.message_count else None
                 waiting.append(message)
                 size += len(message)
                 if size >= _FEWEST_BYTES:
