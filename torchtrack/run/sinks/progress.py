@@ -25,6 +25,7 @@ class ProgressBar:
 
     def add(self, step: Step) -> None:
         """Take one step."""
+        is_first = self._begun is None
         if self._begun is None:
             self._progress.reset(self._task, description=self._session.name)
             self._begun, self._first_us = time.perf_counter() - step.seconds, step.window.t_start_us
@@ -33,7 +34,7 @@ class ProgressBar:
         end_us = self._session.expected_end_us
         total_s = None if end_us is None else max(1e-6 * (end_us - self._first_us), stream_s)
         rates = f"{1e-6 * self._events / wall_s:.2f} Mev/s  {stream_s / wall_s:.2f}x real time"
-        self._progress.update(self._task, total=total_s, completed=stream_s, rates=rates)
+        self._progress.update(self._task, total=total_s, completed=stream_s, rates=rates, refresh=is_first)
 
     def close(self) -> None:
         """Take the task away."""
