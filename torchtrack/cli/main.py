@@ -25,8 +25,8 @@ from torchtrack.core.limits import Limits, limits
 from torchtrack.errors import ConfigError, TorchtrackError
 from torchtrack.run.interrupt import ended_in_good_order
 
-# At Python's own rhythm (700) the collector looks through all that is imported again and again, which was two fifths of the time up to
-# the first pose; what a tracker's step leaves behind are no cycles, so that it hardly ever runs later.
+# At Python's own rhythm (700) the collector looks through all that is imported again and again: 0.7 of 3.7 s of a short run, here 0.3.
+# Little waits for it: 220 windows of tracking leave 7 objects in cycles.
 _ALLOCATIONS_BETWEEN_COLLECTIONS = 50_000
 
 _SETTINGS_HINT = "Any setting can be given by its dotted key, e.g. --tracker.window.duration-us 3000; `torchtrack settings {}` lists them."
