@@ -62,7 +62,7 @@ def _compilation_shown(progress: Progress) -> Iterator[None]:
     task = progress.add_task(_KERNELS, total=None, start=False, visible=False)
     depth = compiled = total = 0
 
-    class Listener(event.Listener):  # type: ignore[misc, name-defined]
+    class Listener(event.Listener):
         """Counts kernels; each compiles those that it calls within its own compilation."""
 
         def on_start(self, event: Any) -> None:
