@@ -90,7 +90,9 @@ class Session:
         if self.end_us is not None:
             return self.end_us
         ends = [int(truth.t_us[-1]) for truth in self.ground_truth if truth is not None]
-        return max(ends) if ends else self.reading and self.reading.expected_end_us
+        if ends:
+            return max(ends)
+        return None if self.reading is None else self.reading.expected_end_us
 
 
 @dataclass(frozen=True)
