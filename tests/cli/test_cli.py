@@ -189,6 +189,34 @@ def test_simulate_and_demo(tmp_path, capsys):
     assert "cube" in output and str(tmp_path / "out") in output
 
 
+def test_demo_needs_no_file(tmp_path, monkeypatch, capsys):
+    """The scene comes with the package, the results go to where one is."""
+    asked = []
+
+    def simulated(scene, path, quiet):
+        asked.append((scene.name, [obj.label for obj in scene.objects], path))
+        return write_tiny_sequence(tmp_path, "demo")
+
+    monkeypatch.setattr("torchtrack.cli.demo.simulated_to", simulated)
+    monkeypatch.chdir(tmp_path)
+    assert command("demo", "--quiet", "--overlay.enabled", "false") == 0
+    assert asked == [("demo", ["cube", "lbracket"], tmp_path / "outputs" / "demo" / "demo.npz")]
+    assert (tmp_path / "outputs" / "demo" / "trajectory_box.tum").exists() and str(tmp_path / "outputs" / "demo") in capsys.readouterr().out
+
+
+def test_version_is_said_without_loading_pytorch():
+    code = "import sys; from torchtrack.cli.main import main; code = main(['--version']); sys.exit(code or 'torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"torchtrack {torchtrack.__version__}\n", "")
+
+
+@pytest.mark.parametrize("arguments", [("--version", "track"), ("track", "a.npz", "--version")])
+def test_version_is_asked_for_alone(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        command(*arguments)
+    assert caught.value.code == 2 and "--version" in capsys.readouterr().err
+
+
 def test_outline_makes_a_model(tmp_path, capsys):
     picture = np.full((80, 120), 200, np.uint8)
     picture[20:50, 30:60] = 10

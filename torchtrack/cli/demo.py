@@ -13,9 +13,9 @@ from torchtrack.core.files import naming
 from torchtrack.sim import SceneConfig
 
 
-def demo(config_file: str, overrides: Mapping[str, Any], *, quiet: bool) -> int:
+def demo(config_file: Path | None, overrides: Mapping[str, Any], *, quiet: bool) -> int:
     """Simulate a scene, track it, show the errors; returns the exit code."""
-    config = load(DemoConfig, Path(config_file), overrides)
+    config = load(DemoConfig, config_file, overrides)
     scene = load(SceneConfig, config.scene)
     with naming(config.scene):
         sequence = simulated_to(scene, config.output / f"{scene.name}.npz", quiet)

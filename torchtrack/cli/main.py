@@ -14,7 +14,8 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
-from torchtrack.cli.console import flushed, report, take_any_text
+from torchtrack import __version__
+from torchtrack.cli.console import flushed, output_console, report, take_any_text
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.options import Demo, Evaluate, Model, Outline, Settings, Simulate, Track
 from torchtrack.cli.options_files import Bench, Convert, Info
@@ -29,6 +30,7 @@ from torchtrack.run.interrupt import ended_in_good_order
 # Little waits for it: 220 windows of tracking leave 7 objects in cycles.
 _ALLOCATIONS_BETWEEN_COLLECTIONS = 50_000
 
+_DESCRIPTION = "6DoF object pose tracking with an event camera. `torchtrack --version` says which version this is."
 _SETTINGS_HINT = "Any setting can be given by its dotted key, e.g. --tracker.window.duration-us 3000; `torchtrack settings {}` lists them."
 
 
@@ -75,9 +77,12 @@ def _rare_collections() -> Iterator[None]:
 
 def _run(arguments: Sequence[str]) -> int:
     """Run one command; an error is told in one line."""
+    if list(arguments) == ["--version"]:
+        output_console().print(f"torchtrack {__version__}")
+        return ExitCode.DONE
     try:
         options, overrides = split_overrides(arguments)
-        command = tyro.cli(_Command, prog="torchtrack", description="6DoF object pose tracking with an event camera.", args=options)
+        command = tyro.cli(_Command, prog="torchtrack", description=_DESCRIPTION, args=options)
         with limits(_limits(overrides)):
             code: int = command.run(overrides)
     except ConfigError as error:

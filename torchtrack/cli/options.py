@@ -192,8 +192,8 @@ class Simulate:
 class Demo:
     """Simulate a scene, track it, and show the errors: the whole pipeline in one command."""
 
-    config: Positional[Annotated[str, arg(metavar="CONFIG")]]
-    """A YAML file, such as configs/demo.yaml."""
+    config: Positional[Annotated[str, option("[CONFIG]")]] = ""
+    """A YAML file; a cube and an L-bracket when not given."""
     output: _Output = None
     """Folder for the scene and the results."""
     quiet: bool = False
@@ -204,7 +204,7 @@ class Demo:
         with starting(quiet=self.quiet):
             from torchtrack.cli.demo import demo
 
-        return demo(self.config, _given(self, ("config", "quiet")) | overrides, quiet=self.quiet)
+        return demo(Path(self.config) if self.config else None, _given(self, ("config", "quiet")) | overrides, quiet=self.quiet)
 
 
 @dataclass(frozen=True)

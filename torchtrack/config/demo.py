@@ -1,5 +1,6 @@
 """Settings of the demonstration: a scene to simulate, and how it is tracked."""
 
+from importlib.resources import files
 from pathlib import Path
 
 from pydantic import Field
@@ -9,10 +10,17 @@ from torchtrack.config.settings import ConfigPath
 from torchtrack.core.limits import Limits, current_limits
 
 
+def _own_scene() -> Path:
+    """The scene that comes with the package: an installed one has no folder of configs."""
+    return Path(str(files("torchtrack") / "scenes" / "demo.yaml"))
+
+
 class DemoConfig(TrackingConfig):
     """Settings of ``torchtrack demo``."""
 
-    scene: ConfigPath = Field(description="YAML file of the scene to simulate, as for `torchtrack simulate`.")
+    scene: ConfigPath = Field(
+        default_factory=_own_scene, description="YAML file of the scene to simulate, as for `torchtrack simulate`; the package's own when not given."
+    )
     output: ConfigPath = Field(
         default_factory=lambda: Path.cwd() / "outputs" / "demo", description="Folder for the results; by default in the working folder."
     )
