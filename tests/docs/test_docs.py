@@ -166,7 +166,7 @@ def test_what_each_component_does_is_said():
 
 def test_files_exist():
     named = set(re.findall(r"[`(\s]((?:configs|scripts|tests|torchtrack|docs|\.github)/[\w./-]*\w|LICENSE)", README))
-    assert {"configs/demo.yaml", "scripts/demo", "torchtrack/tracking/step.py", "LICENSE"} <= named
+    assert {"configs/track/shapes_rotation.yaml", "scripts/demo", "torchtrack/tracking/step.py", "LICENSE"} <= named
     for path in named:
         assert (REPOSITORY / path).exists(), path
 

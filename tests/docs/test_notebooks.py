@@ -5,6 +5,7 @@ import re
 
 import nbformat
 import pytest
+from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 from places import REPOSITORY
 
@@ -36,7 +37,9 @@ def done(tmp_path_factory):
 
     def run(name):
         notebook, folder = read(FOLDER / name), tmp_path_factory.mktemp("notebook")
-        client = NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}})
+        # The kernel is reached through files, not through ports that others could reach, too.
+        manager = AsyncKernelManager(kernel_name="python3", transport="ipc")
+        client = NotebookClient(notebook, km=manager, timeout=300, resources={"metadata": {"path": str(folder)}})
         client.execute(env={**os.environ, **environment})
         return notebook
 
