@@ -5,7 +5,6 @@ import re
 
 import nbformat
 import pytest
-from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 from places import REPOSITORY
 
@@ -37,9 +36,8 @@ def done(tmp_path_factory):
 
     def run(name):
         notebook, folder = read(FOLDER / name), tmp_path_factory.mktemp("notebook")
-        # The kernel is reached through files, not through ports that others could reach, too.
-        manager = AsyncKernelManager(kernel_name="python3", transport="ipc")
-        client = NotebookClient(notebook, km=manager, timeout=300, resources={"metadata": {"path": str(folder)}})
+        resources = {"metadata": {"path": str(folder)}}
+        client = NotebookClient(notebook, kernel_name="python3", timeout=300, startup_timeout=300, resources=resources)
         client.execute(env={**os.environ, **environment})
         return notebook
 
