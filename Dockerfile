@@ -8,7 +8,7 @@ FROM python:3.11-slim AS build
 WORKDIR /source
 COPY pyproject.toml README.md LICENSE constraints.txt ./
 COPY torchtrack torchtrack
-# With the index for CPUs, pip takes torch's build for CPUs: the default one is for CUDA, and ten times as large.
+# With the index for CPUs, pip takes torch's build for CPUs: the default one is for CUDA, and has some gigabytes more.
 RUN python -m venv /opt/venv \
  && /opt/venv/bin/pip install --no-cache-dir --extra-index-url https://download.pytorch.org/whl/cpu -c constraints.txt '.[fast]'
 
