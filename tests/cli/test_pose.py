@@ -58,12 +58,15 @@ def test_a_search_in_a_box(scene, tmp_path, capsys):
     assert f"start_us: {AT_US}" in (tmp_path / "pose.yaml").read_text()
 
 
-def test_near_a_rough_pose(scene, tmp_path):
+def test_near_a_rough_pose(scene, tmp_path, monkeypatch, capsys):
+    # As on a terminal.
+    monkeypatch.setenv("FORCE_COLOR", "1")
     folder, truth = scene
     near = tmp_path / "near.yaml"
     near.write_text(as_block(rough(truth, 35.0, 1.15), "bracket", AT_US))
     assert command(*arguments(folder), "--near", near, "-o", tmp_path / "pose.yaml") == 0
     assert error_deg(written_pose(tmp_path / "pose.yaml"), truth) < 5
+    assert "looking for the pose of in_mm" in capsys.readouterr().err
 
 
 def test_picked_points_in_the_numbers_of_the_file(scene, tmp_path, capsys):

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from torchtrack.cli.console import output_console
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.progress import progress_shown, share_of
 from torchtrack.config.load import load
 from torchtrack.config.run import ObjectConfig, RunConfig
 from torchtrack.config.settings import CommandLineText
@@ -86,7 +87,9 @@ def write_pose(source: str, settings: dict[str, Any], ways: Ways, label: str | N
             check_other_file(path, output)
         check_writable(output)
     obj, begun = object_of(config, label), time.perf_counter()
-    with threads(config.threads), naming(Path(source)):
+    # Somebody who makes it by hand sees what goes on.
+    with threads(config.threads), naming(Path(source)), progress_shown(quiet=ways.browser) as progress:
+        share_of(progress, f"looking for the pose of {obj.label}")
         session = opened(config, obj)
         pose = _pose(ways, session, obj)
         check_in_view(pose.T_cam_obj[None], session.models, [session.camera])
