@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from torchtrack.cli.console import starting
 from torchtrack.cli.option import option
 from torchtrack.config.settings import CommandLineText
 from torchtrack.errors import ConfigError
@@ -50,7 +51,8 @@ class Pose:
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
-        from torchtrack.cli.pose import Ways, write_pose
+        with starting():
+            from torchtrack.cli.pose import Ways, write_pose
 
         ways = Ways(_path(self.points), _path(self.near), self.search, self.box, self.browser, self.port)
         return write_pose(self.recording, self._settings() | overrides, ways, self.label, _path(self.output))
