@@ -9,7 +9,7 @@ from helpers import SMALL_CAMERA, bevelled_model, pose, random_events
 from states import changed
 from tracked_boxes import follow, moving_box, one_box_scene, scene_of_one_stream, scene_of_streams, tensors_of, tracker_of, windows
 
-from torchtrack import Tracker
+from torchtrack import Tracker, preset
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.tracking.association.matches import Matches
@@ -56,6 +56,13 @@ def solved_again():
     follow(tracker, tracker.init(pose()[None], 0), windows(events, 3))
 
 
+def guided_box():
+    """Corners are looked for, and flow is."""
+    _, events = moving_box(pose(), 3)
+    tracker = tracker_of(config=preset("guided"), dtype=torch.float64)
+    follow(tracker, tracker.init(pose()[None], 0), windows(events, 3))
+
+
 def many_events():
     """A start among so many events that its window is taken in parts."""
     tracker = tracker_of(dtype=torch.float64)
@@ -81,6 +88,7 @@ SCENES = (
     smooth_box,
     solved_again,
     long_window,
+    guided_box,
     many_events,
     box_behind_another,
     *(partial(boxes, scene) for scene in (one_box_scene, scene_of_one_stream, scene_of_streams)),

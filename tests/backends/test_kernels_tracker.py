@@ -32,6 +32,7 @@ SETTINGS = {
     "one gate": {"association": {"gates_px": (5.0,)}},
     "no close edges": {"association": {"edge_ambiguity_px": 0.0}, "disabled": ["dark_shift"]},
     "corners": {"corners": {"max_corners": 64}},
+    "guided": {"corners": {"max_corners": 64}, "association": {"search": "guided"}},
     "learned trust": {"association": {"weighting_network": "all"}},
     "no velocity": {"disabled": ["velocity_in_window"]},
     "nothing common": {"solver": {"common_px": 0.0}},
@@ -79,7 +80,7 @@ def test_a_step_of_a_smooth_object_is_the_same():
         torch.testing.assert_close(ours.T_cam_obj, theirs.T_cam_obj, rtol=0, atol=ROUNDINGS[torch.float64])
 
 
-@pytest.mark.parametrize("name", ["paper", "nns", "learned"])
+@pytest.mark.parametrize("name", ["paper", "guided", "nns", "learned"])
 def test_a_step_of_other_presets_is_the_same(name):
     for ours, theirs in both_steps(preset(name), count=3):
         torch.testing.assert_close(ours.T_cam_obj, theirs.T_cam_obj, rtol=0, atol=ROUNDINGS[torch.float64])

@@ -112,7 +112,7 @@ def test_a_prediction_behind_the_camera_is_not_followed():
 
 @pytest.mark.parametrize("tracker", [LineTracker, LeastSquaresTracker])
 def test_curved_objects_are_refused(tracker):
-    with pytest.raises(ModelError, match=r"'ball' is curved.*use the preset default, paper or nns"):
+    with pytest.raises(ModelError, match=r"'ball' is curved.*use the preset default, guided or nns"):
         tracker([box_model(), ball()], SMALL_CAMERA)
 
 

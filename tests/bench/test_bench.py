@@ -139,7 +139,7 @@ def test_surface(tiny, tmp_path):
 def test_flow(tiny, tmp_path):
     assert bench("flow", tmp_path) == ExitCode.DONE
     content = written(tmp_path, "flow")
-    assert [entry["name"] for entry in content["results"]] == ["32 corners", "64 corners"]
+    assert [entry["name"] for entry in content["results"]] == ["32 corners, irls", "32 corners, arrival", "64 corners, irls", "64 corners, arrival"]
     for note in content["notes"]:
         assert "100% have a flow" in note
         assert float(note.split("median error ")[1].split("%")[0]) < 5

@@ -61,7 +61,7 @@ def test_mistakes_on_the_command_line_say_so(tmp_path):
 def test_unknown_preset_is_named_once(tmp_path):
     message = mistakes_of(write(tmp_path, "source: a.npz\npreset: papre\n"))
     assert "1 setting is wrong" in message
-    assert "preset: input should be 'default', 'causal', 'learned', 'paper', 'line', 'ls' or 'nns', got 'papre'" in message
+    assert "preset: input should be 'default', 'causal', 'learned', 'guided', 'paper', 'line', 'ls' or 'nns', got 'papre'" in message
 
 
 @pytest.mark.parametrize(

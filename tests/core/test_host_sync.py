@@ -16,7 +16,9 @@ from torchtrack.core.constants import constant
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
 from torchtrack.tracking import initialization
 from torchtrack.tracking.contours.index import index_contours
+from torchtrack.tracking.frontend.bursts import no_bursts
 from torchtrack.tracking.frontend.corners import detect_corners
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.time_surface import empty_last_event, object_regions, time_surface, update_last_event
 
 COUNT = 6
@@ -143,7 +145,7 @@ def corners_of(pixels, largest_px):
     mask, stream = torch.ones(pixels.shape[:2], dtype=torch.bool), torch.zeros(len(pixels), dtype=torch.int64)
     regions = object_regions(pixels, mask, stream, (120, 160), 12, largest_px)
     surface = time_surface(last, now, regions, 0.03, torch.float32)
-    return regions, detect_corners(surface, regions, last, now, torch.tensor([0.01]), table, CORNERS)
+    return regions, detect_corners(surface, regions, SensorMaps(last, no_bursts(*last.shape)), now, torch.tensor([0.01]), table, CORNERS)
 
 
 def test_regions_of_one_size_give_the_same_corners(nothing_is_read):

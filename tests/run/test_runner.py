@@ -23,6 +23,7 @@ from torchtrack.errors import CalibrationError, ConfigError, EventDataError, Mis
 from torchtrack.io import line_file, read_sequence, read_tum
 from torchtrack.run.runner import run, run_many, track
 from torchtrack.run.session import Session, open_session
+from torchtrack.run.sinks.overlay import note
 from torchtrack.run.streams import build_tracker
 
 
@@ -520,7 +521,7 @@ def test_overlay_and_alignment_are_written_when_asked_for(sequence_path, tmp_pat
     assert measured["tracked"]["share_near"] > 0.9
 
 
-@pytest.mark.parametrize("preset", ["default", "line", "nns"])
+@pytest.mark.parametrize("preset", ["default", "line", "nns", "guided"])
 def test_an_overlay_shows_events_and_corners_whatever_the_tracker_makes_use_of(sequence_path, tmp_path, preset):
     run(RunConfig(source=sequence_path, output=tmp_path / "out", preset=preset, overlay={"stills": 1}))
     (still,) = (tmp_path / "out").glob("overlay_*.png")
@@ -528,6 +529,13 @@ def test_an_overlay_shows_events_and_corners_whatever_the_tracker_makes_use_of(s
     grey, yellow = (red == green) & (green == blue) & (red > 60) & (red < 200), (green > 150) & (red > 150) & (blue < 90)
     assert grey.sum() > 100
     assert yellow.sum() > 20
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("default", "not used in tracking"), ("nns", "corners"), ("guided", "their flow"), ("paper", "their flow")]
+)
+def test_an_overlay_says_whether_what_it_shows_was_used(name, expected):
+    assert note(torchtrack.preset(name)).endswith(expected)
 
 
 def test_planar_shapes_of_a_real_recording(data_dir, tmp_path):

@@ -161,9 +161,9 @@ def test_flow_that_matching_makes_no_use_of_is_estimated_where_it_is_asked_for()
     tracker, state, result, _, _ = started(config=TrackerConfig(corners=CornerConfig(max_corners=32)))
     assert result.corners.mask.any()
     assert not result.corners.has_flow.any()
-    with_flow = tracker.sensors.with_flow(result.corners, state.maps.last_event_us, state.t_us, tracker.config)
-    assert with_flow.has_flow.any()
-    assert torch.equal(with_flow.pixels, result.corners.pixels)
+    flow, has_flow = tracker.sensors.flow(result.corners.points, state.maps, state.t_us, tracker.config)
+    assert has_flow.any()
+    assert (flow[has_flow].norm(dim=-1) > 0).all()
 
 
 def test_contours_are_those_of_the_pose(dtype):

@@ -14,7 +14,6 @@ from torchtrack.config.tracker import (
     CornerConfig,
     MotionConfig,
     SolverConfig,
-    SurfaceConfig,
     TrackerConfig,
 )
 from torchtrack.config.validation import ValidationConfig
@@ -74,10 +73,11 @@ def test_a_tracker_can_be_saved_and_loaded(tmp_path):
         TrackerConfig(solver=SolverConfig(loss="huber")),
         TrackerConfig(contours=ContourConfig(remove_hidden=False)),
         TrackerConfig(association=AssociationConfig(gates_px=(4.0, 2.0))),
-        TrackerConfig(corners=CornerConfig(max_corners=32), surface=SurfaceConfig(filters="kornia")),
+        preset("guided"),
+        preset("nns"),
         TrackerConfig(motion=MotionConfig(model="hold")),
     ],
-    ids=["corners", "no_prior", "huber", "all_contours", "two_rounds", "kornia", "held"],
+    ids=["corners", "no_prior", "huber", "all_contours", "two_rounds", "guided", "nns", "held"],
 )
 def test_a_box_is_tracked_with_other_settings(config):
     assert_tracked(config)

@@ -86,6 +86,14 @@ def test_corners_and_their_flow():
     assert not has_colour(image[145 * SCALE : 155 * SCALE, 33 * SCALE : 60 * SCALE], "yellow")
 
 
+def test_a_note_is_written_below_what_is_said_of_the_objects():
+    plain, noted = (draw_overlay(quiet(), 0, CAMERA, [nothing()], note=note) for note in (None, "yellow: corners"))
+    rows = np.flatnonzero((plain != noted).any((1, 2)))
+    assert has_colour(noted[rows.min() : rows.max() + 1], "yellow")
+    written = np.flatnonzero(plain.any((1, 2)))
+    assert rows.max() > written.max()
+
+
 def test_contour_points_are_joined_by_lines():
     contour, truth = np.array([[50.0, 100.0], [90.0, 100.0]]), np.array([[50.0, 140.0], [90.0, 140.0]])
     thing = replace(nothing(), contour=contour, truth=truth, links=np.array([[0, 1]]))
@@ -152,7 +160,8 @@ def box_result(T_cam_obj: torch.Tensor) -> StepResult:
     pixels = torch.tensor([[70.0, 80.0], [1.0, 1.0]]).expand(count, 2, 2)
     mask = torch.tensor([True, False]).expand(count, 2)
     contours = Contours(points, torch.zeros(count, 2, 3), torch.zeros(count, 2, dtype=torch.int64), mask, points, pixels, pixels)
-    corners = Corners(pixels.long(), pixels, torch.zeros(count, 2), mask, torch.full((count, 2, 2), 7.0), torch.zeros(count, 2, dtype=torch.bool))
+    flow, has_flow = torch.full((count, 2, 2), 7.0), torch.zeros(count, 2, dtype=torch.bool)
+    corners = Corners(pixels.long(), pixels, torch.zeros(count, 2), mask, flow, has_flow, polarity=mask.float())
     status = torch.tensor([int(Status.TRACKING), int(Status.OUT_OF_VIEW)])[:count]
     share = torch.full((count,), 0.75)
     covariance = torch.eye(6, dtype=torch.float64).expand(count, 6, 6)

@@ -114,7 +114,7 @@ class EventLineTracker(Tracker):
         distinct = {id(model): model for model in objects}
         for model in distinct.values():
             if reason := too_curved(model):
-                raise ModelError(f"{reason}. A method that tracks straight lines alone cannot follow it: use the preset default, paper or nns.")
+                raise ModelError(f"{reason}. A method that tracks straight lines alone cannot follow it: use the preset default, guided or nns.")
         # Objects with one model go on having one: they are handled together.
         straight = {key: straight_edges_only(model) for key, model in distinct.items()}
         super().__init__([straight[id(model)] for model in objects], camera, config, stream_index, dtype, kernels=kernels)

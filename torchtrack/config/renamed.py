@@ -55,6 +55,9 @@ KEYS = {
 
 # Settings that were removed, by their sections: what is done in their place, or why nothing is.
 REMOVED: dict[str, dict[str, str]] = {
+    "surface": {
+        "filters": "kornia's filters run, and on a CPU with the extra 'fast' their faster equal",
+    },
     "contours": {
         "mid_window": "contours are those that show at the window's end",
     },

@@ -21,10 +21,9 @@ class WindowConfig(Settings):
 
 
 class SurfaceConfig(Settings):
-    """The time surface (Eq. 5) and its guided filter."""
+    """The time surface (Eq. 5)."""
 
     tau_s: float = Field(0.03, gt=0, le=10, description="Decay constant τ (s).")
-    filters: Literal["sliced", "kornia"] = Field("sliced", description="kornia's guided filter and Harris response, or our faster equal of them.")
 
 
 class CornerConfig(Settings):
@@ -35,9 +34,12 @@ class CornerConfig(Settings):
 
 
 class FlowConfig(Settings):
-    """Event flow of each corner (Eq. 6-11)."""
+    """Event flow (Eq. 6-11), where association makes use of it."""
 
-    radius_px: int = Field(5, ge=1, le=20, description="Events within this distance of the corner take part (px).")
+    model: Literal["arrival", "irls"] = Field(
+        "arrival", description="The speed of edges across themselves, by when they came to each pixel; or least squares on newest events (the paper)."
+    )
+    radius_px: int = Field(3, ge=1, le=20, description="Pixels within this distance take part (px).")
     iterations: int = Field(3, ge=1, le=50, description="Reweightings.")
 
 
@@ -56,7 +58,9 @@ class ContourConfig(Settings):
 class AssociationConfig(Settings):
     """Association of corners and events with contours."""
 
-    search: Literal["nearest", "along_flow"] = Field("nearest", description="The nearest contour, or that along a corner's flow (the paper).")
+    search: Literal["nearest", "guided", "along_flow"] = Field(
+        "nearest", description="The nearest contour; guided by how it moves, as the flow says; or the one along a corner's flow (the paper)."
+    )
     residual: Literal["normal", "point"] = Field("normal", description="Distance normal to the contour, or to the matched point in both coordinates.")
     gates_px: tuple[float, ...] = Field((5.0, 2.5, 1.5, 1.2), min_length=1, description="One round of matching and solving per gate (px).")
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")

@@ -169,7 +169,7 @@ def build_tracker(sessions: Sequence[Session], config: TrackingConfig) -> Tracke
     if not config.compiled:
         return kind(models, cameras, config.tracker, stream_index, dtype, kernels=config.kernels).to(config.device)
     if kind is not Tracker:
-        raise ConfigError(f"compiled: the method '{config.preset}' cannot be compiled. Leave it out, or use the preset default, paper or nns.")
+        raise ConfigError(f"compiled: the method '{config.preset}' cannot be compiled. Leave it out, or use the preset default, guided or nns.")
     return Tracker(models, cameras, config.tracker, stream_index, dtype, compiled=config.compiled, kernels=config.kernels).to(config.device)
 
 

@@ -128,7 +128,7 @@ class TrackedObjects(nn.Module):
     @property
     def looks_back(self) -> bool:
         """Whether anything needs the events of earlier windows: they are not kept for nothing."""
-        return self.config.corners.max_corners > 0 or self.weighting_network is not None
+        return self.config.corners.max_corners > 0 or self.config.association.search == "guided" or self.weighting_network is not None
 
     @property
     def streams(self) -> int:

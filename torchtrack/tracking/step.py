@@ -10,7 +10,8 @@ from torchtrack.config.components import Component
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch
 from torchtrack.tracking.adapt import Lesson, learned_after
-from torchtrack.tracking.association.observations import Observations, corner_observations, join, select_events
+from torchtrack.tracking.association.flow_agreement import guided_by_flow
+from torchtrack.tracking.association.observations import Observations, corner_observations, filled_up, select_events
 from torchtrack.tracking.association.weighting_features import WeightingInputs, judged
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
@@ -19,6 +20,7 @@ from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import Expected, expect, near_objects
 from torchtrack.tracking.frontend.bursts import LONGEST_US
 from torchtrack.tracking.frontend.corners import Corners
+from torchtrack.tracking.frontend.flow import SensorPoints
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.frontend.window_events import ObjectEvents
@@ -109,14 +111,26 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     gate_scale = gate_scale_of(sigma_px, config)
     # Asked for here: a GPU answers while corners are looked for.
     radius_px = given.reads.ask(index_radius(gate_scale, config), usual_index_radius(config))
-    corners = sensors.corners(contours, maps.last_event_us, t_us, expected.window_s, config)
+    maps = replace(maps, burst_age_us=burst_age_us)
+    corners = sensors.corners(contours, maps, t_us, expected.window_s, config)
+    if config.association.search == "along_flow":
+        flow, has_flow = sensors.flow(corners.points, maps, t_us, config)
+        corners = replace(corners, flow=flow, has_flow=has_flow)
     index = index_for(contours, tracked.image_size, config, gate_scale, radius_px)
     observations, most = corner_observations(corners), config.association.max_events
     if most:
-        observations = join(observations, select_events(events, index, prediction.moving(compensated=True), most))
+        observations = filled_up(observations, select_events(events, index, prediction.moving(compensated=True), most), most)
     if tracked.weighting_network is not None:
         history = sensors.history(maps.last_event_us, t_us)
         observations = judged(WeightingInputs(observations, events, prediction, contours, index, history), tracked.weighting_network)
+    if config.association.search == "guided":
+        points = SensorPoints(sensors.nearest_pixels(observations.pixels), observations.age_s, observations.polarity, observations.mask)
+        flow, has_flow = sensors.flow(points, maps, t_us, config)
+        observations = replace(observations, flow=flow, has_flow=has_flow)
+        observations = guided_by_flow(observations, index, contours, prediction, state.health.time_since_validated_s)
+        # The corners are the first of them.
+        own = slice(corners.mask.shape[1])
+        corners = replace(corners, flow=flow[:, own], has_flow=has_flow[:, own])
     return Observed(events, burst_age_us, contours, index, sigma_px, gate_scale, corners, observations)
 
 

@@ -134,6 +134,7 @@ def draw_overlay(
     *,
     decay_s: float = 0.03,
     scale: int | None = None,
+    note: str | None = None,
 ) -> UInt8[np.ndarray, "hs ws 3"]:
     """The picture (BGR) of a stream at ``t_us``.
 
@@ -144,6 +145,7 @@ def draw_overlay(
         objects: from :func:`overlay_objects`.
         decay_s: time constant of the time surface.
         scale: enlargement; by default as much as the sensor needs to be 900 pixels wide.
+        note: a further line of text.
     """
     newest = last_event_us.cpu().numpy() if isinstance(last_event_us, Tensor) else last_event_us
     scale = scale or -(-_LEAST_WIDTH_PX // camera.width)
@@ -157,7 +159,8 @@ def draw_overlay(
         canvas.arrows(thing.corners, thing.corners + thing.flow * _ARROW_S, _YELLOW)
         if thing.axes is not None:
             canvas.axes(thing.axes, thing.name)
-    write_lines(canvas.image, [(f"t = {t_us * 1e-6:.4f} s", _WHITE), *(_legend_line(thing) for thing in objects)])
+    notes = [] if note is None else [(note, _YELLOW)]
+    write_lines(canvas.image, [(f"t = {t_us * 1e-6:.4f} s", _WHITE), *(_legend_line(thing) for thing in objects), *notes])
     return canvas.image
 
 

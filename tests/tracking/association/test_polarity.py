@@ -224,6 +224,6 @@ def test_what_was_not_tracked_is_not_remembered():
     assert torch.equal(tracker.step(blind, events[:0], end_us)[0].appearance.darker_outside, blind.appearance.darker_outside)
 
 
-@pytest.mark.parametrize("name", ["paper", "nns"])
-def test_corners_have_no_polarity_to_remember(name):
-    assert not remembers_polarity(preset(name))
+@pytest.mark.parametrize(("name", "expected"), [("paper", False), ("nns", True)])
+def test_polarity_is_remembered_where_it_counts(name, expected):
+    assert remembers_polarity(preset(name)) == expected

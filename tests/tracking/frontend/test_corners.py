@@ -6,8 +6,11 @@ from helpers import generator, random_events
 
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig
+from torchtrack.core import dispatch
+from torchtrack.tracking.frontend.bursts import no_bursts
 from torchtrack.tracking.frontend.corners import detect_corners, no_corners, select_corners, snap_to_newest
 from torchtrack.tracking.frontend.filters import corner_response
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.sensors import REGION_MARGIN_PX
 from torchtrack.tracking.frontend.time_surface import NEVER_US, Regions, empty_last_event, object_regions, time_surface, update_last_event
 
@@ -41,7 +44,7 @@ def detect(last_event_us, regions, *, most=32, without=(), window_s=1.0, surface
     window = torch.full((streams,), window_s, dtype=dtype)
     table = pixel_table(streams, height, width, dtype)
     config = TrackerConfig(surface=surface_config, corners=CornerConfig(max_corners=most), disabled=frozenset(without))
-    return detect_corners(surface, regions, last_event_us, now, window, table, config)
+    return detect_corners(surface, regions, SensorMaps(last_event_us, no_bursts(streams, height, width)), now, window, table, config)
 
 
 def actual(corners, number=0):
@@ -68,7 +71,7 @@ def square_of_events(u0, v0, u1, v1, t_us=NOW_US, width=96, height=96):
 @pytest.mark.parametrize("square", [(30, 30, 60, 60), (33, 41, 52, 70)])
 def test_the_corners_of_a_square_are_found_and_nothing_else(square):
     u0, v0, u1, v1 = square
-    response = corner_response(squares((*square, 1.0)), SURFACE)
+    response = corner_response(squares((*square, 1.0)))
     pixels, mask = select_corners(response, region(96, 96), CornerConfig(max_corners=32))
     places = pixels[mask]
     assert len(places) == 4
@@ -89,6 +92,14 @@ def test_at_most_one_corner_in_a_cell_and_each_the_largest_around():
         for u, v in places.tolist():
             patch = response[number, max(v - 2, 10) : min(v + 3, 86), max(u - 2, 10) : min(u + 3, 118)]
             assert float(response[number, v, u]) == float(patch.max())
+
+
+def test_in_small_cells_there_is_one_corner_each():
+    """Not the largest of 5x5 pixels, which would leave most cells without any."""
+    response = 1 + torch.rand((1, 96, 96), generator=generator(4))
+    pixels, mask = select_corners(response, region(96, 96), CornerConfig(cell_px=3, max_corners=2000))
+    assert int(mask.sum()) > 500
+    assert len({tuple(cell) for cell in (pixels[mask] // 3).tolist()}) == int(mask.sum())
 
 
 def test_corners_are_the_strongest_and_at_most_as_many_as_asked_for():
@@ -186,6 +197,26 @@ def test_stale_corners_are_dropped_unless_that_is_disabled(fresh_only):
     assert bool((ages >= 5e-3).any()) != fresh_only
 
 
+def test_stale_pixels_take_no_place_from_fresh_ones():
+    """With room for the corners of one square alone, whose response is less."""
+    last = torch.maximum(square_of_events(20, 20, 50, 50, t_us=NOW_US - 6_000), square_of_events(60, 60, 80, 80, t_us=NOW_US - 4_000))
+    last[0, 20:51, 20:51] = NOW_US - 5_500
+    corners = detect(last, region(96, 96), most=4, window_s=5e-3)
+    assert int(corners.mask.sum()) == 4
+    assert (corners.sensor_pixels[corners.mask] > 55).all()
+
+
+def test_corners_have_the_polarity_of_the_edge_that_came_last():
+    last, ages = square_of_events(30, 30, 60, 60), no_bursts(1, 96, 96)
+    ages[0, 1, :45], ages[0, 0, :45] = 2_000, 4_000
+    ages[0, 1, 45:], ages[0, 0, 45:] = 5_000, 1_000
+    surface = time_surface(last, torch.tensor([NOW_US]), region(96, 96), SURFACE.tau_s, torch.float32)
+    corners = detect_corners(surface, region(96, 96), SensorMaps(last, ages), torch.tensor([NOW_US]), torch.ones(1), pixel_table(1, 96, 96), CORNERS)
+    above = corners.sensor_pixels[..., 1] < 45
+    assert (corners.polarity[corners.mask & above] == 1).all() and (corners.polarity[corners.mask & ~above] == -1).all()
+    assert bool((corners.mask & above).any()) and bool((corners.mask & ~above).any())
+
+
 def test_an_event_at_the_start_of_the_window_is_of_the_one_before():
     last = square_of_events(30, 30, 60, 60, t_us=NOW_US - 5_000)
     assert not detect(last, region(96, 96), window_s=5e-3).mask.any()
@@ -208,7 +239,8 @@ def test_ideal_pixels_come_from_the_table_of_the_stream():
     last = square_of_events(30, 30, 60, 60)
     table = pixel_table(1, 96, 96) * 2 + 1
     surface = time_surface(last, torch.tensor([NOW_US]), region(96, 96), SURFACE.tau_s, torch.float32)
-    corners = detect_corners(surface, region(96, 96), last, torch.tensor([NOW_US]), torch.ones(1), table, CORNERS)
+    maps = SensorMaps(last, no_bursts(1, 96, 96))
+    corners = detect_corners(surface, region(96, 96), maps, torch.tensor([NOW_US]), torch.ones(1), table, CORNERS)
     assert corners.mask.any()
     torch.testing.assert_close(corners.pixels, corners.sensor_pixels * 2.0 + 1)
 
@@ -241,9 +273,10 @@ def two_objects(dtype, surface_config=SURFACE):
     return [actual(together, 0), actual(together, 1)], [actual(corners(small)), actual(corners(large))]
 
 
-@pytest.mark.parametrize("filters", ["sliced", "kornia"])
-def test_corners_do_not_depend_on_the_rest_of_the_batch(dtype, filters):
-    together, alone = two_objects(dtype, SurfaceConfig(filters=filters, tau_s=0.3))
+@pytest.mark.parametrize("kernels", [False, True])
+def test_corners_do_not_depend_on_the_rest_of_the_batch(dtype, kernels):
+    with dispatch.backend(wanted=kernels):
+        together, alone = two_objects(dtype, SurfaceConfig(tau_s=0.3))
     assert together == alone
     assert min(len(corners) for corners in alone) > 3
 

@@ -1,4 +1,4 @@
-"""Guided filter and Harris response: the sliced sums are kornia's, at borders too, and do not depend on the batch."""
+"""Guided filter and Harris response: the sliced sums of the CPU are kornia's, at borders too, and do not depend on the batch."""
 
 import pytest
 import torch
@@ -6,8 +6,9 @@ from helpers import generator
 from kornia.feature import harris_response
 from kornia.filters import guided_blur
 
-from torchtrack.config.tracker import SurfaceConfig
-from torchtrack.tracking.frontend.filters import FILTER_EPS, FILTER_SIZE_PX, corner_response, separable_filter, sliced_guided_filter, sliced_harris
+from torchtrack.backends.numba.corner_response import separable_filter, sliced_corner_response, sliced_guided_filter, sliced_harris
+from torchtrack.core import dispatch
+from torchtrack.tracking.frontend.filters import FILTER_EPS, FILTER_SIZE_PX, corner_response
 
 SHAPES = [(1, 16, 16), (1, 32, 32), (3, 64, 96), (9, 40, 33)]
 # Of the largest value.
@@ -24,6 +25,15 @@ def decaying_square(dtype):
     image[0, :20, :30] = torch.linspace(0, 1, 30, dtype=dtype)
     image[0, 30:40, 40:50] = 1
     return image
+
+
+def reference(surface):
+    """The response by kornia."""
+    with dispatch.backend(wanted=False):
+        return corner_response(surface)
+
+
+WAYS = {"sliced": sliced_corner_response, "kornia": reference}
 
 
 def assert_agree(ours, theirs):
@@ -51,30 +61,30 @@ def test_the_sliced_harris_response_is_that_of_kornia(shape, dtype):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_both_settings_give_the_same_response(shape, dtype):
+def test_both_give_the_same_response(shape, dtype):
     surface = surfaces(*shape, seed=2, dtype=dtype)
-    ours, theirs = (corner_response(surface, SurfaceConfig(filters=filters)) for filters in ("sliced", "kornia"))
+    ours, theirs = sliced_corner_response(surface), reference(surface)
     assert_agree(ours, theirs)
 
 
 def test_they_agree_on_steps_and_flat_ground(dtype):
     surface = decaying_square(dtype)
-    ours, theirs = (corner_response(surface, SurfaceConfig(filters=filters)) for filters in ("sliced", "kornia"))
+    ours, theirs = sliced_corner_response(surface), reference(surface)
     assert_agree(ours, theirs)
 
 
 def test_they_agree_at_every_border(dtype):
     """Where the sums reach beyond the image: the outermost rows and columns alone."""
     surface = surfaces(2, 40, 56, seed=3, dtype=dtype)
-    ours, theirs = (corner_response(surface, SurfaceConfig(filters=filters)) for filters in ("sliced", "kornia"))
+    ours, theirs = sliced_corner_response(surface), reference(surface)
     for border in (ours[:, :4] - theirs[:, :4], ours[:, -4:] - theirs[:, -4:], ours[..., :4] - theirs[..., :4], ours[..., -4:] - theirs[..., -4:]):
         assert float(border.abs().max()) <= AGREEMENT[dtype] * float(theirs.abs().max())
 
 
 def test_the_response_is_that_of_kornia_after_the_guided_filter():
-    surface, config = surfaces(2, 48, 48, seed=1, dtype=torch.float32), SurfaceConfig()
+    surface = surfaces(2, 48, 48, seed=1, dtype=torch.float32)
     filtered = guided_blur(surface[:, None], surface[:, None], FILTER_SIZE_PX, FILTER_EPS)
-    torch.testing.assert_close(corner_response(surface, config), harris_response(filtered)[:, 0], rtol=0, atol=1e-7)
+    torch.testing.assert_close(reference(surface), harris_response(filtered)[:, 0], rtol=0, atol=1e-7)
 
 
 # ---- what they do
@@ -84,7 +94,7 @@ def test_the_response_is_that_of_kornia_after_the_guided_filter():
 def test_corners_respond_more_than_edges_and_edges_less_than_nothing(filters):
     surface = torch.zeros(1, 96, 96)
     surface[0, 30:61, 30:61] = 1
-    response = corner_response(surface, SurfaceConfig(filters=filters))[0]
+    response = WAYS[filters](surface)[0]
     assert float(response[30, 30]) > 1e-3
     assert float(response[45, 30]) < 0
     assert float(response[45, 45].abs()) < 1e-6
@@ -103,7 +113,7 @@ def test_the_guided_filter_keeps_strong_edges_and_smooths_weak_noise():
 def test_a_flat_surface_stays_flat_and_has_no_response(value, dtype):
     flat = torch.full((2, 24, 24), value, dtype=dtype)
     torch.testing.assert_close(sliced_guided_filter(flat, 5, 0.01), flat, rtol=0, atol=1e-6)
-    assert float(corner_response(flat, SurfaceConfig()).abs().max()) < 1e-10
+    assert float(sliced_corner_response(flat).abs().max()) < 1e-10
 
 
 @pytest.mark.parametrize("border", ["reflect", "replicate", "constant"])
@@ -118,9 +128,9 @@ def test_separable_filters_correlate_with_the_outer_product(border, dtype):
 
 @pytest.mark.parametrize("filters", ["sliced", "kornia"])
 def test_the_response_of_a_surface_does_not_depend_on_the_rest_of_the_batch(filters, dtype):
-    surface, config = surfaces(5, 32, 48, seed=6, dtype=dtype), SurfaceConfig(filters=filters)
-    together = corner_response(surface, config)
-    alone = torch.cat([corner_response(part, config) for part in surface.split(1)])
+    surface = surfaces(5, 32, 48, seed=6, dtype=dtype)
+    together = WAYS[filters](surface)
+    alone = torch.cat([WAYS[filters](part) for part in surface.split(1)])
     torch.testing.assert_close(together, alone, rtol=0, atol=AGREEMENT[dtype] * float(alone.abs().max()))
 
 
@@ -128,5 +138,5 @@ def test_the_response_of_a_surface_does_not_depend_on_the_rest_of_the_batch(filt
 def test_the_filters_leave_their_input_as_it_was(filters):
     surface = surfaces(2, 48, 48, seed=1)
     copy = surface.clone()
-    corner_response(surface, SurfaceConfig(filters=filters))
+    WAYS[filters](surface)
     assert torch.equal(surface, copy)

@@ -8,11 +8,14 @@ import torch
 from helpers import generator
 
 from torchtrack.config.tracker import FlowConfig
-from torchtrack.tracking.frontend.corners import Corners
-from torchtrack.tracking.frontend.flow import estimate_flow, irls_flow, newest_events_around
+from torchtrack.tracking.frontend.bursts import no_bursts
+from torchtrack.tracking.frontend.flow import SensorPoints, estimate_flow, irls_flow, newest_events_around
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.time_surface import empty_last_event
 
 NOW_US = 50_000_000
+# As wide as these tests were written for.
+IRLS = FlowConfig(model="irls", radius_px=5)
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}
 
 
@@ -45,12 +48,12 @@ def events_around(pixels, last_event_us, *, scale=1.0, streams=None, config=None
     sensor = torch.tensor(pixels)
     streams = torch.zeros(len(sensor), dtype=torch.int64) if streams is None else torch.tensor(streams)
     event_us = last_event_us[streams[:, None], sensor[..., 1], sensor[..., 0]]
-    return newest_events_around(sensor, event_us, last_event_us, streams, table(len(last_event_us), scale=scale), config or FlowConfig())
+    return newest_events_around(sensor, event_us, last_event_us, streams, table(len(last_event_us), scale=scale), config or IRLS)
 
 
 def flow_at(pixels, last_event_us, **kwargs):
     """Flow of one or more pixels per object, and where there is one."""
-    return irls_flow(*events_around(pixels, last_event_us, **kwargs), FlowConfig())
+    return irls_flow(*events_around(pixels, last_event_us, **kwargs), IRLS)
 
 
 def table(streams=1, width=60, height=50, scale=1.0):
@@ -71,7 +74,7 @@ def sweeping_edge(normal, speed_px_s, through=(30, 25), width=60, height=50):
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0), (120.0, -80.0), (-2000.0, 10.0)])
 def test_a_clean_trail_gives_its_velocity(velocity, dtype):
-    flow, valid = irls_flow(*trails(velocity, dtype=dtype), FlowConfig())
+    flow, valid = irls_flow(*trails(velocity, dtype=dtype), IRLS)
     assert valid
     torch.testing.assert_close(flow, torch.tensor(velocity, dtype=dtype), rtol=TOLERANCE[dtype], atol=1e-2 * TOLERANCE[dtype])
 
@@ -81,7 +84,7 @@ def test_outliers_do_not_move_the_flow(share, dtype):
     velocity = [300.0, -150.0]
     count = 80
     offsets, times_s, mask = trails(velocity, count=count, outliers=int(share * count), noise_px=0.2, dtype=dtype)
-    robust, valid = irls_flow(offsets, times_s, mask, FlowConfig(iterations=20))
+    robust, valid = irls_flow(offsets, times_s, mask, FlowConfig(model="irls", iterations=20))
     plain = torch.linalg.lstsq(times_s[:, None], offsets).solution[0]
     assert valid
     truth = torch.tensor(velocity, dtype=dtype)
@@ -94,7 +97,7 @@ def test_the_flow_is_that_of_a_plain_loop(iterations, dtype):
     velocities = [[100.0, 40.0], [-500.0, 900.0], [5.0, 0.0]]
     offsets, times_s, mask = trails(velocities, outliers=12, noise_px=0.5, seed=4, dtype=dtype)
     mask[:, 50:53] = False
-    flow, valid = irls_flow(offsets, times_s, mask, FlowConfig(iterations=iterations))
+    flow, valid = irls_flow(offsets, times_s, mask, FlowConfig(model="irls", iterations=iterations))
     assert valid.all()
     for row in range(3):
         keep = mask[row].numpy()
@@ -105,10 +108,10 @@ def test_the_flow_is_that_of_a_plain_loop(iterations, dtype):
 def test_every_corner_has_a_flow_of_its_own(dtype):
     velocities = [[[100.0, 40.0], [-500.0, 900.0]], [[5.0, 0.0], [0.0, -70.0]]]
     offsets, times_s, mask = trails(velocities, outliers=10, noise_px=0.3, dtype=dtype)
-    together, _ = irls_flow(offsets, times_s, mask, FlowConfig())
+    together, _ = irls_flow(offsets, times_s, mask, IRLS)
     for i in range(2):
         for j in range(2):
-            alone, _ = irls_flow(offsets[i, j], times_s[i, j], mask[i, j], FlowConfig())
+            alone, _ = irls_flow(offsets[i, j], times_s[i, j], mask[i, j], IRLS)
             torch.testing.assert_close(together[i, j], alone, rtol=1e-5, atol=1e-5)
 
 
@@ -116,33 +119,33 @@ def test_masked_events_do_not_count_whatever_they_are(dtype):
     offsets, times_s, mask = trails([100.0, 50.0], dtype=dtype)
     mask[40:] = False
     offsets[40:] = 1e6
-    flow, valid = irls_flow(offsets, times_s, mask, FlowConfig())
+    flow, valid = irls_flow(offsets, times_s, mask, IRLS)
     assert valid
     torch.testing.assert_close(flow, torch.tensor([100.0, 50.0], dtype=dtype), rtol=1e-4, atol=0)
 
 
 def test_too_few_events_give_no_flow(dtype):
     offsets, times_s, mask = trails([100.0, 50.0], count=8, dtype=dtype)
-    assert irls_flow(offsets, times_s, mask, FlowConfig())[1]
+    assert irls_flow(offsets, times_s, mask, IRLS)[1]
     mask[0] = False
-    flow, valid = irls_flow(offsets, times_s, mask, FlowConfig())
+    flow, valid = irls_flow(offsets, times_s, mask, IRLS)
     assert not valid
     assert flow.tolist() == [0, 0]
 
 
 def test_events_at_one_time_give_no_flow(dtype):
     offsets, times_s, mask = trails([100.0, 50.0], dtype=dtype)
-    flow, valid = irls_flow(offsets, torch.zeros_like(times_s), mask, FlowConfig())
+    flow, valid = irls_flow(offsets, torch.zeros_like(times_s), mask, IRLS)
     assert not valid
     assert flow.tolist() == [0, 0]
 
 
 def test_no_events_and_bad_numbers_give_no_flow_and_harm_no_neighbour(dtype):
     offsets, times_s, mask = trails([[100.0, 50.0], [1.0, 2.0], [100.0, 50.0]], dtype=dtype)
-    expected, _ = irls_flow(offsets[0], times_s[0], mask[0], FlowConfig())
+    expected, _ = irls_flow(offsets[0], times_s[0], mask[0], IRLS)
     mask[1] = False
     offsets[2, 3, 0] = torch.nan
-    flow, valid = irls_flow(offsets, times_s, mask, FlowConfig())
+    flow, valid = irls_flow(offsets, times_s, mask, IRLS)
     assert valid.tolist() == [True, False, False]
     assert flow[1:].tolist() == [[0, 0], [0, 0]]
     torch.testing.assert_close(flow[0], expected, rtol=1e-6, atol=0)
@@ -218,21 +221,26 @@ def test_pixels_that_never_fired_have_no_flow_and_the_map_is_left_as_it_was():
 # ---- flow of corners
 
 
-def corners_at(pixels, ages_us, mask, dtype):
-    """Corners of one object whose newest events are ``ages_us`` old."""
-    sensor, nothing = torch.tensor([pixels]), torch.zeros(1, len(pixels), 2, dtype=dtype)
+def points_at(pixels, ages_us, mask, dtype):
+    """Points of one object whose newest events are ``ages_us`` old."""
     age_s = torch.tensor([ages_us], dtype=torch.float64).to(dtype) * 1e-6
-    return Corners(sensor, sensor.to(dtype), age_s, torch.tensor([mask]), nothing, torch.zeros(1, len(pixels), dtype=torch.bool))
+    return SensorPoints(torch.tensor([pixels]), age_s, torch.zeros_like(age_s), torch.tensor([mask]))
 
 
 def test_corners_get_their_flow_from_their_own_event_on(dtype):
     """The edge is at 30 px now; what lies 10 px behind fired 25 ms ago, and has the same flow."""
-    last = sweeping_edge((1.0, 0.0), 400.0)
-    corners = corners_at([(30, 25), (20, 25), (30, 12)], [0, 25_000, 0], [True, True, False], dtype)
-    actual = estimate_flow(corners, last, torch.tensor([NOW_US]), torch.tensor([0]), table().to(dtype), FlowConfig())
-    assert actual.has_flow.tolist() == [[True, True, False]]
-    assert actual.flow.dtype == dtype
-    assert actual.flow[0, :2].tolist() == [pytest.approx([400.0, 0.0], abs=1.0)] * 2
-    assert actual.flow[0, 2].tolist() == [0, 0]
-    assert torch.equal(actual.sensor_pixels, corners.sensor_pixels)
-    assert not corners.has_flow.any()
+    maps = SensorMaps(sweeping_edge((1.0, 0.0), 400.0), no_bursts(1, 50, 60))
+    points = points_at([(30, 25), (20, 25), (30, 12)], [0, 25_000, 0], [True, True, False], dtype)
+    flow, has_flow = estimate_flow(points, maps, torch.tensor([NOW_US]), torch.tensor([0]), table().to(dtype), IRLS)
+    assert has_flow.tolist() == [[True, True, False]]
+    assert flow.dtype == dtype
+    assert flow[0, :2].tolist() == [pytest.approx([400.0, 0.0], abs=1.0)] * 2
+    assert flow[0, 2].tolist() == [0, 0]
+
+
+def test_the_model_says_which_map_is_looked_at(dtype):
+    """No burst is known, so that nothing has arrived anywhere."""
+    maps = SensorMaps(sweeping_edge((1.0, 0.0), 400.0), no_bursts(1, 50, 60))
+    points = points_at([(30, 25)], [0], [True], dtype)
+    for config, expected in ((IRLS, True), (FlowConfig(model="arrival"), False)):
+        assert estimate_flow(points, maps, torch.tensor([NOW_US]), torch.tensor([0]), table().to(dtype), config)[1].tolist() == [[expected]]

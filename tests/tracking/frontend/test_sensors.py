@@ -8,6 +8,7 @@ from torchtrack import Tracker
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, pad_streams
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.time_surface import empty_last_event, update_last_event
 
 BENT = Camera(180.0, 185.0, 70.0, 60.0, 160, 120, "plumb_bob", (-0.3, 0.1, 0.002, -0.001))
@@ -89,5 +90,5 @@ def test_without_corners_none_are_looked_for():
     config = TrackerConfig(corners=CornerConfig(max_corners=0))
     tracker = Tracker([box_model()], SMALL_CAMERA, config)
     contours = tracker.objects.contours(pose()[None].float(), config.contours)
-    nothing = empty_last_event(1, *tracker.image_size)
+    nothing = SensorMaps.empty(1, tracker.image_size, torch.device("cpu"))
     assert tracker.sensors.corners(contours, nothing, NOW_US[:1], torch.tensor([5e-3]), config).mask.shape == (1, 0)

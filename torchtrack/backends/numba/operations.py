@@ -1,11 +1,14 @@
 """All that the kernels accelerate: importing this registers it."""
 
 from torchtrack.backends.numba import (
+    arrival_flow,
     conclusion,
     contour_table,
     contours,
+    corner_response,
     events,
     filtering,
+    flow_agreement,
     forecast,
     hypotheses,
     index,
@@ -18,11 +21,14 @@ from torchtrack.backends.numba import (
 )
 
 __all__ = [
+    "arrival_flow",
     "conclusion",
     "contour_table",
     "contours",
+    "corner_response",
     "events",
     "filtering",
+    "flow_agreement",
     "forecast",
     "hypotheses",
     "index",

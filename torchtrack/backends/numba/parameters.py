@@ -44,6 +44,31 @@ class MatchingSettings(NamedTuple):
     observation_px: float
 
 
+class ArrivalSettings(NamedTuple):
+    """What :mod:`torchtrack.backends.numba.arrival_flow` goes by: constants of :mod:`torchtrack.tracking.frontend.arrival_flow`, and settings."""
+
+    span_us: int
+    min_pixels: int
+    plane_s: float
+    cut_off_us: int
+    bound: float
+    least_scale_s: float
+    least_determinant: float
+    slope_sigmas: float
+    least_spread_px2: float
+    least_slope2: float
+    long_ago_us: int
+    iterations: int
+
+
+class AgreementSettings(NamedTuple):
+    """What :mod:`torchtrack.backends.numba.flow_agreement` goes by: constants of :mod:`torchtrack.tracking.association.flow_agreement`."""
+
+    sigma_share: float
+    sigma_px_s: float
+    sigma_sine: float
+
+
 class RoundSettings(NamedTuple):
     """What :mod:`torchtrack.backends.numba.rounds` goes by beside that: settings, and constants of :mod:`estimation.levenberg_marquardt`."""
 

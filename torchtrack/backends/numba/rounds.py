@@ -158,7 +158,7 @@ def knows(config: TrackerConfig) -> bool:
     """Whether the kernel does all that is set: the settings of the preset ``default``, and most beside them."""
     matching, solver = config.association, config.solver
     usual = solver.prior and solver.iterations == 1 and solver.loss == "tukey" and config.contours.source == "mesh"
-    return usual and matching.search == "nearest" and matching.residual == "normal"
+    return usual and matching.search != "along_flow" and matching.residual == "normal"
 
 
 @accelerates(rounds.align_rounds, supports=lambda start, table, observations, gates, config: knows(config) and not start.extra_terms)

@@ -11,16 +11,17 @@ from kornia.feature import harris_response
 from kornia.filters import guided_blur
 from numpy import ndarray
 
+from torchtrack.backends.numba.corner_response import sliced_guided_filter, sliced_harris
 from torchtrack.bench.peers.comparison import Comparison, Work
 from torchtrack.bench.surface import WINDOW_US, random_events
 from torchtrack.config.tracker import SurfaceConfig
-from torchtrack.tracking.frontend.filters import FILTER_EPS, FILTER_SIZE_PX, sliced_guided_filter, sliced_harris
+from torchtrack.tracking.frontend.filters import FILTER_EPS, FILTER_SIZE_PX, HARRIS_K
 from torchtrack.tracking.frontend.time_surface import Regions, empty_last_event, time_surface, update_last_event
 
 # Width and height: an object's region, and the whole sensor.
 SIZES = ((208, 208), (640, 480))
 _TAU_S = SurfaceConfig().tau_s
-_HARRIS_K, _HARRIS_WINDOW_PX = 0.04, 7
+_HARRIS_WINDOW_PX = 7
 # Borders are treated differently (px).
 _BORDER_PX = 12
 
@@ -70,7 +71,7 @@ def _kornia_guided(image: torch.Tensor) -> Work:
 
 
 def _kornia_harris(image: torch.Tensor) -> Work:
-    return lambda: harris_response(image[:, None], _HARRIS_K)[0, 0].cpu()
+    return lambda: harris_response(image[:, None], HARRIS_K)[0, 0].cpu()
 
 
 def _opencv_guided(image: ndarray) -> Work:
@@ -81,4 +82,4 @@ def _opencv_guided(image: ndarray) -> Work:
 
 
 def _opencv_harris(image: ndarray) -> Work:
-    return lambda: cv2.cornerHarris(image, _HARRIS_WINDOW_PX, 3, _HARRIS_K)
+    return lambda: cv2.cornerHarris(image, _HARRIS_WINDOW_PX, 3, HARRIS_K)

@@ -8,51 +8,73 @@ from torch import Tensor
 
 from torchtrack.config.run import OverlayConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.events import pad_streams
+from torchtrack.core.windows import EventWindow
 from torchtrack.run.session import Session
 from torchtrack.run.stepping import Step
+from torchtrack.tracking.frontend.bursts import LONGEST_US, update_bursts
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
-from torchtrack.tracking.frontend.time_surface import empty_last_event, update_last_event
+from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.state import StepResult, each_tensor
 from torchtrack.viz import OverlayWriter, draw_overlay, overlay_objects
 
-# Corners that are drawn of each object, where the tracker makes no use of any.
+# Corners that are drawn of each object, where the tracker has none.
 _CORNERS = 32
 
 
 class Overlay:
     """Draws the windows that the video has a frame for into ``path``, such as ``overlay.mp4``.
 
-    Time surface, corners and their flow are found here: not every tracker needs them.
+    Corners and flow are those that the tracker made use of. Where it has none, some are found here, and the picture says so.
     """
 
     def __init__(self, path: Path, session: Session, config: OverlayConfig, tracker: TrackerConfig) -> None:
-        self._session, self._config = session, _with_corners(tracker)
+        self._session, self._config, self._note = session, _with_corners(tracker), note(tracker)
+        self._has_corners = tracker.corners.max_corners > 0
         first_stream = torch.zeros(len(session.models), dtype=torch.int64)
         self._sensors = Sensors(*sensor_tables([session.camera]), stream_index=first_stream, tiles=None)
-        self._last_event_us = empty_last_event(1, *self._sensors.image_size)
+        self._maps = SensorMaps.empty(1, self._sensors.image_size, torch.device("cpu"))
         self._writer = OverlayWriter(path, frames_per_second=config.frames_per_second, slow_motion=config.slow_motion, stills=config.stills)
 
     def add(self, step: Step) -> None:
         """Draw one step, if it is due."""
-        t_us, session = step.window.t_end_us, self._session
-        self._last_event_us = update_last_event(self._last_event_us, step.window.events)
+        window, session = step.window, self._session
+        t_us = window.t_end_us
+        self._maps = self._updated(window)
         if not self._writer.is_due(t_us):
             return
         truth = [trajectory.at(torch.tensor([t_us]))[0] if trajectory is not None else None for trajectory in session.ground_truth]
-        objects = overlay_objects(self._with_corners(step), session.models, session.camera, names=session.labels, true_poses=truth)
-        self._writer.add(t_us, draw_overlay(self._last_event_us[0], t_us, session.camera, objects))
+        result = each_tensor(Tensor.cpu, step.result)
+        result = result if self._has_corners else self._for_display(result, window)
+        objects = overlay_objects(result, session.models, session.camera, names=session.labels, true_poses=truth)
+        self._writer.add(t_us, draw_overlay(self._maps.last_event_us[0], t_us, session.camera, objects, note=self._note))
 
-    def _with_corners(self, step: Step) -> StepResult:
+    def _updated(self, window: EventWindow) -> SensorMaps:
+        """The maps of the sensor with a window more; of bursts where they are looked at."""
+        last_event_us, t_us = update_last_event(self._maps.last_event_us, window.events), torch.tensor([window.t_end_us])
+        if self._has_corners:
+            return replace(self._maps, last_event_us=last_event_us)
+        elapsed_us, events = torch.tensor([window.t_end_us - window.t_start_us]), pad_streams(window.events, 1, t_us)
+        return SensorMaps(last_event_us, update_bursts(self._maps.burst_age_us, elapsed_us, events, LONGEST_US)[0])
+
+    def _for_display(self, result: StepResult, window: EventWindow) -> StepResult:
         """The result of a step with the corners around its contours and their flow."""
-        result, window = each_tensor(Tensor.cpu, step.result), step.window
-        window_s = torch.tensor([1e-6 * (window.t_end_us - window.t_start_us)])
-        t_us = torch.tensor([window.t_end_us])
-        corners = self._sensors.corners(result.contours, self._last_event_us, t_us, window_s, self._config)
-        return replace(result, corners=self._sensors.with_flow(corners, self._last_event_us, t_us, self._config))
+        window_s, t_us = torch.tensor([1e-6 * (window.t_end_us - window.t_start_us)]), torch.tensor([window.t_end_us])
+        corners = self._sensors.corners(result.contours, self._maps, t_us, window_s, self._config)
+        flow, has_flow = self._sensors.flow(corners.points, self._maps, t_us, self._config)
+        return replace(result, corners=replace(corners, flow=flow, has_flow=has_flow))
 
     def close(self) -> None:
         """Finish the video."""
         self._writer.close()
+
+
+def note(tracker: TrackerConfig) -> str:
+    """What is drawn in yellow, in words."""
+    if not tracker.corners.max_corners:
+        return "yellow: corners and their normal flow, not used in tracking"
+    return "yellow: corners" if tracker.association.search == "nearest" else "yellow: corners and their flow"
 
 
 def _with_corners(config: TrackerConfig) -> TrackerConfig:

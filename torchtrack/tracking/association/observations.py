@@ -1,6 +1,6 @@
 """What is matched with contours: recent events near them, and corners where there are any."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,7 +11,7 @@ from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.padded import take_points
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.frontend.corners import Corners
-from torchtrack.tracking.frontend.window_events import ObjectEvents
+from torchtrack.tracking.frontend.window_events import GOLDEN_RATIO, ObjectEvents
 
 # Lots are drawn for a little less than what there is room for, as their number varies.
 FILL = 0.95
@@ -41,9 +41,8 @@ class Observations:
 
 
 def corner_observations(corners: Corners) -> Observations:
-    """The corners as observations; their polarity is not known."""
-    unknown = torch.zeros_like(corners.age_s)
-    return Observations(corners.pixels, corners.age_s, unknown, corners.mask, corners.flow, corners.has_flow)
+    """The corners as observations."""
+    return Observations(corners.pixels, corners.age_s, corners.polarity, corners.mask, corners.flow, corners.has_flow)
 
 
 @accelerable
@@ -71,10 +70,17 @@ def event_observations(values: Float[Tensor, "b c 4"], exists: Bool[Tensor, "b c
 
 def join(first: Observations, second: Observations) -> Observations:
     """Observations of both, for each object; none has been judged yet."""
-    if first.mask.shape[1] == 0:
-        return second
     names = [name for name in vars(first) if name != "trust"]
     return Observations(*(_one_after_the_other(getattr(first, name), getattr(second, name)) for name in names))
+
+
+def filled_up(corners: Observations, events: Observations, count: int) -> Observations:
+    """Corners, and as many events beside them, spread evenly over all that are given, as make up ``count`` where corners are fewer."""
+    if corners.mask.shape[1] == 0:
+        return events
+    room, given = count - corners.mask.sum(-1, keepdim=True), events.mask.sum(-1, keepdim=True)
+    lot = (torch.arange(events.mask.shape[1], device=events.mask.device) * GOLDEN_RATIO).frac()
+    return join(corners, replace(events, mask=events.mask & (lot < room / given.clamp(min=1))))
 
 
 def _one_after_the_other(first: Tensor, second: Tensor) -> Tensor:

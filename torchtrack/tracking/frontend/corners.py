@@ -11,9 +11,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.components import Component
-from torchtrack.config.tracker import CornerConfig, SurfaceConfig, TrackerConfig
+from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.tracking.frontend.filters import FILTER_SIZE_PX, corner_response
+from torchtrack.tracking.frontend.flow import SensorPoints
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.time_surface import Regions, at_pixels
 
 # Least Harris response of a corner, as a share of the region's largest: set with the first corners, and not measured alone.
@@ -22,8 +24,8 @@ RELATIVE_THRESHOLD = 1e-3
 _SNAP_PX = 1
 # Sobel, Harris window and local maximum reach this far into a region from its border (px), beside the guided filter.
 _RESPONSE_REACH_PX = 6
-# Large temporaries page-fault on the CPU: regions are filtered this many at a time.
-_CHUNK = 8
+# Where cells are smaller than the neighbourhood that a corner is the largest of (px), one in each is asked for, and no more.
+_LARGEST_OF_PX = 5
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class Corners:
         mask: which entries are corners.
         flow: velocity (px/s); zero where there is none.
         has_flow: where the flow was estimated.
+        polarity: of the edge that came there last: +1 where it got brighter, -1 where darker.
     """
 
     sensor_pixels: Int[Tensor, "b n 2"]
@@ -45,13 +48,12 @@ class Corners:
     mask: Bool[Tensor, "b n"]
     flow: Float[Tensor, "b n 2"]
     has_flow: Bool[Tensor, "b n"]
+    polarity: Float[Tensor, "b n"]
 
-
-def _response(surface: Float[Tensor, "b h w"], config: SurfaceConfig) -> Float[Tensor, "b h w"]:
-    """Harris response of the filtered surface, a few regions at a time."""
-    if surface.device.type != "cpu":
-        return corner_response(surface, config)
-    return torch.cat([corner_response(part, config) for part in surface.split(_CHUNK)])
+    @property
+    def points(self) -> SensorPoints:
+        """Where they are on the sensor, and when."""
+        return SensorPoints(self.sensor_pixels, self.age_s, self.polarity, self.mask)
 
 
 def select_corners(response: Float[Tensor, "b h w"], regions: Regions, config: CornerConfig) -> tuple[Int[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
@@ -68,9 +70,11 @@ def select_corners(response: Float[Tensor, "b h w"], regions: Regions, config: C
     within = _values_around(own, first_u, first_v, step).argmax(-1)
     u, v = first_u + within % cell, first_v + torch.div(within, cell, rounding_mode="floor")
     strong = best > RELATIVE_THRESHOLD * best[:, :1]
-    # The largest of its 5x5 neighbourhood.
-    largest = best >= _values_around(own, u, v, torch.arange(-2, 3, device=response.device)).amax(-1)
-    return torch.stack([u, v], -1), strong & (best > 0) & largest
+    corners = strong & (best > 0)
+    if cell >= _LARGEST_OF_PX:
+        reach = _LARGEST_OF_PX // 2
+        corners &= best >= _values_around(own, u, v, torch.arange(-reach, reach + 1, device=response.device)).amax(-1)
+    return torch.stack([u, v], -1), corners
 
 
 def _own_area(response: Tensor, regions: Regions, reach: int) -> Tensor:
@@ -110,7 +114,7 @@ def snap_to_newest(
 def detect_corners(
     surface: Float[Tensor, "b h w"],
     regions: Regions,
-    last_event_us: Int[Tensor, "s sensor_h sensor_w"],
+    maps: SensorMaps,
     t_us: Int[Tensor, "s"],
     window_s: Float[Tensor, "s"],
     ideal_pixels: Float[Tensor, "s sensor_h sensor_w 2"],
@@ -119,26 +123,30 @@ def detect_corners(
     """Corners of each object's region: filtered surface, Harris, even selection, snapped to the newest event.
 
     Args:
-        window_s: length of the window of each stream; older corners are dropped.
+        maps: of the sensors at ``t_us``.
+        window_s: length of the window of each stream; only pixels that fired within it are corners.
         ideal_pixels: undistortion table of each stream.
     """
-    local, mask = select_corners(_response(surface, config.surface), regions, config.corners)
-    _, height, width = last_event_us.shape
+    response, stream = corner_response(surface), regions.stream_index[:, None]
+    if config.uses(Component.FRESH_CORNERS):
+        # Before the choice: what is too old takes no place.
+        response = torch.where(surface > torch.exp(window_s / -config.surface.tau_s)[stream, None], response, 0)
+    local, mask = select_corners(response, regions, config.corners)
+    _, height, width = maps.last_event_us.shape
     sensor = local + regions.origin[:, None]
     on_it = torch.minimum(sensor.clamp(min=0), constant((width - 1, height - 1), sensor.dtype, sensor.device))
     mask = mask & (on_it == sensor).all(-1)
     reach_px = _SNAP_PX if config.uses(Component.CORNER_SNAP) else 0
-    sensor, newest_us = snap_to_newest(on_it, last_event_us, regions.stream_index, reach_px)
-    stream = regions.stream_index[:, None]
+    sensor, newest_us = snap_to_newest(on_it, maps.last_event_us, regions.stream_index, reach_px)
     age_s = ((t_us[stream] - newest_us).clamp(0, 10**9) * 1e-6).to(surface.dtype)
-    if config.uses(Component.FRESH_CORNERS):
-        mask = mask & (age_s < window_s[stream])
     pixels = at_pixels(ideal_pixels, stream, sensor[..., 0], sensor[..., 1])
-    return Corners(sensor, pixels, age_s, mask, torch.zeros_like(pixels), torch.zeros_like(mask))
+    off_us, on_us = (at_pixels(maps.burst_age_us.flatten(0, 1), 2 * stream + number, sensor[..., 0], sensor[..., 1]) for number in range(2))
+    polarity = torch.where(on_us < off_us, 1.0, -1.0).to(age_s.dtype)
+    return Corners(sensor, pixels, age_s, mask, torch.zeros_like(pixels), torch.zeros_like(mask), polarity)
 
 
 def no_corners(like: Float[Tensor, "b m 2"]) -> Corners:
     """Corners of nothing, for objects of the same number, type and device as ``like``."""
     none = like.new_zeros(len(like), 0, 2)
     mask = torch.zeros(len(like), 0, dtype=torch.bool, device=like.device)
-    return Corners(none.long(), none, none[..., 0], mask, none, mask)
+    return Corners(none.long(), none, none[..., 0], mask, none, mask, none[..., 0])

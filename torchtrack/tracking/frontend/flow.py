@@ -1,6 +1,6 @@
-"""From corners to their event flow: iteratively reweighted least squares with bisquare weights (Eq. 6-11)."""
+"""From corners and events to their flow: iteratively reweighted least squares with bisquare weights (Eq. 6-11), or arrival flow."""
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -8,7 +8,8 @@ from torch import Tensor
 
 from torchtrack.config.tracker import FlowConfig
 from torchtrack.core.constants import disc
-from torchtrack.tracking.frontend.corners import Corners
+from torchtrack.tracking.frontend.arrival_flow import arrival_flow
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.time_surface import at_pixels
 
 # b of the bisquare weight (Eq. 8), in units of the residual's scale: the paper's.
@@ -84,16 +85,40 @@ def _weighted_flow(offsets: Float[Tensor, "*b 2 k"], times_s: Float[Tensor, "*b 
     return (offsets @ weighted_time) / lever.clamp(min=1e-12)
 
 
+@dataclass(frozen=True)
+class SensorPoints:
+    """Corners and events on the sensor, padded.
+
+    Args:
+        sensor_pixels: integer sensor pixels (u, v).
+        age_s: time from the event there to the window's end (s).
+        polarity: of the event, 1 or -1; 0 where it is not known.
+        mask: which entries exist.
+    """
+
+    sensor_pixels: Int[Tensor, "b n 2"]
+    age_s: Float[Tensor, "b n"]
+    polarity: Float[Tensor, "b n"]
+    mask: Bool[Tensor, "b n"]
+
+
 def estimate_flow(
-    corners: Corners,
-    last_event_us: Int[Tensor, "s h w"],
+    points: SensorPoints,
+    maps: SensorMaps,
     t_us: Int[Tensor, "s"],
     stream_index: Int[Tensor, "b"],
     ideal_pixels: Float[Tensor, "s h w 2"],
     config: FlowConfig,
-) -> Corners:
-    """The corners at ``t_us`` with their flow."""
-    event_us = t_us[stream_index, None] - (corners.age_s.double() * 1e6).round().long()
-    flow, valid = irls_flow(*newest_events_around(corners.sensor_pixels, event_us, last_event_us, stream_index, ideal_pixels, config), config)
-    has_flow = valid & corners.mask
-    return replace(corners, flow=torch.where(has_flow[..., None], flow, torch.zeros_like(flow)), has_flow=has_flow)
+) -> tuple[Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
+    """Flow of each point (ideal px/s) by the model that is set, and where there is one; zero elsewhere.
+
+    Args:
+        maps: of the sensors at ``t_us``.
+    """
+    if config.model == "arrival":
+        return arrival_flow(points.sensor_pixels, points.polarity, points.mask, maps.burst_age_us, stream_index, ideal_pixels, config)
+    event_us = t_us[stream_index, None] - (points.age_s.double() * 1e6).round().long()
+    around = newest_events_around(points.sensor_pixels, event_us, maps.last_event_us, stream_index, ideal_pixels, config)
+    flow, valid = irls_flow(*around, config)
+    has_flow = valid & points.mask
+    return torch.where(has_flow[..., None], flow, 0), has_flow

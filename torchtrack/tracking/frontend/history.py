@@ -31,14 +31,18 @@ class History:
 
     def age_s(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n"]:
         """Time since the newest event (s) at ideal pixels, rounded to whole ones; huge where there never was any."""
-        stream = self.stream_index[:, None]
-        number = at_pixels(self.sensor_numbers, stream, *_in_table(self.sensor_numbers, pixels))
+        stream, number = self.stream_index[:, None], numbers_of(self.sensor_numbers, self.stream_index, pixels)
         return (self.t_us[stream] - by_number(self.last_event_us, stream, number)).to(pixels.dtype) * 1e-6
 
 
 def on_sensor(sensor_pixels: Float[Tensor, "s bh bw 2"], stream_index: Int[Tensor, "b"], pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
     """Where the lens puts ideal pixels."""
     return at_pixels(sensor_pixels, stream_index[:, None], *_in_table(sensor_pixels, pixels))
+
+
+def numbers_of(sensor_numbers: Int[Tensor, "s bh bw"], stream_index: Int[Tensor, "b"], pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n"]:
+    """Numbers of the sensor pixels nearest to ideal ones, by the table from :func:`pixel_numbers`."""
+    return at_pixels(sensor_numbers, stream_index[:, None], *_in_table(sensor_numbers, pixels))
 
 
 def pixel_numbers(sensor_pixels: Float[Tensor, "s bh bw 2"], image_size: tuple[int, int]) -> Int[Tensor, "s bh bw"]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -18,8 +18,9 @@ from torchtrack.core.events import PaddedEvents, check_on_sensor, pad_streams
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.bursts import update_bursts
 from torchtrack.tracking.frontend.corners import Corners, detect_corners, no_corners
-from torchtrack.tracking.frontend.flow import estimate_flow
-from torchtrack.tracking.frontend.history import BORDER_PX, History, on_sensor, pixel_numbers
+from torchtrack.tracking.frontend.flow import SensorPoints, estimate_flow
+from torchtrack.tracking.frontend.history import BORDER_PX, History, numbers_of, on_sensor, pixel_numbers
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 from torchtrack.tracking.frontend.time_surface import at_pixels, object_regions, time_surface
 from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
@@ -118,22 +119,25 @@ class Sensors:
         each = [value.expand(len(self.stream_index), *value.shape[1:]) if streams == 1 else value[self.stream_index] for value in values]
         return WindowEvents(each[0], each[1], each[2], each[3], each[4], None if number is None else number.expand_as(each[1]))
 
-    def corners(
-        self, contours: Contours, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], window_s: Float[Tensor, "s"], config: TrackerConfig
-    ) -> Corners:
-        """Corners of the time surface around each object's contours, with their flow where it is made use of."""
+    def corners(self, contours: Contours, maps: SensorMaps, t_us: Int[Tensor, "s"], window_s: Float[Tensor, "s"], config: TrackerConfig) -> Corners:
+        """Corners of the time surface around each object's contours, without their flow; ``maps`` are those at ``t_us``."""
         if config.corners.max_corners == 0:
             return no_corners(contours.pixels)
-        along_flow = config.association.search == "along_flow"
-        margin_px = _ALONG_FLOW_MARGIN_PX if along_flow else REGION_MARGIN_PX
+        margin_px = _ALONG_FLOW_MARGIN_PX if config.association.search == "along_flow" else REGION_MARGIN_PX
         regions = object_regions(self.on_sensor(contours.pixels), contours.mask, self.stream_index, self.image_size, margin_px, _MAX_REGION_PX)
-        surface = time_surface(last_event_us, t_us, regions, config.surface.tau_s, self.ideal_pixels.dtype)
-        corners = detect_corners(surface, regions, last_event_us, t_us, window_s, self.ideal_pixels, config)
-        return self.with_flow(corners, last_event_us, t_us, config) if along_flow else corners
+        surface = time_surface(maps.last_event_us, t_us, regions, config.surface.tau_s, self.ideal_pixels.dtype)
+        return detect_corners(surface, regions, maps, t_us, window_s, self.ideal_pixels, config)
 
-    def with_flow(self, corners: Corners, last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], config: TrackerConfig) -> Corners:
-        """The corners at ``t_us`` with their flow."""
-        return estimate_flow(corners, last_event_us, t_us, self.stream_index, self.ideal_pixels, config.flow)
+    def flow(
+        self, points: SensorPoints, maps: SensorMaps, t_us: Int[Tensor, "s"], config: TrackerConfig
+    ) -> tuple[Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
+        """Flow of points of the sensor (px/s), and where there is one; ``maps`` are those at ``t_us``."""
+        return estimate_flow(points, maps, t_us, self.stream_index, self.ideal_pixels, config.flow)
+
+    def nearest_pixels(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n 2"]:
+        """Columns and rows of the sensor pixels nearest to ideal ones."""
+        number, width = numbers_of(self.sensor_numbers, self.stream_index, pixels).long(), self.image_size[1]
+        return torch.stack([number % width, torch.div(number, width, rounding_mode="floor")], -1)
 
     def on_sensor(self, pixels: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n 2"]:
         """Where the lens puts ideal pixels."""
