@@ -29,7 +29,7 @@ from scenes import DURATION_US, SCENES, write_scenes
 REPOSITORY = Path(__file__).resolve().parents[2]
 PINNED = REPOSITORY / "tests" / "pins" / "base"
 # Lengths of windows (µs), as the presets have them.
-WINDOW_US = {"default": 5_000, "paper": 3_000, "nns": 3_000, "line": 3_000}
+WINDOW_US = {"default": 5_000, "guided": 5_000, "paper": 3_000, "nns": 5_000, "line": 3_000}
 
 
 @dataclass(frozen=True)
