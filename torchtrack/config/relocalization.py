@@ -41,3 +41,8 @@ class RelocalizationConfig(Settings):
     )
     accept_margin: float = Field(0.1, ge=0, le=1, description="By how much the score of a pose near the prediction must be better to be accepted.")
     accept_ratio: float = Field(0.9, ge=0, le=1, description="Share of what an object explains when seen well that is asked of a pose elsewhere.")
+    everywhere_after_us: int = Field(
+        1_000_000,
+        ge=0,
+        description="What was lost for so long is searched for in the whole image and all rotations, a part of that in each window (µs); 0: never.",
+    )

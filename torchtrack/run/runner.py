@@ -24,6 +24,7 @@ from torchtrack.run.executor import TaskFailure, Tell
 from torchtrack.run.executor.groups import run_in_groups
 from torchtrack.run.executor.tasks import without_errors
 from torchtrack.run.interrupt import Interrupt
+from torchtrack.run.lost_search import LostSearch
 from torchtrack.run.outputs import RunOutputs
 from torchtrack.run.refine import Refinement, refined_steps
 from torchtrack.run.session import Session
@@ -70,7 +71,7 @@ def track(
         chunks = mended_batches(chunks, camera.width, camera.height, problems or Problems("the stream", strict=False))
     seen, config = False, window or tracker.config.window
     objects = SmoothedObjects(tracker.centre_obj.double().cpu(), tracker.diameter_m.double().cpu(), tracker.intrinsics.double().cpu())
-    taken = steps(cut_windows(clipped(chunks, start_us), start_us, config), tracker, state)
+    taken = steps(cut_windows(clipped(chunks, start_us), start_us, config), tracker, state, LostSearch(tracker))
     refinement = Refinement(objects, tracker.config, tracker.alone)
     for step in taken if isinstance(source, LiveSource) else refined_steps(taken, refinement):
         seen = True

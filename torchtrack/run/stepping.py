@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Int
@@ -59,13 +60,31 @@ def window_cutter(t_start_us: int, config: WindowConfig) -> TimeWindows | CountW
     return TimeWindows(config.duration_us, t_start_us)
 
 
-def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState) -> Iterator[Step]:
-    """One step per window; nothing is recorded for gradients."""
+@runtime_checkable
+class Between(Protocol):
+    """What is done between the windows of a stream."""
+
+    def after(self, window: EventWindow, state: TrackerState) -> TrackerState:
+        """The state to go on from after a window."""
+        ...
+
+
+def steps(windows: Iterable[EventWindow], tracker: Tracker, state: TrackerState, between: Between | None = None) -> Iterator[Step]:
+    """One step per window, and what is done ``between`` them; nothing is recorded for gradients."""
     for window in windows:
         if window.after_gap:
             state = passed_over(tracker, state, torch.full_like(state.t_us, window.t_start_us))
         state, result, taken = timed_step(tracker, state, window.events, window.t_end_us)
-        yield Step(window, state, result, taken.seconds, taken.stages)
+        onward, more_seconds = (state, 0.0) if between is None else timed_between(between, window, state)
+        yield Step(window, state, result, taken.seconds + more_seconds, taken.stages)
+        state = onward
+
+
+def timed_between(between: Between, window: EventWindow, state: TrackerState) -> tuple[TrackerState, float]:
+    """The state to go on from after a window, and how long it took to come by it (s)."""
+    begun = time.perf_counter()
+    state = between.after(window, state)
+    return state, time.perf_counter() - begun
 
 
 def passed_over(tracker: Tracker, state: TrackerState, t_us: Int[Tensor, "s"]) -> TrackerState:

@@ -4,6 +4,7 @@ from torchtrack.config.tracker import WindowConfig
 from torchtrack.core.events import EventBatch, ForeignEvents, as_batch, check_events
 from torchtrack.core.windows import CountWindows, EventWindow, TimeWindows
 from torchtrack.errors import ConfigError, EventDataError
+from torchtrack.run.lost_search import LostSearch
 from torchtrack.run.stepping import steps, window_cutter
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.tracker import Tracker
@@ -39,7 +40,7 @@ class Stream:
         self.state, self._tracker = state, tracker
         self._start_us = self._newest_us = int(state.t_us[0])
         self._windows: TimeWindows | CountWindows = window_cutter(self._start_us, window or tracker.config.window)
-        self._count = 0
+        self._count, self._lost = 0, LostSearch(tracker)
         tracker.prepare(state)
 
     def push(self, events: EventBatch | ForeignEvents) -> list[StepResult]:
@@ -79,8 +80,9 @@ class Stream:
 
     def _track(self, windows: list[EventWindow]) -> list[StepResult]:
         results = []
-        for step in steps(windows, self._tracker, self.state):
-            self.state = step.state
+        for window in windows:
+            (step,) = steps([window], self._tracker, self.state)
+            self.state = self._lost.after(window, step.state)
             results.append(step.result)
         return results
 

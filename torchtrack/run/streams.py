@@ -19,10 +19,11 @@ from torchtrack.core.events import concatenate
 from torchtrack.core.windows import EventWindow
 from torchtrack.errors import ConfigError, TorchtrackError
 from torchtrack.run.haste import Pace
+from torchtrack.run.lost_search import LostSearch
 from torchtrack.run.refine import Refinement
 from torchtrack.run.session import Session
 from torchtrack.run.smooth import SmoothedObjects
-from torchtrack.run.stepping import Step, passed_over, timed_step
+from torchtrack.run.stepping import Step, passed_over, timed_between, timed_step
 from torchtrack.tracking.state import StepResult, TrackerState, joined, take_part
 from torchtrack.tracking.tracker import Tracker
 
@@ -217,6 +218,7 @@ def _steps(followers: Mapping[int, Follower[R]], config: TrackingConfig) -> Iter
 def _one_batch(streams: Sequence[_Stream], config: TrackingConfig) -> Iterator[tuple[int, Step | Ended]]:
     """The steps of streams whose windows are one batch, as long as there are any."""
     tracker, state, rows = _together(streams, config)
+    searches = [LostSearch(tracker, place) for place in range(len(streams))]
     # Before the first window is asked for: a live camera does not wait.
     tracker.prepare(state)
     pace = Pace(tracker)
@@ -231,17 +233,22 @@ def _one_batch(streams: Sequence[_Stream], config: TrackingConfig) -> Iterator[t
             streams = [stream for stream, _ in due]
             tracker, state, rows = _together(streams, config)
             pace, result = Pace(tracker), None
+            searches = [LostSearch(tracker, place) for place in range(len(streams))]
         events = concatenate(window.events.of_stream(place) for place, (_, window) in enumerate(due))
         t_end_us = torch.tensor([window.t_end_us for _, window in due], device=config.device)
         if any(window.after_gap for _, window in due):
             starts_us = [window.t_start_us if window.after_gap else 0 for _, window in due]
             state = passed_over(tracker, state, torch.tensor(starts_us, device=config.device))
         taker = pace.tracker([window for _, window in due], result)
-        state, result, taken = timed_step(taker, state, events, t_end_us)
-        share = taken.part(len(due))
-        for (stream, window), own in zip(due, rows, strict=True):
-            stream.state = take_part(state, *own)
-            yield stream.number, Step(window, stream.state, take_part(result, *own), share.seconds, share.stages)
+        state, result, spent = timed_step(taker, state, events, t_end_us)
+        share, taken = spent.part(len(due)), []
+        for (stream, window), own, search in zip(due, rows, searches, strict=True):
+            own_state, own_result = take_part(state, *own), take_part(result, *own)
+            stream.state, more_seconds = timed_between(search, window, own_state)
+            taken.append((stream, Step(window, own_state, own_result, share.seconds + more_seconds, share.stages)))
+        if any(stream.state is not step.state for stream, step in taken):
+            state = joined([stream.state for stream, _ in taken])
+        yield from ((stream.number, step) for stream, step in taken)
 
 
 def _together(streams: Sequence[_Stream], config: TrackingConfig) -> tuple[Tracker, TrackerState, list[tuple[slice, slice]]]:

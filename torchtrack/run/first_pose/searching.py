@@ -10,11 +10,12 @@ from torchtrack.errors import EventDataError, PoseError
 from torchtrack.object_model.rotational_symmetry import rotation_group
 from torchtrack.run.first_pose.event_lines import EventLines
 from torchtrack.run.first_pose.outlines import ViewedObject
+from torchtrack.run.first_pose.parts import Parts, finished
 from torchtrack.run.first_pose.rotations import all_rotations, rotations_around
 from torchtrack.run.first_pose.search_view import BOX_PX, SIDE_PX, SearchView
 from torchtrack.run.first_pose.start import Box, Start, box_of_events
 from torchtrack.run.first_pose.tracked import FOLLOWED_US, FirstPose, best_followed
-from torchtrack.run.first_pose.trials import Trials, search
+from torchtrack.run.first_pose.trials import Trials, search_in_parts
 
 # Events that are looked at, for each pixel around the box, and how many at least and at most; and the longest time of them (s).
 _EVENTS_PER_PX, _FEWEST, _MOST = 12, 300, 100_000
@@ -33,7 +34,16 @@ def pose_in_box(start: Start, box: Box | None = None) -> FirstPose:
     Raises:
         EventDataError: if there are too few events in the box.
     """
-    box = box or box_of_events(start, _MOST)
+    return best_followed(start, finished(poses_in_box(start, box or box_of_events(start, _MOST))))
+
+
+def poses_in_box(start: Start, box: Box) -> Parts[Float[Tensor, "n 4 4"]]:
+    """Poses of an object in a box of the image that are worth being followed, one of which is most likely right.
+
+    Raises:
+        EventDataError: if there are too few events in the box.
+        PoseError: if the object fills a box of this shape in no rotation.
+    """
     view = SearchView.of_box(start.camera, box)
     viewed = ViewedObject.of_model(start.model, view.camera)
     # As far away that its diameter fills the box: outlines are taken from there.
@@ -64,7 +74,7 @@ def _around(start: Start, T_cam_obj: Float[Tensor, "4 4"], turn_deg: tuple[float
     centre_px = project(centre, viewed.intrinsics[0].double())[0].float()
     rotations = rotations_around(T_view_obj[:3, :3], *turn_deg)
     trials = Trials(rotations, float(centre[0, 2]), scales, torch.cartesian_prod(steps, steps), centre_px, view.box)
-    return _searched(start, box.grown(0.1), view, viewed, trials)
+    return best_followed(start, finished(_searched(start, box.grown(0.1), view, viewed, trials)))
 
 
 def projected_box(start: Start, T_cam_obj: Float[Tensor, "4 4"]) -> Box:
@@ -79,10 +89,11 @@ def projected_box(start: Start, T_cam_obj: Float[Tensor, "4 4"]) -> Box:
     return Box.around(project(points_cam, start.camera.intrinsics(torch.float64)))
 
 
-def _searched(start: Start, box: Box, view: SearchView, viewed: ViewedObject, trials: Trials) -> FirstPose:
+def _searched(start: Start, box: Box, view: SearchView, viewed: ViewedObject, trials: Trials) -> Parts[Float[Tensor, "n 4 4"]]:
     lines = lines_in(start, box, view)
-    best = search(trials, viewed, lines, rotation_group(start.model))
-    return best_followed(start, view.to_camera(best.best(_FOLLOWED).T_view_obj))
+    yield
+    best = yield from search_in_parts(trials, viewed, lines, rotation_group(start.model))
+    return view.to_camera(best.best(_FOLLOWED).T_view_obj)
 
 
 def lines_in(start: Start, box: Box, view: SearchView) -> EventLines:

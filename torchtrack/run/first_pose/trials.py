@@ -5,6 +5,7 @@ themselves hardly fire, and count less.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +17,7 @@ from torchtrack.errors import PoseError
 from torchtrack.object_model.rotational_symmetry import RotationGroup
 from torchtrack.run.first_pose.event_lines import EventLines, direction_of, near_events
 from torchtrack.run.first_pose.outlines import ViewedObject
+from torchtrack.run.first_pose.parts import Parts
 from torchtrack.run.first_pose.start import Box
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.relocalization.edge_search import FAR_PX, NEAR_PX
@@ -30,6 +32,8 @@ _SHAPE = math.log(1.45)
 _FEWEST_POINTS = 3
 # Best of the first look that are compared, and those of them that are pulled, once and again.
 _COMPARED, _PULLED, _PULLED_AGAIN = 3000, 192, 64
+# Pulled at a time: what is not to be held up for long is searched for in parts.
+_PULLED_TOGETHER = 64
 # Poses with rotations this near to a better one's are left out (degrees): at first, and when they are pulled.
 _APART_DEG, _SAME_DEG = 7.0, 3.0
 # Events lie on an outline that comes through their cell of so many pixels, or through the next one: at a first look, and at the last.
@@ -67,6 +71,11 @@ class Scored:
     T_view_obj: Float[Tensor, "n 4 4"]
     score: Float[Tensor, "n"]
 
+    @classmethod
+    def joined(cls, parts: Sequence["Scored"]) -> "Scored":
+        """The poses of all parts."""
+        return cls(torch.cat([some.T_view_obj for some in parts]), torch.cat([some.score for some in parts]))
+
     def best(self, count: int) -> "Scored":
         """Those with the highest scores."""
         chosen = self.score.topk(min(count, len(self.score))).indices
@@ -85,19 +94,29 @@ class Scored:
         return Scored(self.T_view_obj[kept], self.score[kept])
 
 
-def search(trials: Trials, viewed: ViewedObject, lines: EventLines, group: RotationGroup) -> Scored:
+def search_in_parts(trials: Trials, viewed: ViewedObject, lines: EventLines, group: RotationGroup) -> Parts[Scored]:
     """The best of what is tried, pulled onto the events.
 
     Raises:
         PoseError: if the object fills a box of this shape in no rotation.
     """
-    first = _looked_at(trials, viewed, lines).best(_COMPARED).apart(group, _APART_DEG, _PULLED)
+    looked_at = yield from _looked_at(trials, viewed, lines)
+    first = looked_at.best(_COMPARED).apart(group, _APART_DEG, _PULLED)
     if len(first.score) == 0:
         raise PoseError(f"in no rotation the object fills a box of this shape. {_LOOK}")
-    T = viewed.pulled(first.T_view_obj, lines.density, FAR_PX)
-    again = scored(T, viewed, lines).apart(group, _SAME_DEG, _PULLED_AGAIN)
-    T = viewed.pulled(again.T_view_obj, lines.density, NEAR_PX)
-    return scored(T, viewed, lines).apart(group, _SAME_DEG, _PULLED_AGAIN)
+    yield
+    again = (yield from _pulled(first, viewed, lines, FAR_PX)).apart(group, _SAME_DEG, _PULLED_AGAIN)
+    pulled = yield from _pulled(again, viewed, lines, NEAR_PX)
+    return pulled.apart(group, _SAME_DEG, _PULLED_AGAIN)
+
+
+def _pulled(some: Scored, viewed: ViewedObject, lines: EventLines, reaches_px: tuple[float, ...]) -> Parts[Scored]:
+    """Poses pulled onto the events, and scored there."""
+    parts = []
+    for T in some.T_view_obj.split(_PULLED_TOGETHER):
+        parts.append(scored(viewed.pulled(T, lines.density, reaches_px), viewed, lines))
+        yield
+    return Scored.joined(parts)
 
 
 def scored(T_view_obj: Float[Tensor, "n 4 4"], viewed: ViewedObject, lines: EventLines) -> Scored:
@@ -109,10 +128,13 @@ def scored(T_view_obj: Float[Tensor, "n 4 4"], viewed: ViewedObject, lines: Even
     return Scored(T_view_obj, ratio + covered_share(outlines.pixels, outlines.mask, lines, _FINE_CELL_PX))
 
 
-def _looked_at(trials: Trials, viewed: ViewedObject, lines: EventLines) -> Scored:
+def _looked_at(trials: Trials, viewed: ViewedObject, lines: EventLines) -> Parts[Scored]:
     """The best scale and shift of each rotation."""
-    parts = [_best_places(trials, rotations, outlines, viewed, lines) for rotations, outlines in viewed.by_view(trials.rotations, trials.depth_m)]
-    return Scored(torch.cat([some.T_view_obj for some in parts]), torch.cat([some.score for some in parts]))
+    parts = []
+    for rotations, outlines in viewed.by_view(trials.rotations, trials.depth_m):
+        parts.append(_best_places(trials, rotations, outlines, viewed, lines))
+        yield
+    return Scored.joined(parts)
 
 
 def _best_places(trials: Trials, rotations: Float[Tensor, "n 3 3"], outlines: Contours, viewed: ViewedObject, lines: EventLines) -> Scored:
