@@ -111,7 +111,7 @@ def test_the_printed_plate_shows_its_print_and_the_ellipsoid_none(tmp_path):
 def test_every_scene_preset_precision_and_way_is_run_and_what_cannot_be_is_left_out():
     script = tool("same_digits")
     runs = script.all_runs()
-    assert len(runs) == 6 * 4 * 2 * 2 - 4 + 5
+    assert len(runs) == 6 * 5 * 2 * 2 - 4 + 5
     assert not [run for run in runs if run.scene == "smooth object" and run.preset == "line"]
     short = script.short_runs()
     assert {run.scene for run in short} == set(tool("scenes").SCENES)
