@@ -57,7 +57,7 @@ def test_notes_are_what_a_run_would_warn_of(tmp_path, capsys):
     [
         (("nowhere.ply",), "does not exist"),
         (("box.stl", "--unit", "m"), "141 m across with unit='m'"),
-        (("box.stl", "-o", "box.jpg"), "the picture of a model is a .png file"),
+        (("box.stl", "-o", "box.jpg"), "pictures are .png files"),
         (("box.stl", "--scale", "0"), "give a scale that is a positive number"),
     ],
 )

@@ -2,6 +2,8 @@
 
 import warnings
 
+import cv2
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -85,6 +87,39 @@ def test_picked_points_in_the_numbers_of_the_file(scene, tmp_path, capsys):
     assert torch.allclose(T[:3, 3], truth[:3, 3], atol=0.02)
 
 
+def test_a_config_and_a_picture(scene, tmp_path, monkeypatch, capsys):
+    folder, truth = scene
+    (tmp_path / "mesh").mkdir()
+    mesh = l_prism().apply_translation((0.3, 0.0, 0.0)).apply_scale(1000)
+    mesh.export(tmp_path / "mesh" / "in_mm.stl")
+    middle = torch.from_numpy(l_prism().bounds.mean(0))
+    near = tmp_path / "near.yaml"
+    near.write_text(as_block(rough(moved(truth, middle), 10.0, 1.02), "in_mm", AT_US))
+    monkeypatch.chdir(tmp_path)
+    given = (folder / "bracket.npz", "--mesh", "mesh/in_mm.stl", "--unit", "mm", "--centre", "--at-us", AT_US, "--near", "near.yaml")
+    assert command(*given, "--config", "found.yaml", "--picture", "pose.png") == 0
+    assert "torchtrack track found.yaml" in capsys.readouterr().out
+    written = yaml.safe_load((tmp_path / "found.yaml").read_text())
+    assert set(written) == {"source", "start_us", "output", "objects"}
+    assert (written["start_us"], written["output"]) == (AT_US, "outputs/in_mm")
+    config = load(RunConfig, tmp_path / "found.yaml")
+    (obj,) = config.objects
+    assert (obj.mesh, obj.unit, obj.centre) == (tmp_path / "mesh" / "in_mm.stl", "mm", True)
+    T = configured_pose(obj.initial_pose, AT_US)
+    assert error_deg(T, truth) < 3 and torch.allclose(T[:3, 3], moved(truth, middle)[:3, 3], atol=0.01)
+    # The contours are there in red, and the events in grey.
+    image = cv2.imread(str(tmp_path / "pose.png")).astype(int)
+    assert ((image[..., 2] > 200) & (image[..., 0] < 100)).sum() > 500
+    assert ((image > 100).all(2) & (np.ptp(image, axis=2) == 0)).sum() > 500
+
+
+def moved(T_cam_obj, origin_obj):
+    """The pose of the same object with another point as its origin."""
+    T = T_cam_obj.clone()
+    T[:3, 3] += T[:3, :3] @ origin_obj
+    return T
+
+
 def test_a_block_goes_into_a_config(scene, tmp_path):
     folder, truth = scene
     block = yaml.safe_load(as_block(truth, "bracket", AT_US))
@@ -111,6 +146,9 @@ def test_a_block_goes_into_a_config(scene, tmp_path):
         (("--near", "nowhere.yaml"), 1, "nowhere.yaml"),
         (("--search", "--at-us", "90000000"), 1, "no events"),
         (("--search", "-o", "bracket.npz"), 1, "bracket.npz"),
+        (("--search", "--config", "bracket.npz"), 1, "bracket.npz"),
+        (("--search", "--config", "found.json"), 1, "'found.json': configs are .yaml files"),
+        (("--search", "--picture", "pose.jpg"), 1, "'pose.jpg': pictures are .png files"),
     ],
 )
 def test_what_is_wrong_is_said(scene, monkeypatch, capsys, more, code, message):

@@ -5,19 +5,27 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from rich.table import Table
 
 from torchtrack.cli.console import OutputConsole, output_console
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.picture import check_picture, write_picture
 from torchtrack.cli.progress import progress_shown, share_of
 from torchtrack.config.events import ReadingConfig
 from torchtrack.config.formats import OutputFormat
-from torchtrack.errors import TorchtrackWarning
+from torchtrack.core.atomic import check_other_file
+from torchtrack.core.camera import undistortion_table
+from torchtrack.core.events import concatenate
+from torchtrack.core.windows import clipped
+from torchtrack.errors import EventDataError, TorchtrackWarning
+from torchtrack.io.calibration import read_calibration
 from torchtrack.io.convert import convert
 from torchtrack.io.event_file import DEFAULT_CHOICES, EventFile
 from torchtrack.io.formats import FORMAT_NAMES, open_events
 from torchtrack.io.info import EventInfo, as_plain
 from torchtrack.io.raw_file import RawFile
+from torchtrack.viz.event_picture import SHOWN_US, draw_events, soonest_event
 
 _ONE_POLARITY = " (all alike: polarity may be coded in another way, --polarity)"
 
@@ -33,13 +41,33 @@ class Input:
     choices: ReadingConfig = DEFAULT_CHOICES
 
 
-def info(file: Input, max_events: int | None, *, as_json: bool, quiet: bool = False) -> int:
-    """Show facts about a file of events; returns the exit code."""
+@dataclass(frozen=True)
+class EventPicture:
+    """A picture of some events.
+
+    Args:
+        path: the file to write.
+        at_us: time that is shown; None for the start.
+        calibration: of the camera whose distortion is taken out; None to leave it in.
+    """
+
+    path: Path
+    at_us: int | None = None
+    calibration: Path | None = None
+
+
+def info(file: Input, max_events: int | None, picture: EventPicture | None = None, *, as_json: bool, quiet: bool = False) -> int:
+    """Show facts about a file of events, and draw some of them; returns the exit code."""
+    if picture is not None:
+        check_other_file(file.path, picture.path)
+        check_picture(picture.path)
     source = open_events(file.path, file.width, file.height, file.strict, file.choices)
     with warnings.catch_warnings(), progress_shown(quiet=quiet, kernels=False) as progress:
         # What is wrong is part of the facts.
         warnings.simplefilter("ignore", TorchtrackWarning)
         facts = source.info(max_events, share_of(progress, f"reading {file.path.name}"))
+    if picture is not None:
+        _write_events(source, facts, picture)
     if as_json:
         # Plain text: a console would break lines and colour them.
         OutputConsole(soft_wrap=True, highlight=False, markup=False).print(json.dumps({"format": format_name(source), **as_plain(facts)}, indent=2))
@@ -47,8 +75,33 @@ def info(file: Input, max_events: int | None, *, as_json: bool, quiet: bool = Fa
     table = Table(show_header=False, box=None)
     for row in _rows(source, facts):
         table.add_row(*row)
-    output_console().print(table)
+    console = output_console()
+    console.print(table)
+    if picture is not None:
+        console.print(f"events are shown in {picture.path}", markup=False)
     return ExitCode.DONE
+
+
+def _write_events(source: EventFile, facts: EventInfo, picture: EventPicture) -> None:
+    """Draw the events after a time.
+
+    Raises:
+        EventDataError: if there are none.
+        CalibrationError: if the calibration is of another sensor.
+    """
+    if facts.first_us is None:
+        raise EventDataError(f"'{source.path}': there are no events to draw.")
+    at_us = facts.first_us - 1 if picture.at_us is None else picture.at_us
+    events = concatenate(list(clipped(source.chunks(), at_us, at_us + SHOWN_US)))
+    if len(events) == 0:
+        there = f"there are events from {facts.first_us:,} to {facts.last_us:,} µs"
+        raise EventDataError(f"'{source.path}': no events within {SHOWN_US / 1000:g} ms after {at_us:,} µs; {there}.")
+    pixels = torch.stack([events.x, events.y], 1)
+    if picture.calibration is not None:
+        camera = read_calibration(picture.calibration, facts.width, facts.height)
+        pixels = undistortion_table(camera)[events.y.long(), events.x.long()]
+    surface = soonest_event(pixels.round().long().numpy(), events.t_us.numpy(), at_us, (facts.width, facts.height))
+    write_picture(picture.path, draw_events(surface, at_us))
 
 
 def format_name(source: EventFile) -> str:

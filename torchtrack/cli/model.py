@@ -6,8 +6,8 @@ from rich.table import Table
 
 from torchtrack.cli.console import output_console
 from torchtrack.cli.exit_codes import ExitCode
-from torchtrack.core.atomic import atomic_path, check_other_file, check_writable
-from torchtrack.errors import UnknownFormatError
+from torchtrack.cli.picture import check_picture, write_picture
+from torchtrack.core.atomic import check_other_file
 from torchtrack.object_model.report import ModelReport, SurfaceReport, describe_model
 from torchtrack.object_model.settings import METRES_PER_UNIT, Unit
 
@@ -18,10 +18,8 @@ _NEAR_CENTRE = 0.01
 def show_model(path: Path, unit: Unit | None, scale: float, output: Path | None, *, centre: bool) -> int:
     """Show what a model is, and write a picture of six views of it; returns the exit code."""
     if output is not None:
-        if output.suffix.lower() != ".png":
-            raise UnknownFormatError(f"'{output}': the picture of a model is a .png file. Give it such a name.")
         check_other_file(path, output)
-        check_writable(output)
+        check_picture(output)
     report = describe_model(path, unit, scale, centre=centre)
     table = Table(show_header=False, box=None)
     for row in _rows(report, scale, centre=centre):
@@ -31,19 +29,12 @@ def show_model(path: Path, unit: Unit | None, scale: float, output: Path | None,
     for note in report.notes:
         console.print(f"note: {note}", markup=False)
     if output is not None:
-        _write_picture(report, output)
+        # Drawing needs more of the package than facts do.
+        from torchtrack.viz.model_views import draw_model
+
+        write_picture(output, draw_model(report.model))
         console.print(f"six views are in {output}", markup=False)
     return ExitCode.DONE
-
-
-def _write_picture(report: ModelReport, output: Path) -> None:
-    # Drawing needs more of the package than facts do.
-    import cv2
-
-    from torchtrack.viz.model_views import draw_model
-
-    with atomic_path(output) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", draw_model(report.model))[1].tobytes())
 
 
 def _rows(report: ModelReport, scale: float, *, centre: bool) -> list[tuple[str, str]]:

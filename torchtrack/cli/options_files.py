@@ -41,17 +41,28 @@ class Info:
     """What is wrong is an error."""
     json: bool = False
     """Print JSON."""
+    picture: Annotated[str | None, option("FILE", "-o")] = None
+    """Also draw some events, with a ruler in pixels, into this file (.png)."""
+    at_us: Annotated[int | None, option("N")] = None
+    """Of the picture: its time, in stream time (µs); by default the start."""
+    calibration: Annotated[str | None, option("FILE")] = None
+    """Of the picture: take the distortion of this camera out; what is straight must look straight then."""
     quiet: bool = False
     """No progress bar."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
         with starting(quiet=self.quiet):
-            from torchtrack.cli.files import Input, info
+            from torchtrack.cli.files import EventPicture, Input, info
 
         refuse_settings(overrides)
+        if self.picture is None and (self.at_us is not None or self.calibration is not None):
+            raise ConfigError("command line: --at-us and --calibration are of the picture: name its file with --picture.")
         choices = _choices(self.time_unit, self.polarity, self.topic)
-        return info(Input(Path(self.file), self.width, self.height, self.strict, choices), self.max_events, as_json=self.json, quiet=self.quiet)
+        calibration = None if self.calibration is None else Path(self.calibration)
+        picture = None if self.picture is None else EventPicture(Path(self.picture), self.at_us, calibration)
+        file = Input(Path(self.file), self.width, self.height, self.strict, choices)
+        return info(file, self.max_events, picture, as_json=self.json, quiet=self.quiet)
 
 
 @dataclass(frozen=True)

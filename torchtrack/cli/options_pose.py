@@ -48,14 +48,19 @@ class Pose:
     """Which object of a config."""
     output: Annotated[str | None, option("FILE", "-o")] = None
     """The file to write (.yaml); by default the terminal."""
+    config: _File = None
+    """Also write a config of `torchtrack track` with the pose and all that is said here (.yaml), ready to be run."""
+    picture: _File = None
+    """Also draw the contours at the pose on the events, into this file (.png)."""
 
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
         with starting():
-            from torchtrack.cli.pose import Ways, write_pose
+            from torchtrack.cli.pose import Ways, Written, write_pose
 
         ways = Ways(_path(self.points), _path(self.near), self.search, self.box, self.browser, self.port)
-        return write_pose(self.recording, self._settings() | overrides, ways, self.label, _path(self.output))
+        written = Written(_path(self.output), _path(self.config), _path(self.picture))
+        return write_pose(self.recording, self._settings() | overrides, ways, self.label, written)
 
     def _settings(self) -> dict[str, Any]:
         """What is given of the object, the camera and the time, as settings of a run."""

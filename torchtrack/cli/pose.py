@@ -3,6 +3,7 @@
 import math
 import time
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,18 @@ from rich.console import Console
 
 from torchtrack.cli.console import output_console
 from torchtrack.cli.exit_codes import ExitCode
+from torchtrack.cli.picture import check_picture, write_picture
 from torchtrack.cli.progress import progress_shown, share_of
 from torchtrack.config.load import load
 from torchtrack.config.run import ObjectConfig, RunConfig
 from torchtrack.config.settings import CommandLineText
 from torchtrack.core.atomic import atomic_path, check_other_file, check_writable
 from torchtrack.core.files import naming
-from torchtrack.errors import ConfigError, EventDataError, TorchtrackWarning
+from torchtrack.errors import ConfigError, EventDataError, TorchtrackWarning, UnknownFormatError
+from torchtrack.run.first_pose.config_text import as_config
 from torchtrack.run.first_pose.in_browser import pose_in_browser
 from torchtrack.run.first_pose.picks import pose_of_picks, read_picks
+from torchtrack.run.first_pose.picture import draw_start
 from torchtrack.run.first_pose.request import as_block, known_pose, object_of, opened, parsed_box, placed_picks, read_near
 from torchtrack.run.first_pose.searching import pose_in_box, pose_near, refined_pose
 from torchtrack.run.first_pose.start import Start
@@ -71,21 +75,49 @@ class Ways:
             raise ConfigError("command line: --port is where the page of --browser is, and of no use otherwise.")
 
 
-def write_pose(source: str, settings: dict[str, Any], ways: Ways, label: str | None, output: Path | None) -> int:
+@dataclass(frozen=True)
+class Written:
+    """Where the pose goes.
+
+    Args:
+        block: the file of the ``initial_pose`` block; None for the terminal.
+        config: the file of a config with the pose; None for no config.
+        picture: the file of a picture of it; None for no picture.
+    """
+
+    block: Path | None = None
+    config: Path | None = None
+    picture: Path | None = None
+
+    def check(self, read: Iterable[Path]) -> None:
+        """Refuse files that could not be written, or that are read.
+
+        Raises:
+            OutputError, UnknownFormatError: then.
+        """
+        for path in filter(None, (self.block, self.config, self.picture)):
+            for other in read:
+                check_other_file(other, path)
+            check_writable(path)
+        if self.config is not None and self.config.suffix.lower() not in (".yaml", ".yml"):
+            raise UnknownFormatError(f"'{self.config}': configs are .yaml files. Give it such a name.")
+        if self.picture is not None:
+            check_picture(self.picture)
+
+
+def write_pose(source: str, settings: dict[str, Any], ways: Ways, label: str | None, written: Written) -> int:
     """Find the first pose of an object, and show or write it; returns the exit code.
 
     Args:
         source: a recording, a sequence, or a config of ``torchtrack track``.
         settings: of the run, by dotted key.
         label: of the object, where there are several.
+        written: where it goes.
     """
     ways.check()
     with naming(Path(source)):
         config = _run_config(source, settings)
-    if output is not None:
-        for path in filter(None, (Path(source), ways.points, ways.near)):
-            check_other_file(path, output)
-        check_writable(output)
+    written.check(tuple(filter(None, (Path(source), ways.points, ways.near))))
     obj, begun = object_of(config, label), time.perf_counter()
     # Somebody who makes it by hand sees what goes on.
     with threads(config.threads), naming(Path(source)), progress_shown(quiet=ways.browser) as progress:
@@ -93,8 +125,13 @@ def write_pose(source: str, settings: dict[str, Any], ways: Ways, label: str | N
         session = opened(config, obj)
         pose = _pose(ways, session, obj)
         check_in_view(pose.T_cam_obj[None], session.models, [session.camera])
+        if written.picture is not None:
+            start = Start.from_events(session.models[0], session.camera, session.events, pose.at_us)
+            write_picture(written.picture, draw_start(start, pose, obj.label))
     _tell(pose, obj.label, time.perf_counter() - begun)
-    _show(as_block(pose.T_cam_obj, obj.label, pose.at_us), output)
+    if written.config is not None:
+        _write(written.config, as_config(config, obj.label, pose, written.config.absolute().parent))
+    _show(as_block(pose.T_cam_obj, obj.label, pose.at_us), written)
     return ExitCode.DONE
 
 
@@ -135,21 +172,29 @@ def _tell(pose: FirstPose, label: str, seconds: float) -> None:
     _say(f"'{label}': {explained}; {seconds:.1f} s")
     if pose.quality < _DOUBTFUL_QUALITY:
         message = (
-            f"the events explain {100 * pose.quality:.0f} % of the contour of '{label}': the pose may be wrong. Look at the first still of "
-            "`torchtrack track`, check the model and its unit, or give a box, more points, or another time (--at-us)."
+            f"the events explain {100 * pose.quality:.0f} % of the contour of '{label}': the pose may be wrong. Look at it with "
+            "--picture FILE.png, check the model and its unit, or give a box, more points, or another time (--at-us)."
         )
         warnings.warn(message, TorchtrackWarning, stacklevel=2)
+
+
+def _show(block: str, written: Written) -> None:
+    if written.block is not None:
+        _write(written.block, block)
+        output_console().print(f"the pose is in {written.block}", markup=False)
+    elif written.config is None:
+        output_console().print(block, markup=False, end="")
+    if written.config is not None:
+        output_console().print(f"a config with the pose is in {written.config}: torchtrack track {written.config}", markup=False)
+    if written.picture is not None:
+        _say(f"its contours on the events are in {written.picture}")
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _say(text: str) -> None:
     """On stderr: the terminal's output is the block."""
     Console(stderr=True, highlight=False, soft_wrap=True).print(text, markup=False)
-
-
-def _show(block: str, output: Path | None) -> None:
-    if output is None:
-        output_console().print(block, markup=False, end="")
-        return
-    with atomic_path(output) as temporary:
-        temporary.write_text(block, encoding="utf-8")
-    output_console().print(f"the pose is in {output}", markup=False)

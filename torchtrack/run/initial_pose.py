@@ -27,7 +27,7 @@ def initial_pose(obj: ObjectConfig, truth: Trajectory | None, start_us: int) -> 
         check_pose(T, f"initial_pose of '{obj.label}'")
         return T
     if truth is None:
-        raise ConfigError(f"objects: '{obj.label}' needs an initial_pose, as the source has no ground truth for it.")
+        raise ConfigError(f"objects: '{obj.label}' needs an initial_pose, as the source has no ground truth for it. `torchtrack pose` finds it.")
     return truth.measured_at(start_us, f"the ground truth of '{obj.label}'")
 
 

@@ -133,7 +133,7 @@ def _legend(contours: Contours, model: ObjectModel, width: int) -> np.ndarray:
     for kind, (name, colour) in _COLOURS.items():
         text = f"{name} {int((contours.mask & (contours.kind == int(kind))).sum())}"
         cv2.putText(image, text, (left, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
-        left += 150
+        left += 190
     x, y, z = (1000 * 2 * model.half_extent).tolist()
     cv2.putText(image, f"{x:.1f} x {y:.1f} x {z:.1f} mm", (left, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT, 1, cv2.LINE_AA)
     return image

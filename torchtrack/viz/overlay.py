@@ -148,8 +148,8 @@ def draw_overlay(
         note: a further line of text.
     """
     newest = last_event_us.cpu().numpy() if isinstance(last_event_us, Tensor) else last_event_us
-    scale = scale or -(-_LEAST_WIDTH_PX // camera.width)
-    canvas = _Canvas(_event_picture(newest[: camera.height, : camera.width], t_us, decay_s, scale), camera, scale)
+    scale = scale or enlargement(camera.width)
+    canvas = _Canvas(grey_events(newest[: camera.height, : camera.width], t_us, decay_s, scale), camera, scale)
     for thing in objects:
         canvas.lines(thing.contour, thing.links, _RED, width=min(scale + 1, 4))
     for thing in objects:
@@ -164,7 +164,12 @@ def draw_overlay(
     return canvas.image
 
 
-def _event_picture(last_event_us: np.ndarray, t_us: int, decay_s: float, scale: int) -> np.ndarray:
+def enlargement(width: int) -> int:
+    """How many times a sensor of some width (px) is enlarged, to be seen well."""
+    return -(-_LEAST_WIDTH_PX // width)
+
+
+def grey_events(last_event_us: Int[np.ndarray, "h w"], t_us: int, decay_s: float, scale: int) -> UInt8[np.ndarray, "hs ws 3"]:
     """The exponentially decayed time surface, enlarged, as grey."""
     # Before float32: the difference is exact and small, the times are neither.
     age_s = (t_us - last_event_us).clip(0, 10_000_000).astype(np.float32) * 1e-6

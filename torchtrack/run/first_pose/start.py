@@ -111,6 +111,8 @@ class Box:
 
 # Events are counted in cells of this size (px), and of those with more than a share of what the full ones have, the largest patch is taken.
 _CELL_PX, _SHARE = 8, 0.15
+# What a quarter of the cells stay below is noise; cells so many of its standard deviations above it are not, where there is any.
+_NOISE, _ABOVE_NOISE = 0.25, 4.0
 
 
 def box_of_events(start: Start, count: int) -> Box:
@@ -120,8 +122,10 @@ def box_of_events(start: Start, count: int) -> Box:
         EventDataError: if the events are scattered all over.
     """
     cells = _counts(start, count)
-    full = np.quantile(cells[cells > 0], 0.9) if cells.any() else 0.0
-    busy = (cells > max(_SHARE * full, 1.0)).astype(np.uint8)
+    noise = float(np.quantile(cells, _NOISE))
+    least = noise + _ABOVE_NOISE * noise**0.5 + 1.0
+    full = np.quantile(cells[cells > least], 0.9) if (cells > least).any() else 0.0
+    busy = (cells > max(_SHARE * full, least)).astype(np.uint8)
     joined = cv2.morphologyEx(busy, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     number_of_labels, labels = cv2.connectedComponents(joined)
     if number_of_labels < 2:
