@@ -1,4 +1,4 @@
-"""Every message in docs/when_it_fails.md is brought about by what its row says, and goes away by what the row advises."""
+"""Every message in docs/when_it_fails.md is brought about by what its row says; some symptoms, too, with their cure."""
 
 import json
 import shutil
