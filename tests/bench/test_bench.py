@@ -7,7 +7,7 @@ import pytest
 import torch
 from tiny_sequence import write_tiny_sequence
 
-from torchtrack.bench import flow, io, lost, peers, pipeline, scaling, scene, sim, solver, stages, surface
+from torchtrack.bench import flow, graphs, io, lost, peers, pipeline, scaling, scene, sim, solver, stages, surface
 from torchtrack.bench.clock import Clock
 from torchtrack.bench.plots import Plot, draw
 from torchtrack.bench.results import Report, Result, as_markdown, machine, older_medians, plain, time_result
@@ -42,6 +42,7 @@ def tiny(monkeypatch):
             "HD_MEV_S": 4.0,
         },
         lost: {"SHAPES": ("lbracket", "cube"), "COLUMNS": 2, "LOST": ("lbracket",), "DURATION_S": 0.06, "HIDDEN_FROM_US": 30_000, "KNOWN_AFTER": 3},
+        graphs: {"SCENES": {"cpu": ((1, 1, 1), (2, 2, 1))}, "WINDOWS": 1},
         stages: {"SHAPES": ("lbracket",), "MANY": ((2, 2),)},
         solver: {"TARGETS_MS": {1: 2.0, 3: None}},
         surface: {"WINDOWS": ((64, 48, 500),)},
@@ -116,6 +117,17 @@ def test_stages(tiny, simulator, tmp_path):
     assert matplotlib.image.imread(tmp_path / "bench_stages_shares.png").shape[2] == 4
 
 
+def test_graphs(tiny, simulator, tmp_path):
+    assert bench("graphs", tmp_path) == ExitCode.DONE
+    figures = {entry["name"]: entry["figures"][0] for entry in written(tmp_path, "graphs")["results"]}
+    assumed = ("never_found", "lost", "index_radius(gate_scale, config)", "has(window.triggers, SEARCHED)")
+    for count in ("1 objects", "2 objects"):
+        shares = [figures[f"{count}: windows in which there is any {what}"] for what in assumed]
+        assert shares[:2] == [0, 0] and all(0 <= share <= 100 for share in shares)
+        assert figures[f"{count}: contours"] > 0
+        assert sum(name.startswith(f"{count}: kernel ") for name in figures) == graphs.LONGEST
+
+
 def test_solver(tiny, tmp_path):
     assert bench("solver", tmp_path) == ExitCode.DONE
     content = written(tmp_path, "solver")
@@ -158,7 +170,7 @@ def test_all_parts_but_those_whose_libraries_are_missing(tiny, simulator, tmp_pa
     def without(setup):
         raise MissingExtraError("numba", "sim", "the simulator")
 
-    for part in (pipeline, lost, scaling, peers):
+    for part in (pipeline, lost, graphs, scaling, peers):
         monkeypatch.setattr(part, "measure", without)
     assert bench("all", tmp_path) == ExitCode.DONE
     assert {path.name for path in tmp_path.glob("*.json")} == {f"bench_{part}.json" for part in ("stages", "solver", "surface", "flow", "io", "sim")}
