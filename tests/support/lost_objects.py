@@ -20,6 +20,7 @@ SEEN_WELL = {
     "reference_explained_ratio": 0.9,
     "drift_s": 0.0,
     "time_since_validated_s": 0.0,
+    "looks": 0,
     "is_starting": False,
     "is_due": False,
     "is_drift_due": False,

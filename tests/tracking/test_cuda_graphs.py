@@ -7,12 +7,15 @@ from functools import partial
 import pytest
 import torch
 from helpers import SMALL_CAMERA, bevelled_model, box_model, pose
-from tracked_boxes import follow, moving_box, windows
+from states import changed
+from tracked_boxes import WINDOW_US, follow, moving_box, windows
 
 from torchtrack import Tracker
-from torchtrack.config.tracker import TrackerConfig
+from torchtrack.config.relocalization import RelocalizationConfig
+from torchtrack.config.tracker import AdaptationConfig, TrackerConfig, WindowConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.events import concatenate
+from torchtrack.core.lie import retract_about
 from torchtrack.tracking import cuda_graphs, graphs
 from torchtrack.tracking.adaptation import learned_contours
 from torchtrack.tracking.cuda_graphs import CudaGraphs
@@ -163,3 +166,94 @@ def test_with_a_weigher_of_ones_own_graphs_have_to_be_asked_for(monkeypatch):
     assert plain._are_for(t_us)
     assert not judged._are_for(t_us)
     assert Tracker([bevelled_model()], SMALL_CAMERA).graphs._are_for(t_us)
+
+
+# ---- objects that are lost
+
+
+def _as_there(function):
+    """As on a GPU: nothing is read back within a graph, and there are no kernels for the CPU in it."""
+
+    def graph(*args):
+        with pytest.MonkeyPatch.context() as patch, dispatch.backend(wanted=False):
+            patch.setattr(host_sync, "read_at_once", lambda values: False)
+            return function(*args)
+
+    return graph
+
+
+@pytest.fixture
+def lanes(monkeypatch):
+    """Numbers of calls of the graph for certain objects, and of the one for all."""
+    calls = {"certain": 0, "lane": 0}
+
+    def counted(name, function):
+        def called(*args):
+            calls[name] += 1
+            return _as_there(function)(*args)
+
+        return called
+
+    monkeypatch.setattr(graphs.CompiledStep, "_are_for", lambda self, t_us: True)
+    monkeypatch.setattr(
+        graphs.CompiledStep, "_graph", lambda self, device, learns: counted("certain", partial(graphs.steady_advance, self._tracker, learns=learns))
+    )
+    monkeypatch.setattr(
+        graphs.CompiledStep, "_lane", lambda self, filled, learns: counted("lane", partial(graphs.steady_lane, self._tracker, learns=learns))
+    )
+    monkeypatch.setattr(graphs.CompiledStep, "_near", lambda self, state, events, t_us: graphs.NearbyEvents(events))
+    monkeypatch.setattr(graphs, "_in_bursts", lambda opened, filled, t_us, longest_us: (opened, filled))
+    return calls
+
+
+def _with_one_lost(tracker, batches, known=6):
+    """Results after the middle one of three boxes is put off its place, and made uncertain; its neighbours go on."""
+    with torch.inference_mode():
+        state, _ = follow(tracker, tracker.init(pose()[None].repeat(3, 1, 1), 0), batches[:known])
+        T_cam_obj, covariance = state.T_cam_obj.clone(), state.motion.covariance.clone()
+        off = torch.tensor([[0.09, -0.06, 0.12, 0.008, -0.006, 0.0]], dtype=torch.float64)
+        T_cam_obj[1] = retract_about(T_cam_obj[1:2], off, tracker.centre_obj[1:2].double())[0]
+        covariance[1] *= 100
+        return follow(tracker, changed(state, T_cam_obj=T_cam_obj, covariance=covariance), batches[known:])[1]
+
+
+def _three_streams(count):
+    streams = [moving_box(pose(), count, seed=stream, stream=stream)[1] for stream in range(3)]
+    ends = [(number + 1) * WINDOW_US for number in range(count)]
+    return [(concatenate([events.slice_time(end - WINDOW_US, end) for events in streams]), end) for end in ends]
+
+
+def _three_boxes(**search):
+    parts = {"window": WindowConfig(parts=1), "adaptation": AdaptationConfig(learned_points=0)}
+    config = TrackerConfig(relocalization=RelocalizationConfig(new_below=0, **search), **parts)
+    # A GPU has no kernels of the CPU, whose roundings are others.
+    return Tracker([box_model()] * 3, [SMALL_CAMERA] * 3, config, [0, 1, 2], kernels=False)
+
+
+def test_a_lost_object_does_not_take_its_neighbours_out_of_the_graph(lanes, monkeypatch):
+    """The graph for uncertain objects holds, the lost one is found after it, and its neighbours are what they are when nobody is looked for."""
+    batches, taken = _three_streams(9), []
+    monkeypatch.setattr(Tracker, "_advance", lambda self, *args, whole=Tracker._advance, **more: taken.append(args[2]) or whole(self, *args, **more))
+    by_graphs = _with_one_lost(_three_boxes(), batches)
+    assert taken == []
+    assert lanes["lane"] >= 1 and lanes["certain"] + lanes["lane"] >= len(batches)
+    unsearched = _with_one_lost(_three_boxes(hypotheses=0), batches)
+    for searched, alone in zip(by_graphs, unsearched, strict=True):
+        for number in (0, 2):
+            assert torch.equal(searched.T_cam_obj[number], alone.T_cam_obj[number])
+            assert torch.equal(searched.covariance[number], alone.covariance[number])
+    assert not torch.equal(by_graphs[-1].T_cam_obj[1], unsearched[-1].T_cam_obj[1])
+    monkeypatch.setattr(graphs.CompiledStep, "_are_for", lambda self, t_us: False)
+    for searched, plain in zip(by_graphs, _with_one_lost(_three_boxes(), batches), strict=True):
+        torch.testing.assert_close(searched.T_cam_obj, plain.T_cam_obj, rtol=0, atol=1e-5)
+        assert torch.equal(searched.status, plain.status)
+
+
+def test_when_all_are_certain_again_the_graph_for_these_is_back(lanes):
+    tracker, batches = _three_boxes(), _three_streams(8)
+    with torch.inference_mode():
+        state, _ = follow(tracker, tracker.init(pose()[None].repeat(3, 1, 1), 0), batches[:6])
+        tracker.graphs._expects_uncertain = True
+        before = dict(lanes)
+        follow(tracker, state, batches[6:])
+    assert (lanes["lane"] - before["lane"], lanes["certain"] - before["certain"]) == (1, 1)

@@ -19,10 +19,10 @@ from torch.profiler import ProfilerActivity, profile, record_function
 from torchtrack.bench.results import Report, Result, time_result
 from torchtrack.bench.scene import SHAPES, Run, shapes_of, simulated, started
 from torchtrack.bench.setup import Setup
-from torchtrack.bench.stages import STAGES, StageTimes, timed
 from torchtrack.core import dispatch
 from torchtrack.core.events import EventBatch
 from torchtrack.core.host_sync import AsyncValue, HostReads, SteadyState
+from torchtrack.run.stage_times import STAGES, StageTimes, timed
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.state import TrackerState
 from torchtrack.tracking.step import StepInput, advance, opened
@@ -54,8 +54,8 @@ class NotedState(SteadyState):
 def _asked_for() -> str:
     """The value that a line of the pipeline asks for, as it is written there."""
     lines = (frame.line or "" for frame in reversed(traceback.extract_stack()) if not frame.filename.endswith(("graphs.py", "host_sync.py")))
-    found = (re.search(r"reads\.(?:ask|ask_within|none_of)\(([\w.]+(?:\([^()]*\))?)", line) for line in lines)
-    return next((match[1] for match in found if match), "something else")
+    matches = (re.search(r"reads\.(?:ask|ask_within|none_of)\(([\w.]+(?:\([^()]*\))?)", line) for line in lines)
+    return next((match[1] for match in matches if match), "something else")
 
 
 class NamedStages(StageTimes):
@@ -121,7 +121,7 @@ def _profiled(setup: Setup, run: Run) -> tuple[list[tuple[str, float]], list[tup
     on_gpu, windows = run.state.t_us.is_cuda, run.windows[:WINDOWS]
     state = run.state
     activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if on_gpu else [])]
-    with timed(NamedStages(setup.clock)), profile(activities=activities) as seen:
+    with timed(NamedStages(setup.clock.now)), profile(activities=activities) as seen:
         for window in windows:
             state = _without_graph(run, state, window, HostReads())
     rows, each = seen.key_averages(), 1e-6 / len(windows)

@@ -8,6 +8,9 @@ from torchtrack.config.settings import Settings
 class RelocalizationConfig(Settings):
     """Many poses tried at once, where one prediction is too uncertain or a pose explains less than it did."""
 
+    objects: int = Field(
+        2, ge=1, le=1000, description="Objects of a stream looked for in a window, at most: those least often so far, and of these the longest lost."
+    )
     hypotheses: int = Field(24, ge=0, le=1000, description="Poses aligned at once; 0 switches the search off.")
     rotations: int = Field(
         1000, ge=1, le=10_000, description="Rotations and depths sampled where a prediction is very uncertain, tried in all places of the image."

@@ -84,6 +84,10 @@ class HostReads:
         """Begin to copy values, which in a steady window are all ``usual``."""
         return AsyncValue.to(values)
 
+    def ask_within(self, values: Tensor, usual: int, most: int) -> AsyncValue:
+        """:meth:`ask` for values that are at least ``usual`` and at most ``most``: a bound will do in their place."""
+        return self.ask(values, usual)
+
     def none_of(self, values: Tensor) -> bool:
         """Whether it is certain that no value is true, as in a steady window. On a GPU it is never certain: the CPU would have to wait."""
         return none_of(values)
@@ -108,3 +112,25 @@ class SteadyState(HostReads):
     def wrong(self) -> Tensor:
         """Whether any value so far was not the usual one."""
         return torch.stack(self._wrong).any()
+
+
+class UncertainState(SteadyState):
+    """Takes no object to be certain: what uncertain ones need is computed for all. Whether any was is noted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._uncertain: list[Tensor] = []
+
+    def ask_within(self, values: Tensor, usual: int, most: int) -> AsyncValue:
+        """The values themselves on the device, and the bound for what hangs on the largest of them."""
+        self._uncertain.append((values.detach() != usual).any())
+        return AsyncValue(values.detach(), [most] * values.numel())
+
+    def none_of(self, values: Tensor) -> bool:
+        """Not certain."""
+        self._uncertain.append(values.detach().any())
+        return False
+
+    def uncertain(self) -> Tensor:
+        """Whether any value was other than in a steady window."""
+        return torch.stack(self._uncertain).any()

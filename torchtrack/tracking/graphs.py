@@ -6,8 +6,10 @@ fewer and larger kernels, there and on a CPU. Shapes are those of a GPU (:mod:`t
 is left open.
 
 Where a window turns out not to be steady, as an object is to be searched for, or is very uncertain, what the graph gave is
-dropped and the window is taken as without one; so are windows that contours are learned from, on a CPU. Poses are the same, to
-rounding.
+dropped. On a GPU, another graph takes it then, and those after it, until all objects are certain again: one that holds however uncertain or lost
+objects are, as it does for all what these need (:func:`torchtrack.tracking.step.steady_lane`). Objects that are to be searched for are, after
+it, from what it has computed of the window; the others are as it left them. A window in parts is taken as without a graph; so is every one that a
+compiled graph does not hold for, and on a CPU those that contours are learned from. Poses are the same, to rounding.
 """
 
 import logging
@@ -35,10 +37,11 @@ from torchtrack.tracking.frontend.bursts import LONGEST_US, update_bursts
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.state import S, StepResult, TrackerState, each_tensor
-from torchtrack.tracking.step import opened, steady_advance
+from torchtrack.tracking.step import looked_for, opened, steady_advance, steady_lane
 
 P, R = ParamSpec("P"), TypeVar("R")
 _Graph = Callable[[TrackerState, NearbyEvents, Tensor], tuple[TrackerState, StepResult, Tensor]]
+_Lane = Callable[[TrackerState, NearbyEvents, Tensor], tuple[Any, ...]]
 # At a start, it is looked at more than later on which contours a model lacks.
 _FIRST_WINDOWS = 5
 # Of more events than this, those that are near no object are left out first.
@@ -65,6 +68,9 @@ class CompiledStep:
         self._tracker, self._compiles = tracker, compiles
         # By how many events a stream has at most, where there are several, and by what is learned.
         self._graphs: dict[tuple[int | None, bool], _Graph] = {}
+        self._lanes: dict[tuple[int | None, bool], _Lane] = {}
+        # What the last window was like: whichever graph is tried first, the result is the same.
+        self._expects_uncertain = False
         self._near_tiles: Callable[[TrackerState, Tensor], Tensor | None] | None = None
 
     def __call__(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult] | None:
@@ -82,13 +88,34 @@ class CompiledStep:
             nearby = self._near(plain, events, t_us) if len(events) > _MANY else NearbyEvents(events)
             if len(nearby.events) < 2:
                 return None
-            next_state, result, wrong = self._taken(opened(self._tracker, plain, events), nearby, t_us, learns)
-            is_wrong = host_sync.AsyncValue.to(wrong[None])
-        return None if is_wrong.any() else (_own(next_state).numbered(state), _own(result))
+            done = self._by_lanes(opened(self._tracker, plain, events), nearby, t_us, learns)
+        return None if done is None else (_own(done[0]).numbered(state), _own(done[1]))
+
+    def _by_lanes(self, before: TrackerState, nearby: NearbyEvents, t_us: Tensor, learns: bool) -> tuple[TrackerState, StepResult] | None:
+        """State and result by the graph for objects that are all certain, or else by the one for others; None where neither holds."""
+        if not self._expects_uncertain:
+            next_state, result, wrong = self._taken(before, nearby, t_us, learns)
+            if not host_sync.AsyncValue.to(wrong[None]).any():
+                return next_state, result
+            if self._compiles:
+                return None
+        filled = _filled(nearby, len(t_us))
+        next_state, result, stated, in_place = self._lane(filled, learns)(before, filled, t_us)
+        is_wrong, searches, self._expects_uncertain = host_sync.AsyncValue.to(stated).numbers()
+        if is_wrong:
+            return None
+        return looked_for(self._tracker, before, in_place.window(), filled, t_us, learns=learns) if searches else (next_state, result)
+
+    def _lane(self, filled: NearbyEvents, learns: bool) -> _Lane:
+        """The graph that holds however uncertain objects are."""
+        kind = filled.events.most_of_one, learns
+        if kind not in self._lanes:
+            self._lanes[kind] = CudaGraphs(partial(steady_lane, self._tracker, learns=learns))
+        return self._lanes[kind]
 
     def __getstate__(self) -> dict[str, Any]:
         """Of a copy, which has no graphs yet: these are of this tracker's tensors where they are now, and of this process."""
-        return {**vars(self), "_graphs": {}, "_near_tiles": None}
+        return {**vars(self), "_graphs": {}, "_lanes": {}, "_near_tiles": None}
 
     def _are_for(self, t_us: Tensor) -> bool:
         """Whether there are graphs for windows of that device. For a weighting network of one's own they have to be asked for."""
@@ -96,7 +123,7 @@ class CompiledStep:
 
     def __len__(self) -> int:
         """How many graphs there are."""
-        return len(self._graphs)
+        return len(self._graphs) + len(self._lanes)
 
     @torch.inference_mode()
     def prepare(self, state: TrackerState) -> None:

@@ -15,7 +15,7 @@ from torchtrack.tracking.association.observations import Observations, corner_ob
 from torchtrack.tracking.association.weighting_features import WeightingInputs, judged
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.estimation.rounds import Fit, align, gate_scale_of, index_for, index_radius, usual_index_radius
+from torchtrack.tracking.estimation.rounds import Fit, align, gate_scale_of, index_for, index_radius, usual_index_radius, widest_index_radius
 from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import Expected, expect, near_objects
 from torchtrack.tracking.frontend.bursts import LONGEST_US
@@ -26,13 +26,13 @@ from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.initialization import of_unknown_motion
 from torchtrack.tracking.objects import TrackedObjects
-from torchtrack.tracking.relocalization.evidence import gather_evidence
+from torchtrack.tracking.relocalization.evidence import TriggerEvidence, gather_evidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_object import OtherPoses, Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.tentative import confirm_or_take_back
 from torchtrack.tracking.relocalization.triggers import SEARCHED, has, may_have_rotated, triggers
-from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.state import StepResult, TrackerState, each_tensor
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.measures import required_spread
 from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, reference_where_known, score_fit
@@ -85,6 +85,28 @@ class Observed:
     observations: Observations
 
 
+@dataclass(frozen=True)
+class SteadyWindow:
+    """What a window gave for all objects, before any of them is looked for elsewhere.
+
+    Args:
+        expected, seen: of the window.
+        scored: the fits.
+        evidence: for relocalization, and the ``triggers`` that it sets.
+    """
+
+    expected: Expected
+    seen: Observed
+    scored: ScoredFit
+    evidence: TriggerEvidence
+    triggers: Int[Tensor, "b"]
+
+    @property
+    def located(self) -> Relocalized:
+        """The same with nothing relocalized."""
+        return Relocalized(self.scored, self.expected.prediction, self.seen.gate_scale)
+
+
 def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> tuple[TrackerState, StepResult]:
     """A window from its events to poses.
 
@@ -93,12 +115,21 @@ def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> t
         state: from :func:`opened`.
         given: the window.
     """
+    window = steady_window(tracked, state, given)
+    # A GPU is waited for: a pose that begins to slip is farther off a window later.
+    searches = given.reads.ask(has(window.triggers, SEARCHED), False).any()
+    return update(tracked, state, window, relocalized(tracked, state, window, given.t_us) if searches else window.located, given)
+
+
+def steady_window(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> SteadyWindow:
+    """Stages 1 to 4, of all objects alike, and which of them have triggers."""
     expected = expect(tracked, state, given.events.events, given.t_us, given.reads)
     seen = observe(tracked, state, expected, given)
     fit = align(expected.prediction, seen.contours, seen.index, seen.gate_scale, seen.observations, tracked.config, extra_terms=given.extra_terms)
     scored = validate(tracked, state, expected, seen, fit)
-    located = relocalized(tracked, state, expected, seen, scored, given)
-    return update(tracked, state, expected, seen, located, given)
+    is_starting = torch.zeros_like(tracked.stream_index, dtype=torch.bool) if given.is_starting is None else given.is_starting
+    evidence = gather_evidence(state, expected.scheduled, scored, seen.sigma_px, is_starting, tracked.ambiguities)
+    return SteadyWindow(expected, seen, scored, evidence, triggers(evidence, tracked.config))
 
 
 def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, given: StepInput) -> Observed:
@@ -110,7 +141,7 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(tracked.diameter_m)
     gate_scale = gate_scale_of(sigma_px, config)
     # Asked for here: a GPU answers while corners are looked for.
-    radius_px = given.reads.ask(index_radius(gate_scale, config), usual_index_radius(config))
+    radius_px = given.reads.ask_within(index_radius(gate_scale, config), usual_index_radius(config), widest_index_radius(config))
     maps = replace(maps, burst_age_us=burst_age_us)
     corners = sensors.corners(contours, maps, t_us, expected.window_s, config)
     if config.association.search == "along_flow":
@@ -145,32 +176,25 @@ def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, s
     return scored
 
 
-def relocalized(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, scored: ScoredFit, given: StepInput) -> Relocalized:
-    """Stage 5: other poses for the objects that have a trigger, and for no others."""
-    config = tracked.config
-    is_starting = torch.zeros_like(tracked.stream_index, dtype=torch.bool) if given.is_starting is None else given.is_starting
-    evidence = gather_evidence(state, expected.scheduled, scored, seen.sigma_px, is_starting, tracked.ambiguities)
-    flags, window = triggers(evidence, config), Relocalized(scored, expected.prediction, seen.gate_scale)
-    # A GPU is waited for: a pose that begins to slip is farther off a window later.
-    if not given.reads.ask(has(flags, SEARCHED), False).any():
-        return window
-    others = OtherPoses(LastSeen.from_state(state, tracked.objects, given.t_us, config), tracked.ambiguities)
-    return relocalize(window, flags, evidence, seen.events, others, config)
+def relocalized(tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, t_us: Int[Tensor, "s"]) -> Relocalized:
+    """Stage 5: other poses for objects that have a trigger, and for no others."""
+    others = OtherPoses(LastSeen.from_state(state, tracked.objects, t_us, tracked.config), tracked.ambiguities)
+    return relocalize(window.located, window.triggers, window.evidence, window.seen.events, others, tracked.config)
 
 
 def update(
-    tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, located: Relocalized, given: StepInput
+    tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, located: Relocalized, given: StepInput
 ) -> tuple[TrackerState, StepResult]:
     """Stage 6: the filter's update, statuses, and what is learned."""
-    config = tracked.config
+    config, expected, seen = tracked.config, window.expected, window.seen
     scored, prediction = located.scored, located.prediction.detached()
     next_state, result = conclude(state, located.prediction, located.gate_scale, scored, seen.corners, expected.dt_s, config)
     if config.uses(Component.TENTATIVE):
         next_state, result = confirm_or_take_back(state, next_state, result, prediction, located.gate_scale, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, learns=given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
-    maps = replace(next_state.maps, burst_age_us=seen.burst_age_us)
-    return replace(next_state, t_us=given.t_us, maps=maps), replace(result, t_us=given.t_us)
+    maps, health = replace(next_state.maps, burst_age_us=seen.burst_age_us), next_state.health.with_looks(located.looked)
+    return replace(next_state, t_us=given.t_us, maps=maps, health=health), replace(result, t_us=given.t_us)
 
 
 def opened(tracked: TrackedObjects, state: TrackerState, events: EventBatch) -> TrackerState:
@@ -187,3 +211,41 @@ def steady_advance(
     steady = host_sync.SteadyState()
     steady.ask(of_unknown_motion(state, t_us, tracked.objects, tracked.config), False)
     return *advance(tracked, state, StepInput(events, t_us, reads=steady, learns=learns)), steady.wrong()
+
+
+def steady_lane(
+    tracked: TrackedObjects, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"], *, learns: bool = False
+) -> tuple[TrackerState, StepResult, Bool[Tensor, "3"], "InPlace"]:
+    """:func:`steady_advance` that holds however uncertain or lost objects are: what these need is done for all, and nobody is looked for.
+
+    Returns:
+        State; result; whether the window may be called for in parts, and so does not hold, whether anybody is to be looked for, and whether anything
+        was uncertain; and the window itself, for :func:`looked_for`.
+    """
+    reads = host_sync.UncertainState()
+    reads.ask(of_unknown_motion(state, t_us, tracked.objects, tracked.config), False)
+    given = StepInput(events, t_us, reads=reads, learns=learns)
+    window = steady_window(tracked, state, given)
+    stated = torch.stack([reads.wrong(), has(window.triggers, SEARCHED).any(), reads.uncertain()])
+    return *update(tracked, state, window, window.located, given), stated, InPlace(window)
+
+
+class InPlace:
+    """A window that stays where a graph has computed it, until the graph is started again: no dataclass, so that its tensors are not copied."""
+
+    def __init__(self, window: SteadyWindow) -> None:
+        self._window = window
+
+    def window(self) -> SteadyWindow:
+        """The window as it is now. What was computed from it another time is not in it."""
+        return each_tensor(lambda tensor: tensor, self._window)
+
+
+def looked_for(
+    tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, events: NearbyEvents, t_us: Int[Tensor, "s"], *, learns: bool
+) -> tuple[TrackerState, StepResult]:
+    """State and result of a window of :func:`steady_lane`, with those looked for that have triggers: as :func:`advance` gives them."""
+    given = StepInput(events, t_us, learns=learns)
+    next_state, result = update(tracked, state, window, relocalized(tracked, state, window, t_us), given)
+    # What it passes on is in the graph's memory.
+    return each_tensor(Tensor.clone, next_state), each_tensor(Tensor.clone, result)

@@ -15,6 +15,7 @@ from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
+from torchtrack.tracking.relocalization import refine
 from torchtrack.tracking.relocalization.hypotheses import around_prediction, around_prediction_released, sampled_around
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
@@ -74,7 +75,8 @@ def test_a_further_source_needs_no_change_of_the_loop():
 
     further = Source(Trigger.LOST, oracle, lambda *_: acceptance_test())
     given = evidence(earlier=int(Trigger.LOST))
-    assert looped(lost, seen, given).scored is lost.window.scored
+    untried = looped(lost, seen, given)
+    assert untried.scored is lost.window.scored and untried.looked.tolist() == [False]
     after = looped(lost, seen, given, (*SOURCES, further))
     degrees, millimetres = pose_errors(after.scored.fit.solution.T_cam_obj.double(), T_true)
     assert float(degrees) < 0.5 and float(millimetres) < 1.0
@@ -199,6 +201,31 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
             pixels = [contours.pixels[number][contours.mask[number]] for contours in (ours.contours, theirs.contours)]
             torch.testing.assert_close(*pixels, rtol=0, atol=1e-4)
     assert not torch.equal(poses_of(runs["with"], 1), poses_of(runs["without"], 1))
+
+
+def test_the_work_of_a_window_is_bounded_however_many_are_lost(monkeypatch):
+    """Of four that are lost, one is looked for in a window, each in its turn, by as many hypotheses as one that is lost alone."""
+    aligned = []
+    whole = refine.align_and_score
+    monkeypatch.setattr(
+        refine, "align_and_score", lambda rows, offsets, lost: aligned.append((lost.number, len(offsets))) or whole(rows, offsets, lost)
+    )
+    _, events = moving_box(pose(), 8)
+    config = TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, new_below=0, objects=1))
+    tracker = Tracker([box_model()] * 4, SMALL_CAMERA, config)
+    state, _ = follow(tracker, tracker.init(pose()[None].repeat(4, 1, 1), 0), windows(events, 3))
+    work, looks = [], torch.zeros(4, dtype=torch.int64)
+    for batch, end_us in windows(events, 5, 3 * WINDOW_US):
+        aligned.clear()
+        # Lost before every window, whatever the last one gave.
+        lost = changed(state, covariance=1e3 * state.motion.covariance)
+        state, _ = tracker.step(replace(lost, health=replace(lost.health, looks=looks)), batch, end_us)
+        looked_for = {number for number, _ in aligned}
+        assert len(looked_for) == 1
+        looks = looks + torch.tensor([number in looked_for for number in range(4)])
+        work.append(sum(count for _, count in aligned))
+    assert looks.tolist() == [2, 1, 1, 1]
+    assert len(set(work)) == 1
 
 
 @pytest.mark.parametrize(("count", "times"), [(0, 0), (29, 0), (200, 1)])

@@ -75,6 +75,12 @@ def usual_index_radius(config: TrackerConfig) -> int:
     return int(max(config.association.gates_px)) + _INDEX_MARGIN_PX
 
 
+def widest_index_radius(config: TrackerConfig) -> int:
+    """The same for one that hardly anything is known of."""
+    widest = gate_scale_of(torch.full((1,), torch.inf), config)
+    return int(index_radius(widest, config))
+
+
 def index_for(
     contours: Contours, image_size: tuple[int, int], config: TrackerConfig, gate_scale: Float[Tensor, "b"], radius_px: AsyncValue | None = None
 ) -> ContourIndex:

@@ -38,6 +38,7 @@ class TriggerEvidence:
         reference_explained_ratio: what the object explains when it is seen well.
         drift_s: for how long it has explained too little by smeared events (s).
         time_since_validated_s: how long ago it was last seen well (s).
+        looks: in how many windows it was looked for since then.
         is_starting: objects whose motion is not known yet.
         is_due, is_drift_due: as :class:`Schedule` has them.
         has_symmetry: objects with a plane of symmetry; ``has_axis``, with an axis that most of it can be rotated about unseen.
@@ -52,6 +53,7 @@ class TriggerEvidence:
     reference_explained_ratio: Float[Tensor, "b"]
     drift_s: Float[Tensor, "b"]
     time_since_validated_s: Float[Tensor, "b"]
+    looks: Int[Tensor, "b"]
     is_starting: Bool[Tensor, "b"]
     is_due: Bool[Tensor, "b"]
     is_drift_due: Bool[Tensor, "b"]
@@ -82,6 +84,7 @@ def gather_evidence(
         reference_explained_ratio=state.health.reference_explained_ratio,
         drift_s=state.health.drift_s,
         time_since_validated_s=state.health.time_since_validated_s,
+        looks=state.health.looks,
         is_starting=is_starting,
         is_due=window.is_due,
         is_drift_due=window.is_drift_due,

@@ -7,11 +7,11 @@ nothing but its two edges. What gives it away is that its events go on, in line,
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
+from torchtrack.core import host_sync
 from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.relocalization.event_image import event_density, look_up
+from torchtrack.tracking.relocalization.event_image import event_density, look_up, of_neighbours
 
 # Contour points that are looked at, at most.
 _POINTS = 256
@@ -34,7 +34,7 @@ def running_on(contours: Contours, places: tuple[Float[Tensor, "1 e 2"], Bool[Te
         image_size: height and width (px).
     """
     # Larger than zero where there is an event two pixels away or nearer.
-    fired = max_pool2d(event_density(*places, image_size)[None], 3, 1, 1)[0]
+    fired = of_neighbours(event_density(*places, image_size), torch.maximum)
     chosen, exists = select_ranked(contours.mask, _POINTS)
     pixels, normals = take_points(contours.pixels, chosen), take_points(contours.normals, chosen)
     along = torch.stack([-normals[..., 1], normals[..., 0]], -1)
@@ -45,15 +45,20 @@ def running_on(contours: Contours, places: tuple[Float[Tensor, "1 e 2"], Bool[Te
         is_end, runs_on = seen, seen
         for step_px in _BEFORE_PX:
             before = pixels - step_px * forward
-            is_end = is_end & _has_point(own, before, _ON_PX) & (look_up(fired, before) > 0)
+            is_end = _with_point(own, before, _ON_PX, is_end & (look_up(fired, before) > 0))
         for step_px in _BEYOND_PX:
             beyond = pixels + step_px * forward
-            is_end = is_end & ~_has_point(own, beyond, _OFF_PX)
+            is_end = is_end & ~_with_point(own, beyond, _OFF_PX, is_end)
             runs_on = runs_on & (look_up(fired, beyond) > 0)
         ends, running = ends + is_end.sum(-1), running + (is_end & runs_on).sum(-1)
     return running / (ends + _GRANTED)
 
 
-def _has_point(own: Float[Tensor, "n m 2"], places: Float[Tensor, "n k 2"], distance_px: float) -> Bool[Tensor, "n k"]:
-    """Whether any of a pose's contour points is no farther from a place than this."""
-    return torch.cdist(places, own, compute_mode="donot_use_mm_for_euclid_dist").amin(-1) <= distance_px
+def _with_point(own: Float[Tensor, "n m 2"], places: Float[Tensor, "n k 2"], distance_px: float, among: Bool[Tensor, "n k"]) -> Bool[Tensor, "n k"]:
+    """Which places, ``among`` some, have any of their pose's contour points no farther away than this."""
+    if not host_sync.read_at_once(among):
+        return among & (torch.cdist(places, own, compute_mode="donot_use_mm_for_euclid_dist").amin(-1) <= distance_px)
+    # Few are left after the first tests: the distances of these alone are looked at.
+    pose, place = among.nonzero().unbind(1)
+    least_px2 = (own[pose] - places[pose, place][:, None]).square().sum(-1).amin(-1)
+    return among.index_put((pose, place), least_px2 <= distance_px**2)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -22,11 +22,13 @@ class Relocalized:
         scored: the fit of each object.
         prediction: what each is to be weighed against.
         gate_scale: how many times wider than configured the first gate of each is.
+        looked: objects that other poses were tried for; none where that was nobody.
     """
 
     scored: ScoredFit
     prediction: Prediction
     gate_scale: Float[Tensor, "b"]
+    looked: Bool[Tensor, "b"] | None = None
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ def exchanged(lost: LostObject, hypotheses: Hypotheses, tried: ScoredFit, choice
     if hypotheses.gate_scale is not None:
         own = torch.arange(len(gate_scale), device=gate_scale.device) == number
         gate_scale = torch.where(own & accepted, hypotheses.gate_scale, gate_scale)
-    return Relocalized(scored, prediction, gate_scale)
+    return replace(window, scored=scored, prediction=prediction, gate_scale=gate_scale)
 
 
 def replaced(scored: ScoredFit, number: int, tried: ScoredFit, choice: Choice) -> ScoredFit:

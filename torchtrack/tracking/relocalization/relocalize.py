@@ -15,6 +15,7 @@ from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import Acceptance
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.last_seen import with_drift
+from torchtrack.tracking.relocalization.looks import Asks, among, in_turn
 from torchtrack.tracking.relocalization.lost_object import LostObject, OtherPoses, Relocalized
 from torchtrack.tracking.relocalization.refine import exchanged, refined
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
@@ -30,7 +31,7 @@ def relocalize(
     config: TrackerConfig,
     sources: Sequence[Source] = SOURCES,
 ) -> Relocalized:
-    """Try other poses for the objects with triggers, and take those that pass the tests of their sources.
+    """Try other poses for objects with triggers, as many of them as a window has looks for, and take those that pass the tests of their sources.
 
     Args:
         window: what it gave so far.
@@ -45,11 +46,14 @@ def relocalize(
     sigma_px = torch.where(drifts, widened.sigma_px(window.scored.fit.contours), evidence.sigma_px)
     # Without events no pose is better than another; what is looked for all around may have its own there.
     enough = events.counts() >= config.validation.min_observations
-    flags = AsyncValue.to(torch.where(enough, triggers, triggers & int(AROUND_LAST_SEEN))).numbers()
+    asking = _asking(window, torch.where(enough, triggers, triggers & int(AROUND_LAST_SEEN)), evidence, sources)
+    looks = in_turn(asking, config.relocalization.objects)
+    window = replace(window, looked=among([asks.number for asks in looks], drifts))
     sigmas_px = AsyncValue.to(torch.stack([sigma_px, evidence.sigma_px], 1)).numbers()
     for comes_last in (False, True):
-        for number, own in enumerate(flags):
-            calls = [pair for pair in zip(sources, tests, strict=True) if pair[0].comes_last == comes_last and pair[0].is_called_for(own)]
+        for asks in looks:
+            number = asks.number
+            calls = [pair for pair in zip(sources, tests, strict=True) if pair[0].comes_last == comes_last and pair[0].is_called_for(asks.flags)]
             if calls:
                 (px, predicted_px), since_s = sigmas_px[number], evidence.time_since_validated_s[number]
                 lost = LostObject(number, window, widened, px, predicted_px, since_s, events.of_object(number), others, config)
@@ -57,6 +61,14 @@ def relocalize(
         if not comes_last:
             window = _settled(window, drifts, widened, gate_scale_of(sigma_px, config))
     return window
+
+
+def _asking(window: Relocalized, triggers: Int[Tensor, "b"], evidence: TriggerEvidence, sources: Sequence[Source]) -> list[Asks]:
+    """The objects that a source is called for."""
+    whole = AsyncValue.to(torch.stack([window.prediction.objects.stream_index, triggers, evidence.looks], 1))
+    lost_s = AsyncValue.to(evidence.time_since_validated_s).numbers()
+    asking = [Asks(number, stream, flags, looks, lost_s[number]) for number, (stream, flags, looks) in enumerate(whole.numbers())]
+    return [asks for asks in asking if any(source.is_called_for(asks.flags) for source in sources)]
 
 
 def _tried(lost: LostObject, calls: Iterable[tuple[Source, Acceptance]]) -> Relocalized:
@@ -75,4 +87,4 @@ def _settled(window: Relocalized, drifts: Bool[Tensor, "b"], widened: Prediction
     had_drifted = drifts & window.scored.is_relocalized
     covariance = torch.where(had_drifted[:, None, None], widened.covariance, window.prediction.covariance)
     prediction = replace(window.prediction, covariance=covariance)
-    return Relocalized(window.scored, prediction, torch.where(had_drifted, gate_scale, window.gate_scale))
+    return replace(window, prediction=prediction, gate_scale=torch.where(had_drifted, gate_scale, window.gate_scale))

@@ -1,9 +1,9 @@
 """How well each object was seen so far, and what is not confirmed yet."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -24,6 +24,7 @@ class TrackHealth:
         drift_s: for how long, less the time it was not, the object has explained too little by smeared events (s).
         T_last_validated: pose of each object when it was last seen well (float64).
         time_since_validated_s: how long ago that was (s).
+        looks: in how many windows other poses of it were tried since then.
     """
 
     score: Float[Tensor, "b"]
@@ -35,6 +36,12 @@ class TrackHealth:
     drift_s: Float[Tensor, "b"]
     T_last_validated: Float[Tensor, "b 4 4"]
     time_since_validated_s: Float[Tensor, "b"]
+    looks: Int[Tensor, "b"]
+
+    def with_looks(self, looked: Bool[Tensor, "b"] | None) -> "TrackHealth":
+        """The same after a window in which objects were looked for; nobody where not given."""
+        looks = self.looks if looked is None else self.looks + looked
+        return replace(self, looks=torch.where(self.time_since_validated_s == 0, 0, looks))
 
     @classmethod
     def unknown(cls, T_cam_obj: Float[Tensor, "b 4 4"], dtype: torch.dtype) -> "TrackHealth":
@@ -50,6 +57,7 @@ class TrackHealth:
             drift_s=zero,
             T_last_validated=T_cam_obj.clone(),
             time_since_validated_s=zero,
+            looks=torch.zeros_like(zero, dtype=torch.int64),
         )
 
 
