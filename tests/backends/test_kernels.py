@@ -218,7 +218,7 @@ def random_matches(batch=3, count=900):
     offsets, near = uniform(batch, count, low=-6, high=6, seed=1), uniform(batch, count, seed=2) < 0.7
     zeros, points = torch.zeros_like(offsets), torch.zeros(batch, count, 3).double()
     targets, directions = uniform(batch, count, 2, high=180, seed=3), uniform(batch, count, 2, low=-1, seed=4)
-    stated = uniform(batch, count, low=0.5, seed=5), zeros, zeros, zeros, torch.where(near, 1.0, -1.0).double()
+    stated = uniform(batch, count, low=0.5, seed=5), zeros, zeros, torch.where(near, 1.0, -1.0).double()
     return MatchesWithCues(zeros.long(), near, uniform(batch, count, seed=6), zeros, points, targets, directions, offsets, near, *stated)
 
 

@@ -35,7 +35,6 @@ SETTINGS = {
     "guided": {"corners": {"max_corners": 64}, "association": {"search": "guided"}},
     "learned trust": {"association": {"weighting_network": "all"}},
     "no velocity": {"disabled": ["velocity_in_window"]},
-    "nothing common": {"solver": {"common_px": 0.0}},
     "damped": {"solver": {"damping": 0.1}},
     "no hidden": {"contours": {"remove_hidden": False}},
     "no gathering": {"disabled": ["inlier_ratio"]},

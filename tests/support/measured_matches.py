@@ -20,7 +20,6 @@ def matches_at(targets, near=None, offsets=0.0):
         ones,
         zeros,
         *place,
-        silhouette=zeros,
         neighbours=zeros,
         edge_ambiguity_px2=zeros,
         dark=zeros,

@@ -71,6 +71,7 @@ REMOVED: dict[str, dict[str, str]] = {
         "acceleration_in_window": "the velocity is the same all along a window",
         "silhouette_offset_px": "smooth silhouettes lie where their model has them",
         "swelling_px": "smooth silhouettes lie where their model has them",
+        "common_px": "observations of a smooth silhouette count each for itself",
     },
     "motion": {
         "acceleration_px": "no acceleration is estimated",

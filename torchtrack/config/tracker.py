@@ -83,10 +83,7 @@ class SolverConfig(Settings):
     loss: Literal["tukey", "huber", "none"] = Field("tukey", description="Robust loss, with the round's gate as its scale.")
     damping: float = Field(1e-6, ge=0, description="Initial damping, as a share of the Hessian's diagonal.")
     prior: bool = Field(True, description="Weigh the observations against the prediction by its covariance, and find the velocity with the pose.")
-    observation_px: float = Field(1.5, gt=0, description="Standard deviation of one observation (px), with its share of what all have in common.")
-    common_px: float = Field(
-        0.25, ge=0, le=10, description="The same of what observations of a smooth silhouette in one place of the image have in common beside it (px)."
-    )
+    observation_px: float = Field(1.5, gt=0, description="Standard deviation of one observation (px).")
 
 
 class MotionConfig(Settings):

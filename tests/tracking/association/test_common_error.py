@@ -8,18 +8,12 @@ import torch
 from close_edges import two_depths
 from helpers import IMAGE_SIZE, contours_at, generator, moving_objects, seen, upright_line
 from nearest_cases import matching
-from tracked_boxes import in_motion
 
-from torchtrack.config.tracker import SolverConfig, TrackerConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.nearest import contour_table, match_nearest
-from torchtrack.tracking.association.observations import join, select_events
 from torchtrack.tracking.association.weights import SORTED_PX2, edge_ambiguity_px2, effective_weight
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.points import joined
-from torchtrack.tracking.estimation.rounds import align, gate_scale_of, index_for
-
-WITHOUT = TrackerConfig(solver=SolverConfig(common_px=0.0))
 
 
 @pytest.mark.parametrize(("observation_px", "common_px"), [(1.0, 0.5), (1.5, 0.2), (0.2, 1.0)])
@@ -44,42 +38,6 @@ def test_observations_are_counted_by_patch_where_they_are_on_a_contour():
     observations, still = seen(torch.stack([columns, rows], -1)[None]), moving_objects((0.0, 0.0), 1, torch.float64)
     matches, _ = match_nearest(observations, table, observations.pixels, still, 4.0, matching(concentration=True, polarity=True))
     assert matches.neighbours[0].tolist() == [30] * 30 + [5] * 5 + [30] * 8
-
-
-def solved(times, config, kind=ContourKind.SMOOTH):
-    """A window of a box whose edges are taken for those of ``kind``, with each of its events observed so many times."""
-    tracker, prediction, events, _, _ = in_motion(config)
-    contours = prediction.objects.contours(prediction.T_cam_obj, tracker.config.contours)
-    contours = replace(contours, kind=torch.full_like(contours.kind, int(kind)))
-    tight = gate_scale_of(torch.zeros(1), tracker.config)
-    index = index_for(contours, tracker.image_size, tracker.config, tight)
-    once = observations = select_events(events, index, prediction.moving(compensated=True), 1000)
-    for _ in range(times - 1):
-        observations = join(observations, once)
-    return prediction, align(prediction, contours, index, tight, observations, tracker.config).solution
-
-
-def stated(times, config, kind=ContourKind.SMOOTH):
-    """How much these tell of the pose, beside what was predicted: the trace of the information, by the prediction's covariance."""
-    prediction, solution = solved(times, config, kind)
-    observed = solution.hessian[0, :6, :6].double() / config.solver.observation_px**2 - prediction.information[0, :6, :6]
-    return float((observed @ prediction.covariance[0, :6, :6]).trace())
-
-
-def test_events_of_a_smooth_silhouette_seen_many_times_over_tell_little_more():
-    assert stated(8, WITHOUT) / stated(1, WITHOUT) == pytest.approx(8, rel=0.2)
-    assert 1 < stated(8, TrackerConfig()) / stated(1, TrackerConfig()) < 5
-
-
-@pytest.mark.parametrize("kind", [ContourKind.CREASE, ContourKind.TEXTURE, ContourKind.SEGMENT, ContourKind.LEARNED])
-def test_what_is_no_smooth_silhouette_has_nothing_in_common(kind):
-    for theirs, ours in zip(*(vars(solved(2, config, kind)[1]).values() for config in (WITHOUT, TrackerConfig())), strict=True):
-        assert torch.equal(theirs, ours)
-
-
-def test_what_is_in_common_leaves_exact_poses_alone():
-    *_, truth = in_motion()
-    assert float((solved(1, TrackerConfig())[1].T_cam_obj.double() - truth).abs().max()) < 3e-3
 
 
 def test_a_displaced_place_with_many_events_pulls_less_with_an_error_in_common():

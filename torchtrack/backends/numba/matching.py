@@ -14,8 +14,8 @@ X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, SMOOTH, ORIENTED, EXPECTED, E
 COLUMNS = 11
 # Rows of a match.
 WEIGHT, MATCH_AGE, POINT_X, POINT_Y, POINT_Z, TARGET_U, TARGET_V, DIRECTION_U, DIRECTION_V = range(9)
-OFFSET, IS_SMOOTH, NEIGHBOURS, ERROR, DARK, AS_EXPECTED = range(9, 15)
-ROWS = 15
+OFFSET, NEIGHBOURS, ERROR, DARK, AS_EXPECTED = range(9, 14)
+ROWS = 14
 # Patches of the image: votes of the observations in each.
 _ON, _NEAR, _VOTES = range(3)
 
@@ -118,7 +118,7 @@ def _match_one(
     dark = dark * table[nearest_index, ORIENTED]
     rows[WEIGHT, i], rows[MATCH_AGE, i], rows[POINT_X, i], rows[POINT_Y, i], rows[POINT_Z, i] = as_expected, age, point_x, point_y, point_z
     rows[TARGET_U, i], rows[TARGET_V, i], rows[DIRECTION_U, i], rows[DIRECTION_V, i] = target_u, target_v, nu, nv
-    rows[OFFSET, i], rows[IS_SMOOTH, i], rows[ERROR, i] = offset, table[nearest_index, SMOOTH], table[nearest_index, EDGE_AMBIGUITY]
+    rows[OFFSET, i], rows[ERROR, i] = offset, table[nearest_index, EDGE_AMBIGUITY]
     rows[DARK, i], rows[AS_EXPECTED, i] = dark, as_expected
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     next_u, next_v = carried_u - (u - table[nearest_index, INDEXED_U]), carried_v - (v - table[nearest_index, INDEXED_V])
@@ -161,6 +161,5 @@ def believe(seen: Array, is_matched: Array, matches: Array, settings: MatchingSe
     enough = total >= settings.min_observations
     for i in range(len(is_matched)):
         is_matched[i] = is_matched[i] and enough
-        common_px2 = matches[ERROR, i] + settings.common_px2 * matches[IS_SMOOTH, i]
-        effective = 1.0 / (1.0 + matches[NEIGHBOURS, i] * common_px2 / settings.observation_px**2)
+        effective = 1.0 / (1.0 + matches[NEIGHBOURS, i] * matches[ERROR, i] / settings.observation_px**2)
         matches[WEIGHT, i] *= enough * effective

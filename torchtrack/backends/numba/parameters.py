@@ -40,7 +40,6 @@ class MatchingSettings(NamedTuple):
     patch_bits: int
     patches: int
     min_observations: int
-    common_px2: float
     observation_px: float
 
 

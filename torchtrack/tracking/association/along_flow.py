@@ -4,7 +4,6 @@ import torch
 
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.core.padded import take_points
-from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association.matches import MatchesWithCues
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.points import Contours
@@ -35,7 +34,6 @@ def match_along_flow(observations: Observations, contours: Contours, objects: Mo
     directions = take_points(contours.normals, contour)
     mask = observations.mask & observations.has_flow & torch.isfinite(distance)
     offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
-    silhouette = (contours.kind == int(ContourKind.SMOOTH)).gather(1, contour).to(offsets.dtype)
     none, all_of_it = torch.zeros_like(offsets), torch.ones_like(offsets)
     geometry = observations.age_s, points_obj, targets, directions, offsets, mask
-    return MatchesWithCues(contour, mask, all_of_it, *geometry, all_of_it, silhouette, neighbours=none, edge_ambiguity_px2=none, dark=none)
+    return MatchesWithCues(contour, mask, all_of_it, *geometry, all_of_it, neighbours=none, edge_ambiguity_px2=none, dark=none)

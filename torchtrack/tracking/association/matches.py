@@ -41,13 +41,11 @@ class MatchesWithCues(Matches):
     """Matches, and what else their weights in the cost and what is remembered of contours are made of.
 
     Args:
-        silhouette: 1 where the contour is the smooth silhouette, 0 where not.
         neighbours: how many observations are on the contour in the patch of the image that each lies in.
         edge_ambiguity_px2: mean square of how far off each is, should it be of an edge that lies beside its contour (px²).
         dark: 1 where an event says that the outer side of its contour is the darker one, -1 the inner one; 0 where that is not known.
     """
 
-    silhouette: Float[Tensor, "b n"]
     neighbours: Float[Tensor, "b n"]
     edge_ambiguity_px2: Float[Tensor, "b n"]
     dark: Float[Tensor, "b n"]

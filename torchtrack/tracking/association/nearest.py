@@ -102,6 +102,6 @@ def match_nearest(
     as_expected, dark = agreeing(dark * expected), dark * oriented
     weights, neighbours = match_weights(offsets, targets, near, dark, as_expected, config.association)
     geometry = observations.age_s, points_obj, targets, normals, offsets
-    matches = MatchesWithCues(contour, matched, weights, *geometry, near, as_expected, silhouette, neighbours, edge_ambiguity, dark)
+    matches = MatchesWithCues(contour, matched, weights, *geometry, near, as_expected, neighbours, edge_ambiguity, dark)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)

@@ -236,9 +236,7 @@ def _believed(matches: MatchesWithCues, observations: Observations, config: Trac
     if observations.trust is not None:
         weights = weights * observations.trust
     enough = weights.sum(-1, keepdim=True) >= config.validation.min_observations
-    # The model of a smooth silhouette, which has facets, and its shading put a whole piece of it off.
-    common_px2 = torch.add(matches.edge_ambiguity_px2, matches.silhouette, alpha=config.solver.common_px**2)
-    effective = effective_weight(matches.neighbours, common_px2, config.solver.observation_px)
+    effective = effective_weight(matches.neighbours, matches.edge_ambiguity_px2, config.solver.observation_px)
     return replace(matches, mask=matches.mask & enough, weights=weights * enough * effective)
 
 
