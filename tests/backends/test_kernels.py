@@ -6,7 +6,6 @@ import pytest
 import torch
 import trimesh
 from both_ways import assert_as_close, both_ways
-from close_edges import two_depths
 from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_events, random_pose, random_twist
 from solid_models import ball, l_prism
 
@@ -141,22 +140,14 @@ def test_of_no_contours_nothing_is_found():
         assert (index.look_up(contours.pixels)[1] == -1).all()
 
 
-@pytest.mark.parametrize("close_px", [0.0, 1.7])
 @pytest.mark.parametrize("polarity", [None, uniform(3, 8, low=-1)])
-def test_the_table_of_contours(close_px, polarity, dtype):
+def test_the_table_of_contours(polarity, dtype):
     contours, polarity = random_contours(dtype=dtype), None if polarity is None else polarity.to(dtype)
     contours = replace(contours, points_cam=contours.points_cam + uniform(*contours.mask.shape, 1, seed=5, dtype=dtype))
     index = index_contours(contours, IMAGE_SIZE, 7, 2)
-    ours, theirs = both_ways(lambda: contour_table(contours, index, polarity, close_px=close_px).rows)
+    ours, theirs = both_ways(lambda: contour_table(contours, index, polarity).rows)
     counts = contours.mask[:, None].expand_as(ours)
     torch.testing.assert_close(ours[counts], theirs[counts], rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("apart_px", [0.05, 0.3, 1.0])
-def test_the_table_of_sharp_edges_that_nearly_cover_each_other(apart_px):
-    contours, index = two_depths(apart_px)
-    ours, theirs = both_ways(lambda: contour_table(contours, index, close_px=1.7).rows)
-    torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-12)
 
 
 def window_events(batch=3, count=4000, dtype=torch.float64):
@@ -218,7 +209,7 @@ def random_matches(batch=3, count=900):
     offsets, near = uniform(batch, count, low=-6, high=6, seed=1), uniform(batch, count, seed=2) < 0.7
     zeros, points = torch.zeros_like(offsets), torch.zeros(batch, count, 3).double()
     targets, directions = uniform(batch, count, 2, high=180, seed=3), uniform(batch, count, 2, low=-1, seed=4)
-    stated = uniform(batch, count, low=0.5, seed=5), zeros, zeros, torch.where(near, 1.0, -1.0).double()
+    stated = uniform(batch, count, low=0.5, seed=5), torch.where(near, 1.0, -1.0).double()
     return MatchesWithCues(zeros.long(), near, uniform(batch, count, seed=6), zeros, points, targets, directions, offsets, near, *stated)
 
 

@@ -137,7 +137,7 @@ def random_find(tracker, prediction, dtype):
     of_each = [uniform(OBJECTS, 50, low=low, seed=seed).to(dtype) for low, seed in ((0, 28), (-1, 29))]
     matches = MatchesWithCues(
         *(exists.long(), exists, of_each[0], nothing, nothing[..., None].expand(-1, -1, 3), pairs, sides, of_each[1]),
-        *(exists, torch.ones_like(nothing), nothing, nothing, of_each[1].sign()),
+        *(exists, torch.ones_like(nothing), of_each[1].sign()),
     )
     solution = Linearisation(T_cam_obj, offset.to(dtype), hessian.to(dtype), offset.to(dtype))
     measured, inlier_ratio = uniform(OBJECTS, low=0.3, seed=23).to(dtype), uniform(OBJECTS, seed=24).to(dtype)

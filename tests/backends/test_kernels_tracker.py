@@ -30,7 +30,7 @@ SETTINGS = {
     "no polarity": {"association": {"polarity": False}},
     "no compensation": {"association": {"motion_compensation": False}},
     "one gate": {"association": {"gates_px": (5.0,)}},
-    "no close edges": {"association": {"edge_ambiguity_px": 0.0}, "disabled": ["dark_shift"]},
+    "no dark shift": {"disabled": ["dark_shift"]},
     "corners": {"corners": {"max_corners": 64}},
     "guided": {"corners": {"max_corners": 64}, "association": {"search": "guided"}},
     "learned trust": {"association": {"weighting_network": "all"}},

@@ -20,8 +20,6 @@ def matches_at(targets, near=None, offsets=0.0):
         ones,
         zeros,
         *place,
-        neighbours=zeros,
-        edge_ambiguity_px2=zeros,
         dark=zeros,
         as_expected=ones,
     )

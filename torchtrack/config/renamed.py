@@ -41,7 +41,6 @@ KEYS = {
         "limb_dark_shift_px": "silhouette_dark_shift_px",
         "learned_trust": "weighting_network",
         "polarity_memory_s": "polarity_prior_s",
-        "close_edges_px": "edge_ambiguity_px",
     },
     "learning": {
         "below_share": "below_ratio",
@@ -66,6 +65,7 @@ REMOVED: dict[str, dict[str, str]] = {
         "burst_px": "events count at their own times, however late in a burst",
         "burst_us": "events count at their own times, however late in a burst",
         "pixel_latency": "events count at their own times, however late in a burst",
+        "edge_ambiguity_px": "what is seen of parallel edges counts in full, however close they are",
     },
     "solver": {
         "acceleration_in_window": "the velocity is the same all along a window",

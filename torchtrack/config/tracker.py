@@ -66,9 +66,6 @@ class AssociationConfig(Settings):
     motion_compensation: bool = Field(True, description="Move each observation to the window's end with its contour's velocity.")
     concentration: bool = Field(True, description="Trust observations less where those around them are smeared across the contour.")
     polarity: bool = Field(True, description="Trust events less whose polarity is not that of most others on the contour around them.")
-    edge_ambiguity_px: float = Field(
-        1.7, ge=0, le=10, description="Parallel edges closer than about this may be taken for each other, and tell less (px); 0 for never."
-    )
     weighting_network: Literal["none", "silhouettes", "all"] = Field(
         "silhouettes",
         description="Which observations to trust as a small network has learned from the events around them: those of smooth silhouettes, or all.",

@@ -10,12 +10,12 @@ from torchtrack.backends.numba.parameters import Cells, MatchingSettings
 # Rows of what was observed.
 U, V, AGE, POLARITY, TRUST = range(5)
 # Columns of a contour point: its place on the object, its normal, where it was indexed, and marks.
-X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, SMOOTH, ORIENTED, EXPECTED, EDGE_AMBIGUITY = range(11)
-COLUMNS = 11
+X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, SMOOTH, ORIENTED, EXPECTED = range(10)
+COLUMNS = 10
 # Rows of a match.
 WEIGHT, MATCH_AGE, POINT_X, POINT_Y, POINT_Z, TARGET_U, TARGET_V, DIRECTION_U, DIRECTION_V = range(9)
-OFFSET, NEIGHBOURS, ERROR, DARK, AS_EXPECTED = range(9, 14)
-ROWS = 14
+OFFSET, DARK, AS_EXPECTED = range(9, 12)
+ROWS = 12
 # Patches of the image: votes of the observations in each.
 _ON, _NEAR, _VOTES = range(3)
 
@@ -118,8 +118,7 @@ def _match_one(
     dark = dark * table[nearest_index, ORIENTED]
     rows[WEIGHT, i], rows[MATCH_AGE, i], rows[POINT_X, i], rows[POINT_Y, i], rows[POINT_Z, i] = as_expected, age, point_x, point_y, point_z
     rows[TARGET_U, i], rows[TARGET_V, i], rows[DIRECTION_U, i], rows[DIRECTION_V, i] = target_u, target_v, nu, nv
-    rows[OFFSET, i], rows[ERROR, i] = offset, table[nearest_index, EDGE_AMBIGUITY]
-    rows[DARK, i], rows[AS_EXPECTED, i] = dark, as_expected
+    rows[OFFSET, i], rows[DARK, i], rows[AS_EXPECTED, i] = offset, dark, as_expected
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     next_u, next_v = carried_u - (u - table[nearest_index, INDEXED_U]), carried_v - (v - table[nearest_index, INDEXED_V])
     place[i, 0], place[i, 1] = next_u if is_matched else place[i, 0], next_v if is_matched else place[i, 1]
@@ -134,14 +133,13 @@ def _match_one(
 
 @kernel(fastmath=FAST)
 def _weigh(is_near: Array, matches: Array, votes: Array, settings: MatchingSettings) -> None:
-    """How far each match is to be trusted by those around it, and how many of these are on the contour."""
+    """How far each match is to be trusted by those around it."""
     gain = 1.0 / (settings.gathered_share - settings.smeared_share)
     for i in range(matches.shape[1]):
         if not is_near[i]:
             continue
         cell = patch(matches[TARGET_U, i], matches[TARGET_V, i], settings.patch_bits, settings.patches)
         on = votes[cell, _ON]
-        matches[NEIGHBOURS, i] = on
         weight = matches[AS_EXPECTED, i]
         if settings.concentration:
             share = (on + 1.0) / (votes[cell, _NEAR] + 2.0)
@@ -161,5 +159,4 @@ def believe(seen: Array, is_matched: Array, matches: Array, settings: MatchingSe
     enough = total >= settings.min_observations
     for i in range(len(is_matched)):
         is_matched[i] = is_matched[i] and enough
-        effective = 1.0 / (1.0 + matches[NEIGHBOURS, i] * matches[ERROR, i] / settings.observation_px**2)
-        matches[WEIGHT, i] *= enough * effective
+        matches[WEIGHT, i] *= enough

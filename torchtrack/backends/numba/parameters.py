@@ -40,7 +40,6 @@ class MatchingSettings(NamedTuple):
     patch_bits: int
     patches: int
     min_observations: int
-    observation_px: float
 
 
 class ArrivalSettings(NamedTuple):
@@ -127,26 +126,11 @@ class IndexSettings(NamedTuple):
 
 
 class TableSettings(NamedTuple):
-    """What :mod:`torchtrack.backends.numba.contour_table` goes by: settings, and constants of :mod:`torchtrack.tracking.association.weights`.
-
-    Args:
-        silhouette, crease, texture: numbers of kinds of contours.
-        close_px: distance from which parallel edges are told apart; 0 for always.
-        aside_px: where an edge is looked for beside another.
-        parallel, apart_px: contours this parallel and this far apart are two edges.
-        touching_px, depth_share, sorted_px2: how little apart edges at different depths are, and by how much more they seem so.
-    """
+    """Numbers of kinds of contours that :mod:`torchtrack.backends.numba.contour_table` goes by."""
 
     silhouette: int
     crease: int
     texture: int
-    close_px: float
-    aside_px: float
-    parallel: float
-    apart_px: float
-    touching_px: float
-    depth_share: float
-    sorted_px2: float
 
 
 class GridSettings(NamedTuple):

@@ -180,15 +180,7 @@ def align_rounds_numba(
         cells_of(table.index),
         *as_arrays(prediction.velocity, information, objects.intrinsics, objects.centre_obj),
         *as_arrays(constant(config.association.gates_px, offset.dtype, offset.device), gates.wider, gates.subcell_lookup),
-        filled(
-            MatchingSettings,
-            config.association,
-            config.solver,
-            config.validation,
-            weights,
-            dark_shift_px=step_px,
-            silhouette_dark_shift_px=silhouette_px,
-        ),
+        filled(MatchingSettings, config.association, config.validation, weights, dark_shift_px=step_px, silhouette_dark_shift_px=silhouette_px),
         RoundSettings(config.association.motion_compensation, config.uses(Component.VELOCITY_IN_WINDOW)),
         damping_settings(config.solver, information),
         *as_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
@@ -202,10 +194,10 @@ def _seen(observations: Observations) -> Float[Tensor, "b 5 n"]:
     return torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.polarity, trust], 1)
 
 
-def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 14 n"]) -> MatchesWithCues:
+def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 12 n"]) -> MatchesWithCues:
     """The matches as the pipeline knows them."""
-    weights, age_s, points, targets, directions, *rest = rows.split((1, 1, 3, 2, 2, 1, 1, 1, 1, 1), 1)
-    offsets, neighbours, edge_ambiguity, dark, as_expected = (value[:, 0] for value in rest)
+    weights, age_s, points, targets, directions, *rest = rows.split((1, 1, 3, 2, 2, 1, 1, 1), 1)
+    offsets, dark, as_expected = (value[:, 0] for value in rest)
     points_obj, targets, directions = (value.transpose(1, 2) for value in (points, targets, directions))
     geometry = weights[:, 0], age_s[:, 0], points_obj, targets, directions, offsets
-    return MatchesWithCues(contour, is_matched, *geometry, is_near, as_expected, neighbours, edge_ambiguity, dark)
+    return MatchesWithCues(contour, is_matched, *geometry, is_near, as_expected, dark)

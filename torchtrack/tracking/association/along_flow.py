@@ -34,6 +34,6 @@ def match_along_flow(observations: Observations, contours: Contours, objects: Mo
     directions = take_points(contours.normals, contour)
     mask = observations.mask & observations.has_flow & torch.isfinite(distance)
     offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
-    none, all_of_it = torch.zeros_like(offsets), torch.ones_like(offsets)
+    all_of_it = torch.ones_like(offsets)
     geometry = observations.age_s, points_obj, targets, directions, offsets, mask
-    return MatchesWithCues(contour, mask, all_of_it, *geometry, all_of_it, neighbours=none, edge_ambiguity_px2=none, dark=none)
+    return MatchesWithCues(contour, mask, all_of_it, *geometry, all_of_it, dark=torch.zeros_like(offsets))

@@ -1,4 +1,4 @@
-"""What an observation is matched with: where, and how far that is to be trusted; apart from it, the cues that weights are made of."""
+"""What an observation is matched with: where, and how far that is to be trusted; apart from it, what is remembered of contours."""
 
 from dataclasses import dataclass, replace
 
@@ -38,16 +38,12 @@ class Matches:
 
 @dataclass(frozen=True)
 class MatchesWithCues(Matches):
-    """Matches, and what else their weights in the cost and what is remembered of contours are made of.
+    """Matches, and what they say of the sides of contours.
 
     Args:
-        neighbours: how many observations are on the contour in the patch of the image that each lies in.
-        edge_ambiguity_px2: mean square of how far off each is, should it be of an edge that lies beside its contour (px²).
         dark: 1 where an event says that the outer side of its contour is the darker one, -1 the inner one; 0 where that is not known.
     """
 
-    neighbours: Float[Tensor, "b n"]
-    edge_ambiguity_px2: Float[Tensor, "b n"]
     dark: Float[Tensor, "b n"]
 
 

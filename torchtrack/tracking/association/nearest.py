@@ -20,7 +20,6 @@ from torchtrack.tracking.association.polarity import octant
 from torchtrack.tracking.association.weights import (
     agreeing,
     dark_shift_px,
-    edge_ambiguity_px2,
     leading_side,
     match_weights,
 )
@@ -43,28 +42,26 @@ class ContourTable:
     not_plain: Bool[Tensor, "b"]
 
     def take(self, contour: Int[Tensor, "b n"]) -> tuple[Tensor, ...]:
-        """Of contour points: places on the object, normals, pixels when indexed; smooth silhouette or not, oriented or not, darker side, error."""
+        """Of contour points: places on the object, normals, pixels when indexed; smooth silhouette or not, oriented or not, darker side."""
         taken = self.rows.gather(2, contour[:, None].expand(-1, self.rows.shape[1], -1)).transpose(1, 2)
-        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 4), -1)
+        points_obj, normals, indexed, marks = taken.split((3, 2, 2, 3), -1)
         return points_obj, normals, indexed, *marks.unbind(-1)
 
 
 @accelerable
-def contour_table(contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, close_px: float = 0.0) -> ContourTable:
+def contour_table(contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None) -> ContourTable:
     """The table of contours and their index.
 
     The normals of the mesh's own edges are oriented: they point outwards.
 
     Args:
         polarity: expected of the mesh's own edges, by the octant that they face (:func:`torchtrack.tracking.association.polarity.expected_polarity`).
-        close_px: distance from which parallel edges are told apart; 0 for always.
     """
     silhouette, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.SMOOTH, ContourKind.CREASE, ContourKind.TEXTURE))
     oriented, expected = silhouette | crease, torch.zeros_like(contours.pixels[..., 0])
     if polarity is not None:
         expected = torch.where(oriented, polarity.gather(1, octant(contours.normals)), expected)
-    edge_ambiguity = edge_ambiguity_px2(contours, index, oriented, crease, close_px) if close_px else torch.zeros_like(expected)
-    marks = torch.stack([silhouette.to(expected.dtype), oriented.to(expected.dtype), expected, edge_ambiguity], -1)
+    marks = torch.stack([silhouette.to(expected.dtype), oriented.to(expected.dtype), expected], -1)
     values = (contours.points_obj, contours.normals, index.pixels, marks)
     return ContourTable(torch.cat([value.transpose(1, 2) for value in values], 1), index, ((silhouette | texture) & contours.mask).any(1))
 
@@ -90,7 +87,7 @@ def match_nearest(
     """
     wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
     nearest_index = table.index.look_up(place, subcell_lookup)
-    points_obj, normals, indexed, silhouette, oriented, expected, edge_ambiguity = table.take(contour := nearest_index.clamp(min=0))
+    points_obj, normals, indexed, silhouette, oriented, expected = table.take(contour := nearest_index.clamp(min=0))
     pixels, velocity = objects.show(points_obj)
     dark = observations.polarity * leading_side(vecdot(normals, velocity))
     carried = torch.addcmul(observations.pixels, velocity, observations.age_s[..., None])
@@ -100,8 +97,7 @@ def match_nearest(
     matched = near & (vecdot(difference, difference) < (gate_px * wider)[:, None].square())
     offsets = vecdot(difference, normals) / wider[:, None]
     as_expected, dark = agreeing(dark * expected), dark * oriented
-    weights, neighbours = match_weights(offsets, targets, near, dark, as_expected, config.association)
-    geometry = observations.age_s, points_obj, targets, normals, offsets
-    matches = MatchesWithCues(contour, matched, weights, *geometry, near, as_expected, neighbours, edge_ambiguity, dark)
+    weights = match_weights(offsets, targets, near, dark, as_expected, config.association)
+    matches = MatchesWithCues(contour, matched, weights, observations.age_s, points_obj, targets, normals, offsets, near, as_expected, dark)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)

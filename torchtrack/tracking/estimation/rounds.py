@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.components import Component
-from torchtrack.config.tracker import AssociationConfig, TrackerConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.host_sync import AsyncValue
@@ -15,7 +15,6 @@ from torchtrack.tracking.association.along_flow import match_along_flow
 from torchtrack.tracking.association.matches import MatchesWithCues, both_coordinates
 from torchtrack.tracking.association.nearest import ContourTable, contour_table, match_nearest
 from torchtrack.tracking.association.observations import Observations
-from torchtrack.tracking.association.weights import effective_weight
 from torchtrack.tracking.contours.index import INDEX_CELL_PX, ContourIndex, index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject
@@ -117,7 +116,7 @@ def align(
     information = _information(prediction, config)
     begin = prediction if offset is None else prediction.moved(offset)
     offset = torch.zeros_like(information[:, 0]) if offset is None else offset
-    table = _table(contours, index, objects, matching)
+    table = contour_table(contours, index, objects.polarity)
     gates = Gates(gate_scale, _narrowing(gate_scale, len(matching.gates_px)), _needs_subcell_lookup(objects, begin, table, gate_scale, config))
     start = Start(prediction, begin, offset, information, contours, index, extra_terms)
     solution, matches, contours = align_rounds(start, table, observations, gates, config)
@@ -176,7 +175,7 @@ def align_rounds(
         if number and config.contours.source == "splat":
             contours = objects.contours(begin.T_cam_obj, config.contours)
             index = index_for(contours, objects.image_size, config, gates.gate_scale, start.index.radius_px)
-            table = _table(contours, index, objects, matching)
+            table = contour_table(contours, index, objects.polarity)
             place = _first_place(begin, observations, config)
         moving = begin.moving(compensated=matching.motion_compensation)
         if matching.search == "along_flow":
@@ -205,11 +204,6 @@ def _needs_subcell_lookup(
     return subcell_lookup & (gate_scale <= 1)
 
 
-def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config: AssociationConfig) -> ContourTable:
-    """What observations take from their contours, with the polarity that is expected of them."""
-    return contour_table(contours, index, objects.polarity, close_px=config.edge_ambiguity_px)
-
-
 def _narrowing(gate_scale: Float[Tensor, "b"], rounds: int) -> Float[Tensor, "r b"]:
     """How many times wider than configured the gate of every round is: as given at first, not at all at last."""
     left = tuple((1 - number / max(rounds - 1, 1),) for number in range(rounds))
@@ -236,8 +230,7 @@ def _believed(matches: MatchesWithCues, observations: Observations, config: Trac
     if observations.trust is not None:
         weights = weights * observations.trust
     enough = weights.sum(-1, keepdim=True) >= config.validation.min_observations
-    effective = effective_weight(matches.neighbours, matches.edge_ambiguity_px2, config.solver.observation_px)
-    return replace(matches, mask=matches.mask & enough, weights=weights * enough * effective)
+    return replace(matches, mask=matches.mask & enough, weights=weights * enough)
 
 
 def _problem(start: Start, matches: MatchesWithCues, offset: Float[Tensor, "b k"], gate_px: Float[Tensor, "b"], config: TrackerConfig) -> PoseProblem:
