@@ -142,10 +142,10 @@ def random_find(tracker, prediction, dtype):
     solution = Linearisation(T_cam_obj, offset.to(dtype), hessian.to(dtype), offset.to(dtype))
     measured, inlier_ratio = uniform(OBJECTS, low=0.3, seed=23).to(dtype), uniform(OBJECTS, seed=24).to(dtype)
     measured[0], measured[1], measured[5], inlier_ratio[2] = 0.05, 0.3, torch.nan, torch.nan
-    elsewhere, axis_ambiguous = torch.arange(OBJECTS) % 3 == 0, torch.arange(OBJECTS) % 4 == 2
+    elsewhere = torch.arange(OBJECTS) % 3 == 0
     reference_inlier_ratio, apart, required_spread = (uniform(OBJECTS, seed=seed).to(dtype) for seed in (26, 30, 31))
     stated = measured, torch.ones_like(measured), count, inlier_ratio, reference_inlier_ratio, apart, required_spread
-    return ScoredFit(Fit(solution, contours, matches), *stated, elsewhere, axis_ambiguous)
+    return ScoredFit(Fit(solution, contours, matches), *stated, elsewhere)
 
 
 def conclusions(config, dtype, spoil=lambda scored: None):

@@ -25,7 +25,6 @@ SEEN_WELL = {
     "is_due": False,
     "is_drift_due": False,
     "has_symmetry": False,
-    "has_axis": False,
     "earlier": int(NONE),
 }
 
@@ -50,7 +49,6 @@ def lost_object(tracker, prediction, seen, scored, sigma_px, config=None):
         widened=prediction,
         sigma_px=sigma_px,
         predicted_sigma_px=sigma_px,
-        time_since_validated_s=torch.zeros(()),
         events=seen.of_object(0),
         others=others,
         config=config or tracker.config,

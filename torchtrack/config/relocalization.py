@@ -24,9 +24,6 @@ class RelocalizationConfig(Settings):
     mirrored_below: float = Field(
         0.8, ge=0, le=1, description="Share of what an object explains when seen well below which it may be mirrored in depth; 0 for never."
     )
-    axis_rotation: bool = Field(
-        True, description="What can be turned about an axis nearly unseen is not taken to be seen well again until events tell how it is turned."
-    )
     not_validated_us: int = Field(
         100_000,
         ge=0,

@@ -15,7 +15,6 @@ KEYS = {
         "dropped_to": "low_score_below",
         "slipped_to": "score_drop_below",
         "mirrored_to": "mirrored_below",
-        "turned": "axis_rotation",
         "unseen_us": "last_seen_us",
         "anew_us": "not_validated_us",
         "anew_below": "not_validated_below",
@@ -76,6 +75,9 @@ REMOVED: dict[str, dict[str, str]] = {
     "motion": {
         "acceleration_px": "no acceleration is estimated",
         "acceleration_s": "no acceleration is estimated",
+    },
+    "relocalization": {
+        "axis_rotation": "no rotations about an axis are compared",
     },
 }
 

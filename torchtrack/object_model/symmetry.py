@@ -143,14 +143,8 @@ def no_planes(_: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tensor, "0 3"]]
 
 def revolution_axes(models: Sequence[ObjectModel]) -> Float[Tensor, "b 3"]:
     """Direction of the :func:`revolution_axis` of each object (float64); zero where there is none."""
-    return stacked(of_each(models, revolution_axis))[1]
-
-
-def stacked(axes: Sequence[RevolutionAxis | None]) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3"]]:
-    """A point on each axis, and its direction (float64); zeros where there is none."""
     nothing = torch.zeros(3, dtype=torch.float64)
-    points, directions = zip(*((nothing, nothing) if axis is None else (axis.point_obj, axis.direction_obj) for axis in axes), strict=True)
-    return torch.stack(points), torch.stack(directions)
+    return torch.stack([nothing if axis is None else axis.direction_obj for axis in of_each(models, revolution_axis)])
 
 
 def of_each(models: Sequence[ObjectModel], look: Callable[[ObjectModel], T]) -> list[T]:

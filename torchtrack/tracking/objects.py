@@ -11,14 +11,14 @@ from torchtrack.core.camera import Camera
 from torchtrack.errors import ModelError
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourModel, group_by_model
-from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, stacked, symmetry_planes, turning_axis
+from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, symmetry_planes
 from torchtrack.tracking.association.weighting_network import SilhouetteTrust, TrustNetwork, shipped_network
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
 from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.motion.prediction import far_pose
-from torchtrack.tracking.relocalization.symmetric import Ambiguities, RotationAxes, SymmetryPlanes
-from torchtrack.tracking.relocalization.triggers import tries_mirrored, tries_rotated
+from torchtrack.tracking.relocalization.symmetric import Ambiguities, SymmetryPlanes
+from torchtrack.tracking.relocalization.triggers import tries_mirrored
 
 
 class TrackedObjects(nn.Module):
@@ -36,9 +36,6 @@ class TrackedObjects(nn.Module):
     symmetry_points: Tensor
     symmetry_normals: Tensor
     has_symmetry: Tensor
-    turning_points: Tensor
-    turning_directions: Tensor
-    has_turning_axis: Tensor
     with_surface: Tensor
     far_pose: Tensor
 
@@ -77,11 +74,6 @@ class TrackedObjects(nn.Module):
         self.register_buffer("symmetry_points", torch.stack(points))
         self.register_buffer("symmetry_normals", torch.stack([pad(each, (0, 0, 0, 3 - len(each))) for each in normals]))
         self.register_buffer("has_symmetry", torch.tensor(self.symmetry_counts) > 0)
-        on_axes, directions = stacked(of_each(objects, turning_axis) if tries_rotated(self.config) else [None] * len(objects))
-        self.register_buffer("turning_points", on_axes)
-        self.register_buffer("turning_directions", directions)
-        self.register_buffer("has_turning_axis", directions.any(1))
-        self.turns = bool(directions.any())
         self.register_buffer("far_pose", far_pose(self.centre_obj))
         self.weighting_network = shipped_network(self.models, self.config.association) if weighting_network is None else weighting_network
         # On dense meshes no line of sight is followed.
@@ -108,7 +100,7 @@ class TrackedObjects(nn.Module):
     def ambiguities(self) -> Ambiguities:
         """In which other poses each object looks about the same."""
         planes = SymmetryPlanes(self.symmetry_points, self.symmetry_normals, self.symmetry_counts)
-        return Ambiguities(planes, RotationAxes(self.turning_points, self.turning_directions), self.has_symmetry, self.has_turning_axis)
+        return Ambiguities(planes, self.has_symmetry)
 
     @property
     def sensors(self) -> Sensors:

@@ -31,7 +31,7 @@ from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_object import OtherPoses, Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.tentative import confirm_or_take_back
-from torchtrack.tracking.relocalization.triggers import SEARCHED, has, may_have_rotated, triggers
+from torchtrack.tracking.relocalization.triggers import SEARCHED, has, triggers
 from torchtrack.tracking.state import StepResult, TrackerState, each_tensor
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.measures import required_spread
@@ -170,10 +170,7 @@ def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, s
     config, health = tracked.config, state.health
     reference = reference_where_known(seen.sigma_px, health.reference_inlier_ratio, config.relocalization)
     spread = required_spread(health.reference_normal_spread, health.time_since_validated_s, config.validation)
-    scored = score_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference, spread)
-    if tracked.turns:
-        return replace(scored, axis_ambiguous=may_have_rotated(tracked.has_turning_axis, health.time_since_validated_s))
-    return scored
+    return score_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference, spread)
 
 
 def relocalized(tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, t_us: Int[Tensor, "s"]) -> Relocalized:

@@ -97,8 +97,7 @@ def judged_objects(
     T_cam_obj = torch.where(held[:, None, None], state.T_cam_obj, T_cam_obj)
     trusted = torch.where(failed, 0, torch.maximum(hidden, trust(explained, config.validation, reference, gate_scale)))
     smeared = ~failed & is_smeared(scored.score, reference, scored.inlier_ratio, scored.reference_inlier_ratio)
-    unsure = smeared | (~failed & scored.axis_ambiguous)
-    status = torch.where(unsure, status.clamp(min=int(Status.UNCERTAIN)), status)
+    status = torch.where(smeared, status.clamp(min=int(Status.UNCERTAIN)), status)
     velocity, covariance = _updated_motion(prediction, scored, failed, trusted, dt_s, config)
     centre_cam = lie.transform_points(T_cam_obj, objects.centre_obj[:, None].double())[:, 0]
     certain = (explained >= CERTAIN * reference) & (status == int(Status.TRACKING))

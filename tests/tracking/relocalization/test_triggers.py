@@ -64,7 +64,6 @@ ALONE = {
     Trigger.DRIFT: {"is_drift_due": True, "drift_s": 0.051, "sigma_px": 3.9, "matches": 10},
     Trigger.SLOW_DRIFT: {"is_drift_due": True, "time_since_validated_s": 0.051, "last_score": 0.7},
     Trigger.MIRROR_AMBIGUOUS: {"is_drift_due": True, "has_symmetry": True, "score": 0.7, "last_score": 0.7, "mean_score": 0.8},
-    Trigger.AXIS_AMBIGUOUS: {"is_drift_due": True, "has_axis": True, "time_since_validated_s": 0.051},
     Trigger.LOST: {"earlier": int(Trigger.LOST)},
     Trigger.DEPTH_CHANGED: {"earlier": int(Trigger.DEPTH_CHANGED)},
     Trigger.FAR_BELOW_REFERENCE: {"earlier": int(Trigger.FAR_BELOW_REFERENCE)},
@@ -88,7 +87,7 @@ def test_every_trigger_but_those_that_hang_on_others_is_set_alone_here():
 
 
 def test_what_is_seen_well_has_no_trigger_whatever_it_is_time_for():
-    assert flags_of(evidence(is_due=True, is_drift_due=True, has_symmetry=True, has_axis=True)) == [NONE]
+    assert flags_of(evidence(is_due=True, is_drift_due=True, has_symmetry=True)) == [NONE]
 
 
 @pytest.mark.parametrize("trigger", ALONE, ids=lambda trigger: trigger.name)
@@ -160,23 +159,6 @@ def test_what_has_a_plane_of_symmetry_and_does_not_explain_all_may_be_mirrored_w
     assert having(SEARCHED, given, Component.SCORE_DROP, Component.LOW_SCORE, **only_mirrors) == [True] + [False] * 5
     assert not any(having(Trigger.MIRROR_AMBIGUOUS, given, mirrored_below=0))
     assert not any(having(Trigger.MIRROR_AMBIGUOUS, given, Component.DRIFT))
-
-
-def test_what_may_have_rotated_is_looked_at_once_it_is_seen_well_again_and_sure_of_its_place():
-    settings = {"accept_ratio": 0.9}
-    axis, known, due = ([number != wrong for number in range(5)] for wrong in (2, 3, 4))
-    given = evidence(
-        5,
-        score=[0.82, 0.8, 0.82, 0.82, 0.82],
-        has_axis=axis,
-        is_starting=[not value for value in known],
-        is_drift_due=due,
-        time_since_validated_s=0.1,
-    )
-    assert having(Trigger.AXIS_AMBIGUOUS, given, **settings) == [True, False, False, False, False]
-    assert having(SEARCHED, given, **settings)[0]
-    assert not any(having(Trigger.AXIS_AMBIGUOUS, replace(given, sigma_px=torch.full((5,), 6.1)), **settings))
-    assert not any(having(Trigger.AXIS_AMBIGUOUS, replace(given, time_since_validated_s=torch.full((5,), 0.049)), **settings))
 
 
 def test_what_drifts_or_is_very_uncertain_is_looked_for_as_it_was_last_seen_when_it_is_time():

@@ -49,7 +49,6 @@ def conclude(
     offset: Array,
     hessian: Array,
     is_relocalized: Array,
-    axis_ambiguous: Array,
     matched: Array,
     measured: Array,
     dt_s: Array,
@@ -70,7 +69,7 @@ def conclude(
         T_before: poses before the window, ``[b, 4, 4]``.
         T_prior, usable, velocity, covariance: of the prediction.
         T_estimated, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 12]``, ``[b, 12, 12]``.
-        is_relocalized, axis_ambiguous: ``[b]``, of the fits; ``matched [b]``, how many observations they have.
+        is_relocalized, matched: ``[b]``, of the fits: whether they are of a search, and how many observations they have.
         measured: ``[MEASURED, b]``, what else is known of them.
         remembered, T_last_validated: ``[REMEMBERED, b]`` and ``[b, 4, 4]`` before the window; changed to those after it.
         T_cam_obj, new_velocity, posterior, left, status: after the window, ``left`` being the covariance of poses; filled.
@@ -86,7 +85,7 @@ def conclude(
             T_cam_obj[b] = T_before[b]
         trusted = 0.0 if failed else max(hidden, _trust(explained, reference, measured[GATE_SCALE, b], settings))
         smeared = not failed and _is_smeared(b, measured, reference, settings)
-        if smeared or (axis_ambiguous[b] and not failed):
+        if smeared:
             status[b] = max(status[b], UNCERTAIN)
         inverse(hessian[b], inverses)
         _update(trusted, failed, dt, velocity[b], covariance[b], offset[b], inverses, settings, new_velocity[b], posterior[b])
@@ -285,7 +284,7 @@ def judged_objects_numba(
     conclude(
         *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance),
         *as_arrays(solution.T_cam_obj, solution.from_prior, solution.hessian),
-        *as_arrays(scored.is_relocalized, scored.axis_ambiguous, scored.count, packed, dt_s, objects.centre_obj, objects.diameter_m),
+        *as_arrays(scored.is_relocalized, scored.count, packed, dt_s, objects.centre_obj, objects.diameter_m),
         _settings(config),
         *as_arrays(remembered, T_last_validated, T_cam_obj, velocity, covariance, left, status_of),
     )

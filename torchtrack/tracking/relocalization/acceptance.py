@@ -39,12 +39,10 @@ class Choice:
     Args:
         row: of the best.
         is_accepted: whether it takes the place of the object's own pose.
-        axis_is_clear: whether that tells how the object is rotated about its axis; none where that is not asked.
     """
 
     row: Int[Tensor, "1"]
     is_accepted: Bool[Tensor, "1"]
-    axis_is_clear: Bool[Tensor, "1"] | None = None
 
 
 @runtime_checkable

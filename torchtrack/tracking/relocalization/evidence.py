@@ -41,7 +41,7 @@ class TriggerEvidence:
         looks: in how many windows it was looked for since then.
         is_starting: objects whose motion is not known yet.
         is_due, is_drift_due: as :class:`Schedule` has them.
-        has_symmetry: objects with a plane of symmetry; ``has_axis``, with an axis that most of it can be rotated about unseen.
+        has_symmetry: objects with a plane of symmetry.
         earlier: triggers that are set already.
     """
 
@@ -58,7 +58,6 @@ class TriggerEvidence:
     is_due: Bool[Tensor, "b"]
     is_drift_due: Bool[Tensor, "b"]
     has_symmetry: Bool[Tensor, "b"]
-    has_axis: Bool[Tensor, "b"]
     earlier: Int[Tensor, "b"]
 
     def stays_below(self, level: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
@@ -89,6 +88,5 @@ def gather_evidence(
         is_due=window.is_due,
         is_drift_due=window.is_drift_due,
         has_symmetry=ambiguities.has_symmetry,
-        has_axis=ambiguities.has_axis,
         earlier=window.triggers,
     )

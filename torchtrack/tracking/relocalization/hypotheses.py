@@ -8,7 +8,7 @@ line in :mod:`torchtrack.tracking.relocalization.sources`.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.tracking.contours.points import Contours
@@ -44,14 +44,6 @@ class Hypotheses:
     replaces_prediction: bool = False
     released: Float[Tensor, "12 12"] | None = None
     gate_scale: Float[Tensor, "1"] | None = None
-
-    def rows(self, count: int) -> Prediction:
-        """The prediction that each of ``count`` of them is an offset from."""
-        return self.prediction.copies(0, count)
-
-    def prediction_at(self, row: Int[Tensor, "1"]) -> Prediction:
-        """The prediction of the object alone that the hypothesis in a row is weighed against."""
-        return self.prediction
 
 
 def around_prediction(lost: LostObject) -> Hypotheses:

@@ -53,7 +53,6 @@ class LostObject:
         window: what the window gave so far, for all objects.
         widened: the predictions of all objects, of those that drift as uncertain as that makes them.
         sigma_px: standard deviation of the object's widened prediction in the image; ``predicted_sigma_px``, that of its own.
-        time_since_validated_s: how long ago it was last seen well (s).
         events: of the object.
         others: where objects may be besides.
     """
@@ -63,7 +62,6 @@ class LostObject:
     widened: Prediction
     sigma_px: float
     predicted_sigma_px: float
-    time_since_validated_s: Float[Tensor, ""]
     events: WindowEvents
     others: OtherPoses
     config: TrackerConfig

@@ -24,11 +24,11 @@ _ALIGNED_AGAIN = 8
 def refined(hypotheses: Hypotheses, lost: LostObject) -> ScoredFit:
     """The hypotheses aligned on the events of their object, and scored; of a very uncertain object, the best of them once more."""
     search = lost.config.relocalization
-    tried = align_and_score(hypotheses.rows(len(hypotheses.offsets)), hypotheses.offsets, lost)
+    tried = align_and_score(hypotheses.prediction.copies(0, len(hypotheses.offsets)), hypotheses.offsets, lost)
     for _ in range(search.realignments if hypotheses.is_wide else 0):
         # From some way off, a pose comes near the right one before its contours are those that are seen there.
         best = tried.score.topk(min(_ALIGNED_AGAIN, len(tried.score))).indices
-        tried = align_and_score(hypotheses.rows(len(best)), tried.fit.solution.from_prior[best], lost)
+        tried = align_and_score(hypotheses.prediction.copies(0, len(best)), tried.fit.solution.from_prior[best], lost)
     return tried
 
 
@@ -50,19 +50,15 @@ def align_and_score(rows: Prediction, offsets: Float[Tensor, "n 12"], lost: Lost
 def exchanged(lost: LostObject, hypotheses: Hypotheses, tried: ScoredFit, choice: Choice) -> Relocalized:
     """What the window gave, with the chosen hypothesis in the place of the object's own pose, where that is accepted."""
     window, number, accepted = lost.window, lost.number, choice.is_accepted
-    if choice.axis_is_clear is None and host_sync.none_of(accepted):
+    if host_sync.none_of(accepted):
         return window
     scored, prediction, gate_scale = replaced(window.scored, number, tried, choice), window.prediction, window.gate_scale
-    if choice.axis_is_clear is not None:
-        unclear = scored.axis_ambiguous.clone()
-        unclear[number] &= ~choice.axis_is_clear[0]
-        scored = replace(scored, axis_ambiguous=unclear)
     if hypotheses.released is not None:
         hessian = scored.fit.solution.hessian.clone()
         hessian[number] += (hypotheses.released * accepted).to(hessian.dtype)
         scored = replace(scored, fit=replace(scored.fit, solution=replace(scored.fit.solution, hessian=hessian)))
     if hypotheses.replaces_prediction:
-        prediction = prediction.exchanged(number, hypotheses.prediction_at(choice.row), accepted[0])
+        prediction = prediction.exchanged(number, hypotheses.prediction, accepted[0])
     if hypotheses.gate_scale is not None:
         own = torch.arange(len(gate_scale), device=gate_scale.device) == number
         gate_scale = torch.where(own & accepted, hypotheses.gate_scale, gate_scale)
@@ -83,7 +79,6 @@ def replaced(scored: ScoredFit, number: int, tried: ScoredFit, choice: Choice) -
     count = max(mine.contours.mask.shape[1], theirs.contours.mask.shape[1])
     own, others = mine.contours.widened(count), theirs.contours.widened(count)
     contours = Contours(*(put(value, getattr(others, name)) for name, value in vars(own).items()))
-    names = [field.name for field in fields(ScoredFit) if field.name not in ("fit", "axis_ambiguous")]
+    names = [field.name for field in fields(ScoredFit) if field.name != "fit"]
     measures = {name: put(getattr(scored, name), getattr(tried, name)) for name in names}
-    # Another pose says nothing of whether it is the only possible.
-    return ScoredFit(fit=Fit(solution, contours, mine.matches), axis_ambiguous=scored.axis_ambiguous, **measures)
+    return ScoredFit(fit=Fit(solution, contours, mine.matches), **measures)

@@ -55,8 +55,7 @@ def relocalize(
             number = asks.number
             calls = [pair for pair in zip(sources, tests, strict=True) if pair[0].comes_last == comes_last and pair[0].is_called_for(asks.flags)]
             if calls:
-                (px, predicted_px), since_s = sigmas_px[number], evidence.time_since_validated_s[number]
-                lost = LostObject(number, window, widened, px, predicted_px, since_s, events.of_object(number), others, config)
+                lost = LostObject(number, window, widened, *sigmas_px[number], events.of_object(number), others, config)
                 window = _tried(lost, calls)
         if not comes_last:
             window = _settled(window, drifts, widened, gate_scale_of(sigma_px, config))

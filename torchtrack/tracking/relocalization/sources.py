@@ -10,7 +10,6 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization import acceptance, hypotheses
 from torchtrack.tracking.relocalization.acceptance import Acceptance
-from torchtrack.tracking.relocalization.axis_rotation import rotated, rotation_test
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.lost_object import LostObject
@@ -48,6 +47,5 @@ SOURCES = (
     Source(Trigger.SCORE_DROP, hypotheses.around_prediction_released, acceptance.elsewhere),
     Source(Trigger.NOT_VALIDATED, hypotheses.as_last_seen, acceptance.as_last_seen),
     *(Source(Trigger.MIRROR_AMBIGUOUS, partial(hypotheses.mirrored, plane=plane), acceptance.elsewhere) for plane in range(MOST_PLANES)),
-    Source(Trigger.AXIS_AMBIGUOUS, rotated, rotation_test),
     Source(AROUND_LAST_SEEN, hypotheses.around_last_seen, acceptance.around_last_seen, comes_last=True),
 )

@@ -1,24 +1,21 @@
-"""Poses in which an object looks about the same: mirrored in depth, or rotated about an axis.
+"""Poses in which an object looks about the same: mirrored in depth.
 
 Seen from afar, all points of a body may be mirrored in the plane through its middle that faces the camera, and none moves in the
 image. Mirrored in its own plane of symmetry as well, the body is as it was, but rotated: both poses have the same outline, and
 where they meet, as the body rotates, a tracker may follow either. Perspective, and what is seen within the outline, tell them apart.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import normalize
 
-from torchtrack.core.lie import retract_about
 from torchtrack.tracking.motion.prediction import Prediction
 
 # Planes of symmetry of an object, at most.
 MOST_PLANES = 3
-# How certain a rotation about the axis is (rad), and its rate (rad/s), that was not seen.
-_ROTATION_RAD, _RATE_RAD_S = 0.1, 4.0
 
 
 @dataclass(frozen=True)
@@ -43,48 +40,16 @@ class SymmetryPlanes:
 
 
 @dataclass(frozen=True)
-class RotationAxes:
-    """The axis of each object that most of it can be rotated about unseen.
-
-    Args:
-        points_obj: a point on it (m).
-        directions_obj: its unit direction; zero of objects without an axis.
-    """
-
-    points_obj: Float[Tensor, "b 3"]
-    directions_obj: Float[Tensor, "b 3"]
-
-    def rotated(self, number: int, prediction: Prediction, angles: Float[Tensor, "n"]) -> Prediction:
-        """The ``prediction`` of the object ``number`` alone, rotated by some angles about its axis, of which hardly anything is known then.
-
-        What is on the axis goes on as it did.
-        """
-        count, point, direction = len(angles), self.points_obj[number], self.directions_obj[number]
-        copies, along = prediction.copies(0, count), prediction.T_cam_obj[0, :3, :3] @ direction
-        rotations = pad(angles[:, None] * along, (0, 3))
-        moved = replace(copies, T_cam_obj=retract_about(copies.T_cam_obj, rotations, point.expand(count, 3)))
-        gained = torch.linalg.cross(copies.velocity[:, :3], moved.centre_cam - copies.centre_cam, dim=-1)
-        unknown, spread = torch.zeros_like(prediction.covariance), torch.outer(along, along).to(prediction.covariance.dtype)
-        for first, sigma in ((0, _ROTATION_RAD), (6, _RATE_RAD_S)):
-            unknown[:, first : first + 3, first : first + 3] = sigma**2 * spread
-        velocity = torch.cat([copies.velocity[:, :3], copies.velocity[:, 3:] + gained], 1)
-        return replace(moved, velocity=velocity, covariance=copies.covariance + unknown)
-
-
-@dataclass(frozen=True)
 class Ambiguities:
     """In which other poses each object looks about the same.
 
     Args:
         planes: of symmetry.
-        axes: that most of an object can be rotated about unseen.
-        has_symmetry: objects with a plane; ``has_axis``, with an axis.
+        has_symmetry: objects with a plane.
     """
 
     planes: SymmetryPlanes
-    axes: RotationAxes
     has_symmetry: Bool[Tensor, "b"]
-    has_axis: Bool[Tensor, "b"]
 
 
 def mirrored(prediction: Prediction, point_obj: Float[Tensor, "3"], normal_obj: Float[Tensor, "3"]) -> Prediction:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from enum import IntFlag, auto
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchtrack.config.components import Component
@@ -49,7 +49,6 @@ class Trigger(IntFlag):
     SLOW_DRIFT = auto()
     HELD = auto()
     MIRROR_AMBIGUOUS = auto()
-    AXIS_AMBIGUOUS = auto()
     NOT_VALIDATED = auto()
     DEPTH_CHANGED = auto()
     FAR_BELOW_REFERENCE = auto()
@@ -65,7 +64,7 @@ AROUND_LAST_SEEN = Trigger.DEPTH_CHANGED | Trigger.FAR_BELOW_REFERENCE
 AROUND_PREDICTION = Trigger.STARTING | Trigger.UNCERTAIN | Trigger.NEW | Trigger.LOW_SCORE | DRIFTS
 # What calls for a search. An object that is lost is expected where it was last validated, and uncertain there; an object that was not
 # validated for long is uncertain or drifts.
-SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP | Trigger.MIRROR_AMBIGUOUS | Trigger.AXIS_AMBIGUOUS
+SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP | Trigger.MIRROR_AMBIGUOUS
 
 
 def triggers(evidence: TriggerEvidence, config: TrackerConfig) -> Int[Tensor, "b"]:
@@ -176,17 +175,6 @@ def is_mirror_ambiguous(evidence: TriggerEvidence, config: TrackerConfig) -> Boo
     return _is_sure(evidence) & low & _looks_far(evidence, config) & evidence.has_symmetry
 
 
-def is_axis_ambiguous(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """AXIS_AMBIGUOUS: objects that may be rotated about their axis: sure of their place, they explain as much as when seen well again."""
-    if none_of(evidence.is_drift_due):
-        return evidence.is_drift_due
-    unseen = may_have_rotated(evidence.has_axis, evidence.time_since_validated_s)
-    if none_of(unseen):
-        return unseen
-    well = evidence.score >= config.relocalization.accept_ratio * evidence.reference_explained_ratio
-    return unseen & _is_sure(evidence) & well & _looks_far(evidence, config)
-
-
 def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """NOT_VALIDATED: objects that drift or are very uncertain, and were not seen well for long: they are also looked for as they were then."""
     if none_of(evidence.is_drift_due):
@@ -206,7 +194,6 @@ _CONDITIONS: tuple[dict[int, Condition], ...] = (
         int(Trigger.SCORE_DROP): has_score_dropped,
         int(Trigger.HELD): is_held,
         int(Trigger.MIRROR_AMBIGUOUS): is_mirror_ambiguous,
-        int(Trigger.AXIS_AMBIGUOUS): is_axis_ambiguous,
         int(Trigger.NOT_VALIDATED): is_not_validated,
     },
 )
@@ -235,13 +222,3 @@ def searches(config: TrackerConfig) -> bool:
 def tries_mirrored(config: TrackerConfig) -> bool:
     """Whether mirrored ones are."""
     return searches(config) and config.relocalization.mirrored_below > 0
-
-
-def tries_rotated(config: TrackerConfig) -> bool:
-    """Whether those rotated about an axis are."""
-    return searches(config) and config.relocalization.axis_rotation and config.uses(Component.DRIFT)
-
-
-def may_have_rotated(has_axis: Bool[Tensor, "b"], time_since_validated_s: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
-    """Which objects with an axis were not seen well for so long that they may have rotated about it unseen."""
-    return has_axis & (time_since_validated_s >= 1e-6 * DRIFT_US)

@@ -32,7 +32,6 @@ class ScoredFit:
         normal_spread: how far the normals of the contours are spread that events lie on.
         required_spread: how far they have to be to count in full; zero for nothing required.
         is_relocalized: objects that a search took to another pose than the prediction led to.
-        axis_ambiguous: which may be rotated otherwise about their axis (:mod:`torchtrack.tracking.relocalization.axis_rotation`).
     """
 
     fit: Fit
@@ -44,7 +43,6 @@ class ScoredFit:
     normal_spread: Float[Tensor, "b"]
     required_spread: Float[Tensor, "b"]
     is_relocalized: Bool[Tensor, "b"]
-    axis_ambiguous: Bool[Tensor, "b"]
 
     @once
     def explained_ratio(self) -> Float[Tensor, "b"]:
@@ -89,7 +87,6 @@ def score_fit(
         normal_spread=spread,
         required_spread=nothing if required_spread is None else required_spread,
         is_relocalized=nothing.bool(),
-        axis_ambiguous=nothing.bool(),
     )
 
 
