@@ -6,7 +6,7 @@ from torchtrack.tracking.relocalization import hypotheses, last_seen, schedule, 
 from torchtrack.tracking.relocalization.acceptance import AcceptanceTest
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen
-from torchtrack.tracking.relocalization.lost_object import LostObject, OtherPoses, Relocalized
+from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
 from torchtrack.tracking.relocalization.refine import exchanged, refined
 from torchtrack.tracking.relocalization.triggers import NONE
 
@@ -24,7 +24,6 @@ SEEN_WELL = {
     "is_starting": False,
     "is_due": False,
     "is_drift_due": False,
-    "has_symmetry": False,
     "earlier": int(NONE),
 }
 
@@ -42,15 +41,13 @@ def acceptance_test(margin=0.1, min_score=0.0, min_inlier_ratio=0.0, min_matches
 
 def lost_object(tracker, prediction, seen, scored, sigma_px, config=None):
     """The first object of a tracker, to try other poses for."""
-    others = OtherPoses(LastSeen(prediction.T_cam_obj.double(), prediction.covariance), tracker.ambiguities)
     return LostObject(
         number=0,
         window=Relocalized(scored, prediction, torch.ones_like(scored.score)),
         widened=prediction,
         sigma_px=sigma_px,
-        predicted_sigma_px=sigma_px,
         events=seen.of_object(0),
-        others=others,
+        last_seen=LastSeen(prediction.T_cam_obj.double(), prediction.covariance),
         config=config or tracker.config,
     )
 

@@ -21,9 +21,6 @@ class RelocalizationConfig(Settings):
     )
     wide_sigma_px: float = Field(10.0, gt=0, description="Standard deviation of the prediction from which it is very uncertain (px).")
     interval_us: int = Field(10_000, ge=0, description="A very uncertain object is searched for once in this time (µs); 0 for in every window.")
-    mirrored_below: float = Field(
-        0.8, ge=0, le=1, description="Share of what an object explains when seen well below which it may be mirrored in depth; 0 for never."
-    )
     not_validated_us: int = Field(
         100_000,
         ge=0,

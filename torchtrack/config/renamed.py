@@ -14,7 +14,6 @@ KEYS = {
         "realigned": "realignments",
         "dropped_to": "low_score_below",
         "slipped_to": "score_drop_below",
-        "mirrored_to": "mirrored_below",
         "unseen_us": "last_seen_us",
         "anew_us": "not_validated_us",
         "anew_below": "not_validated_below",
@@ -78,6 +77,7 @@ REMOVED: dict[str, dict[str, str]] = {
     },
     "relocalization": {
         "axis_rotation": "no rotations about an axis are compared",
+        "mirrored_below": "no poses mirrored in depth are tried",
     },
 }
 

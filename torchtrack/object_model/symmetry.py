@@ -1,8 +1,7 @@
 """Surfaces of revolution, such as bottles and bowls, which turned about their axis look the same, or nearly so; and planes of symmetry."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -26,8 +25,6 @@ _CLEARLY_DISTINCT = 2e-3
 _TRIANGLES = 5000
 # A surface is its own mirror image when samples of the image lie this near to it, in the mean (diameters).
 _MIRRORED = 0.02
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -119,7 +116,7 @@ def symmetry_planes(model: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tenso
     """
     points = model.surface_points.double()
     if len(points) == 0:
-        return no_planes(model)
+        return torch.zeros(3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
     arms = points - points.mean(0)
     return points.mean(0), mirrored_across(model, torch.linalg.eigh(arms.mT @ arms).eigenvectors.mT)
 
@@ -136,21 +133,12 @@ def mirrored_across(model: ObjectModel, axes: Float[Tensor, "k 3"]) -> Float[Ten
     return axes[apart_m < _MIRRORED * model.diameter_m]
 
 
-def no_planes(_: ObjectModel) -> tuple[Float[Tensor, "3"], Float[Tensor, "0 3"]]:
-    """What :func:`symmetry_planes` gives of a model without any."""
-    return torch.zeros(3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-
-
 def revolution_axes(models: Sequence[ObjectModel]) -> Float[Tensor, "b 3"]:
     """Direction of the :func:`revolution_axis` of each object (float64); zero where there is none."""
     nothing = torch.zeros(3, dtype=torch.float64)
-    return torch.stack([nothing if axis is None else axis.direction_obj for axis in of_each(models, revolution_axis)])
-
-
-def of_each(models: Sequence[ObjectModel], look: Callable[[ObjectModel], T]) -> list[T]:
-    """What is found of each model; one that several objects have is looked at once."""
-    by_model = {number: look(model) for number, model in {id(model): model for model in models}.items()}
-    return [by_model[id(model)] for model in models]
+    # A model that several objects have is looked at once.
+    axes = {number: revolution_axis(model) for number, model in {id(model): model for model in models}.items()}
+    return torch.stack([nothing if (axis := axes[id(model)]) is None else axis.direction_obj for model in models])
 
 
 def _quartered(triangles: Float[Tensor, "f 3 3"]) -> Float[Tensor, "q 3 3"]:

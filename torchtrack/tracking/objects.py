@@ -4,21 +4,18 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import Camera
 from torchtrack.errors import ModelError
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourModel, group_by_model
-from torchtrack.object_model.symmetry import no_planes, of_each, revolution_axes, symmetry_planes
+from torchtrack.object_model.symmetry import revolution_axes
 from torchtrack.tracking.association.weighting_network import SilhouetteTrust, TrustNetwork, shipped_network
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
 from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.motion.prediction import far_pose
-from torchtrack.tracking.relocalization.symmetric import Ambiguities, SymmetryPlanes
-from torchtrack.tracking.relocalization.triggers import tries_mirrored
 
 
 class TrackedObjects(nn.Module):
@@ -33,9 +30,6 @@ class TrackedObjects(nn.Module):
     half_extent: Tensor
     diameter_m: Tensor
     revolution_axes: Tensor
-    symmetry_points: Tensor
-    symmetry_normals: Tensor
-    has_symmetry: Tensor
     with_surface: Tensor
     far_pose: Tensor
 
@@ -68,12 +62,6 @@ class TrackedObjects(nn.Module):
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
         self.register_buffer("revolution_axes", revolution_axes(objects))
         self.revolves = bool(self.revolution_axes.any())
-        # Looking for planes takes as long as some windows.
-        points, normals = zip(*of_each(objects, symmetry_planes if tries_mirrored(self.config) else no_planes), strict=True)
-        self.symmetry_counts = tuple(len(each) for each in normals)
-        self.register_buffer("symmetry_points", torch.stack(points))
-        self.register_buffer("symmetry_normals", torch.stack([pad(each, (0, 0, 0, 3 - len(each))) for each in normals]))
-        self.register_buffer("has_symmetry", torch.tensor(self.symmetry_counts) > 0)
         self.register_buffer("far_pose", far_pose(self.centre_obj))
         self.weighting_network = shipped_network(self.models, self.config.association) if weighting_network is None else weighting_network
         # On dense meshes no line of sight is followed.
@@ -95,12 +83,6 @@ class TrackedObjects(nn.Module):
         shape = (self.streams, *self.image_size)
         own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m, self.stream_index
         return ObjectBatch(self.models, *own, shape, self._shared)
-
-    @property
-    def ambiguities(self) -> Ambiguities:
-        """In which other poses each object looks about the same."""
-        planes = SymmetryPlanes(self.symmetry_points, self.symmetry_normals, self.symmetry_counts)
-        return Ambiguities(planes, self.has_symmetry)
 
     @property
     def sensors(self) -> Sensors:

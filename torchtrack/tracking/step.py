@@ -28,7 +28,7 @@ from torchtrack.tracking.initialization import of_unknown_motion
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence, gather_evidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen
-from torchtrack.tracking.relocalization.lost_object import OtherPoses, Relocalized
+from torchtrack.tracking.relocalization.lost_object import Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.tentative import confirm_or_take_back
 from torchtrack.tracking.relocalization.triggers import SEARCHED, has, triggers
@@ -175,8 +175,8 @@ def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, s
 
 def relocalized(tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, t_us: Int[Tensor, "s"]) -> Relocalized:
     """Stage 5: other poses for objects that have a trigger, and for no others."""
-    others = OtherPoses(LastSeen.from_state(state, tracked.objects, t_us, tracked.config), tracked.ambiguities)
-    return relocalize(window.located, window.triggers, window.evidence, window.seen.events, others, tracked.config)
+    last_seen = LastSeen.from_state(state, tracked.objects, t_us, tracked.config)
+    return relocalize(window.located, window.triggers, window.evidence, window.seen.events, last_seen, tracked.config)
 
 
 def update(

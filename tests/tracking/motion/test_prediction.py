@@ -99,6 +99,17 @@ def test_copies_are_of_one_object():
         assert ours.data_ptr() == given[1].data_ptr()
 
 
+def test_one_prediction_takes_the_place_of_another_where_it_is_taken():
+    rotations, speeds = ((0.5, 0.6, 0.1), (0.1, 0.2, 0.3)), torch.arange(12.0).view(2, 1, 6)
+    own, other = (boxes(pose(rotations[row])[None], random_covariance(seed=row), speeds[row]) for row in range(2))
+    three = own.copies(0, 3)
+    for taken in (True, False):
+        now = three.exchanged(1, other, torch.tensor(taken))
+        expected = [own, other if taken else own, own]
+        for name in ("T_cam_obj", "velocity", "covariance"):
+            assert torch.equal(getattr(now, name), torch.cat([getattr(p, name) for p in expected])), name
+
+
 # ---- the first gate
 
 

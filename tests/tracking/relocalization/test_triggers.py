@@ -63,7 +63,6 @@ ALONE = {
     Trigger.SCORE_DROP: {"score": 0.62},
     Trigger.DRIFT: {"is_drift_due": True, "drift_s": 0.051, "sigma_px": 3.9, "matches": 10},
     Trigger.SLOW_DRIFT: {"is_drift_due": True, "time_since_validated_s": 0.051, "last_score": 0.7},
-    Trigger.MIRROR_AMBIGUOUS: {"is_drift_due": True, "has_symmetry": True, "score": 0.7, "last_score": 0.7, "mean_score": 0.8},
     Trigger.LOST: {"earlier": int(Trigger.LOST)},
     Trigger.DEPTH_CHANGED: {"earlier": int(Trigger.DEPTH_CHANGED)},
     Trigger.FAR_BELOW_REFERENCE: {"earlier": int(Trigger.FAR_BELOW_REFERENCE)},
@@ -87,7 +86,7 @@ def test_every_trigger_but_those_that_hang_on_others_is_set_alone_here():
 
 
 def test_what_is_seen_well_has_no_trigger_whatever_it_is_time_for():
-    assert flags_of(evidence(is_due=True, is_drift_due=True, has_symmetry=True)) == [NONE]
+    assert flags_of(evidence(is_due=True, is_drift_due=True)) == [NONE]
 
 
 @pytest.mark.parametrize("trigger", ALONE, ids=lambda trigger: trigger.name)
@@ -146,19 +145,6 @@ def test_new_objects_that_leave_much_unexplained_are_searched_for_when_it_is_tim
     # One window that is a little worse is no reason.
     assert not any(having(Trigger.NEW, replace(given, last_score=torch.full((3,), 0.95))))
     assert not any(having(Trigger.NEW, given, new_below=0))
-
-
-def test_what_has_a_plane_of_symmetry_and_does_not_explain_all_may_be_mirrored_when_it_is_time():
-    settings, score = {"mirrored_below": 0.8}, torch.tensor([0.7, 0.73, 0.7, 0.7, 0.7, 0.7])
-    flags = {name: [at != number for at in range(6)] for name, number in (("is_drift_due", 2), ("has_symmetry", 3))}
-    given = evidence(6, sigma_px=[1.0] * 4 + [6.1, 1.0], score=score, last_score=0.7, is_starting=[False] * 5 + [True], **flags)
-    assert having(Trigger.MIRROR_AMBIGUOUS, given, **settings) == [True] + [False] * 5
-    # One window that is a little worse is no reason.
-    assert not any(having(Trigger.MIRROR_AMBIGUOUS, replace(given, last_score=torch.full((6,), 0.73)), **settings))
-    only_mirrors = {"trigger_sigma_px": 9.0, "at_start": False}
-    assert having(SEARCHED, given, Component.SCORE_DROP, Component.LOW_SCORE, **only_mirrors) == [True] + [False] * 5
-    assert not any(having(Trigger.MIRROR_AMBIGUOUS, given, mirrored_below=0))
-    assert not any(having(Trigger.MIRROR_AMBIGUOUS, given, Component.DRIFT))
 
 
 def test_what_drifts_or_is_very_uncertain_is_looked_for_as_it_was_last_seen_when_it_is_time():

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.tracking.relocalization.symmetric import Ambiguities
 from torchtrack.tracking.state import TrackerState
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 
@@ -41,7 +40,6 @@ class TriggerEvidence:
         looks: in how many windows it was looked for since then.
         is_starting: objects whose motion is not known yet.
         is_due, is_drift_due: as :class:`Schedule` has them.
-        has_symmetry: objects with a plane of symmetry.
         earlier: triggers that are set already.
     """
 
@@ -57,7 +55,6 @@ class TriggerEvidence:
     is_starting: Bool[Tensor, "b"]
     is_due: Bool[Tensor, "b"]
     is_drift_due: Bool[Tensor, "b"]
-    has_symmetry: Bool[Tensor, "b"]
     earlier: Int[Tensor, "b"]
 
     def stays_below(self, level: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
@@ -71,7 +68,6 @@ def gather_evidence(
     scored: ScoredFit,
     sigma_px: Float[Tensor, "b"],
     is_starting: Bool[Tensor, "b"],
-    ambiguities: Ambiguities,
 ) -> TriggerEvidence:
     """The evidence of a window that was aligned."""
     return TriggerEvidence(
@@ -87,6 +83,5 @@ def gather_evidence(
         is_starting=is_starting,
         is_due=window.is_due,
         is_drift_due=window.is_drift_due,
-        has_symmetry=ambiguities.has_symmetry,
         earlier=window.triggers,
     )

@@ -1,7 +1,7 @@
 """Where the poses that are tried come from: sources of hypotheses, all of the same signature.
 
 A source looks at an object (:class:`torchtrack.tracking.relocalization.lost_object.LostObject`) and gives poses that are worth
-aligning, with what changes where one of them is accepted; or none. A further source of hypotheses is a function like these, and a
+aligning, with what changes where one of them is accepted. A further source of hypotheses is a function like these, and a
 line in :mod:`torchtrack.tracking.relocalization.sources`.
 """
 
@@ -65,22 +65,13 @@ def around_prediction_released(lost: LostObject) -> Hypotheses:
 
 def as_last_seen(lost: LostObject) -> Hypotheses:
     """Rotated and as far away as when it was last validated, in the place of the image where it is predicted."""
-    T_last_seen = lost.others.last_seen.T_cam_obj[lost.number]
+    T_last_seen = lost.last_seen.T_cam_obj[lost.number]
     return _sampled_elsewhere(lost, where_last_seen(lost.predicted(), T_last_seen), lost.sigma_px)
-
-
-def mirrored(lost: LostObject, plane: int) -> Hypotheses | None:
-    """Mirrored in depth by a plane of symmetry; none where the object has no plane of that number."""
-    other = lost.others.ambiguities.planes.mirrored(lost.number, plane, lost.as_scored())
-    if other is None:
-        return None
-    slip_px = SCORE_DROP_SIGMA_PX
-    return _sampled_elsewhere(lost, less_certain(other, lost.predicted_sigma_px, slip_px), slip_px)
 
 
 def around_last_seen(lost: LostObject) -> Hypotheses:
     """All around where it was last validated, at rest there."""
-    other = lost.others.last_seen.prediction(lost.number, lost.window.prediction)
+    other = lost.last_seen.prediction(lost.number, lost.window.prediction)
     # A look from there is a wide one, however far this one goes.
     hypotheses = _sampled_elsewhere(lost, other, 2 * lost.config.relocalization.wide_sigma_px)
     return replace(hypotheses, gate_scale=gate_scale_of(torch.full_like(lost.window.gate_scale[:1], torch.inf), lost.config))

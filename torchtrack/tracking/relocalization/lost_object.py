@@ -10,7 +10,6 @@ from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.last_seen import LastSeen
-from torchtrack.tracking.relocalization.symmetric import Ambiguities
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 
@@ -32,19 +31,6 @@ class Relocalized:
 
 
 @dataclass(frozen=True)
-class OtherPoses:
-    """Where objects may be, if not around their predictions.
-
-    Args:
-        last_seen: where they were validated for the last time.
-        ambiguities: in which other poses they look about the same.
-    """
-
-    last_seen: LastSeen
-    ambiguities: Ambiguities
-
-
-@dataclass(frozen=True)
 class LostObject:
     """An object that other poses are tried for, as the sources of hypotheses see it.
 
@@ -52,28 +38,22 @@ class LostObject:
         number: of the object.
         window: what the window gave so far, for all objects.
         widened: the predictions of all objects, of those that drift as uncertain as that makes them.
-        sigma_px: standard deviation of the object's widened prediction in the image; ``predicted_sigma_px``, that of its own.
+        sigma_px: standard deviation of the object's widened prediction in the image.
         events: of the object.
-        others: where objects may be besides.
+        last_seen: where objects were validated for the last time.
     """
 
     number: int
     window: Relocalized
     widened: Prediction
     sigma_px: float
-    predicted_sigma_px: float
     events: WindowEvents
-    others: OtherPoses
+    last_seen: LastSeen
     config: TrackerConfig
 
     def predicted(self) -> Prediction:
         """The widened prediction of the object alone."""
         return self.widened.copies(self.number, 1)
-
-    def as_scored(self) -> Prediction:
-        """The prediction of the object alone, moved to where it is by now."""
-        solution, own = self.window.scored.fit.solution, slice(self.number, self.number + 1)
-        return self.window.prediction.copies(self.number, 1).at(solution.T_cam_obj[own], solution.from_prior[own])
 
     def contours(self) -> Contours:
         """Its contours where it is by now."""

@@ -14,9 +14,9 @@ from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import Acceptance
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
-from torchtrack.tracking.relocalization.last_seen import with_drift
+from torchtrack.tracking.relocalization.last_seen import LastSeen, with_drift
+from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
 from torchtrack.tracking.relocalization.looks import Asks, among, in_turn
-from torchtrack.tracking.relocalization.lost_object import LostObject, OtherPoses, Relocalized
 from torchtrack.tracking.relocalization.refine import exchanged, refined
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
 from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, DRIFTS, Trigger, has
@@ -27,7 +27,7 @@ def relocalize(
     triggers: Int[Tensor, "b"],
     evidence: TriggerEvidence,
     events: ObjectEvents,
-    others: OtherPoses,
+    last_seen: LastSeen,
     config: TrackerConfig,
     sources: Sequence[Source] = SOURCES,
 ) -> Relocalized:
@@ -36,7 +36,7 @@ def relocalize(
     Args:
         window: what it gave so far.
         events: of all objects.
-        others: where objects may be besides.
+        last_seen: where objects were validated for the last time.
         sources: of hypotheses, in the order in which they are tried.
     """
     tests = [source.test(evidence, triggers, window.scored, config) for source in sources]
@@ -49,13 +49,13 @@ def relocalize(
     asking = _asking(window, torch.where(enough, triggers, triggers & int(AROUND_LAST_SEEN)), evidence, sources)
     looks = in_turn(asking, config.relocalization.objects)
     window = replace(window, looked=among([asks.number for asks in looks], drifts))
-    sigmas_px = AsyncValue.to(torch.stack([sigma_px, evidence.sigma_px], 1)).numbers()
+    sigmas_px = AsyncValue.to(sigma_px).numbers()
     for comes_last in (False, True):
         for asks in looks:
             number = asks.number
             calls = [pair for pair in zip(sources, tests, strict=True) if pair[0].comes_last == comes_last and pair[0].is_called_for(asks.flags)]
             if calls:
-                lost = LostObject(number, window, widened, *sigmas_px[number], events.of_object(number), others, config)
+                lost = LostObject(number, window, widened, sigmas_px[number], events.of_object(number), last_seen, config)
                 window = _tried(lost, calls)
         if not comes_last:
             window = _settled(window, drifts, widened, gate_scale_of(sigma_px, config))
@@ -74,10 +74,9 @@ def _tried(lost: LostObject, calls: Iterable[tuple[Source, Acceptance]]) -> Relo
     """What the window gives with the hypotheses of some sources tried for an object, one after the other."""
     for source, test in calls:
         hypotheses = source.propose(lost)
-        if hypotheses is not None:
-            tried = refined(hypotheses, lost)
-            choice = test.row(lost.number).choose(tried, hypotheses, lost)
-            lost = replace(lost, window=exchanged(lost, hypotheses, tried, choice))
+        tried = refined(hypotheses, lost)
+        choice = test.row(lost.number).choose(tried, hypotheses, lost)
+        lost = replace(lost, window=exchanged(lost, hypotheses, tried, choice))
     return lost.window
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 from jaxtyping import Int
 from torch import Tensor
@@ -13,7 +12,6 @@ from torchtrack.tracking.relocalization.acceptance import Acceptance
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.lost_object import LostObject
-from torchtrack.tracking.relocalization.symmetric import MOST_PLANES
 from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 
@@ -24,14 +22,14 @@ class Source:
 
     Args:
         triggers: any of which calls for them.
-        propose: the hypotheses of an object, or none.
+        propose: the hypotheses of an object.
         test: what is asked of them, of each object, before any are tried.
         unless: a trigger that calls for others in their place.
         comes_last: whether they are tried once all others were, and what these gave is settled.
     """
 
     triggers: Trigger
-    propose: Callable[[LostObject], Hypotheses | None]
+    propose: Callable[[LostObject], Hypotheses]
     test: Callable[[TriggerEvidence, Int[Tensor, "b"], ScoredFit, TrackerConfig], Acceptance]
     unless: Trigger = NONE
     comes_last: bool = False
@@ -46,6 +44,5 @@ SOURCES = (
     Source(AROUND_PREDICTION, hypotheses.around_prediction, acceptance.near_prediction, unless=Trigger.HELD),
     Source(Trigger.SCORE_DROP, hypotheses.around_prediction_released, acceptance.elsewhere),
     Source(Trigger.NOT_VALIDATED, hypotheses.as_last_seen, acceptance.as_last_seen),
-    *(Source(Trigger.MIRROR_AMBIGUOUS, partial(hypotheses.mirrored, plane=plane), acceptance.elsewhere) for plane in range(MOST_PLANES)),
     Source(AROUND_LAST_SEEN, hypotheses.around_last_seen, acceptance.around_last_seen, comes_last=True),
 )

@@ -48,7 +48,6 @@ class Trigger(IntFlag):
     DRIFT = auto()
     SLOW_DRIFT = auto()
     HELD = auto()
-    MIRROR_AMBIGUOUS = auto()
     NOT_VALIDATED = auto()
     DEPTH_CHANGED = auto()
     FAR_BELOW_REFERENCE = auto()
@@ -64,7 +63,7 @@ AROUND_LAST_SEEN = Trigger.DEPTH_CHANGED | Trigger.FAR_BELOW_REFERENCE
 AROUND_PREDICTION = Trigger.STARTING | Trigger.UNCERTAIN | Trigger.NEW | Trigger.LOW_SCORE | DRIFTS
 # What calls for a search. An object that is lost is expected where it was last validated, and uncertain there; an object that was not
 # validated for long is uncertain or drifts.
-SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP | Trigger.MIRROR_AMBIGUOUS
+SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP
 
 
 def triggers(evidence: TriggerEvidence, config: TrackerConfig) -> Int[Tensor, "b"]:
@@ -167,14 +166,6 @@ def has_score_dropped(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[
     return _is_sure(evidence) & ~has(evidence.earlier, DRIFTS) & dropped & config.uses(Component.SCORE_DROP)
 
 
-def is_mirror_ambiguous(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """MIRROR_AMBIGUOUS: objects that may be in a pose that has the outline of the right one: sure of it, they do not explain all."""
-    if none_of(evidence.is_drift_due):
-        return evidence.is_drift_due
-    low = evidence.stays_below(config.relocalization.mirrored_below * evidence.reference_explained_ratio)
-    return _is_sure(evidence) & low & _looks_far(evidence, config) & evidence.has_symmetry
-
-
 def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """NOT_VALIDATED: objects that drift or are very uncertain, and were not seen well for long: they are also looked for as they were then."""
     if none_of(evidence.is_drift_due):
@@ -193,7 +184,6 @@ _CONDITIONS: tuple[dict[int, Condition], ...] = (
         int(Trigger.LOW_SCORE): is_scored_low,
         int(Trigger.SCORE_DROP): has_score_dropped,
         int(Trigger.HELD): is_held,
-        int(Trigger.MIRROR_AMBIGUOUS): is_mirror_ambiguous,
         int(Trigger.NOT_VALIDATED): is_not_validated,
     },
 )
@@ -217,8 +207,3 @@ def _looks_far(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor,
 def searches(config: TrackerConfig) -> bool:
     """Whether other poses are ever tried."""
     return config.relocalization.hypotheses > 0 and config.solver.prior
-
-
-def tries_mirrored(config: TrackerConfig) -> bool:
-    """Whether mirrored ones are."""
-    return searches(config) and config.relocalization.mirrored_below > 0
