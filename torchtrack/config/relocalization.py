@@ -16,9 +16,6 @@ class RelocalizationConfig(Settings):
         1000, ge=1, le=10_000, description="Rotations and depths sampled where a prediction is very uncertain, tried in all places of the image."
     )
     trigger_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which other poses are tried (px).")
-    realignments: int = Field(
-        2, ge=0, le=20, description="How many times the best poses of a very uncertain object are aligned again, each from where it came to."
-    )
     wide_sigma_px: float = Field(10.0, gt=0, description="Standard deviation of the prediction from which it is very uncertain (px).")
     interval_us: int = Field(10_000, ge=0, description="A very uncertain object is searched for once in this time (µs); 0 for in every window.")
     not_validated_us: int = Field(

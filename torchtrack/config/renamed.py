@@ -11,7 +11,6 @@ KEYS = {
         "drawn": "samples",
         "turns": "rotations",
         "kept": "kept_rotations",
-        "realigned": "realignments",
         "dropped_to": "low_score_below",
         "slipped_to": "score_drop_below",
         "unseen_us": "last_seen_us",
@@ -78,6 +77,7 @@ REMOVED: dict[str, dict[str, str]] = {
     "relocalization": {
         "axis_rotation": "no rotations about an axis are compared",
         "mirrored_below": "no poses mirrored in depth are tried",
+        "realignments": "every pose is aligned once",
     },
 }
 

@@ -128,7 +128,7 @@ def steady_window(tracked: TrackedObjects, state: TrackerState, given: StepInput
     fit = align(expected.prediction, seen.contours, seen.index, seen.gate_scale, seen.observations, tracked.config, extra_terms=given.extra_terms)
     scored = validate(tracked, state, expected, seen, fit)
     is_starting = torch.zeros_like(tracked.stream_index, dtype=torch.bool) if given.is_starting is None else given.is_starting
-    evidence = gather_evidence(state, expected.scheduled, scored, seen.sigma_px, is_starting, tracked.ambiguities)
+    evidence = gather_evidence(state, expected.scheduled, scored, seen.sigma_px, is_starting)
     return SteadyWindow(expected, seen, scored, evidence, triggers(evidence, tracked.config))
 
 

@@ -11,7 +11,6 @@ from tracked_boxes import in_motion, tensors_of
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization.hypotheses import around_prediction_released
-from torchtrack.tracking.relocalization.refine import align_and_score
 from torchtrack.tracking.validation.scored_fit import explained_at_rest
 
 SEARCHED = TrackerConfig()
@@ -67,24 +66,6 @@ def test_a_box_is_found_again_half_a_quarter_turn_off_about_any_axis(axis):
     better = searched(lost_object(tracker, prediction, seen, scored, 40.0))
     degrees, millimetres = pose_errors(better.fit.solution.T_cam_obj.double(), T_true)
     assert float(degrees) < 1.0 and float(millimetres) < 3.0
-
-
-def test_the_best_poses_are_aligned_again_where_hardly_anything_is_known_and_nowhere_else(monkeypatch):
-    counts = []
-    noted = lambda rows, offsets, lost: counts.append(len(offsets)) or align_and_score(rows, offsets, lost)  # noqa: E731
-    monkeypatch.setattr("torchtrack.tracking.relocalization.refine.align_and_score", noted)
-    tracker, prediction, seen, scored, _ = in_motion(displaced=DISPLACED)
-    for sigma_px in (8.0, 30.0):
-        searched(lost_object(tracker, prediction, seen, scored, sigma_px))
-    once = replace_settings(tracker.config, realignments=0)
-    searched(lost_object(tracker, prediction, seen, scored, 30.0, once))
-    few = replace_settings(tracker.config, hypotheses=3, realignments=1)
-    searched(lost_object(tracker, prediction, seen, scored, 30.0, few))
-    assert counts == [24, 24, 8, 8, 24, 3, 3]
-
-
-def replace_settings(config, **search_settings):
-    return config.model_copy(update={"relocalization": config.relocalization.model_copy(update=search_settings)})
 
 
 def test_a_search_leaves_what_it_was_given_as_it_was():

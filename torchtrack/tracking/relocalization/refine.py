@@ -3,7 +3,6 @@
 from dataclasses import fields, replace
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.core import host_sync
@@ -11,30 +10,16 @@ from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.rounds import Fit, align, index_for
 from torchtrack.tracking.estimation.terms import Linearisation
-from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import Choice
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
 from torchtrack.tracking.validation.scored_fit import ScoredFit, score_fit
 
-# So many of the poses of a very uncertain object, those that explain most, are aligned again.
-_ALIGNED_AGAIN = 8
-
 
 def refined(hypotheses: Hypotheses, lost: LostObject) -> ScoredFit:
-    """The hypotheses aligned on the events of their object, and scored; of a very uncertain object, the best of them once more."""
-    search = lost.config.relocalization
-    tried = align_and_score(hypotheses.prediction.copies(0, len(hypotheses.offsets)), hypotheses.offsets, lost)
-    for _ in range(search.realignments if hypotheses.is_wide else 0):
-        # From some way off, a pose comes near the right one before its contours are those that are seen there.
-        best = tried.score.topk(min(_ALIGNED_AGAIN, len(tried.score))).indices
-        tried = align_and_score(hypotheses.prediction.copies(0, len(best)), tried.fit.solution.from_prior[best], lost)
-    return tried
-
-
-def align_and_score(rows: Prediction, offsets: Float[Tensor, "n 12"], lost: LostObject) -> ScoredFit:
-    """Align predictions of an object, each from its own offset, on the events of the object, and score them."""
-    config, scored, number = lost.config, lost.window.scored, lost.number
+    """The hypotheses aligned on the events of their object, and scored."""
+    config, scored, number, offsets = lost.config, lost.window.scored, lost.number, hypotheses.offsets
+    rows = hypotheses.prediction.copies(0, len(offsets))
     begin = rows.moved(offsets)
     contours = rows.objects.contours(begin.T_cam_obj, config.contours)
     tight = torch.ones_like(offsets[:, 0])
