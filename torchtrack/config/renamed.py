@@ -78,6 +78,7 @@ REMOVED: dict[str, dict[str, str]] = {
         "axis_rotation": "no rotations about an axis are compared",
         "mirrored_below": "no poses mirrored in depth are tried",
         "realignments": "every pose is aligned once",
+        "at_start": "what starts is searched for as any other object",
     },
 }
 

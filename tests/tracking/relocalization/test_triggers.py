@@ -56,7 +56,6 @@ def having(trigger, given, *disabled, **settings):
 
 
 ALONE = {
-    Trigger.STARTING: {"is_starting": True},
     Trigger.UNCERTAIN: {"sigma_px": 4.1},
     Trigger.NEW: {"is_due": True, "reference_explained_ratio": 0.5, "score": 0.8, "last_score": 0.8, "mean_score": 0.8},
     Trigger.LOW_SCORE: {"score": 0.71, "last_score": 0.71},
@@ -120,16 +119,10 @@ def test_what_is_sure_of_its_place_and_explains_far_less_at_once_has_dropped():
     assert not any(having(Trigger.SCORE_DROP, given, Component.SCORE_DROP))
 
 
-@pytest.mark.parametrize("at_start", [True, False])
-def test_objects_whose_motion_is_not_known_are_searched_for(at_start):
-    assert having(SEARCHED, evidence(2, is_starting=[True, False]), at_start=at_start) == [at_start, False]
-
-
 def test_very_uncertain_objects_wait_until_it_is_time_and_others_do_not():
     settings = {"trigger_sigma_px": 4.0, "wide_sigma_px": 10.0}
     given = evidence(3, sigma_px=[11.0, 11.0, 9.0], is_due=[False, True, False], score=0.0, last_score=0.0)
     assert having(Trigger.UNCERTAIN, given, **settings) == having(Trigger.LOW_SCORE, given, **settings) == [False, True, True]
-    assert all(having(SEARCHED, replace(given, is_starting=torch.ones(3, dtype=torch.bool)), **settings))
 
 
 def test_objects_that_drift_are_searched_for_however_certain_they_are():

@@ -40,7 +40,6 @@ _NEW = 0.9
 class Trigger(IntFlag):
     """Why other poses of an object are tried; what each means is said by the function of its name below."""
 
-    STARTING = auto()
     UNCERTAIN = auto()
     NEW = auto()
     LOW_SCORE = auto()
@@ -60,7 +59,7 @@ DRIFTS = Trigger.DRIFT | Trigger.SLOW_DRIFT
 # An object that is looked for all around where it was last validated.
 AROUND_LAST_SEEN = Trigger.DEPTH_CHANGED | Trigger.FAR_BELOW_REFERENCE
 # An object that is looked for around its prediction.
-AROUND_PREDICTION = Trigger.STARTING | Trigger.UNCERTAIN | Trigger.NEW | Trigger.LOW_SCORE | DRIFTS
+AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.NEW | Trigger.LOW_SCORE | DRIFTS
 # What calls for a search. An object that is lost is expected where it was last validated, and uncertain there; an object that was not
 # validated for long is uncertain or drifts.
 SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP
@@ -130,11 +129,6 @@ def is_held(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b
     return drifts & _is_sure(evidence) & explains & are_many(evidence.matches, config.validation) & config.uses(Component.HELD)
 
 
-def is_starting(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """STARTING: objects whose motion is not known yet."""
-    return evidence.is_starting if config.relocalization.at_start else torch.zeros_like(evidence.is_starting)
-
-
 def is_uncertain(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """UNCERTAIN: objects whose prediction is not certain; of those where it is very uncertain, when it is time."""
     return _is_near_or_due(evidence, config) & (evidence.sigma_px > config.relocalization.trigger_sigma_px)
@@ -178,7 +172,6 @@ def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[T
 _CONDITIONS: tuple[dict[int, Condition], ...] = (
     {int(Trigger.DRIFT): is_drifting, int(Trigger.SLOW_DRIFT): is_drifting_slowly},
     {
-        int(Trigger.STARTING): is_starting,
         int(Trigger.UNCERTAIN): is_uncertain,
         int(Trigger.NEW): is_new,
         int(Trigger.LOW_SCORE): is_scored_low,
