@@ -26,9 +26,6 @@ class RelocalizationConfig(Settings):
     not_validated_below: float = Field(
         0.75, ge=0, le=1, description="Share of what an object explains when seen well below which, as long, it is looked for there; 0 for never."
     )
-    new_below: float = Field(
-        0.9, ge=0, le=1, description="For its first windows, an object that explains less is searched for where this much is explained; 0 for never."
-    )
     slow_drift_below: float = Field(
         0.85, ge=0, le=1, description="Share of what an object explains when seen well below which, as long, it is looked for as well; 0 for never."
     )
