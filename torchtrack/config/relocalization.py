@@ -23,9 +23,6 @@ class RelocalizationConfig(Settings):
         ge=0,
         description="What was not seen well for so long, and is lost or far off in depth, is looked for all around where it was then (µs); 0: never.",
     )
-    not_validated_below: float = Field(
-        0.75, ge=0, le=1, description="Share of what an object explains when seen well below which, as long, it is looked for there; 0 for never."
-    )
     slow_drift_below: float = Field(
         0.85, ge=0, le=1, description="Share of what an object explains when seen well below which, as long, it is looked for as well; 0 for never."
     )
