@@ -8,6 +8,7 @@ from states import changed
 from tracked_boxes import tensors_of
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.core.linalg import inverse
@@ -177,19 +178,18 @@ def test_conclusions(settings, dtype):
     assert_as_close((state, result), (other_state, other_result), tolerance=TOLERANCE[dtype])
 
 
-@pytest.mark.parametrize(("partly_hidden", "holds_on"), [(True, False), (False, True), (False, False)])
-def test_conclusions_of_what_may_be_partly_hidden(partly_hidden, holds_on, dtype):
+@pytest.mark.parametrize("partly_hidden", [True, False])
+def test_conclusions_of_what_may_be_partly_hidden(partly_hidden, dtype):
     def spoil(scored):
         scored.measured_ratio[:] = 0.2
         scored.reference_inlier_ratio[:] = torch.linspace(0.4, 0.9, OBJECTS)
         scored.inlier_ratio[:] = scored.reference_inlier_ratio * torch.tensor([1.0, 0.95, 0.9, 0.85, 1.0, 1.1, torch.nan])
 
-    disabled = [] if partly_hidden else ["partly_hidden"]
-    config = TrackerConfig.model_validate({"validation": {"holds_on": holds_on}, "disabled": disabled})
+    config = TrackerConfig(disabled=frozenset() if partly_hidden else {Component.PARTLY_HIDDEN})
     (state, result), (other_state, other_result) = both_ways(conclusions(config, dtype, spoil))
     assert_as_close((state, result), (other_state, other_result), tolerance=TOLERANCE[dtype])
     # Looked for in many places, it would be lost.
-    assert int(result.status[5]) == (Status.UNCERTAIN if partly_hidden or holds_on else Status.LOST)
+    assert int(result.status[5]) == (Status.UNCERTAIN if partly_hidden else Status.LOST)
 
 
 @pytest.mark.parametrize("what", ["T_cam_obj", "hessian", "from_prior"])

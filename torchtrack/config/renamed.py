@@ -80,6 +80,9 @@ REMOVED: dict[str, dict[str, str]] = {
         "new_below": "a new object is searched for as any other",
         "not_validated_below": "what explains little is not looked for where it was last seen well, unless it is lost or off in depth",
     },
+    "validation": {
+        "holds_on": "a pose that goes on from the one before is asked for as much as any other",
+    },
 }
 
 

@@ -12,10 +12,6 @@ class ValidationConfig(Settings):
     min_visible_ratio: float = Field(0.2, ge=0, le=1, description="A smaller share of the contour inside the image: out of view.")
     uncertain_below: float = Field(0.4, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is uncertain.")
     lost_below: float = Field(0.1, ge=0, le=1, description="Share of the moving contour explained by events below which a pose is lost.")
-    holds_on: bool = Field(
-        True,
-        description="A pose by many events that goes on from the one before is not asked for as much as a find: it was not lost, but is hidden more.",
-    )
     all_directions: bool = Field(
         True, description="What has not been seen well for a while has to be held by more than parallel lines: those of what hides it are."
     )

@@ -25,7 +25,6 @@ from torchtrack.tracking.validation.measures import visible_ratio
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import (
     Status,
-    holding_on,
     is_smeared,
     judge,
     partly_hidden,
@@ -88,8 +87,7 @@ def judged_objects(
     # A new pose of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     step = solution.from_prior[:, :6] * ~(scored.is_relocalized & may_be_anywhere(gate_scale))[:, None]
     hidden = partly_hidden(scored.inlier_ratio, scored.reference_inlier_ratio, scored.count, scored.is_relocalized, config)
-    asked_less = torch.where(holding_on(scored.count, scored.is_relocalized, config.validation), 1, hidden)
-    status = judge(explained, scored.count, in_view, step, objects.diameter_m, config.validation, gate_scale, asked_less)
+    status = judge(explained, scored.count, in_view, step, objects.diameter_m, config.validation, gate_scale, hidden)
     status = torch.where(prediction.usable, status, int(Status.DIVERGED))
     failed = status >= int(Status.LOST)
     T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, solution.T_cam_obj).double())

@@ -12,7 +12,7 @@ from torchtrack.config.validation import ValidationConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.validation.measures import explained_ratio, inlier_ratio, visible_ratio
-from torchtrack.tracking.validation.status import Status, holding_on, judge, needed_ratio, partly_hidden, trust
+from torchtrack.tracking.validation.status import Status, judge, needed_ratio, partly_hidden, trust
 
 IMAGE_SIZE = (150, 200)
 CONFIG, TRACKER = ValidationConfig(), TrackerConfig()
@@ -158,13 +158,6 @@ def test_of_a_hidden_object_no_more_is_asked_in_more_places():
     assert needed_ratio(gate_scale, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.35, 0.275, 0.2])
     stated = torch.full((2,), 0.3), torch.full((2,), 100), torch.ones(2), torch.zeros(2, 6), torch.ones(2)
     assert judge(*stated, config, gate_scale[:2], torch.tensor([0.0, 1.0])).tolist() == [Status.LOST, Status.UNCERTAIN]
-
-
-def test_what_goes_on_by_many_events_holds_on():
-    count, elsewhere = torch.tensor([120, 119, 120]), torch.tensor([False, False, True])
-    config = ValidationConfig(min_observations=30)
-    assert holding_on(count, elsewhere, config).tolist() == [True, False, False]
-    assert not holding_on(count, elsewhere, config.model_copy(update={"holds_on": False})).any()
 
 
 def test_an_uncertain_object_may_be_found_farther_away():

@@ -118,9 +118,6 @@ def _judge(
 ) -> int:
     """The status of an object: :func:`torchtrack.tracking.validation.status.judge`."""
     gate_scale, explained, status = measured[GATE_SCALE, b], measured[EXPLAINED_RATIO, b], TRACKING
-    # As torchtrack.tracking.validation.status.holding_on has it.
-    if settings.holds_on and not is_relocalized[b] and matched[b] >= settings.hidden_observations:
-        hidden = 1.0
     wider, rotated, moved = _clamped(gate_scale - 1.0, 0.0, 1.0) * (1.0 - hidden), 0.0, 0.0
     # A new pose of what may be anywhere is no jump, however far away it is; what is not a number stays that.
     counts = 0.0 if is_relocalized[b] and gate_scale >= settings.anywhere else 1.0

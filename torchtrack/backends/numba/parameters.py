@@ -235,7 +235,6 @@ class ConclusionSettings(NamedTuple):
         holds: whether what failed stays where it was.
         anywhere: scale of the first gate from which an object may be anywhere.
         hidden_from, hidden_fully, hidden_least, hidden_observations: what :func:`torchtrack.tracking.validation.status.partly_hidden` goes by.
-        holds_on: whether poses by so many observations that go on from those before are not asked for more.
         smeared: events that gather less than this ratio of how far they usually do are smeared.
         usual_gain, fall_gain: share of a new window in what is usual, and in what is seen well where it is less.
         certain_ratio, certain_count: of what it explains when it is seen well, and by how many, from which a pose is remembered as one.
@@ -252,7 +251,6 @@ class ConclusionSettings(NamedTuple):
     hidden_fully: float
     hidden_least: float
     hidden_observations: int
-    holds_on: bool
     min_observations: int
     min_visible_ratio: float
     max_rotation_rad: float

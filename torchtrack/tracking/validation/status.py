@@ -83,15 +83,6 @@ def are_many(count: Int[Tensor, "b"], config: ValidationConfig) -> Bool[Tensor, 
     return count >= HIDDEN_TIMES * config.min_observations
 
 
-def holding_on(count: Int[Tensor, "b"], is_relocalized: Bool[Tensor, "b"], config: ValidationConfig) -> Bool[Tensor, "b"]:
-    """Which poses go on from the one before by many events: what little is explained of an object that is hidden ever more is still it.
-
-    Given up, it would coast away from where it is, and be looked for among the edges of what hides it. Arguments are those of
-    :func:`partly_hidden`.
-    """
-    return ~is_relocalized & are_many(count, config) & config.holds_on
-
-
 def trust(
     explained_ratio: Float[Tensor, "b"],
     config: ValidationConfig,
