@@ -23,9 +23,6 @@ class RelocalizationConfig(Settings):
         ge=0,
         description="What was not seen well for so long, and is lost or far off in depth, is looked for all around where it was then (µs); 0: never.",
     )
-    slow_drift_below: float = Field(
-        0.85, ge=0, le=1, description="Share of what an object explains when seen well below which, as long, it is looked for as well; 0 for never."
-    )
     accept_margin: float = Field(0.1, ge=0, le=1, description="By how much the score of a pose near the prediction must be better to be accepted.")
     accept_ratio: float = Field(0.9, ge=0, le=1, description="Share of what an object explains when seen well that is asked of a pose elsewhere.")
     everywhere_after_us: int = Field(
