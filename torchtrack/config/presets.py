@@ -58,7 +58,7 @@ def _paper() -> TrackerConfig:
         solver=SolverConfig(iterations=5, damping=1e-3, prior=False),
         motion=MotionConfig(model="hold", without_events="hold"),
         adaptation=AdaptationConfig(learned_points=0),
-        validation=ValidationConfig(min_observations=6, all_directions=False),
+        validation=ValidationConfig(min_observations=6),
     )
 
 
@@ -70,7 +70,6 @@ def _lines(loss: Literal["tukey", "none"]) -> TrackerConfig:
         association=AssociationConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500, weighting_network="none"),
         solver=SolverConfig(iterations=3, loss=loss, damping=1e-4, prior=False),
         adaptation=AdaptationConfig(learned_points=0),
-        validation=ValidationConfig(all_directions=False),
     )
 
 

@@ -82,6 +82,7 @@ REMOVED: dict[str, dict[str, str]] = {
     },
     "validation": {
         "holds_on": "a pose that goes on from the one before is asked for as much as any other",
+        "all_directions": "a pose may be held by parallel lines alone",
     },
 }
 

@@ -34,7 +34,6 @@ from torchtrack.tracking.relocalization.tentative import confirm_or_take_back
 from torchtrack.tracking.relocalization.triggers import SEARCHED, has, triggers
 from torchtrack.tracking.state import StepResult, TrackerState, each_tensor
 from torchtrack.tracking.update import conclude
-from torchtrack.tracking.validation.measures import required_spread
 from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, reference_where_known, score_fit
 
 _READS = host_sync.HostReads()
@@ -167,10 +166,9 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
 
 def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, fit: Fit) -> ScoredFit:
     """Stage 4, after the alignment: what each pose explains of its contours, and of the events around them."""
-    config, health = tracked.config, state.health
-    reference = reference_where_known(seen.sigma_px, health.reference_inlier_ratio, config.relocalization)
-    spread = required_spread(health.reference_normal_spread, health.time_since_validated_s, config.validation)
-    return score_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference, spread)
+    config = tracked.config
+    reference = reference_where_known(seen.sigma_px, state.health.reference_inlier_ratio, config.relocalization)
+    return score_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference)
 
 
 def relocalized(tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, t_us: Int[Tensor, "s"]) -> Relocalized:

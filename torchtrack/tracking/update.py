@@ -60,8 +60,7 @@ def conclude(
     contours = _where_they_are(scored.fit, motion.T_cam_obj, status >= int(Status.LOST), prediction.objects.intrinsics)
     result = StepResult(state.t_us, motion.T_cam_obj, covariance, status, scored.explained_ratio, contours, corners, scored.count)
     appearance = replace(state.appearance, darker_outside=_darker_outside(state, scored, status, dt_s, config))
-    health = replace(health, score=scored.score, reference_normal_spread=_normal_spread(health, scored))
-    return replace(state, motion=motion, health=health, appearance=appearance), result
+    return replace(state, motion=motion, health=replace(health, score=scored.score), appearance=appearance), result
 
 
 def _where_they_are(fit: Fit, T_cam_obj: Float[Tensor, "b 4 4"], failed: Bool[Tensor, "b"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
@@ -134,12 +133,6 @@ def _with_references(health: TrackHealth, scored: ScoredFit, failed: Bool[Tensor
         reference_inlier_ratio=torch.where(failed | scored.inlier_ratio.isnan(), inliers, _seen_well(inliers, scored.inlier_ratio)),
         reference_matches=torch.where(failed, matches, _seen_well(matches, scored.count.to(matches.dtype))),
     )
-
-
-def _normal_spread(health: TrackHealth, scored: ScoredFit) -> Float[Tensor, "b"]:
-    """How far apart the directions of contours are when objects are seen well, with a window more."""
-    spread = health.reference_normal_spread
-    return torch.where(health.time_since_validated_s == 0, _seen_well(spread, scored.normal_spread), spread)
 
 
 def _seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:

@@ -27,8 +27,7 @@ def refined(hypotheses: Hypotheses, lost: LostObject) -> ScoredFit:
     events = lost.events.repeated(len(offsets))
     observations = select_events(events, index, begin.moving(compensated=True), config.association.max_events)
     fit = align(rows, contours, index, tight, observations, config, offsets)
-    references = (value[number].expand_as(tight) for value in (scored.reference_inlier_ratio, scored.required_spread))
-    tried = score_fit(rows, fit, config, torch.zeros_like(tight), *references)
+    tried = score_fit(rows, fit, config, torch.zeros_like(tight), scored.reference_inlier_ratio[number].expand_as(tight))
     return replace(tried, is_relocalized=torch.ones_like(tried.is_relocalized))
 
 
