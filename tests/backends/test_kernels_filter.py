@@ -56,9 +56,9 @@ def boxes(config=None, dtype=torch.float64):
 # ---- the forecast
 
 
-def forecasts(tracker, state, axes_obj=None):
+def forecasts(tracker, state):
     dt_s = uniform(OBJECTS, low=1e-3, high=2e-2, seed=11).to(tracker.intrinsics.dtype)
-    return lambda: forecast(state.motion, dt_s, tracker.objects, axes_obj, tracker.far_pose, tracker.config)
+    return lambda: forecast(state.motion, dt_s, tracker.objects, tracker.far_pose, tracker.config)
 
 
 def stated(prediction):
@@ -74,12 +74,9 @@ MOTIONS = {
 
 
 @pytest.mark.parametrize("settings", MOTIONS.values(), ids=MOTIONS)
-@pytest.mark.parametrize("spins", [False, True])
-def test_forecasts(settings, spins, dtype):
+def test_forecasts(settings, dtype):
     tracker, state = boxes(TrackerConfig(motion=MotionConfig(**settings)), dtype)
-    axes_obj = torch.nn.functional.normalize(random_twist(OBJECTS, seed=4)[:, :3], dim=1).to(dtype)
-    axes_obj[2] = 0
-    for by_kernel, plain in zip(*map(stated, both_ways(forecasts(tracker, state, axes_obj if spins else None))), strict=True):
+    for by_kernel, plain in zip(*map(stated, both_ways(forecasts(tracker, state))), strict=True):
         assert_as_close(by_kernel, plain, tolerance=TOLERANCE[dtype])
 
 

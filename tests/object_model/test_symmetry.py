@@ -8,7 +8,7 @@ from helpers import random_pose
 from torchtrack.core.lie import se3_exp, so3_exp
 from torchtrack.io import Trajectory
 from torchtrack.object_model import ObjectModel
-from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axes, revolution_axis, symmetry_planes, turning_axis
+from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axis, symmetry_planes, turning_axis
 from torchtrack.run.metrics import pose_errors
 from torchtrack.sim.curved import vase
 
@@ -98,14 +98,6 @@ def test_errors_of_a_vase_do_not_count_its_turns_but_its_tilts():
     assert float(pose_errors(t_us, turned, Trajectory(t_us, T), axis).rotation_deg.max()) < 1e-4
     assert float(pose_errors(t_us, turned, Trajectory(t_us, T)).rotation_deg.min()) == pytest.approx(math.degrees(2.0))
     assert float(pose_errors(t_us, tilted, Trajectory(t_us, T), axis).rotation_deg.min()) == pytest.approx(math.degrees(0.1))
-
-
-def test_axes_of_many_objects_are_those_of_each():
-    can, box = (ObjectModel.from_mesh(mesh) for mesh in (TURNED_SHAPES["cylinder"], trimesh.creation.box((0.1, 0.1, 0.02))))
-    axes = revolution_axes([can, box, can])
-    assert torch.equal(axes[0], revolution_axis(can).direction_obj)
-    assert torch.equal(axes[0], axes[2])
-    assert torch.equal(axes[1], torch.zeros(3, dtype=torch.float64))
 
 
 # ---- axes that most of an object can be turned about

@@ -1,12 +1,10 @@
 """The tracker as a filter: its covariance, its usual quality, and objects that come back after an outage."""
 
-import math
 from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
-import trimesh
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors
 from states import changed
 from tracked_boxes import WINDOW_US, follow, moving_box, started, tracker_of, windows
@@ -17,9 +15,8 @@ from torchtrack.config.tracker import MotionConfig, SolverConfig, TrackerConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import difference_about, retract_about, transform_points
 from torchtrack.core.pose_covariance import left_covariance
-from torchtrack.object_model import ObjectModel
 from torchtrack.tracking.expectation import predicted_after
-from torchtrack.tracking.motion.model import COAST_S, initial_covariance
+from torchtrack.tracking.motion.model import initial_covariance
 from torchtrack.tracking.validation.status import Status
 
 
@@ -166,17 +163,3 @@ def test_a_share_that_is_too_small_for_so_wide_a_search_is_no_find():
     assert int(result.status) >= Status.LOST
     prediction = predicted_after(tracker, changed(uncertain, T_cam_obj=away), torch.tensor([5e-3]))
     torch.testing.assert_close(result.T_cam_obj, prediction.T_cam_obj.double(), rtol=0, atol=1e-6)
-
-
-def test_a_spin_that_nothing_shows_fades_for_its_object_alone():
-    can = ObjectModel.from_mesh(trimesh.creation.cylinder(0.03, 0.1, sections=32), name="can")
-    start = pose().expand(2, 4, 4)
-    velocities = []
-    for fades in (True, False):
-        tracker = Tracker([can, box_model()], SMALL_CAMERA, TrackerConfig(motion=MotionConfig(spin_fades=fades)))
-        state = tracker.init(start, t_us=0)
-        spinning = torch.cat([5.0 * start[:, :3, 2], torch.zeros(2, 3)], 1).float()
-        velocities.append(silent(tracker, changed(state, velocity=spinning), 4)[-1].velocity)
-    slowed, free = velocities
-    assert torch.equal(slowed[1], free[1])
-    assert float(slowed[0].norm() / free[0].norm()) == pytest.approx(math.exp(-4 * WINDOW_US * 1e-6 / COAST_S), rel=1e-4)

@@ -70,6 +70,7 @@ REMOVED: dict[str, dict[str, str]] = {
     "motion": {
         "acceleration_px": "no acceleration is estimated",
         "acceleration_s": "no acceleration is estimated",
+        "spin_fades": "a spin that no event shows goes on",
     },
     "relocalization": {
         "axis_rotation": "no rotations about an axis are compared",

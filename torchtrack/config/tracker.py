@@ -96,7 +96,6 @@ class MotionConfig(Settings):
     turn_s: float = Field(
         0.2, ge=0, le=10, description="A turn that events hardly show dies away with this time constant (s), not to run away; 0 for not at all."
     )
-    spin_fades: bool = Field(True, description="So does the spin of a surface of revolution about its axis, which no event can show.")
 
 
 class AdaptationConfig(Settings):

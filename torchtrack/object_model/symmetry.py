@@ -1,6 +1,5 @@
 """Surfaces of revolution, such as bottles and bowls, which turned about their axis look the same, or nearly so; and planes of symmetry."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -131,14 +130,6 @@ def mirrored_across(model: ObjectModel, axes: Float[Tensor, "k 3"]) -> Float[Ten
     images = (arms - 2 * (arms @ axis)[:, None] * axis for axis in axes)
     apart_m = torch.tensor([surface.query(image.numpy())[0].mean() for image in images])
     return axes[apart_m < _MIRRORED * model.diameter_m]
-
-
-def revolution_axes(models: Sequence[ObjectModel]) -> Float[Tensor, "b 3"]:
-    """Direction of the :func:`revolution_axis` of each object (float64); zero where there is none."""
-    nothing = torch.zeros(3, dtype=torch.float64)
-    # A model that several objects have is looked at once.
-    axes = {number: revolution_axis(model) for number, model in {id(model): model for model in models}.items()}
-    return torch.stack([nothing if (axis := axes[id(model)]) is None else axis.direction_obj for model in models])
 
 
 def _quartered(triangles: Float[Tensor, "f 3 3"]) -> Float[Tensor, "q 3 3"]:

@@ -63,8 +63,7 @@ def predicted_after(tracked: TrackedObjects, state: TrackerState, dt_s: Float[Te
     """Predicted pose and motion of each object after a time, and how certain they are; ``objects`` are the tracked ones as a batch, where at hand."""
     config = tracked.config
     objects = objects_as_known(objects or tracked.objects, state, tracked.on_surfaces is not None, config)
-    axes_obj = tracked.revolution_axes if tracked.revolves and config.motion.spin_fades else None
-    return forecast(state.motion, dt_s, objects, axes_obj, tracked.far_pose, config)
+    return forecast(state.motion, dt_s, objects, tracked.far_pose, config)
 
 
 def near_objects(tracked: TrackedObjects, expected: Expected, events: NearbyEvents) -> NearbyEvents:

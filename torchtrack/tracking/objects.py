@@ -10,7 +10,6 @@ from torchtrack.core.camera import Camera
 from torchtrack.errors import ModelError
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourModel, group_by_model
-from torchtrack.object_model.symmetry import revolution_axes
 from torchtrack.tracking.association.weighting_network import SilhouetteTrust, TrustNetwork, shipped_network
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
@@ -29,7 +28,6 @@ class TrackedObjects(nn.Module):
     centre_obj: Tensor
     half_extent: Tensor
     diameter_m: Tensor
-    revolution_axes: Tensor
     with_surface: Tensor
     far_pose: Tensor
 
@@ -60,8 +58,6 @@ class TrackedObjects(nn.Module):
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
         self.register_buffer("half_extent", torch.stack([model.half_extent for model in objects]))
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))
-        self.register_buffer("revolution_axes", revolution_axes(objects))
-        self.revolves = bool(self.revolution_axes.any())
         self.register_buffer("far_pose", far_pose(self.centre_obj))
         self.weighting_network = shipped_network(self.models, self.config.association) if weighting_network is None else weighting_network
         # On dense meshes no line of sight is followed.

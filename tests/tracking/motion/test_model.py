@@ -1,7 +1,5 @@
 """Motion: the covariance of a prediction against drawn motions, inverses, the left perturbation, and velocities that die away."""
 
-import math
-
 import pytest
 import torch
 from helpers import generator, pose
@@ -16,7 +14,6 @@ from torchtrack.tracking.motion.model import (
     initial_covariance,
     predict_covariance,
     with_dropped,
-    without_spin,
 )
 
 DIAMETER_M = 0.2
@@ -205,32 +202,6 @@ def test_a_velocity_that_is_set_aside_is_uncertain_by_as_much():
     added = (actual - covariance)[0, 6:, 6:]
     torch.testing.assert_close(added, torch.outer(dropped[0], dropped[0]).double())
     assert (torch.linalg.eigvalsh(actual) > 0).all()
-
-
-# ---- surfaces of revolution
-
-
-def test_a_spin_dies_away_about_the_axis_alone():
-    axis = double(0.0, 0.6, 0.8)[None]
-    velocity = torch.cat([7.0 * axis + double(2.0, 0.0, 0.0), double(0.1, 0.2, 0.3)[None]], 1)
-    covariance, dt_s, config = random_covariance(), double(0.01), MotionConfig()
-    slower, narrower = without_spin(velocity, covariance, axis, dt_s, config)
-    kept = math.exp(-0.05)
-    assert torch.allclose(slower, torch.cat([7.0 * kept * axis + double(2.0, 0.0, 0.0), velocity[:, 3:]], 1))
-    for start in (0, 6):
-        before, after = (matrix[0, start : start + 3, start : start + 3] for matrix in (covariance, narrower))
-        assert float(axis[0] @ after @ axis[0]) == pytest.approx(kept**2 * float(axis[0] @ before @ axis[0]))
-        across = double(0.0, -0.8, 0.6)
-        assert float(across @ after @ across) == pytest.approx(float(across @ before @ across))
-    assert torch.allclose(narrower, narrower.mT)
-    assert float(torch.linalg.eigvalsh(narrower).min()) > 0
-
-
-def test_an_object_without_an_axis_spins_on():
-    velocity, covariance = double(1.0, 2.0, 3.0, 0.1, 0.2, 0.3)[None], random_covariance()
-    slower, narrower = without_spin(velocity, covariance, double(0.0, 0.0, 0.0)[None], double(0.01), MotionConfig())
-    assert torch.equal(slower, velocity)
-    assert torch.allclose(narrower, covariance)
 
 
 # ---- turns that hardly show

@@ -26,7 +26,6 @@ def forecast(
     dt_s: Array,
     centre_obj: Array,
     diameter_m: Array,
-    axes_obj: Array,
     far_pose: Array,
     settings: ForecastSettings,
     T_prior: Array,
@@ -38,7 +37,6 @@ def forecast(
 
     Args:
         T_cam_obj, velocity, covariance: of the state: ``[b, 4, 4]``, ``[b, 6]``, ``[b, 12, 12]``.
-        axes_obj: ``[b, 3]`` of surfaces of revolution, zero of other objects; or none at all, ``[0, 3]``.
         far_pose: ``[b, 4, 4]``, in the place of a pose that is not usable.
         T_prior, usable, new_velocity, predicted: ``[b, 4, 4]``, ``[b]``, ``[b, 6]`` and ``[b, 12, 12]``; filled.
     """
@@ -47,8 +45,6 @@ def forecast(
         dt = np.float64(dt_s[b])
         start[:] = covariance[b]
         _expected_velocity(velocity[b], dt, settings, before, start)
-        if len(axes_obj):
-            _without_spin(T_cam_obj[b], axes_obj[b], dt, settings, before, start)
         rotation_sigma, move_sigma = _acceleration_sigma(before, diameter_m[b], settings)
         _predict(start, rotation_sigma, move_sigma, dt, diameter_m[b], settings.most_uncertain, predicted[b])
         for k in range(6):
@@ -69,29 +65,6 @@ def _expected_velocity(velocity: Array, dt: float, settings: ForecastSettings, b
             for k in range(6):
                 covariance[6 + j, 6 + k] += before[j] * before[k]
         before[:] = 0.0
-
-
-@kernel()
-def _without_spin(T_cam_obj: Array, axis_obj: Array, dt: float, settings: ForecastSettings, velocity: Array, covariance: Array) -> None:
-    """The spin about an axis of revolution dies away: :func:`torchtrack.tracking.motion.model.without_spin`, in place."""
-    lost, axis = 1.0 - np.exp(-dt / settings.coast_s), np.zeros(3)
-    for j in range(3):
-        for k in range(3):
-            axis[j] += T_cam_obj[j, k] * axis_obj[k]
-    _drop(axis, lost, velocity[:3])
-    for first in (0, 6):
-        for k in range(12):
-            _drop(axis, lost, covariance[first : first + 3, k])
-        for k in range(12):
-            _drop(axis, lost, covariance[k, first : first + 3])
-
-
-@kernel()
-def _drop(axis: Array, share: float, values: Array) -> None:
-    """Take a share of what lies along an axis off a vector, in place."""
-    along = share * (axis[0] * values[0] + axis[1] * values[1] + axis[2] * values[2])
-    for k in range(3):
-        values[k] -= along * axis[k]
 
 
 @kernel()
@@ -154,16 +127,15 @@ def forecast_numba(
     state: MotionState,
     dt_s: Float[Tensor, "b"],
     objects: ObjectBatch,
-    axes_obj: Float[Tensor, "b 3"] | None,
     far_pose: Float[Tensor, "b 4 4"],
     config: TrackerConfig,
 ) -> Prediction:
     """Object by object."""
-    batch, axes = len(dt_s), far_pose.new_empty(0, 3) if axes_obj is None else axes_obj
+    batch = len(dt_s)
     T_prior, usable = far_pose.new_empty(batch, 4, 4), torch.empty(batch, dtype=torch.bool)
     velocity, covariance = far_pose.new_empty(batch, 6), state.covariance.new_empty(batch, 12, 12)
     known = as_arrays(state.T_cam_obj, state.velocity, state.covariance, dt_s)
-    of_objects = as_arrays(objects.centre_obj, objects.diameter_m, axes, far_pose)
+    of_objects = as_arrays(objects.centre_obj, objects.diameter_m, far_pose)
     settings = filled(
         ForecastSettings, config.motion, model, holds=config.motion.model == "hold", least_depth_m=MIN_DEPTH_M, most_depth_m=MAX_DEPTH_M
     )

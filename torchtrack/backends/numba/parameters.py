@@ -220,7 +220,6 @@ class ForecastSettings(NamedTuple):
 
     holds: bool
     turn_s: float
-    coast_s: float
     acceleration_rate_hz: float
     acceleration_floor_m_s2: float
     most_uncertain: float

@@ -107,28 +107,6 @@ def expected_velocity(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], 
     return torch.cat([turning * torch.exp(-dt_s / config.turn_s)[:, None], moving], 1)
 
 
-def without_spin(
-    velocity: Float[Tensor, "b 6"],
-    covariance: Float[Tensor, "b 12 12"],
-    axis_cam: Float[Tensor, "b 3"],
-    dt_s: Float[Tensor, "b"],
-    config: MotionConfig,
-) -> tuple[Float[Tensor, "b 6"], Float[Tensor, "b 12 12"]]:
-    """Velocity and covariance of surfaces of revolution, whose spin about their axis dies away where nothing shows it.
-
-    Nothing in their outline tells of it: without this, the facets of a mesh would be taken for signs of a spin, which grows.
-
-    Args:
-        axis_cam: unit axis in the camera's frame; zero for an object that has none.
-    """
-    lost = 1 - torch.exp(-dt_s / COAST_S)
-    keep = torch.eye(3, dtype=axis_cam.dtype, device=axis_cam.device) - lost[:, None, None] * axis_cam[:, :, None] * axis_cam[:, None]
-    velocity = torch.cat([(keep @ velocity[:, :3, None])[..., 0], velocity[:, 3:]], -1)
-    whole = torch.eye(12, dtype=covariance.dtype, device=covariance.device).repeat(len(covariance), 1, 1)
-    whole[:, :3, :3] = whole[:, 6:9, 6:9] = keep.to(covariance.dtype)
-    return velocity, whole @ covariance @ whole.mT
-
-
 def with_dropped(covariance: Float[Tensor, "b 12 12"], dropped: Float[Tensor, "b 6"]) -> Float[Tensor, "b 12 12"]:
     """Covariance where part of the velocity was set aside: it is uncertain by that much."""
     dropped = torch.nn.functional.pad(dropped.to(covariance.dtype), (6, 0))

@@ -8,7 +8,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import lie
 from torchtrack.core.dispatch import accelerable
 from torchtrack.tracking.contours.objects import ObjectBatch
-from torchtrack.tracking.motion.model import MotionState, expected_velocity, predict_covariance, with_dropped, without_spin
+from torchtrack.tracking.motion.model import MotionState, expected_velocity, predict_covariance, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction, before_camera
 
 
@@ -17,7 +17,6 @@ def forecast(
     state: MotionState,
     dt_s: Float[Tensor, "b"],
     objects: ObjectBatch,
-    axes_obj: Float[Tensor, "b 3"] | None,
     far_pose: Float[Tensor, "b 4 4"],
     config: TrackerConfig,
 ) -> Prediction:
@@ -27,16 +26,12 @@ def forecast(
         state: where the window begins.
         dt_s: length of the window.
         objects: the objects, as they are known.
-        axes_obj: unit axes of surfaces of revolution whose spin fades, zero of other objects; none at all where no object is one.
         far_pose: poses in the place of those that are not usable.
     """
     motion, covariance = config.motion, state.covariance
     velocity = expected_velocity(state.velocity, dt_s, motion)
     if motion.model == "hold":
         velocity, covariance = torch.zeros_like(velocity), with_dropped(covariance, velocity)
-    if axes_obj is not None:
-        axes_cam = (state.T_cam_obj[:, :3, :3].to(velocity.dtype) @ axes_obj[..., None])[..., 0]
-        velocity, covariance = without_spin(velocity, covariance, axes_cam, dt_s, motion)
     covariance = predict_covariance(covariance.detach(), velocity.detach(), dt_s, objects.diameter_m, motion)
     T_prior = lie.step_about(state.T_cam_obj.to(velocity.dtype), velocity * dt_s[:, None], objects.centre_obj)
     T_prior, usable = before_camera(T_prior, objects.centre_obj, far_pose)
