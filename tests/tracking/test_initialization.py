@@ -6,6 +6,7 @@ from helpers import SMALL_CAMERA, box_model, pose
 from tracked_boxes import follow, moving_box, tracker_of, windows
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import MotionConfig, TrackerConfig
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.initialization import largest_speed, limit_speed, unknown_speed
@@ -53,7 +54,7 @@ def test_without_events_some_speed_is_left():
 @pytest.mark.parametrize("held_back", [True, False])
 def test_an_object_that_has_not_been_found_is_held_back(held_back):
     _, events = moving_box(pose(), 2, move=(0.02, 0.0, 0.0), turn=(0.0, 0.0, 0.0))
-    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(motion=MotionConfig(speed_from_events=held_back)))
+    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(disabled=frozenset() if held_back else {Component.SPEED_FROM_EVENTS}))
     few = events[torch.arange(len(events)) % 20 == 0]
     state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(few, 1))
     assert (float(state.motion.covariance[0, 9, 9].sqrt()) < 0.3) == held_back

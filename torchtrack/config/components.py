@@ -15,6 +15,8 @@ class Component(StrEnum):
     SILHOUETTE_DARK_SHIFT = "silhouette_dark_shift"
     WIDE_GATES = "wide_gates"
     SUBCELL_LOOKUP = "subcell_lookup"
+    # motion
+    SPEED_FROM_EVENTS = "speed_from_events"
     # estimation and validation
     VELOCITY_IN_WINDOW = "velocity_in_window"
     PARTLY_HIDDEN = "partly_hidden"
@@ -24,6 +26,7 @@ class Component(StrEnum):
     DRIFT = "drift"
     HELD = "held"
     LAST_SEEN = "last_seen"
+    AROUND_LAST_SEEN = "around_last_seen"
     # how they are compared
     MATCH_COUNT = "match_count"
     INLIER_RATIO = "inlier_ratio"

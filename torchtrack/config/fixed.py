@@ -80,11 +80,13 @@ SWITCHES: dict[str, dict[str, Component]] = {
         "silhouette_dark_shift_px": Component.SILHOUETTE_DARK_SHIFT,
     },
     "solver": {"velocity_in_window": Component.VELOCITY_IN_WINDOW},
+    "motion": {"speed_from_events": Component.SPEED_FROM_EVENTS},
     "validation": {"partly_hidden": Component.PARTLY_HIDDEN},
     "relocalization": {
         "low_score_below": Component.LOW_SCORE,
         "score_drop_below": Component.SCORE_DROP,
         "last_seen_us": Component.LAST_SEEN,
+        "not_validated_us": Component.AROUND_LAST_SEEN,
         "by_matches": Component.MATCH_COUNT,
         "line_ends": Component.LINE_ENDS,
         "tentative": Component.TENTATIVE,

@@ -18,11 +18,6 @@ class RelocalizationConfig(Settings):
     trigger_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which other poses are tried (px).")
     wide_sigma_px: float = Field(10.0, gt=0, description="Standard deviation of the prediction from which it is very uncertain (px).")
     interval_us: int = Field(10_000, ge=0, description="A very uncertain object is searched for once in this time (µs); 0 for in every window.")
-    not_validated_us: int = Field(
-        100_000,
-        ge=0,
-        description="What was not seen well for so long, and is lost or far off in depth, is looked for all around where it was then (µs); 0: never.",
-    )
     accept_margin: float = Field(0.1, ge=0, le=1, description="By how much the score of a pose near the prediction must be better to be accepted.")
     accept_ratio: float = Field(0.9, ge=0, le=1, description="Share of what an object explains when seen well that is asked of a pose elsewhere.")
     everywhere_after_us: int = Field(

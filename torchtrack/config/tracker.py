@@ -89,7 +89,6 @@ class MotionConfig(Settings):
     model: Literal["constant_velocity", "hold"] = Field("constant_velocity", description="Carry the velocity on, or start from the last pose.")
     initial_shift: float = Field(0.005, gt=0, le=1, description="Standard deviation of the initial pose (diameters).")
     initial_speed_m_s: float = Field(0.6, gt=0, description="Standard deviation of the initial speed (m/s).")
-    speed_from_events: bool = Field(True, description="Few events before an object that has not been found yet: its speed cannot be large.")
     acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.components import Component
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch, pad_streams
 from torchtrack.tracking.adapt import objects_as_known
@@ -52,7 +53,7 @@ def expect(tracked: TrackedObjects, state: TrackerState, events: EventBatch, t_u
     lost = has(scheduled.triggers, Trigger.LOST)
     # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.
     never_found = ~(state.health.mean_score > 0)
-    if tracked.config.motion.speed_from_events and not reads.none_of(never_found):
+    if tracked.config.uses(Component.SPEED_FROM_EVENTS) and not reads.none_of(never_found):
         state = held_back(state, never_found, objects, tracked.sensors.seen(pad_streams(events, tracked.streams, t_us)), dt_s)
     if not reads.none_of(lost):
         state = LastSeen.from_state(state, objects, t_us, tracked.config).in_place_of(state, lost)

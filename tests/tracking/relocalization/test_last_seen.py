@@ -12,7 +12,6 @@ from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, started, win
 
 from torchtrack import Tracker
 from torchtrack.config.components import Component
-from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization import last_seen
@@ -142,8 +141,8 @@ def test_an_object_that_ran_off_is_found_again_where_it_was_seen_well(name):
     lost = LOST[name]
     trajectory, events = moving_box(pose(), 30)
 
-    def after(not_validated_us):
-        tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(relocalization=RelocalizationConfig(not_validated_us=not_validated_us)))
+    def after(*disabled):
+        tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(disabled=frozenset(disabled)))
         state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 8))
         away = moved_away(tracker, state, lost["metres"])
         away[:, 0, 3] += lost["sideways_m"]
@@ -152,9 +151,9 @@ def test_an_object_that_ran_off_is_found_again_where_it_was_seen_well(name):
         true = trajectory.at(torch.tensor([150_000]))[0]
         return float((results[-1].T_cam_obj[0] - true)[:3, 3].norm()), int(results[-1].status[0])
 
-    found_m, status = after(100_000)
+    found_m, status = after()
     assert found_m < 5e-3 and status == Status.TRACKING
-    assert after(0)[0] > 0.05
+    assert after(Component.AROUND_LAST_SEEN)[0] > 0.05
 
 
 def test_as_last_seen_it_is_turned_and_as_far_away_as_then_in_the_place_of_now():
@@ -194,8 +193,8 @@ def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(monkeypatch, as_las
             velocity=torch.zeros_like(state.velocity),
         )
 
-    search, disabled = RelocalizationConfig(not_validated_us=0), frozenset() if as_last_seen else {Component.LAST_SEEN}
-    config = TrackerConfig(corners=CornerConfig(max_corners=32), relocalization=search, disabled=disabled)
+    disabled = {Component.AROUND_LAST_SEEN} if as_last_seen else {Component.AROUND_LAST_SEEN, Component.LAST_SEEN}
+    config = TrackerConfig(corners=CornerConfig(max_corners=32), disabled=disabled)
     results, trajectory = runs_on(config, run_off)
     degrees, _ = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
     assert (float(degrees) < 1) == as_last_seen

@@ -6,6 +6,7 @@ from lost_states import moved_away, uncertain, unseen
 from states import changed
 from tracked_boxes import started
 
+from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization.schedule import is_time, schedule
@@ -39,7 +40,7 @@ def test_an_object_is_lost_once_nothing_is_known_of_it_and_it_was_not_seen_for_l
     assert not is_lost(tracker, unseen(gone, 0.05))
     assert not is_lost(tracker, unseen(state))
     assert not is_lost(tracker, changed(gone, mean_score=torch.zeros(1)))
-    assert not is_lost(tracker, gone, TrackerConfig(relocalization=RelocalizationConfig(not_validated_us=0)))
+    assert not is_lost(tracker, gone, TrackerConfig(disabled=frozenset({Component.AROUND_LAST_SEEN})))
     # Without searches nothing would find it there.
     assert not is_lost(tracker, gone, TrackerConfig(relocalization=RelocalizationConfig(hypotheses=0)))
 

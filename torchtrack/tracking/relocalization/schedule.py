@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import none_of
@@ -17,6 +18,8 @@ from torchtrack.tracking.state import TrackerState
 _NOTHING_KNOWN = 0.8
 # Farther away, or nearer, than when it was last seen well by this factor, an object may have been mistaken for others' edges.
 _DEPTH_FACTOR = 1.25
+# What was not seen well for so long, and is lost or far off in depth, is looked for all around where it was then (µs). Not measured alone.
+_NOT_VALIDATED_US = 100_000
 
 
 def schedule(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> Schedule:
@@ -48,9 +51,9 @@ def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_
 
 
 def _lacks_validation(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    if not (config.relocalization.not_validated_us and searches(config)):
+    if not (config.uses(Component.AROUND_LAST_SEEN) and searches(config)):
         return torch.zeros_like(state.health.time_since_validated_s, dtype=torch.bool)
-    return (state.health.time_since_validated_s >= 1e-6 * config.relocalization.not_validated_us) & (state.health.mean_score > 0)
+    return (state.health.time_since_validated_s >= 1e-6 * _NOT_VALIDATED_US) & (state.health.mean_score > 0)
 
 
 def _is_unknown(state: TrackerState, diameter_m: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
