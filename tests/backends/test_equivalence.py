@@ -139,8 +139,6 @@ def stated(name, value, args):
     if operation == "mesh_points":
         points, tangents, kind, mask = value
         return [points[mask], tangents[mask], kind[mask]]
-    if operation == "update_bursts":
-        return [value[0]]
     if operation in ("hidden_by_self", "hidden_in_buffer"):
         return [value[args[1].mask]]
     if operation == "contour_table":
@@ -166,7 +164,7 @@ def _of(value):
         value = value.rows()
     if isinstance(value, WindowEvents):
         # Kept ones may be numbered as of all events, or among themselves.
-        return [value.mask.sum(-1), *(tensor[value.mask] for tensor in (value.pixels, value.age_s, value.into_burst_s, value.polarity))]
+        return [value.mask.sum(-1), *(tensor[value.mask] for tensor in (value.pixels, value.age_s, value.polarity))]
     if isinstance(value, ContourIndex):
         # The cells that it is laid out in are its own.
         v, u = torch.meshgrid(torch.arange(0.0, 150, 7), torch.arange(0.0, 320, 7), indexing="ij")

@@ -13,7 +13,7 @@ from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.expectation import predicted_after
-from torchtrack.tracking.frontend.bursts import LONG_AGO_US, LONGEST_US
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.window_events import SharedEvents, WindowEvents
 from torchtrack.tracking.initialization import first_state
@@ -37,7 +37,7 @@ def window_of(objects: int, count: int, window_us: int, camera: Camera = SMALL_C
 
     def seen():
         nearby = sensors.near_objects(NearbyEvents(events), prediction, dt_s, tracker.config)
-        return sensors.window_events(nearby, ages, t_us, t_us, LONGEST_US)
+        return sensors.window_events(nearby, ages, t_us, t_us)
 
     return tracker, events, prediction, seen
 
@@ -99,6 +99,6 @@ def test_events_of_no_stream_are_not_seen():
         counts = []
         for batch in (events, concatenate([events, beyond])):
             nearby = tracker.sensors.near_objects(NearbyEvents(batch), prediction, dt_s, tracker.config)
-            seen, _ = tracker.sensors.window_events(nearby, ages, t_us, t_us, 1000)
+            seen, _ = tracker.sensors.window_events(nearby, ages, t_us, t_us)
             counts.append(seen.counts())
     assert torch.equal(*counts)

@@ -199,5 +199,5 @@ def test_events_outside_the_sensor_are_told_before_a_compiled_graph_is_given_the
     spoilt.x[7] = SMALL_CAMERA.width
     before = state.maps.burst_age_us.clone()
     with torch.inference_mode(), pytest.raises(EventDataError, match="event 7 is at .*, outside the sensor of 200x150 pixels"):
-        graphs._in_bursts(state, graphs._filled(NearbyEvents(spoilt), 1), torch.tensor([end_us]), 1000)
+        graphs._in_bursts(state, graphs._filled(NearbyEvents(spoilt), 1), torch.tensor([end_us]))
     assert torch.equal(state.maps.burst_age_us, before)

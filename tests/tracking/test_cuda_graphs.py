@@ -139,7 +139,7 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
                 graphs.CompiledStep, "_graph", lambda self, device, learns, advance=advance_as_there: CudaGraphs(partial(advance, learns=learns))
             )
             monkeypatch.setattr(graphs.CompiledStep, "_near", lambda self, state, events, t_us: graphs.NearbyEvents(events))
-            monkeypatch.setattr(graphs, "_in_bursts", lambda opened, filled, t_us, longest_us: (opened, filled))
+            monkeypatch.setattr(graphs, "_in_bursts", lambda opened, filled, t_us: (opened, filled))
         with torch.inference_mode():
             actual.append(follow(tracker, tracker.init(pose().expand(streams, 4, 4), 0), cut)[1])
     assert sum(graph.starts for graph in recorded) >= COUNT // 3

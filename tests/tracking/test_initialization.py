@@ -19,7 +19,7 @@ COVARIANCE = initial_covariance(DIAMETER_M, MotionConfig(initial_speed_m_s=0.6))
 def events_at(pixels):
     pixels = torch.as_tensor(pixels)[None]
     age_s = torch.zeros(pixels.shape[:2])
-    return WindowEvents(pixels, age_s, age_s, age_s, torch.ones_like(age_s, dtype=torch.bool))
+    return WindowEvents(pixels, age_s, age_s, torch.ones_like(age_s, dtype=torch.bool))
 
 
 def test_unknown_speed_is_that_of_the_rim():

@@ -33,7 +33,7 @@ from torchtrack.errors import ConfigError
 from torchtrack.tracking.adapt import learns_next
 from torchtrack.tracking.cuda_graphs import CudaGraphs
 from torchtrack.tracking.expectation import near_tiles
-from torchtrack.tracking.frontend.bursts import LONGEST_US, update_bursts
+from torchtrack.tracking.frontend.bursts import update_bursts
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.state import S, StepResult, TrackerState, each_tensor
@@ -158,7 +158,7 @@ class CompiledStep:
         """What the graph makes of a window, and whether that does not hold."""
         filled = _filled(nearby, len(t_us))
         if t_us.device.type == "cpu":
-            before, filled = _in_bursts(before, filled, t_us, LONGEST_US)
+            before, filled = _in_bursts(before, filled, t_us)
         kind = filled.events.most_of_one, learns
         if kind not in self._graphs:
             self._graphs[kind] = self._graph(t_us.device, learns=learns)
@@ -243,20 +243,16 @@ def _filled(nearby: NearbyEvents, streams: int) -> NearbyEvents:
     return NearbyEvents(filled, torch.arange(len(filled)) if streams == 1 and not host_sync.on_gpu(x) else None)
 
 
-def _in_bursts(before: TrackerState, filled: NearbyEvents, t_us: Tensor, longest_us: int) -> tuple[TrackerState, NearbyEvents]:
-    """The state with its map of bursts brought up, and the events with how far into them they are.
+def _in_bursts(before: TrackerState, filled: NearbyEvents, t_us: Tensor) -> tuple[TrackerState, NearbyEvents]:
+    """The state with its map of bursts brought up with the events.
 
     Not in the graph: where 16 bits are enough, a CPU's compiler takes one pixel at a time.
     """
-    streams, most = len(t_us), filled.events.most_of_one
     if host_sync.read_at_once(t_us):
         height, width = before.maps.burst_age_us.shape[-2:]
         check_on_sensor(filled.events, width, height)
-    window = pad_streams(filled.events, streams, t_us)
-    burst_age_us, into_burst_us = update_bursts(before.maps.burst_age_us, t_us - before.t_us, window, longest_us)
-    if most is not None:
-        into_burst_us = pad(into_burst_us, (0, min(most, len(filled.events)) - into_burst_us.shape[1]))
-    return replace(before, maps=replace(before.maps, burst_age_us=burst_age_us)), replace(filled, into_burst_us=into_burst_us)
+    burst_age_us = update_bursts(before.maps.burst_age_us, t_us - before.t_us, pad_streams(filled.events, len(t_us), t_us))
+    return replace(before, maps=replace(before.maps, burst_age_us=burst_age_us)), replace(filled, are_in_map=True)
 
 
 def _of_any_number(filled: NearbyEvents) -> NearbyEvents:
@@ -265,8 +261,6 @@ def _of_any_number(filled: NearbyEvents) -> NearbyEvents:
     for values in (events.x, events.y, events.t_us, events.polarity, events.stream_index, filled.number):
         if values is not None:
             torch._dynamo.mark_dynamic(values, 0)
-    if filled.into_burst_us is not None:
-        torch._dynamo.mark_dynamic(filled.into_burst_us, 1)
     return filled
 
 

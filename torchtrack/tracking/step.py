@@ -18,7 +18,6 @@ from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.rounds import Fit, align, gate_scale_of, index_for, index_radius, usual_index_radius, widest_index_radius
 from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import Expected, expect, near_objects
-from torchtrack.tracking.frontend.bursts import LONGEST_US
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.flow import SensorPoints
 from torchtrack.tracking.frontend.tiles import NearbyEvents
@@ -135,7 +134,7 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     """Stage 2: events, corners and flow near the objects, and the contours that they are matched with."""
     config, sensors, maps, t_us = tracked.config, tracked.sensors, state.maps, given.t_us
     prediction, nearby = expected.prediction.detached(), near_objects(tracked, expected, given.events)
-    events, burst_age_us = sensors.window_events(nearby, maps.burst_age_us, t_us, t_us - state.t_us, LONGEST_US)
+    events, burst_age_us = sensors.window_events(nearby, maps.burst_age_us, t_us, t_us - state.t_us)
     contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
     sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(tracked.diameter_m)
     gate_scale = gate_scale_of(sigma_px, config)

@@ -18,7 +18,7 @@ def numbered(near, count):
     pixels = torch.stack([torch.where(near, 80.0, 10.0), torch.full_like(number, 60.0)], -1)
     lines = contours_at(upright_line(80.0).pixels.expand(len(near), -1, -1))
     index = index_contours(lines, IMAGE_SIZE, 5, 1)
-    events = WindowEvents(pixels, number, number, torch.ones_like(number), torch.ones_like(near))
+    events = WindowEvents(pixels, number, torch.ones_like(number), torch.ones_like(near))
     chosen = select_events(events, index, moving_objects((0.0, 0.0), len(near)), count)
     assert chosen.pixels.shape == (len(near), count, 2)
     return [row[mask].long().tolist() for row, mask in zip(chosen.age_s, chosen.mask, strict=True)]
@@ -36,7 +36,7 @@ def random_near(seed=0, total=NEAR):
 def choose(pixels, contours, *, age_s=0.0, velocity=(0.0, 0.0), count=100, mask=None):
     observations = seen(pixels, age_s=age_s, mask=mask, polarity=1.0)
     index = index_contours(contours, IMAGE_SIZE, 5, 1)
-    events = WindowEvents(observations.pixels, observations.age_s, observations.age_s, observations.polarity, observations.mask)
+    events = WindowEvents(observations.pixels, observations.age_s, observations.polarity, observations.mask)
     return select_events(events, index, moving_objects(velocity, len(observations.pixels)), count)
 
 
@@ -123,7 +123,7 @@ def test_values_go_with_their_events(dtype):
     place = torch.stack([torch.full((400,), 80.0, dtype=dtype), torch.linspace(20, 119, 400, dtype=dtype)], -1)[None]
     age_s, polarity = torch.linspace(0, 5e-3, 400, dtype=dtype)[None], torch.where(torch.arange(400) % 2 == 0, 1, -1).to(dtype)[None]
     index = index_contours(upright_line(80.0, dtype), IMAGE_SIZE, 5, 1)
-    events = WindowEvents(place, age_s, 2 * age_s, polarity, torch.ones(1, 400, dtype=torch.bool))
+    events = WindowEvents(place, age_s, polarity, torch.ones(1, 400, dtype=torch.bool))
     chosen = select_events(events, index, moving_objects((0.0, 0.0), dtype=dtype), 50)
     number = ((chosen.pixels[0, :, 1] - 20) / 99 * 399).round().long()[chosen.mask[0]]
     assert len(number) > 40
@@ -150,8 +150,8 @@ def test_what_is_drawn_hangs_on_an_events_own_number_also_where_others_were_left
     near = torch.rand((1, 4000), generator=generator(7)) < 0.5
     numbers = torch.arange(4000.0)[None]
     left = (near | (torch.rand(near.shape, generator=generator(8)) < 0.3))[0].nonzero()[:, 0]
-    all_of_them = WindowEvents(torch.stack([numbers, numbers], -1), numbers, numbers, numbers, torch.ones_like(near))
-    some = WindowEvents(*(getattr(all_of_them, name)[:, left] for name in ("pixels", "age_s", "into_burst_s", "polarity", "mask")), left[None])
+    all_of_them = WindowEvents(torch.stack([numbers, numbers], -1), numbers, numbers, torch.ones_like(near))
+    some = WindowEvents(*(getattr(all_of_them, name)[:, left] for name in ("pixels", "age_s", "polarity", "mask")), left[None])
     share = torch.tensor([[0.1]])
     chosen, exists = all_of_them.draw(near, share, 300)
     of_some, some_exist = some.draw(near[:, left], share, 300)
@@ -164,24 +164,24 @@ def test_what_is_drawn_hangs_on_an_events_own_number_also_where_others_were_left
 
 
 def test_each_object_can_have_events_of_its_own():
-    values = [torch.rand((2, 9, *shape), generator=generator(k)) for k, shape in enumerate([(2,), (), (), ()])]
+    values = [torch.rand((2, 9, *shape), generator=generator(k)) for k, shape in enumerate([(2,), (), ()])]
     mask = torch.ones(2, 9, dtype=torch.bool)
     mask[1, 5] = False
     chosen, exists = torch.tensor([[1, 4, 0], [2, 5, 8]]), torch.tensor([[True, True, False], [True, True, True]])
     own = WindowEvents(*values, mask).only(chosen, exists)
     assert own.mask.tolist() == [[True, True, False], [True, False, True]]
     assert torch.equal(own.number, chosen)
-    for name, value in zip(("pixels", "age_s", "into_burst_s", "polarity"), values, strict=True):
+    for name, value in zip(("pixels", "age_s", "polarity"), values, strict=True):
         assert torch.equal(getattr(own, name), torch.stack([value[number, chosen[number]] for number in range(2)]))
     again = own.only(torch.tensor([[1], [2]]), torch.ones(2, 1, dtype=torch.bool))
     assert again.number.tolist() == [[4], [8]]
 
 
 def test_the_events_of_one_object_can_be_repeated():
-    values = [torch.rand((3, 5, *shape), generator=generator(k)) for k, shape in enumerate([(2,), (), (), ()])]
+    values = [torch.rand((3, 5, *shape), generator=generator(k)) for k, shape in enumerate([(2,), (), ()])]
     events = WindowEvents(*values, torch.rand((3, 5), generator=generator(4)) < 0.5)
     repeated = events.of_object(1).repeated(4)
-    for name in ("pixels", "age_s", "into_burst_s", "polarity", "mask"):
+    for name in ("pixels", "age_s", "polarity", "mask"):
         value = getattr(events, name)
         many = getattr(repeated, name)
         assert many.shape == (4, *value.shape[1:])

@@ -1,4 +1,4 @@
-"""Bursts: which events belong to one, and how far into it each comes."""
+"""Bursts: when the newest one of each pixel and polarity began."""
 
 import pytest
 import torch
@@ -17,30 +17,27 @@ def batch(*events, stream=0):
 def update(ages, events, elapsed_us, end_us):
     streams = len(ages)
     ends = torch.full((streams,), end_us)
-    return update_bursts(ages, torch.full((streams,), elapsed_us), pad_streams(events, streams, ends), LONGEST_US)
+    return update_bursts(ages, torch.full((streams,), elapsed_us), pad_streams(events, streams, ends))
 
 
 def test_events_of_a_pixel_and_polarity_are_one_burst():
-    ages, into = update(no_bursts(1, 4, 6), batch((1000, 2, 1, 1), (1500, 2, 1, 1), (3000, 2, 1, 1), (3500, 3, 1, 1), (4000, 2, 1, 0)), 5000, 5000)
-    assert into.tolist() == [[0, 500, 2000, 0, 0]]
+    ages = update(no_bursts(1, 4, 6), batch((1000, 2, 1, 1), (1500, 2, 1, 1), (3000, 2, 1, 1), (3500, 3, 1, 1), (4000, 2, 1, 0)), 5000, 5000)
     assert int(ages[0, 1, 1, 2]) == 4000
     assert int(ages[0, 1, 1, 3]) == 1500
     assert int(ages[0, 0, 1, 2]) == 1000
 
 
 def test_a_burst_goes_on_from_window_to_window():
-    ages, _ = update(no_bursts(1, 4, 6), batch((1000, 2, 1, 1)), 5000, 5000)
-    ages, into = update(ages, batch((6000, 2, 1, 1)), 5000, 10_000)
-    assert into.tolist() == [[5000]]
+    ages = update(no_bursts(1, 4, 6), batch((1000, 2, 1, 1)), 5000, 5000)
+    ages = update(ages, batch((6000, 2, 1, 1)), 5000, 10_000)
     assert int(ages[0, 1, 1, 2]) == 9000
 
 
 def test_after_its_longest_time_the_next_event_begins_another():
-    ages, _ = update(no_bursts(1, 4, 6), batch((1000, 2, 1, 1)), 5000, 5000)
-    ages, _ = update(ages, EventBatch.empty(), 5000, 10_000)
-    ages, into = update(ages, batch((10_900, 2, 1, 1), (11_000, 2, 1, 1), (12_000, 2, 1, 1)), 5000, 15_000)
+    ages = update(no_bursts(1, 4, 6), batch((1000, 2, 1, 1)), 5000, 5000)
+    ages = update(ages, EventBatch.empty(), 5000, 10_000)
     # The first is 9.9 ms into the old burst; the second begins a new one.
-    assert into.tolist() == [[9900, 0, 1000]]
+    ages = update(ages, batch((10_900, 2, 1, 1), (11_000, 2, 1, 1), (12_000, 2, 1, 1)), 5000, 15_000)
     assert int(ages[0, 1, 1, 2]) == 4000
 
 
@@ -49,58 +46,46 @@ def test_bursts_are_those_of_the_events_one_by_one(windows):
     make, count, length_us = generator(3), 3000, 40_000
     t = torch.randint(1, length_us, (count,), generator=make).sort().values
     x, y, p = (torch.randint(0, high, (count,), generator=make) for high in (6, 4, 2))
-    start, expected = {}, []
-    for now, *pixel in zip(t.tolist(), x.tolist(), y.tolist(), p.tolist(), strict=True):
-        if now - start.get(tuple(pixel), -(10**9)) >= LONGEST_US:
-            start[tuple(pixel)] = now
-        expected.append(now - start[tuple(pixel)])
-    ages, actual = no_bursts(1, 4, 6), []
-    step = length_us // windows // 8
+    start, ages, step = {}, no_bursts(1, 4, 6), length_us // windows // 8
     for end in range(step, length_us + step, step):
         inside = (t > end - step) & (t <= end)
-        events = batch(*zip(t[inside].tolist(), x[inside].tolist(), y[inside].tolist(), p[inside].tolist(), strict=True))
-        ages, into = update(ages, events, step, end)
-        actual += into[0].tolist()
-    assert actual == expected
+        events = [column[inside].tolist() for column in (t, x, y, p)]
+        for now, *pixel in zip(*events, strict=True):
+            if now - start.get(tuple(pixel), -(10**9)) >= LONGEST_US:
+                start[tuple(pixel)] = now
+        ages = update(ages, batch(*zip(*events, strict=True)), step, end)
+        for (column, row, polarity), began in start.items():
+            assert int(ages[0, polarity, row, column]) == min(end - began, LONG_AGO_US)
 
 
 def test_streams_are_apart_and_padding_is_no_event():
     events = concatenate([batch((1000, 0, 0, 0), (2000, 0, 0, 0)), batch((3000, 0, 0, 0), stream=1)])
-    ages, into = update(no_bursts(2, 2, 2), events, 5000, 5000)
-    assert into[0].tolist() == [0, 1000] and int(into[1, 0]) == 0
+    ages = update(no_bursts(2, 2, 2), events, 5000, 5000)
     assert ages[:, 0, 0, 0].tolist() == [4000, 2000]
     assert (ages.flatten(1)[:, 1:] == LONG_AGO_US).all()
 
 
 def test_the_old_map_is_left_as_it_was_and_ages_do_not_overflow():
     before = no_bursts(1, 2, 2)
-    ages, _ = update(before, batch((1000, 0, 0, 0)), 5000, 5000)
+    ages = update(before, batch((1000, 0, 0, 0)), 5000, 5000)
     assert (before == LONG_AGO_US).all()
     for elapsed_us in (5000, 30_000, 10_000_000):
-        ages, _ = update(ages, EventBatch.empty(), elapsed_us, elapsed_us)
+        ages = update(ages, EventBatch.empty(), elapsed_us, elapsed_us)
         assert (ages > 0).all() and (ages <= LONG_AGO_US).all()
     assert (ages == LONG_AGO_US).all()
 
 
-def test_in_windows_longer_than_ages_are_kept_events_still_get_numbers():
-    ages, into = update(no_bursts(1, 2, 2), batch((1000, 0, 0, 0), (990_000, 0, 0, 0)), 1_000_000, 1_000_000)
-    assert (into >= 0).all() and (into <= LONG_AGO_US).all()
-    assert (ages >= 0).all()
+def test_of_a_window_longer_than_ages_are_kept_ages_are_still_numbers():
+    ages = update(no_bursts(1, 2, 2), batch((1000, 0, 0, 0), (990_000, 0, 0, 0)), 1_000_000, 1_000_000)
+    assert (ages >= 0).all() and (ages <= LONG_AGO_US).all()
 
 
-def test_no_event_of_a_long_window_is_farther_into_its_burst_than_a_burst_is_long():
-    _, into = update(no_bursts(1, 2, 2), batch((1000, 0, 0, 0), (3000, 0, 0, 0), (15_000, 0, 0, 0), (16_000, 0, 0, 0)), 20_000, 20_000)
-    assert into.tolist() == [[0, 2000, 0, 0]]
-
-
-def test_where_bursts_have_no_length_there_are_none():
-    events = pad_streams(batch((1000, 0, 0, 0), (2000, 0, 0, 0), (4000, 0, 0, 0)), 1, torch.tensor([5000]))
-    _, into = update_bursts(no_bursts(1, 2, 2), torch.tensor([5000]), events, 0)
-    assert not into.any()
+def test_of_several_bursts_in_a_window_the_first_is_kept():
+    ages = update(no_bursts(1, 2, 2), batch((1000, 0, 0, 0), (3000, 0, 0, 0), (15_000, 0, 0, 0), (16_000, 0, 0, 0)), 20_000, 20_000)
+    assert int(ages[0, 0, 0, 0]) == 19_000
 
 
 def test_padded_events_of_nothing():
     nothing = torch.zeros(1, 1, dtype=torch.int64)
     none = PaddedEvents(nothing, nothing, nothing, nothing.bool(), nothing.bool())
-    ages, into = update_bursts(no_bursts(1, 2, 2), torch.tensor([5000]), none, LONGEST_US)
-    assert (ages == LONG_AGO_US).all() and not into[none.mask].any()
+    assert (update_bursts(no_bursts(1, 2, 2), torch.tensor([5000]), none) == LONG_AGO_US).all()

@@ -15,15 +15,15 @@ from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.dispatch import accelerates
 from torchtrack.core.events import EventBatch, PaddedEvents, check_on_sensor, of_streams, stream_bounds
 from torchtrack.tracking.frontend import bursts, tiles, time_surface
-from torchtrack.tracking.frontend.bursts import LONG_AGO_US
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US, LONGEST_US
 from torchtrack.tracking.frontend.sensors import Sensors
 from torchtrack.tracking.frontend.tiles import TILE_BITS, NearbyEvents, SensorTiles
 from torchtrack.tracking.frontend.window_events import ObjectEvents, SharedEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 
 # Rows of what an object sees of an event.
-PIXELS, AGE, INTO_BURST, POLARITY = 0, 2, 3, 4
-SEEN = 5
+PIXELS, AGE, POLARITY = 0, 2, 3
+SEEN = 4
 # Events that are looked at together: what is found of them stays in the processor's nearest memory.
 _BLOCK = 1024
 
@@ -178,14 +178,13 @@ def see_kept(
     """
     width, brighter = np.uint64(ideal_pixels.shape[1]), np.uint64(ideal_pixels.shape[0] * ideal_pixels.shape[1])
     aged, ideal = ages.ravel(), ideal_pixels.reshape(-1, 2)
-    u, v, age_s, into_s, sign = seen[PIXELS], seen[PIXELS + 1], seen[AGE], seen[INTO_BURST], seen[POLARITY]
+    u, v, age_s, sign = seen[PIXELS], seen[PIXELS + 1], seen[AGE], seen[POLARITY]
     _age(before.ravel(), np.int16(elapsed_us), np.int16(long_ago_us - elapsed_us), aged)
     for j in range(len(kept)):
         i = np.uint64(kept[j])
         pixel, age = np.uint64(y[i]) * width + np.uint64(x[i]), end_us - t_us[i]
-        place = pixel + np.uint64(polarity[i]) * brighter
-        into = _into_burst(aged, place, min(age, long_ago_us), True, elapsed_us, longest_us)
-        u[j], v[j], age_s[j], into_s[j] = ideal[pixel, 0], ideal[pixel, 1], age * 1e-6, into * 1e-6
+        _fire(aged, pixel + np.uint64(polarity[i]) * brighter, min(age, long_ago_us), True, elapsed_us, longest_us)
+        u[j], v[j], age_s[j] = ideal[pixel, 0], ideal[pixel, 1], age * 1e-6
         sign[j], exists[j] = 2.0 * polarity[i] - 1.0, True
     for j in range(len(kept), len(exists)):
         exists[j] = False
@@ -214,17 +213,15 @@ def divide(kept: Array, x: Array, y: Array, near: Array, tile_bits: int, columns
 
 
 @kernel()
-def _into_burst(ages: Array, place: int, age: int, exists: bool, elapsed_us: int, longest_us: int) -> int:
-    """How far into its burst an event is (µs), which may begin one; ``ages`` are those of the map, all at the window's end.
+def _fire(ages: Array, place: int, age: int, exists: bool, elapsed_us: int, longest_us: int) -> None:
+    """Bring a map of bursts up with one event, which may begin one; ``ages`` are those of the map, all at the window's end.
 
     Events come in the order of their times: the first of a pixel that begins a burst in the window is the oldest, and those after
     it begin none. What is younger than the window began in it.
     """
     began = np.int64(ages[place])
-    goes_on = began - age < longest_us
     # Written always, in the place of a branch of which a processor would guess many wrong: twice as fast.
-    ages[place] = np.int16(age if exists and not goes_on and began >= elapsed_us else began)
-    return int(began - age) if goes_on else 0
+    ages[place] = np.int16(age if exists and began - age >= longest_us and began >= elapsed_us else began)
 
 
 @kernel()
@@ -239,15 +236,14 @@ def update_bursts(
     long_ago_us: int,
     before: Array,
     ages: Array,
-    into_us: Array,
 ) -> None:
-    """Bring a map of bursts up to a window's end, and tell how far into its burst each event is (µs).
+    """Bring a map of bursts up to a window's end.
 
     Args:
         x, y, age_us, polarity, mask: ``[s, e]``.
         elapsed_us: ``[s]``.
         before: ``[s, 2, h, w]``, where the window began.
-        ages, into_us: at its end, and ``[s, e]``; filled.
+        ages: at its end; filled.
     """
     height, width = np.uint64(before.shape[2]), np.uint64(before.shape[3])
     for s in range(len(mask)):
@@ -255,7 +251,7 @@ def update_bursts(
         _age(before[s].ravel(), np.int16(elapsed), np.int16(long_ago_us - elapsed), aged)
         for i in range(mask.shape[1]):
             place = (np.uint64(polarity[s, i]) * height + np.uint64(y[s, i])) * width + np.uint64(x[s, i])
-            into_us[s, i] = _into_burst(aged, place, min(age_us[s, i], long_ago_us), mask[s, i], elapsed, longest_us)
+            _fire(aged, place, min(age_us[s, i], long_ago_us), mask[s, i], elapsed, longest_us)
 
 
 @kernel()
@@ -266,13 +262,11 @@ def _age(before: Array, elapsed: int, most: int, ages: Array) -> None:
 
 
 @kernel(fastmath=FAST)
-def see(
-    x: Array, y: Array, age_us: Array, into_us: Array, polarity: Array, mask: Array, ideal_pixels: Array, stream_index: Array, seen: Array
-) -> None:
+def see(x: Array, y: Array, age_us: Array, polarity: Array, mask: Array, ideal_pixels: Array, stream_index: Array, seen: Array) -> None:
     """Events of several streams as each object's camera saw them.
 
     Args:
-        x, y, age_us, into_us, polarity, mask: ``[s, e]`` of a window.
+        x, y, age_us, polarity, mask: ``[s, e]`` of a window.
         ideal_pixels: ``[s, h, w, 2]``.
         stream_index: ``[b]``; of one stream, ``[1]`` is enough for all that see it.
         seen: ``[SEEN, b, e]``, filled; zero where there is nothing.
@@ -288,23 +282,21 @@ def see(
                 continue
             pixel = np.uint64(y[s, i]) * width + np.uint64(x[s, i])
             seen[PIXELS, b, i], seen[PIXELS + 1, b, i] = ideal[pixel, 0], ideal[pixel, 1]
-            seen[AGE, b, i], seen[INTO_BURST, b, i] = age_us[s, i] * 1e-6, into_us[s, i] * 1e-6
+            seen[AGE, b, i] = age_us[s, i] * 1e-6
             seen[POLARITY, b, i] = 1.0 if polarity[s, i] else -1.0
 
 
-def _ages_tell(burst_age_us: Tensor, elapsed_us: Tensor, events: PaddedEvents, longest_us: int) -> bool:
+def _ages_tell(burst_age_us: Tensor, elapsed_us: Tensor, events: PaddedEvents) -> bool:
     """Whether ages of bursts tell what began in the window: not in longer ones."""
     return bool((elapsed_us < LONG_AGO_US).all())
 
 
 @accelerates(bursts.update_bursts, supports=_ages_tell)
-def update_bursts_numba(
-    burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int
-) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
+def update_bursts_numba(burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents) -> Int[Tensor, "s 2 h w"]:
     """One event after the other."""
-    ages, into_us = torch.empty(burst_age_us.shape, dtype=torch.int16), torch.empty(events.mask.shape, dtype=torch.int16)
-    update_bursts(*as_arrays(*vars(events).values(), elapsed_us), longest_us, LONG_AGO_US, *as_arrays(burst_age_us, ages, into_us))
-    return ages, into_us
+    ages = torch.empty(burst_age_us.shape, dtype=torch.int16)
+    update_bursts(*as_arrays(*vars(events).values(), elapsed_us), LONGEST_US, LONG_AGO_US, *as_arrays(burst_age_us, ages))
+    return ages
 
 
 @accelerates(time_surface.update_last_event)
@@ -339,23 +331,19 @@ def numbers_near_numba(sensor: SensorTiles, events: EventBatch, near: Bool[Tenso
     return kept[:count]
 
 
-@accelerates(Sensors.seen, supports=lambda sensors, window, into_burst_us=None, number=None: into_burst_us is not None and number is None)
-def seen_numba(
-    sensors: Sensors, window: PaddedEvents, into_burst_us: Int[Tensor, "s e"] | None = None, number: Int[Tensor, "e"] | None = None
-) -> WindowEvents:
+@accelerates(Sensors.seen, supports=lambda sensors, window, number=None: number is None)
+def seen_numba(sensors: Sensors, window: PaddedEvents, number: Int[Tensor, "e"] | None = None) -> WindowEvents:
     """Event by event."""
-    if into_burst_us is None:
-        raise ValueError("a kernel needs to be told how far events are into their bursts.")
     batch = len(sensors.stream_index)
     # What all see alike is written once.
     own = sensors.stream_index[:1] if len(sensors.ideal_pixels) == 1 else sensors.stream_index
     seen = sensors.ideal_pixels.new_empty(SEEN, len(own), window.mask.shape[1])
-    arrays = as_arrays(window.x, window.y, window.age_us, into_burst_us, window.polarity, window.mask, sensors.ideal_pixels)
+    arrays = as_arrays(window.x, window.y, window.age_us, window.polarity, window.mask, sensors.ideal_pixels)
     see(*arrays, *as_arrays(own), seen.numpy())
     return _of_rows(seen.expand(-1, batch, -1), window.mask[own].expand(batch, -1))
 
 
-def _are_chosen(sensors: Sensors, nearby: NearbyEvents, burst_age_us: Tensor, t_us: Tensor, elapsed_us: Tensor, longest_us: int) -> bool:
+def _are_chosen(sensors: Sensors, nearby: NearbyEvents, burst_age_us: Tensor, t_us: Tensor, elapsed_us: Tensor) -> bool:
     """Whether the events that count are still to be chosen by their tiles, in a window short enough for ages of bursts to tell what began in it."""
     return nearby.near_tiles is not None and int(elapsed_us) < LONG_AGO_US
 
@@ -367,7 +355,6 @@ def window_events_numba(
     burst_age_us: Int[Tensor, "s 2 h w"],
     t_us: Int[Tensor, "s"],
     elapsed_us: Int[Tensor, "s"],
-    longest_us: int,
 ) -> tuple[ObjectEvents, Int[Tensor, "s 2 h w"]]:
     """The events in tiles near each object, as it saw them, and the bursts' ages with them, event by event."""
     near, tiles_of = nearby.near_tiles, sensors.tiles
@@ -379,7 +366,7 @@ def window_events_numba(
     numbers = kept if len(kept) else np.zeros(1, np.int64)
     places = len(numbers)
     seen, ages_us = sensors.ideal_pixels.new_empty(SEEN, 1, places), torch.empty(burst_age_us.shape, dtype=burst_age_us.dtype)
-    exists, of_bursts = torch.empty(1, places, dtype=torch.bool), (int(elapsed_us), longest_us, LONG_AGO_US)
+    exists, of_bursts = torch.empty(1, places, dtype=torch.bool), (int(elapsed_us), LONGEST_US, LONG_AGO_US)
     of_events = as_arrays(events.x, events.y, events.t_us, events.polarity)
     maps = as_arrays(sensors.ideal_pixels[0], burst_age_us[0], ages_us[0])
     see_kept(kept, *of_events, int(t_us), *of_bursts, *maps, *as_arrays(seen[:, 0], exists[0]))
@@ -392,7 +379,7 @@ def window_events_numba(
     return SharedEvents(shared, own, counts), ages_us
 
 
-def _of_rows(seen: Float[Tensor, "5 b e"], exists: Bool[Tensor, "b e"]) -> WindowEvents:
-    """Events by their rows: pixels, ages, times into their bursts, and polarities."""
-    age_s, into_burst_s, polarity = seen[2:].unbind()
-    return WindowEvents(seen[:2].permute(1, 2, 0), age_s, into_burst_s, polarity, exists)
+def _of_rows(seen: Float[Tensor, "4 b e"], exists: Bool[Tensor, "b e"]) -> WindowEvents:
+    """Events by their rows: pixels, ages and polarities."""
+    age_s, polarity = seen[AGE:].unbind()
+    return WindowEvents(seen[:AGE].permute(1, 2, 0), age_s, polarity, exists)

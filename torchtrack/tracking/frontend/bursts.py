@@ -1,7 +1,7 @@
 """Bursts: an edge that passes a pixel fires it several times, for the longer the slower the pixel is.
 
-Where the edge is blurred, its events are spread evenly around the moment when it passes. Real pixels go on firing long
-after that, above all where it got dark. How far into its burst an event comes tells the two apart.
+The first event of a burst tells when the edge came; those after it tell less, above all where it got dark: real pixels go on firing
+long after that.
 """
 
 import torch
@@ -29,21 +29,16 @@ def aged(burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"]) -> 
 
 
 @accelerable
-def update_bursts(
-    burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents, longest_us: int
-) -> tuple[Int[Tensor, "s 2 h w"], Int[Tensor, "s e"]]:
-    """Ages of the newest burst of every pixel and polarity at a window's end (µs), and how far into its burst each event is (µs).
+def update_bursts(burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents) -> Int[Tensor, "s 2 h w"]:
+    """Ages of the newest burst of every pixel and polarity at a window's end (µs).
 
-    What one pixel fires of one polarity within ``longest_us`` is one burst; the next event after that begins another. In a
-    window that is longer, bursts that follow the first of a pixel are not told from one another: each event begins its own.
+    What one pixel fires of one polarity within :data:`LONGEST_US` is one burst; the next event after that begins another. In a
+    window that is longer, the first burst that begins in it is the newest.
 
     Args:
         burst_age_us: of the bursts before the window, where it begins; left as it was.
         elapsed_us: how long the window lasts.
         events: of the window.
-        longest_us: less than :data:`LONG_AGO_US`.
-
-    Of padding, the second result says nothing.
     """
     _, _, height, width = burst_age_us.shape
     ages = aged(burst_age_us, elapsed_us)
@@ -52,9 +47,8 @@ def update_bursts(
     place = (events.polarity * height + events.y) * width + events.x
     age_us = events.age_us.clamp(max=LONG_AGO_US).to(torch.int16)
     before_us = flat.gather(1, place)
-    begins = events.mask & (before_us - age_us >= longest_us)
+    begins = events.mask & (before_us - age_us >= LONGEST_US)
     # Of several events of a pixel that would begin a burst the oldest does.
     flat.scatter_reduce_(1, place, torch.where(begins, -1, before_us), "amin")
     flat.scatter_reduce_(1, place, torch.where(begins, age_us, -1), "amax")
-    into_us = torch.where(begins, flat.gather(1, place), before_us) - age_us
-    return ages, torch.where(into_us < longest_us, into_us, 0)
+    return ages

@@ -84,40 +84,37 @@ class Sensors:
 
     @accelerable
     def window_events(
-        self, nearby: NearbyEvents, burst_age_us: Int[Tensor, "s 2 h w"], t_us: Int[Tensor, "s"], elapsed_us: Int[Tensor, "s"], longest_us: int
+        self, nearby: NearbyEvents, burst_age_us: Int[Tensor, "s 2 h w"], t_us: Int[Tensor, "s"], elapsed_us: Int[Tensor, "s"]
     ) -> tuple[ObjectEvents, Int[Tensor, "s 2 h w"]]:
         """The events of a window as each object's camera saw them, and the bursts' ages with them (µs).
 
         Args:
             nearby: the events that count.
-            burst_age_us: ages where the window begins; at its end, where ``nearby`` says how far into their bursts they are.
+            burst_age_us: ages where the window begins; at its end, where ``nearby`` says that they are in the map.
             t_us: end of the window of each stream.
             elapsed_us: how long the window lasts.
-            longest_us: how long a pixel's events are of one burst.
         """
         if self.tiles is not None and nearby.near_tiles is not None:
             nearby = self.tiles.keep(nearby.events, nearby.near_tiles)
         window = pad_streams(nearby.events, len(self.ideal_pixels), t_us)
         if host_sync.read_at_once(t_us):
             check_on_sensor(nearby.events, self.image_size[1], self.image_size[0])
-        into_burst_us = nearby.into_burst_us
-        if into_burst_us is None:
-            burst_age_us, into_burst_us = update_bursts(burst_age_us, elapsed_us, window, longest_us)
-        seen = self.seen(window, into_burst_us, nearby.number)
+        if not nearby.are_in_map:
+            burst_age_us = update_bursts(burst_age_us, elapsed_us, window)
+        seen = self.seen(window, nearby.number)
         return seen if nearby.of_each is None else seen.only(*nearby.of_each), burst_age_us
 
     @accelerable
-    def seen(self, window: PaddedEvents, into_burst_us: Int[Tensor, "s e"] | None = None, number: Int[Tensor, "e"] | None = None) -> WindowEvents:
-        """A window's events as each object's camera saw them; of bursts nothing is said where nothing is given."""
+    def seen(self, window: PaddedEvents, number: Int[Tensor, "e"] | None = None) -> WindowEvents:
+        """A window's events as each object's camera saw them."""
         streams = len(self.ideal_pixels)
         stream = torch.arange(streams, device=window.x.device)[:, None]
         pixels = at_pixels(self.ideal_pixels, stream, window.x, window.y).transpose(1, 2).contiguous().transpose(1, 2)
         age_s = window.age_us.to(pixels.dtype) * 1e-6
-        into_burst_s = torch.zeros_like(age_s) if into_burst_us is None else into_burst_us.to(pixels.dtype) * 1e-6
-        values = (pixels, age_s, into_burst_s, 2 * window.polarity.to(pixels.dtype) - 1, window.mask)
+        values = (pixels, age_s, 2 * window.polarity.to(pixels.dtype) - 1, window.mask)
         # Of one stream without a copy for every object.
         each = [value.expand(len(self.stream_index), *value.shape[1:]) if streams == 1 else value[self.stream_index] for value in values]
-        return WindowEvents(each[0], each[1], each[2], each[3], each[4], None if number is None else number.expand_as(each[1]))
+        return WindowEvents(each[0], each[1], each[2], each[3], None if number is None else number.expand_as(each[1]))
 
     def corners(self, contours: Contours, maps: SensorMaps, t_us: Int[Tensor, "s"], window_s: Float[Tensor, "s"], config: TrackerConfig) -> Corners:
         """Corners of the time surface around each object's contours, without their flow; ``maps`` are those at ``t_us``."""

@@ -36,14 +36,14 @@ class NearbyEvents:
         events: the events.
         number: of each among all of the window, where some were left out.
         of_each: indices of those that can have to do with each object, padded, and which of these exist; all where not given.
-        into_burst_us: how far each is into its burst (µs), a padded row per stream, where the map of bursts has been brought up already.
+        are_in_map: whether the map of bursts has been brought up with them already.
         near_tiles: tiles near each object, where the events in them are still to be chosen.
     """
 
     events: EventBatch
     number: Int[Tensor, "e"] | None = None
     of_each: tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]] | None = None
-    into_burst_us: Int[Tensor, "s e"] | None = None
+    are_in_map: bool = False
     near_tiles: Bool[Tensor, "b t"] | None = None
 
 

@@ -20,7 +20,6 @@ class WindowEvents:
     Args:
         pixels: ideal pixels.
         age_s: time from the event to the window's end (s).
-        into_burst_s: time from the first event of its burst to the event (s).
         polarity: +1 where the pixel got brighter, -1 where darker.
         mask: which entries exist.
         number: of each event among all of its window, where some of them were left out.
@@ -28,7 +27,6 @@ class WindowEvents:
 
     pixels: Float[Tensor, "b e 2"]
     age_s: Float[Tensor, "b e"]
-    into_burst_s: Float[Tensor, "b e"]
     polarity: Float[Tensor, "b e"]
     mask: Bool[Tensor, "b e"]
     number: Int[Tensor, "b e"] | None = None
