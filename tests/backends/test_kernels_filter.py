@@ -9,7 +9,7 @@ from tracked_boxes import tensors_of
 
 from torchtrack import Tracker
 from torchtrack.config.components import Component
-from torchtrack.config.tracker import MotionConfig, TrackerConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.core.linalg import inverse
 from torchtrack.tracking.association.matches import MatchesWithCues
@@ -68,14 +68,14 @@ def stated(prediction):
 
 MOTIONS = {
     "as it is": {},
-    "hold": {"model": "hold"},
-    "turns go on": {"turn_s": 0},
+    "hold": {"motion": {"model": "hold"}},
+    "turns go on": {"disabled": ["turns_fade"]},
 }
 
 
 @pytest.mark.parametrize("settings", MOTIONS.values(), ids=MOTIONS)
 def test_forecasts(settings, dtype):
-    tracker, state = boxes(TrackerConfig(motion=MotionConfig(**settings)), dtype)
+    tracker, state = boxes(TrackerConfig.model_validate(settings), dtype)
     for by_kernel, plain in zip(*map(stated, both_ways(forecasts(tracker, state))), strict=True):
         assert_as_close(by_kernel, plain, tolerance=TOLERANCE[dtype])
 

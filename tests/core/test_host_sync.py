@@ -10,7 +10,7 @@ from tracked_boxes import SCENES, assert_same, follow, started
 
 from torchtrack import Tracker
 from torchtrack.config.relocalization import RelocalizationConfig
-from torchtrack.config.tracker import CornerConfig, TrackerConfig, WindowConfig
+from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
@@ -173,16 +173,17 @@ def test_of_a_larger_object_the_middle_is_taken(nothing_is_read):
 
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize(
-    "config",
+    ("config", "max_unknown_px"),
     [
-        TrackerConfig(),
-        TrackerConfig(window=WindowConfig(parts=2, max_unknown_px=0.01)),
-        TrackerConfig(relocalization=RelocalizationConfig(trigger_sigma_px=1e-3, hypotheses=4, rotations=10)),
+        (TrackerConfig(), 2.0),
+        (TrackerConfig(), 0.01),
+        (TrackerConfig(relocalization=RelocalizationConfig(trigger_sigma_px=1e-3, hypotheses=4, rotations=10)), 2.0),
     ],
     ids=["default", "in parts", "searched"],
 )
-def test_a_tracker_that_reads_nothing_finds_the_same(nothing_is_read, monkeypatch, scene, config):
+def test_a_tracker_that_reads_nothing_finds_the_same(nothing_is_read, monkeypatch, scene, config, max_unknown_px):
     monkeypatch.setattr(initialization, "_EVENTS_OF_A_PART", 20)
+    monkeypatch.setattr(initialization, "MAX_UNKNOWN_PX", max_unknown_px)
     starts, stream_index, cameras, cut = scene(COUNT)
     boxes = Tracker([box_model()] * len(starts), cameras, config, stream_index, dtype=torch.float64)
     begin = boxes.init(torch.stack(starts), 0)

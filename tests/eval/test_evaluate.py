@@ -331,14 +331,14 @@ def test_methods_are_joined_in_the_order_of_their_names():
         {
             "methods": {
                 "both": {"joins": ["short", "inner"], "tracker": {"window": {"count": 99}}},
-                "short": {"preset": "causal", "tracker": {"window": {"duration_us": 2500, "parts": 1}}},
+                "short": {"preset": "causal", "tracker": {"window": {"duration_us": 2500, "mode": "count"}}},
                 "longer": {"tracker": {"window": {"duration_us": 4000}}},
                 "inner": {"joins": ["longer"]},
             }
         }
     ).methods
     window = methods["both"].tracker.window
-    assert (methods["both"].preset, window.duration_us, window.parts, window.count) == ("causal", 4000, 1, 99)
+    assert (methods["both"].preset, window.duration_us, window.mode, window.count) == ("causal", 4000, "count", 99)
     assert methods["inner"] == methods["longer"]
 
 

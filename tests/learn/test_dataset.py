@@ -11,7 +11,8 @@ from torch.utils.data import DataLoader
 from tracked_boxes import assert_same
 
 from torchtrack import ObjectModel, Tracker, read_sequence
-from torchtrack.config.tracker import MotionConfig, TrackerConfig
+from torchtrack.config.components import Component
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg, se3_exp
 from torchtrack.errors import EventDataError, MissingFileError
@@ -180,7 +181,7 @@ def test_a_tracker_follows_a_batch_from_its_start(folder):
     data = WindowDataset([folder / "one.npz"], ClipConfig(windows=3), AugmentationConfig(stretch_time=(0.8, 1.2)))
     batch = collate([data[number] for number in range(3)])
     model = ObjectModel.from_file(data.sequences[0].objects[0].model_path())
-    tracker = Tracker([model] * 3, [CAMERA] * 3, TrackerConfig(motion=MotionConfig(turn_s=0)), range(3), torch.float64)
+    tracker = Tracker([model] * 3, [CAMERA] * 3, TrackerConfig(disabled=frozenset({Component.TURNS_FADE})), range(3), torch.float64)
     state = start_state(tracker, batch, speed_sigma_m_s=0.05)
     assert torch.equal(state.t_us, batch.t_us[:, 0]) and (state.maps.last_event_us <= batch.t_us[:, 0, None, None]).all()
     for number in range(batch.windows):

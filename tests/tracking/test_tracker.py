@@ -241,7 +241,7 @@ def test_without_events_the_pose_is_held_and_the_status_says_so(dtype):
 
 def test_without_events_the_motion_goes_on_where_asked_for_and_dies_away(dtype):
     # What is lost for long rests where it was last seen well, unless it is never looked for there.
-    config = PREDICT.model_copy(update={"motion": MotionConfig(turn_s=0), "disabled": frozenset({Component.AROUND_LAST_SEEN})})
+    config = PREDICT.model_copy(update={"disabled": frozenset({Component.AROUND_LAST_SEEN, Component.TURNS_FADE})})
     tracker, state, _, _, trajectory = started(dtype, config)
     after, result = tracker.step(state, EventBatch.empty(), 30_000)
     assert Status(int(result.status)) == Status.TOO_FEW_EVENTS

@@ -7,7 +7,8 @@ from states import changed
 from tracked_boxes import assert_same, follow, moving_box, poses_of, started, windows
 
 from torchtrack import Tracker
-from torchtrack.config.tracker import TrackerConfig, WindowConfig
+from torchtrack.config.components import Component
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.tracking import initialization
 from torchtrack.tracking.state import choose_rows
@@ -21,27 +22,26 @@ def few_events_make_a_part(monkeypatch):
     monkeypatch.setattr(initialization, "_EVENTS_OF_A_PART", 40)
 
 
-def in_parts(parts):
-    return TrackerConfig(window=WindowConfig(parts=parts))
+WHOLE = TrackerConfig(disabled=frozenset({Component.WINDOW_PARTS}))
 
 
-def errors_of(parts, count=8):
+def errors_of(count=8):
     trajectory, events = moving_box(pose(), count, **FAST)
-    tracker = Tracker([box_model()], SMALL_CAMERA, in_parts(parts))
+    tracker = Tracker([box_model()], SMALL_CAMERA)
     _, results = follow(tracker, tracker.init(pose()[None], 0), windows(events, count))
     times = torch.stack([result.t_us[0] for result in results])
     return pose_errors(poses_of(results), trajectory.at(times))
 
 
 def test_a_start_in_full_motion_is_followed():
-    rotation_deg, translation_mm = errors_of(parts=4)
+    rotation_deg, translation_mm = errors_of()
     assert float(rotation_deg[2:].max()) < 1
     assert float(translation_mm[2:].max()) < 1
 
 
 def test_an_object_whose_motion_is_known_is_taken_whole(monkeypatch):
     tracker, state, _, (events, end_us), _ = started()
-    calm = Tracker([box_model()], SMALL_CAMERA, in_parts(1))
+    calm = Tracker([box_model()], SMALL_CAMERA, WHOLE)
     assert_same(tracker.step(state, events, end_us), calm.step(state, events, end_us))
 
 

@@ -17,6 +17,8 @@ class Component(StrEnum):
     SUBCELL_LOOKUP = "subcell_lookup"
     # motion
     SPEED_FROM_EVENTS = "speed_from_events"
+    WINDOW_PARTS = "window_parts"
+    TURNS_FADE = "turns_fade"
     # estimation and validation
     VELOCITY_IN_WINDOW = "velocity_in_window"
     PARTLY_HIDDEN = "partly_hidden"

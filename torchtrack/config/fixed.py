@@ -4,7 +4,7 @@ from torchtrack.config.components import Component
 
 # Constants, with their values, by sections.
 FIXED: dict[str, dict[str, str]] = {
-    "window": {"max_age_us": "20000"},
+    "window": {"max_age_us": "20000", "max_unknown_px": "2"},
     "surface": {
         "margin_px": "12, and at 16 with association.search along_flow",
         "max_region_px": "256",
@@ -72,6 +72,7 @@ FIXED: dict[str, dict[str, str]] = {
 
 # Components, which ``disabled`` switches off, by sections.
 SWITCHES: dict[str, dict[str, Component]] = {
+    "window": {"parts": Component.WINDOW_PARTS},
     "corners": {"snap": Component.CORNER_SNAP, "fresh_only": Component.FRESH_CORNERS},
     "association": {
         "fine_unless_plain": Component.SUBCELL_LOOKUP,
@@ -80,7 +81,7 @@ SWITCHES: dict[str, dict[str, Component]] = {
         "silhouette_dark_shift_px": Component.SILHOUETTE_DARK_SHIFT,
     },
     "solver": {"velocity_in_window": Component.VELOCITY_IN_WINDOW},
-    "motion": {"speed_from_events": Component.SPEED_FROM_EVENTS},
+    "motion": {"speed_from_events": Component.SPEED_FROM_EVENTS, "turn_s": Component.TURNS_FADE},
     "validation": {"partly_hidden": Component.PARTLY_HIDDEN},
     "relocalization": {
         "low_score_below": Component.LOW_SCORE,

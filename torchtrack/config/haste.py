@@ -6,8 +6,8 @@ from torchtrack.config.tracker import TrackerConfig
 
 # A search that takes about as long as ten windows, where one takes as long as a hundred.
 _HYPOTHESES, _ROTATIONS = 8, 60
-# What is not searched for at all.
-_LEFT_OUT = frozenset({Component.LOW_SCORE, Component.SCORE_DROP})
+# What is not searched for at all, and what takes a window several times over.
+_LEFT_OUT = frozenset({Component.LOW_SCORE, Component.SCORE_DROP, Component.WINDOW_PARTS})
 
 
 def in_haste(config: TrackerConfig, *, searches: bool) -> TrackerConfig:
@@ -18,8 +18,7 @@ def in_haste(config: TrackerConfig, *, searches: bool) -> TrackerConfig:
         searches: whether objects that are lost are searched for, by fewer poses than otherwise.
     """
     search = _brief(config.relocalization) if searches else _without(config.relocalization)
-    window = config.window.model_copy(update={"parts": 1})
-    return config.model_copy(update={"window": window, "relocalization": search, "disabled": config.disabled | _LEFT_OUT})
+    return config.model_copy(update={"relocalization": search, "disabled": config.disabled | _LEFT_OUT})
 
 
 def _without(search: RelocalizationConfig) -> RelocalizationConfig:

@@ -16,8 +16,6 @@ class WindowConfig(Settings):
     mode: Literal["time", "count"] = Field("time", description="Windows of equal duration, or of an equal number of events.")
     duration_us: int = Field(5_000, ge=100, le=1_000_000, description="Length of a window in mode 'time' (µs).")
     count: int = Field(5_000, ge=10, description="Events of a window in mode 'count'.")
-    parts: int = Field(4, ge=1, le=100, description="Parts in which a window is taken while an object's motion is not known; 1 for never.")
-    max_unknown_px: float = Field(2.0, gt=0, description="Unknown part of a motion in a window from which it is taken in parts (px).")
 
 
 class SurfaceConfig(Settings):
@@ -92,9 +90,6 @@ class MotionConfig(Settings):
     acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
     without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
-    turn_s: float = Field(
-        0.2, ge=0, le=10, description="A turn that events hardly show dies away with this time constant (s), not to run away; 0 for not at all."
-    )
 
 
 class AdaptationConfig(Settings):

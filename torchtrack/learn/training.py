@@ -12,10 +12,11 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.utils.data import DataLoader
 
+from torchtrack.config.components import Component
 from torchtrack.config.presets import preset
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.settings import Settings
-from torchtrack.config.tracker import TrackerConfig, WindowConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.lie import difference_about
 from torchtrack.learn.augmentation import AugmentationConfig
 from torchtrack.learn.dataset import ClipConfig, SequenceBatches, WindowDataset
@@ -200,7 +201,7 @@ class Trainer:
 
 def tracker_config(config: TrackerConfig) -> TrackerConfig:
     """Settings for training: without search, and without windows in parts."""
-    return config.model_copy(update={"relocalization": RelocalizationConfig(hypotheses=0), "window": WindowConfig(parts=1)})
+    return config.model_copy(update={"relocalization": RelocalizationConfig(hypotheses=0), "disabled": config.disabled | {Component.WINDOW_PARTS}})
 
 
 def _error_px(tracker: Tracker, T_cam_obj: Float[Tensor, "b 4 4"], T_true: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b"]:

@@ -23,7 +23,7 @@ from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.graphs import CompiledStep
-from torchtrack.tracking.initialization import check_poses, first_state, to_be_parted
+from torchtrack.tracking.initialization import PARTS, check_poses, first_state, to_be_parted
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.sampling import rehearse
 from torchtrack.tracking.relocalization.triggers import searches
@@ -207,7 +207,7 @@ class Tracker(TrackedObjects):
         self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor, extra_terms: tuple[CostTerm, ...]
     ) -> tuple[TrackerState, StepResult]:
         """The window as several short ones, with a search for objects that are ``starting``; further terms hold at the end of the last."""
-        for left in range(self.config.window.parts, 1, -1):
+        for left in range(PARTS, 1, -1):
             until_us = state.t_us + (t_us - state.t_us) // left
             early = events.t_us <= until_us[events.stream_index]
             state, _ = self._advance(state, events[early], until_us, starting)

@@ -15,12 +15,13 @@ from window_problems import windowed
 from torchtrack import Tracker, preset
 from torchtrack.baselines import tracker_class
 from torchtrack.config.relocalization import RelocalizationConfig
-from torchtrack.config.tracker import SolverConfig, TrackerConfig, WindowConfig
+from torchtrack.config.tracker import SolverConfig, TrackerConfig
 from torchtrack.core import dispatch
 from torchtrack.core.camera import project
 from torchtrack.core.image_velocity import pose_jacobian
 from torchtrack.core.lie import affine, move_about, retract_about, transform_points, turned
 from torchtrack.tracking import initialization
+from torchtrack.tracking import tracker as tracker_module
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.estimation.implicit_gradient import newton_step, with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import offset_from_prior, robust_cost, solve_pose
@@ -296,8 +297,10 @@ def test_a_step_takes_a_further_term(name):
 
 def test_where_a_window_is_taken_in_parts_a_further_term_is_of_its_end(monkeypatch):
     monkeypatch.setattr(initialization, "_EVENTS_OF_A_PART", 40)
+    for module in (initialization, tracker_module):
+        monkeypatch.setattr(module, "PARTS", 3)
     trajectory, events = moving_box(pose(), 1)
-    config = TrackerConfig(window=WindowConfig(parts=3), relocalization=RelocalizationConfig(hypotheses=0))
+    config = TrackerConfig(relocalization=RelocalizationConfig(hypotheses=0))
     tracker = Tracker([box_model()], SMALL_CAMERA, config, dtype=torch.float64)
     start, (window,) = tracker.init(pose()[None], 0), windows(events, 1)
     assert bool(initialization.to_be_parted(start, window[0], torch.tensor([window[1]]), tracker.objects, config).all())

@@ -9,6 +9,7 @@ from torchtrack.core.lie import retract_about, se3_inverse, se3_log, transform_p
 from torchtrack.core.linalg import inverse
 from torchtrack.core.pose_covariance import left_covariance
 from torchtrack.tracking.motion.model import (
+    TURN_S,
     expected_velocity,
     fade,
     initial_covariance,
@@ -210,19 +211,14 @@ def test_a_velocity_that_is_set_aside_is_uncertain_by_as_much():
 def test_a_turn_dies_away_with_its_time_constant_and_a_move_goes_on(dtype):
     velocity = torch.arange(1.0, 13.0, dtype=dtype).view(2, 6)
     dt_s = torch.tensor([0.02, 0.1], dtype=dtype)
-    expected = expected_velocity(velocity, dt_s, MotionConfig(turn_s=0.1))
+    expected = expected_velocity(velocity, dt_s)
     assert torch.equal(expected[:, 3:], velocity[:, 3:])
-    torch.testing.assert_close(expected[:, :3], velocity[:, :3] * torch.exp(-dt_s / 0.1)[:, None])
-
-
-def test_turns_go_on_where_that_is_switched_off():
-    velocity = double(1, 2, 3, 4, 5, 6)[None]
-    assert torch.equal(expected_velocity(velocity, double(0.5), MotionConfig(turn_s=0)), velocity)
+    torch.testing.assert_close(expected[:, :3], velocity[:, :3] * torch.exp(-dt_s / TURN_S)[:, None])
 
 
 def test_what_dies_away_of_a_turn_is_little_of_what_may_change_in_a_window():
     dt_s, turn_rad_s = 0.005, 3.0
     velocity = double(turn_rad_s, 0, 0, 0, 0, 0)[None]
-    lost = float((velocity - expected_velocity(velocity, double(dt_s), MotionConfig())).norm())
+    lost = float((velocity - expected_velocity(velocity, double(dt_s))).norm())
     change = predicted(torch.zeros(1, 12, 12, dtype=torch.float64), velocity[0].tolist(), dt_s)[0, 6, 6].sqrt()
     assert 0 < lost < 0.25 * float(change)

@@ -12,7 +12,7 @@ from tracked_boxes import assert_same, follow, in_motion, moving_box, poses_of, 
 from torchtrack import Tracker
 from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
-from torchtrack.config.tracker import CornerConfig, MotionConfig, TrackerConfig
+from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization.triggers import NONE, SEARCHED, Trigger, triggers
@@ -21,10 +21,9 @@ from torchtrack.tracking.validation.status import Status, is_smeared
 
 # The box fires few events: with corners beside them, enough is observed of one that slipped to say more than that it is too little.
 # Polarities of these events are drawn by lot: there is nothing to remember of them.
-UNREMEMBERED = frozenset({Component.POLARITY_PRIOR})
 # What slips turns on: with turns that die away it would be drawn back.
-TURNING = MotionConfig(turn_s=0)
-SEARCHING = TrackerConfig(corners=CornerConfig(max_corners=32), motion=TURNING, disabled=UNREMEMBERED)
+UNREMEMBERED = frozenset({Component.POLARITY_PRIOR, Component.TURNS_FADE})
+SEARCHING = TrackerConfig(corners=CornerConfig(max_corners=32), disabled=UNREMEMBERED)
 NEVER_DRIFTING = SEARCHING.model_copy(update={"disabled": UNREMEMBERED | {Component.DRIFT, Component.SCORE_DROP}})
 # Twenty degrees, onto other edges: farther than a pose that is sure of itself is looked for.
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)

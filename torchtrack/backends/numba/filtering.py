@@ -92,6 +92,6 @@ def moves_unknown_numba(state: TrackerState, t_us: Int[Tensor, "s"], objects: Ob
     """Object by object."""
     is_unknown = torch.empty_like(objects.stream_index, dtype=torch.bool)
     own = as_arrays(objects.centre_obj, objects.intrinsics[:, 0], objects.diameter_m, objects.stream_index, t_us - state.t_us)
-    limits = config.window.max_unknown_px, config.relocalization.wide_sigma_px
+    limits = initialization.MAX_UNKNOWN_PX, config.relocalization.wide_sigma_px
     find_unknown_motion(*as_arrays(state.motion.covariance, state.T_cam_obj), *own, *limits, is_unknown.numpy())
     return is_unknown

@@ -9,6 +9,7 @@ from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.backends.numba.geometry import depth_of, is_finite, turn
 from torchtrack.backends.numba.parameters import ForecastSettings, filled
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.dispatch import accelerates
@@ -137,7 +138,13 @@ def forecast_numba(
     known = as_arrays(state.T_cam_obj, state.velocity, state.covariance, dt_s)
     of_objects = as_arrays(objects.centre_obj, objects.diameter_m, far_pose)
     settings = filled(
-        ForecastSettings, config.motion, model, holds=config.motion.model == "hold", least_depth_m=MIN_DEPTH_M, most_depth_m=MAX_DEPTH_M
+        ForecastSettings,
+        config.motion,
+        model,
+        holds=config.motion.model == "hold",
+        turn_s=model.TURN_S if config.uses(Component.TURNS_FADE) else 0.0,
+        least_depth_m=MIN_DEPTH_M,
+        most_depth_m=MAX_DEPTH_M,
     )
     forecast(*known, *of_objects, settings, *as_arrays(T_prior, usable, velocity, covariance))
     return Prediction(objects, T_prior, usable, velocity, covariance)

@@ -20,6 +20,8 @@ MOST_UNCERTAIN = 0.5
 
 # A motion that no events confirm dies away with this time constant (s). Not measured alone.
 COAST_S = 0.2
+# A turn that events hardly show dies away with this time constant (s), not to run away. Not measured alone.
+TURN_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -95,16 +97,14 @@ def fade(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], failed: Bool[
     return torch.where(failed[:, None], velocity * torch.exp(-dt_s / COAST_S)[:, None], velocity)
 
 
-def expected_velocity(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 6"]:
+def expected_velocity(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"]) -> Float[Tensor, "b 6"]:
     """The velocity after ``dt_s``, before any acceleration: turns die away slowly (an Ornstein-Uhlenbeck process).
 
     Events that show a turn hold it up: what dies away in a window is a quarter of the change that is to be expected in it.
     One that hardly any show, because what would is hidden, feeds on the facets of the mesh, and would grow.
     """
-    if not config.turn_s:
-        return velocity
     turning, moving = velocity.split(3, 1)
-    return torch.cat([turning * torch.exp(-dt_s / config.turn_s)[:, None], moving], 1)
+    return torch.cat([turning * torch.exp(-dt_s / TURN_S)[:, None], moving], 1)
 
 
 def with_dropped(covariance: Float[Tensor, "b 12 12"], dropped: Float[Tensor, "b 6"]) -> Float[Tensor, "b 12 12"]:

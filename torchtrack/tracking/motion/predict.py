@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import lie
 from torchtrack.core.dispatch import accelerable
@@ -29,7 +30,7 @@ def forecast(
         far_pose: poses in the place of those that are not usable.
     """
     motion, covariance = config.motion, state.covariance
-    velocity = expected_velocity(state.velocity, dt_s, motion)
+    velocity = expected_velocity(state.velocity, dt_s) if config.uses(Component.TURNS_FADE) else state.velocity
     if motion.model == "hold":
         velocity, covariance = torch.zeros_like(velocity), with_dropped(covariance, velocity)
     covariance = predict_covariance(covariance.detach(), velocity.detach(), dt_s, objects.diameter_m, motion)
