@@ -47,11 +47,10 @@ class EventStream(ABC):
 
 
 @dataclass(frozen=True)
-class LaterStream(EventStream):
-    """Another stream without the events before ``start_us``."""
+class DerivedStream(EventStream):
+    """A stream made of another one, batch by batch."""
 
     inner: EventSource
-    start_us: int
 
     @property
     def width(self) -> int:  # type: ignore[override]
@@ -65,7 +64,20 @@ class LaterStream(EventStream):
 
     def chunks(self, max_events: int = DEFAULT_CHUNK_EVENTS) -> Iterator[EventBatch]:
         """The events in time order; see :class:`torchtrack.io.event_source.EventSource`."""
-        for chunk in self.inner.chunks(max_events):
-            later = chunk.slice_time(self.start_us - 1, int(chunk.t_us[-1]))
-            if len(later):
-                yield later
+        for chunk in self._passed(self.inner.chunks(max_events)):
+            if len(chunk):
+                yield chunk
+
+    @abstractmethod
+    def _passed(self, chunks: Iterator[EventBatch]) -> Iterator[EventBatch]:
+        """What becomes of the batches."""
+
+
+@dataclass(frozen=True)
+class LaterStream(DerivedStream):
+    """Another stream without the events before ``start_us``."""
+
+    start_us: int
+
+    def _passed(self, chunks: Iterator[EventBatch]) -> Iterator[EventBatch]:
+        return (chunk.slice_time(self.start_us - 1, int(chunk.t_us[-1])) for chunk in chunks)
