@@ -204,7 +204,7 @@ def test_the_work_of_a_window_is_bounded_however_many_are_lost(monkeypatch):
         refine, "align_and_score", lambda rows, offsets, lost: aligned.append((lost.number, len(offsets))) or whole(rows, offsets, lost)
     )
     _, events = moving_box(pose(), 8)
-    config = TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, new_below=0, objects=1))
+    config = TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, objects=1))
     tracker = Tracker([box_model()] * 4, SMALL_CAMERA, config)
     state, _ = follow(tracker, tracker.init(pose()[None].repeat(4, 1, 1), 0), windows(events, 3))
     work, looks = [], torch.zeros(4, dtype=torch.int64)
