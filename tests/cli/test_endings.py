@@ -90,7 +90,7 @@ def test_what_a_killed_run_has_written_can_be_read_and_taken_up(sequence_path, t
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert track(sequence_path, out, "--resume", "--quiet") == ExitCode.DONE
     assert len(read_tum(out / "trajectory_box.tum")) == 8
-    assert sorted(path.name for path in out.iterdir()) == ["config.yaml", "poses.csv", "summary.json", "trajectory_box.tum"]
+    assert sorted(path.name for path in out.iterdir()) == ["config.yaml", "first_window.png", "poses.csv", "summary.json", "trajectory_box.tum"]
 
 
 def test_several_are_taken_up_together(folder, tmp_path, capsys):

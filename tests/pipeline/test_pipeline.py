@@ -52,7 +52,7 @@ def test_a_moving_box_is_followed(rotation, motion, dtype):
     results = followed(box_model(), SMALL_CAMERA, edge_events(trajectory), pose(rotation), dtype=dtype)
     degrees, millimetres = errors_of(results, trajectory)
     assert len(results) == 12
-    assert [Status(int(result.status)) for result in results[2:]] == [Status.TRACKING] * 10
+    assert [Status(int(result.status)) for result in results[4:]] == [Status.TRACKING] * 8
     assert float(degrees[3:].max()) < 0.5
     # A speed that is far from the rest that was assumed takes longer to be learned, in depth above all.
     speed_m_s = max(abs(part) for part in motion.get("move", (0.0,)))

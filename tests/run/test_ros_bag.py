@@ -50,7 +50,7 @@ def test_a_run_writes_poses_and_transforms(tracked):
     folder, steps = tracked
     messages = messages_of(folder / "poses.mcap")
     assert sorted(path.name for path in folder.iterdir()) == sorted(
-        ["config.yaml", "poses.csv", "poses.mcap", "summary.json", "trajectory_left.tum", "trajectory_right.2.tum"]
+        ["config.yaml", "first_window.png", "poses.csv", "poses.mcap", "summary.json", "trajectory_left.tum", "trajectory_right.2.tum"]
     )
     trajectory = read_tum(folder / "trajectory_right.2.tum")
     poses = [(stamp, message) for topic, stamp, message in messages if topic == "/torchtrack/right_2/pose"]

@@ -126,7 +126,7 @@ def test_public_objects_show_themselves_in_a_line(tracker, state, events, sequen
     assert all(len(text) < 200 and "\n" not in text and "tensor(" not in text for text in shown.values()), shown
     assert shown["tracker"].startswith("Tracker(1 object (") and "120x90 pixels, cpu, float32" in shown["tracker"]
     assert shown["state"].startswith(f"TrackerState({START_US} µs, positions (")
-    assert "TRACKING" in shown["result"] and "7000 µs" in shown["result"]
+    assert "UNCERTAIN" in shown["result"] and "7000 µs" in shown["result"]
     assert shown["events"] == f"EventBatch({len(events)} events, {int(events.t_us[0])} to {int(events.t_us[-1])} µs, cpu)"
     assert repr(EventBatch.empty()) == "EventBatch(no events)"
     assert "diameter 0.1755 m" in shown["model"] and "12 faces" in shown["model"]

@@ -36,9 +36,10 @@ def test_what_is_well_seen_is_no_trouble(model):
         (at(10, 5, 502), r"'mug' is 0\.079 px across at 502 m at the start: too small.*in metres .translation_m., or in mm"),
         (at(2, 0, 0.5), r"'mug' is outside the image at the start: its centre is at pixel \(1040, 90\) of 240x180, 2\.06 m away"),
         (at(0, -1, 0.5), "outside the image"),
+        (at(0, 0, -0.5), r"'mug' is behind the camera at the start: its centre is at z = -0\.5 m.*perhaps it is the inverse"),
         (at(0, 0, 0.02), r"the camera is inside 'mug' at the start: the object's centre is 0\.02 m away"),
     ],
-    ids=["in_mm", "right", "above", "within"],
+    ids=["in_mm", "right", "above", "behind", "within"],
 )
 def test_what_cannot_be_seen_is_refused(T, message):
     with pytest.raises(PoseError, match=message):

@@ -31,7 +31,8 @@ from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.tracker import Tracker
 from torchtrack.tracking.validation.measures import explained_ratio, visible_ratio
-from torchtrack.tracking.validation.status import Status, judge
+from torchtrack.tracking.validation.status import Status
+from torchtrack.tracking.validation.verdict import Limits, Measured, judge
 
 # Contour points lie so far apart at most that an event on a line is within this of one of its points (px).
 _POINT_SPACING_PX = 6.0
@@ -217,11 +218,18 @@ class EventLineTracker(Tracker):
         self, window: Window, solution: Linearisation, contours: Contours, matches: Matches
     ) -> tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]]:
         """Status and quality of each object, and which poses are taken."""
-        settings = self.config.validation
         share = explained_ratio(contours, matches, self._contour_velocity(window, contours), self.image_size, self.config)
         step = lie.small_difference_about(window.T_start, solution.T_cam_obj, self.centre_obj)
         in_view = visible_ratio(contours, self.image_size)
-        status = judge(share, matches.mask.sum(-1), in_view, step, self.diameter_m, settings)
+        rotated_rad, moved_m = step.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
+        scale, yes, no = torch.ones_like(share), torch.ones_like(share, dtype=torch.bool), torch.zeros_like(share, dtype=torch.bool)
+        measured = Measured(
+            *(share, share, scale, scale, in_view, scale, rotated_rad, moved_m / self.diameter_m, matches.mask.sum(-1)),
+            is_moving=yes,
+            is_usable=yes,
+            is_relocalized=no,
+        )
+        status = judge(measured, torch.zeros_like(share), Limits.from_config(self.config))
         return status, share, status < int(Status.TOO_FEW_EVENTS)
 
     def _close(

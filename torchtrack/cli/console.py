@@ -118,3 +118,8 @@ def starting(*, quiet: bool = False) -> Iterator[None]:
 def tell_failure(text: str) -> None:
     """Tell on stderr what failed while the rest went on."""
     Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {text}", markup=False)
+
+
+def tell_warning(text: str) -> None:
+    """Tell on stderr what the user should look at."""
+    Console(stderr=True, highlight=False, soft_wrap=True).print(f"warning: {text}", markup=False)

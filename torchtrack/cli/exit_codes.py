@@ -9,4 +9,5 @@ class ExitCode(IntEnum):
     DONE = 0
     FAILED = 1
     WRONG_SETTINGS = 2
+    NOT_TRACKED = 3
     INTERRUPTED = 130

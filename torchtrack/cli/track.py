@@ -3,13 +3,14 @@
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
 
-from torchtrack.cli.console import OutputLines, output_console, tell_failure
+from torchtrack.cli.console import OutputLines, output_console, tell_failure, tell_warning
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.progress import progress_shown
 from torchtrack.config.executor import ExecutorName
@@ -23,13 +24,15 @@ from torchtrack.run.executor import TaskFailure
 from torchtrack.run.runner import run, run_many
 from torchtrack.run.session import open_session
 from torchtrack.run.sinks import Sink
-from torchtrack.run.sinks.folder import check_folder
+from torchtrack.run.sinks.folder import FIRST_STILL, check_folder
 from torchtrack.run.sinks.pose_lines import PoseLines
 from torchtrack.run.sinks.progress import ProgressBar
 from torchtrack.run.sinks.rerun_log import RerunLog, check_target
 from torchtrack.run.sinks.resume import check_resumable, is_complete
-from torchtrack.run.sinks.summary import RunSummary
+from torchtrack.run.sinks.start_support import StartNotice
+from torchtrack.run.sinks.summary import ObjectSummary, RunSummary
 from torchtrack.run.stage_times import stages_timed
+from torchtrack.tracking.validation.status import Status
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,8 @@ class ExtraOutputs:
 
 
 _NO_EXTRA = ExtraOutputs()
+# Which exit code tells of many runs that ended in different ways.
+_GRAVEST_FIRST = (ExitCode.INTERRUPTED, ExitCode.FAILED, ExitCode.NOT_TRACKED, ExitCode.DONE)
 
 
 def track(config_or_source: str, overrides: Mapping[str, Any], extra: ExtraOutputs = _NO_EXTRA, *, resume: bool = False, quiet: bool) -> int:
@@ -81,7 +86,7 @@ def track_many(
                 codes.append(ExitCode.FAILED)
             else:
                 codes.append(_show_run(console, outcome, configs[number].output))
-    return max(codes)
+    return next(code for code in _GRAVEST_FIRST if code in codes)
 
 
 def _in_own_folder(config: RunConfig, name: str) -> RunConfig:
@@ -114,6 +119,9 @@ def run_and_show(config: RunConfig, quiet: bool, resume: bool = False, extra: Ex
             progress.console.print("compiling the tracker, which takes a minute or two for the first time")
         if not (quiet or only_poses):
             sinks.append(ProgressBar(progress, session))
+        if not resume:
+            tell = partial(progress.console.print, markup=False, highlight=False, soft_wrap=True)
+            sinks.append(StartNotice(session.labels, tell, config.output / FIRST_STILL, only_doubts=quiet or only_poses))
         if extra.poses is not None:
             lines = stack.enter_context(closing(OutputLines() if only_poses else LineFile(Path(extra.poses))))
             sinks.append(PoseLines(lines, session.labels))
@@ -133,4 +141,20 @@ def _show_run(console: Console, summary: RunSummary, output: Path) -> ExitCode:
         left_out = f"{summary.dropped_windows} were dropped, {summary.dropped_events} events left out"
         console.print(f"events came too fast: {summary.joined_windows} windows were joined with the next, {left_out}")
     console.print(f"Results are in {output}")
-    return ExitCode.INTERRUPTED if summary.interrupted else ExitCode.DONE
+    for label, share in summary.not_tracked.items():
+        tell_warning(f"'{label}' was tracked in {100 * share:.1f} % of the windows. {_what_to_try(summary.objects[label], output)}")
+    if summary.interrupted:
+        return ExitCode.INTERRUPTED
+    return ExitCode.NOT_TRACKED if summary.not_tracked else ExitCode.DONE
+
+
+def _what_to_try(of_object: ObjectSummary, output: Path) -> str:
+    """What helps an object that was not tracked."""
+    if of_object.status.get(Status.TOO_FEW_EVENTS.name, 0) > sum(of_object.status.values()) / 2:
+        return "Most windows had too few events on it: try longer ones (tracker.window.duration_us), and see whether it moves at all."
+    if of_object.status.get(Status.OUT_OF_VIEW.name, 0) > sum(of_object.status.values()) / 2:
+        return f"It was out of view: check the initial pose, its time and the camera; {output / FIRST_STILL} shows the start."
+    return (
+        f"Look at {output / FIRST_STILL}: does the contour lie on the events? If not, `torchtrack pose` finds a pose (--points, --near, --search); "
+        "if it does, check the size of the model (`torchtrack model`) and the calibration."
+    )

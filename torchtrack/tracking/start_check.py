@@ -94,6 +94,11 @@ def _check_object(T: Float[Tensor, "4 4"], model: ObjectModel, view: _View) -> N
     away = f"{float(centre.norm()):.3g} m"
     if bool(((se3_inverse(T)[:3, 3] - middle).abs() < half).all()):
         raise PoseError(f"the camera is inside '{model.name}' at the start: the object's centre is {away} away. {_UNITS}")
+    if float(centre[0, 2]) <= 0:
+        raise PoseError(
+            f"'{model.name}' is behind the camera at the start: its centre is at z = {float(centre[0, 2]):.3g} m. T_cam_obj maps points of the "
+            "object to the camera's frame, whose z axis points from the camera to the scene; perhaps it is the inverse."
+        )
     across_px = model.diameter_m * float(view.focal[0] / centre[0, 2])
     if across_px < _LEAST_PX:
         raise PoseError(f"'{model.name}' is {across_px:.2g} px across at {away} at the start: too small to be seen. {_UNITS}")

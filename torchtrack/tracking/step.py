@@ -34,6 +34,7 @@ from torchtrack.tracking.relocalization.triggers import SEARCHED, has, triggers
 from torchtrack.tracking.state import StepResult, TrackerState, each_tensor
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, reference_where_known, score_fit
+from torchtrack.tracking.validation.verdict import Limits, confirmed_status
 
 _READS = host_sync.HostReads()
 
@@ -187,8 +188,9 @@ def update(
         next_state, result = confirm_or_take_back(state, next_state, result, prediction, located.gate_scale, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, learns=given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
+    status = confirmed_status(result.status, next_state.health.confirmations, Limits.from_config(config))
     maps, health = replace(next_state.maps, burst_age_us=seen.burst_age_us), next_state.health.with_looks(located.looked)
-    return replace(next_state, t_us=given.t_us, maps=maps, health=health), replace(result, t_us=given.t_us)
+    return replace(next_state, t_us=given.t_us, maps=maps, health=health), replace(result, t_us=given.t_us, status=status)
 
 
 def opened(tracked: TrackedObjects, state: TrackerState, events: EventBatch) -> TrackerState:

@@ -7,8 +7,8 @@ from torchtrack.tracking.relocalization.triggers import Trigger
 from torchtrack.tracking.validation.health import TrackHealth
 
 
-def asks(number, looks=0, lost_s=0.0, *, stream=0, flags=Trigger.UNCERTAIN):
-    return Asks(number, stream, int(flags), looks, lost_s)
+def asks(number, looks=0, lost_s=0.0, *, stream=0, is_starting=False):
+    return Asks(number, stream, int(Trigger.UNCERTAIN), looks, lost_s, is_starting)
 
 
 def numbers(*asking, most=1):
@@ -35,7 +35,7 @@ def test_streams_do_not_matter_to_one_another():
 
 
 def test_all_whose_motion_is_not_known_are_looked_for_beside_the_others():
-    starting = [asks(number, flags=Trigger.STARTING | Trigger.UNCERTAIN) for number in range(3)]
+    starting = [asks(number, is_starting=True) for number in range(3)]
     assert numbers(*starting, asks(3), asks(4)) == [0, 1, 2, 3]
 
 

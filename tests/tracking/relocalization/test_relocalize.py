@@ -150,7 +150,8 @@ def test_a_box_that_slipped_is_found_within_a_window_however_sure_it_is_of_itsel
     never = TrackerConfig(disabled={Component.DRIFT, Component.SCORE_DROP})
     actual, T_true = displaced_runs(slips, 1.0, displaced=farther * DISPLACED)
     held, _ = displaced_runs(never, 1.0, displaced=farther * DISPLACED)
-    assert int(actual[0].status) == int(actual[-1].status) == Status.TRACKING
+    # What a search gave is not confirmed at once.
+    assert int(actual[0].status) == Status.UNCERTAIN and int(actual[-1].status) == Status.TRACKING
     degrees, millimetres = pose_errors(actual[-1].T_cam_obj, T_true)
     assert float(degrees) < 0.3 and float(millimetres) < 0.5
     assert [int(result.status) for result in held[:5]] == [Status.TOO_FEW_EVENTS] * 5

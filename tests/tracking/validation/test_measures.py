@@ -1,30 +1,19 @@
-"""Statuses one by one, the explained ratio, what is in view, and how far a pose is trusted."""
-
-import math
+"""The explained ratio, what gathers on contours, and what is in view."""
 
 import pytest
 import torch
 from measured_matches import matches_at
 
-from torchtrack.config.components import Component
 from torchtrack.config.tracker import AssociationConfig, CornerConfig, TrackerConfig
 from torchtrack.config.validation import ValidationConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.validation.measures import explained_ratio, inlier_ratio, visible_ratio
-from torchtrack.tracking.validation.status import Status, judge, needed_ratio, partly_hidden, trust
 
 IMAGE_SIZE = (150, 200)
 CONFIG, TRACKER = ValidationConfig(), TrackerConfig()
 
 CORNERS_ALONE = TrackerConfig(corners=CornerConfig(max_corners=32), association=AssociationConfig(max_events=0))
-
-
-def verdict(*, quality=1.0, count=100, in_view=1.0, rotated=0.0, moved=0.0, config=CONFIG):
-    """Status of one object whose prediction was rotated by ``rotated`` rad and moved by ``moved`` diameters."""
-    step = torch.tensor([[0.6 * rotated, 0.8 * rotated, 0.0, 0.0, 0.0, 0.2 * moved]])
-    status = judge(torch.tensor([quality]), torch.tensor([count]), torch.tensor([in_view]), step, torch.tensor([0.2]), config)
-    return Status(int(status))
 
 
 def contours_at(pixels, normals=(1.0, 0.0), mask=None):
@@ -43,128 +32,6 @@ def upright_line(u=80.0, count=80, first=20.0):
 def ratio(contours, matches, velocity=(100.0, 0.0), config=TRACKER):
     moving = torch.tensor(velocity, dtype=torch.float64).expand_as(contours.pixels)
     return explained_ratio(contours, matches, moving, IMAGE_SIZE, config)
-
-
-# ---- statuses
-
-
-def test_a_good_pose_is_tracking():
-    assert verdict() == Status.TRACKING
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"quality": 0.39}, Status.UNCERTAIN),
-        ({"quality": 0.4}, Status.TRACKING),
-        ({"quality": 0.09}, Status.LOST),
-        ({"quality": 0.2}, Status.UNCERTAIN),
-        ({"quality": 0.0}, Status.LOST),
-        ({"count": 29}, Status.TOO_FEW_EVENTS),
-        ({"count": 30}, Status.TRACKING),
-        ({"count": 0}, Status.TOO_FEW_EVENTS),
-        ({"in_view": 0.19}, Status.OUT_OF_VIEW),
-        ({"in_view": 0.2}, Status.TRACKING),
-        ({"rotated": 0.51}, Status.DIVERGED),
-        ({"rotated": 0.49}, Status.TRACKING),
-        ({"moved": 0.51}, Status.DIVERGED),
-        ({"moved": 0.49}, Status.TRACKING),
-        ({"rotated": float("nan")}, Status.DIVERGED),
-        ({"moved": float("inf")}, Status.DIVERGED),
-    ],
-    ids=lambda value: value.name if isinstance(value, Status) else "-".join(f"{k}={v}" for k, v in value.items()),
-)
-def test_each_reason_has_its_status(change, expected):
-    assert verdict(**change) == expected
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"quality": 0.0, "count": 0}, Status.TOO_FEW_EVENTS),
-        ({"quality": 0.0, "count": 0, "in_view": 0.0}, Status.OUT_OF_VIEW),
-        ({"quality": 0.0, "count": 0, "in_view": 0.0, "rotated": 1.0}, Status.DIVERGED),
-    ],
-)
-def test_the_gravest_reason_is_told(change, expected):
-    assert verdict(**change) == expected
-
-
-def test_thresholds_are_those_of_the_settings():
-    config = ValidationConfig(min_observations=200, uncertain_below=0.9, lost_below=0.8, min_visible_ratio=0.7, max_rotation_rad=0.1)
-    assert verdict(count=150, config=config) == Status.TOO_FEW_EVENTS
-    assert verdict(count=250, quality=0.85, config=config) == Status.UNCERTAIN
-    assert verdict(count=250, quality=0.75, config=config) == Status.LOST
-    assert verdict(count=250, in_view=0.6, config=config) == Status.OUT_OF_VIEW
-    assert verdict(count=250, rotated=0.2, config=config) == Status.DIVERGED
-
-
-def test_objects_are_judged_each_for_itself():
-    status = judge(
-        torch.tensor([1.0, 0.3, 0.0, 1.0]), torch.tensor([100, 100, 100, 3]), torch.ones(4), torch.zeros(4, 6), torch.full((4,), 0.2), CONFIG
-    )
-    assert status.tolist() == [Status.TRACKING, Status.UNCERTAIN, Status.LOST, Status.TOO_FEW_EVENTS]
-
-
-@pytest.mark.parametrize(("gate_scale", "expected"), [(1.0, Status.UNCERTAIN), (1.5, Status.UNCERTAIN), (1.75, Status.LOST), (3.0, Status.LOST)])
-def test_more_is_asked_of_an_object_that_was_looked_for_in_more_places(gate_scale, expected):
-    """Between lost below 0.2 and found again from 0.35: 0.275 is needed at 1.5 times the gate, 0.3125 at 1.75, and no more than 0.35."""
-    config = ValidationConfig(lost_below=0.2)
-    status = judge(*(torch.tensor(value) for value in ([0.3], [100], [1.0])), torch.zeros(1, 6), torch.ones(1), config, torch.tensor([gate_scale]))
-    assert Status(int(status)) == expected
-
-
-# ---- how far a pose is trusted
-
-
-def test_the_ratio_that_is_needed_rises_with_the_gate_to_its_limit():
-    gate_scale = torch.tensor([1.0, 1.5, 2.0, 3.2])
-    assert needed_ratio(gate_scale, ValidationConfig(lost_below=0.2)).tolist() == pytest.approx([0.2, 0.275, 0.35, 0.35])
-    # A ratio to be caught at that is less than that of a lost one asks for nothing more.
-    assert needed_ratio(gate_scale, ValidationConfig(lost_below=0.4)).tolist() == pytest.approx([0.4] * 4)
-
-
-def test_trust_rises_from_lost_to_certain():
-    explained = torch.tensor([0.0, 0.2, 0.3, 0.4, 1.0])
-    assert trust(explained, ValidationConfig(lost_below=0.2, uncertain_below=0.4)).tolist() == pytest.approx([0, 0, 0.5, 1, 1])
-    step = trust(torch.tensor([0.29, 0.31]), ValidationConfig(lost_below=0.3, uncertain_below=0.3))
-    assert step.tolist() == [0, 1]
-
-
-def test_more_is_asked_of_finds_in_many_places_by_what_is_usual():
-    config = ValidationConfig(lost_below=0.1, uncertain_below=0.4)
-    explained, usual, gate_scale = torch.tensor([0.4, 0.4, 0.6, 0.4]), torch.tensor([0.8, 0.8, 0.8, 0.2]), torch.tensor([1.0, 2.0, 3.0, 2.0])
-    assert trust(explained, config, usual, gate_scale).tolist() == pytest.approx([1.0, 0.6, 1.0, 1.0])
-
-
-def hidden(inlier_ratio=0.8, usually=0.8, count=200, elsewhere=False, config=TRACKER):
-    return float(partly_hidden(torch.tensor([inlier_ratio]), torch.tensor([usually]), torch.tensor([count]), torch.tensor([elsewhere]), config))
-
-
-@pytest.mark.parametrize(("inlier_ratio", "expected"), [(0.0, 0), (0.64, 0), (0.7, 0.5), (0.76, 1), (1.0, 1), (math.nan, 0)])
-def test_what_gathers_as_ever_counts_however_little_is_explained(inlier_ratio, expected):
-    assert hidden(inlier_ratio) == pytest.approx(expected, abs=1e-6)
-
-
-def test_nothing_counts_as_hidden_that_does_not_tell():
-    # Found by a search, too few observations, hardly gathering when seen well, never seen well, switched off.
-    assert hidden(elsewhere=True) == hidden(count=100) == hidden(0.5, 0.5) == hidden(usually=0.0) == 0
-    assert hidden(config=TrackerConfig(disabled={Component.PARTLY_HIDDEN})) == 0
-    assert hidden(count=30, config=TrackerConfig(validation=ValidationConfig(min_observations=7))) == 1
-
-
-def test_of_a_hidden_object_no_more_is_asked_in_more_places():
-    config, gate_scale = ValidationConfig(lost_below=0.2), torch.full((3,), 2.0)
-    assert needed_ratio(gate_scale, config, torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.35, 0.275, 0.2])
-    stated = torch.full((2,), 0.3), torch.full((2,), 100), torch.ones(2), torch.zeros(2, 6), torch.ones(2)
-    assert judge(*stated, config, gate_scale[:2], torch.tensor([0.0, 1.0])).tolist() == [Status.LOST, Status.UNCERTAIN]
-
-
-def test_an_uncertain_object_may_be_found_farther_away():
-    step = torch.zeros(2, 6)
-    step[:, 0] = 0.8
-    status = judge(torch.ones(2), torch.full((2,), 100), torch.ones(2), step, torch.ones(2), ValidationConfig(), torch.tensor([1.0, 2.0]))
-    assert status.tolist() == [Status.DIVERGED, Status.TRACKING]
 
 
 # ---- the explained ratio

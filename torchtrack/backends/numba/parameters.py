@@ -227,41 +227,17 @@ class ForecastSettings(NamedTuple):
     most_depth_m: float
 
 
-class ConclusionSettings(NamedTuple):
-    """What :mod:`torchtrack.backends.numba.conclusion` goes by: settings, and constants of the stages that it stands for.
+class CorrectionSettings(NamedTuple):
+    """How :mod:`torchtrack.backends.numba.conclusion` goes on from a verdict.
 
     Args:
         holds: whether what failed stays where it was.
-        anywhere: scale of the first gate from which an object may be anywhere.
-        hidden_from, hidden_fully, hidden_least, hidden_observations: what :func:`torchtrack.tracking.validation.status.partly_hidden` goes by.
-        smeared: events that gather less than this ratio of how far they usually do are smeared.
-        usual_gain, fall_gain: share of a new window in what is usual, and in what is seen well where it is less.
-        certain_ratio, certain_count: of what it explains when it is seen well, and by how many, from which a pose is remembered as one.
+        coast_s: time in which the velocity of what failed fades.
     """
 
     holds: bool
-    anywhere: float
-    uncertain_below: float
-    lost_below: float
-    refound_above: float
-    validated_from: float
-    partly_hidden: bool
-    hidden_from: float
-    hidden_fully: float
-    hidden_least: float
-    hidden_observations: int
-    min_observations: int
-    min_visible_ratio: float
-    max_rotation_rad: float
-    max_translation: float
     observation_px: float
     coast_s: float
-    drift_below: float
-    smeared: float
-    usual_gain: float
-    fall_gain: float
-    certain_ratio: float
-    certain_count: float
 
 
 class PatchSettings(NamedTuple):

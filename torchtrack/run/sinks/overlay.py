@@ -3,11 +3,15 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
+from jaxtyping import UInt8
 from torch import Tensor
 
 from torchtrack.config.run import OverlayConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.atomic import writing
 from torchtrack.core.events import pad_streams
 from torchtrack.core.windows import EventWindow
 from torchtrack.run.session import Session
@@ -23,32 +27,32 @@ from torchtrack.viz import OverlayWriter, draw_overlay, overlay_objects
 _CORNERS = 32
 
 
-class Overlay:
-    """Draws the windows that the video has a frame for into ``path``, such as ``overlay.mp4``.
+class _Drawing:
+    """Pictures of steps.
 
     Corners and flow are those that the tracker made use of. Where it has none, some are found here, and the picture says so.
     """
 
-    def __init__(self, path: Path, session: Session, config: OverlayConfig, tracker: TrackerConfig) -> None:
+    def __init__(self, session: Session, tracker: TrackerConfig) -> None:
         self._session, self._config, self._note = session, _with_corners(tracker), note(tracker)
         self._has_corners = tracker.corners.max_corners > 0
         first_stream = torch.zeros(len(session.models), dtype=torch.int64)
         self._sensors = Sensors(*sensor_tables([session.camera]), stream_index=first_stream, tiles=None)
         self._maps = SensorMaps.empty(1, self._sensors.image_size, torch.device("cpu"))
-        self._writer = OverlayWriter(path, frames_per_second=config.frames_per_second, slow_motion=config.slow_motion, stills=config.stills)
 
-    def add(self, step: Step) -> None:
-        """Draw one step, if it is due."""
+    def see(self, step: Step) -> None:
+        """Take the events of a step."""
+        self._maps = self._updated(step.window)
+
+    def draw(self, step: Step) -> UInt8[np.ndarray, "h w 3"]:
+        """The step that was seen last."""
         window, session = step.window, self._session
         t_us = window.t_end_us
-        self._maps = self._updated(window)
-        if not self._writer.is_due(t_us):
-            return
         truth = [trajectory.at(torch.tensor([t_us]))[0] if trajectory is not None else None for trajectory in session.ground_truth]
         result = each_tensor(Tensor.cpu, step.result)
         result = result if self._has_corners else self._for_display(result, window)
         objects = overlay_objects(result, session.models, session.camera, names=session.labels, true_poses=truth)
-        self._writer.add(t_us, draw_overlay(self._maps.last_event_us[0], t_us, session.camera, objects, note=self._note))
+        return draw_overlay(self._maps.last_event_us[0], t_us, session.camera, objects, note=self._note)
 
     def _updated(self, window: EventWindow) -> SensorMaps:
         """The maps of the sensor with a window more; of bursts where they are looked at."""
@@ -65,9 +69,43 @@ class Overlay:
         flow, has_flow = self._sensors.flow(corners.points, self._maps, t_us, self._config)
         return replace(result, corners=replace(corners, flow=flow, has_flow=has_flow))
 
+
+class Overlay:
+    """Draws the windows that the video has a frame for into ``path``, such as ``overlay.mp4``."""
+
+    def __init__(self, path: Path, session: Session, config: OverlayConfig, tracker: TrackerConfig) -> None:
+        self._drawing = _Drawing(session, tracker)
+        self._writer = OverlayWriter(path, frames_per_second=config.frames_per_second, slow_motion=config.slow_motion, stills=config.stills)
+
+    def add(self, step: Step) -> None:
+        """Draw one step, if it is due."""
+        self._drawing.see(step)
+        if self._writer.is_due(step.window.t_end_us):
+            self._writer.add(step.window.t_end_us, self._drawing.draw(step))
+
     def close(self) -> None:
         """Finish the video."""
         self._writer.close()
+
+
+class FirstStill:
+    """Draws the very first window into ``path``, a PNG: does the pose that a run starts from lie on the events?"""
+
+    def __init__(self, path: Path, session: Session, tracker: TrackerConfig) -> None:
+        self._path, self._drawing, self._is_drawn = path, _Drawing(session, tracker), False
+
+    def add(self, step: Step) -> None:
+        """Draw the first step; pass over the others."""
+        if self._is_drawn:
+            return
+        self._is_drawn = True
+        self._drawing.see(step)
+        _, png = cv2.imencode(".png", self._drawing.draw(step))
+        with writing(self._path):
+            self._path.write_bytes(png.tobytes())
+
+    def close(self) -> None:
+        """Nothing is open."""
 
 
 def note(tracker: TrackerConfig) -> str:

@@ -15,6 +15,7 @@ from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.symmetry import RevolutionAxis, revolution_axis
 from torchtrack.run.metrics import PoseErrors, pose_errors
 from torchtrack.run.sinks.silences import Silences
+from torchtrack.run.sinks.start_support import StartSupport
 from torchtrack.run.stepping import Step
 from torchtrack.tracking.validation.status import Status
 
@@ -45,6 +46,7 @@ class ObjectRecord:
         self.statuses: Counter[int] = Counter()
         # Of windows with too few events nothing is known.
         self.quality_sum, self.judged_windows = 0.0, 0
+        self.start = StartSupport()
         # Sum of the rotations between windows (rad, camera axes): full turns count.
         self.turned = torch.zeros(3, dtype=torch.float64)
         self._last_rotation: Tensor | None = None
@@ -54,6 +56,7 @@ class ObjectRecord:
     def add(self, t_us: Tensor, T_cam_obj: Tensor, status: int, quality: float) -> None:
         """Take one window: time ``[1]``, pose ``[4, 4]``."""
         self.statuses[status] += 1
+        self.start.add(status, quality)
         if status != Status.TOO_FEW_EVENTS:
             self.quality_sum, self.judged_windows = self.quality_sum + quality, self.judged_windows + 1
         rotation = T_cam_obj[:3, :3]
@@ -69,6 +72,8 @@ class ObjectRecord:
         if not len(t_us):
             return
         self.statuses.update(statuses)
+        for status, quality in zip(statuses, qualities, strict=True):
+            self.start.add(status, quality)
         judged = [quality for status, quality in zip(statuses, qualities, strict=True) if status != Status.TOO_FEW_EVENTS]
         self.quality_sum, self.judged_windows = self.quality_sum + sum(judged), self.judged_windows + len(judged)
         rotations = T_cam_obj[:, :3, :3]

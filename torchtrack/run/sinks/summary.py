@@ -23,6 +23,8 @@ from torchtrack.tracking.validation.status import Status
 
 # For what may come into a summary at its end: why it ended, gaps, changes of the clock.
 _ROOM_BYTES = 8192
+# An object that is tracked in a smaller share of the windows was not tracked; fewer windows tell nothing.
+LEAST_TRACKED, FEW_WINDOWS = 0.1, 10
 
 Ended = Literal["running", "completed", "interrupted", "failed"]
 
@@ -36,6 +38,7 @@ class ObjectSummary:
         mean_quality: mean over all windows that had enough events to judge by, 0 to 1; NaN where none had.
         angular_velocity_rad_s: mean over the run, camera axes.
         errors: against ground truth; None where it is not known.
+        start_supported: whether the events of its first windows support the pose that it started from; None where too few windows tell.
         unseen_turns: whether the object is a surface of revolution, whose turns about its axis are no errors.
         more: what other sinks have to say, by name.
     """
@@ -44,6 +47,7 @@ class ObjectSummary:
     mean_quality: float
     angular_velocity_rad_s: tuple[float, ...]
     errors: Metrics | None
+    start_supported: bool | None = None
     unseen_turns: bool = False
     more: dict[str, Any] = field(default_factory=dict)
 
@@ -104,6 +108,14 @@ class RunSummary:
     gaps: tuple[Silence, ...] = ()
     gap_count: int = 0
     resumed_us: int | None = None
+
+    @property
+    def not_tracked(self) -> dict[str, float]:
+        """Objects that were tracked in less than a tenth of the windows, and in which share of them."""
+        if self.windows < FEW_WINDOWS:
+            return {}
+        shares = {label: of_object.status.get(Status.TRACKING.name, 0) / self.windows for label, of_object in self.objects.items()}
+        return {label: share for label, share in shares.items() if share < LEAST_TRACKED}
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; numbers that are not finite become None, as JSON has none."""
@@ -195,6 +207,7 @@ def _summarise_object(record: ObjectRecord, duration_s: float, more: dict[str, A
         mean_quality=_ratio(record.quality_sum, record.judged_windows),
         angular_velocity_rad_s=tuple(_ratio(turned, duration_s) for turned in record.turned.tolist()),
         errors=summarise(record.errors) if record.errors is not None else None,
+        start_supported=record.start.supported,
         unseen_turns=record.axis is not None,
         more=more,
     )

@@ -17,7 +17,7 @@ from torchtrack.tracking.relocalization.line_ends import running_on
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.triggers import Trigger, has
 from torchtrack.tracking.validation.scored_fit import ScoredFit
-from torchtrack.tracking.validation.status import VALIDATED_FROM
+from torchtrack.tracking.validation.verdict import VALIDATED_FROM
 
 # Ratios that differ by less are the same: which of them is larger is chance.
 AS_MUCH = 0.02

@@ -13,7 +13,6 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from torchtrack.core.constants import constant
-from torchtrack.tracking.relocalization.triggers import Trigger
 
 
 @dataclass(frozen=True)
@@ -25,6 +24,7 @@ class Asks:
         flags: its triggers.
         looks: in how many windows it was looked for since it was last seen well.
         lost_s: how long ago that was (s).
+        is_starting: whether its motion is not known yet.
     """
 
     number: int
@@ -32,6 +32,7 @@ class Asks:
     flags: int
     looks: int
     lost_s: float
+    is_starting: bool
 
 
 def in_turn(asking: Sequence[Asks], most: int) -> list[Asks]:
@@ -45,10 +46,9 @@ def in_turn(asking: Sequence[Asks], most: int) -> list[Asks]:
     """
     chosen, left = [], Counter(dict.fromkeys((asks.stream for asks in asking), most))
     for asks in sorted(asking, key=lambda asks: (asks.looks, -asks.lost_s)):
-        is_starting = bool(asks.flags & Trigger.STARTING)
-        if is_starting or left[asks.stream]:
+        if asks.is_starting or left[asks.stream]:
             chosen.append(asks)
-            left[asks.stream] -= not is_starting
+            left[asks.stream] -= not asks.is_starting
     return sorted(chosen, key=lambda asks: asks.number)
 
 

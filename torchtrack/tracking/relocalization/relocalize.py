@@ -63,9 +63,12 @@ def relocalize(
 
 def _asking(window: Relocalized, triggers: Int[Tensor, "b"], evidence: TriggerEvidence, sources: Sequence[Source]) -> list[Asks]:
     """The objects that a source is called for."""
-    whole = AsyncValue.to(torch.stack([window.prediction.objects.stream_index, triggers, evidence.looks], 1))
+    whole = AsyncValue.to(torch.stack([window.prediction.objects.stream_index, triggers, evidence.looks, evidence.is_starting], 1))
     lost_s = AsyncValue.to(evidence.time_since_validated_s).numbers()
-    asking = [Asks(number, stream, flags, looks, lost_s[number]) for number, (stream, flags, looks) in enumerate(whole.numbers())]
+    asking = [
+        Asks(number, stream, flags, looks, lost_s[number], is_starting=bool(starts))
+        for number, (stream, flags, looks, starts) in enumerate(whole.numbers())
+    ]
     return [asks for asks in asking if any(source.is_called_for(asks.flags) for source in sources)]
 
 

@@ -16,7 +16,8 @@ from torchtrack.tracking.estimation.rounds import may_be_anywhere
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.health import TentativeTrack
-from torchtrack.tracking.validation.status import VALIDATED_FROM, Status
+from torchtrack.tracking.validation.status import Status
+from torchtrack.tracking.validation.verdict import VALIDATED_FROM
 
 # A window speaks for a pose by its ratio of what is wanted, as far as it is more than this.
 _NEUTRAL = 0.6

@@ -18,7 +18,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import none_of
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
-from torchtrack.tracking.validation.status import are_many
+from torchtrack.tracking.validation.verdict import Limits
 
 # What drifts for so long is looked for farther away, once in this time (µs).
 DRIFT_US = 50_000
@@ -100,7 +100,7 @@ def is_held(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b
         return torch.zeros_like(evidence.is_due)
     drifts = has(evidence.earlier, Trigger.DRIFT)
     explains = evidence.score >= HELD_FROM * evidence.reference_explained_ratio
-    return drifts & _is_sure(evidence) & explains & are_many(evidence.matches, config.validation) & config.uses(Component.HELD)
+    return drifts & _is_sure(evidence) & explains & (evidence.matches >= Limits.from_config(config).many) & config.uses(Component.HELD)
 
 
 def is_uncertain(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.tracking.validation.verdict import References
+
 
 @dataclass(frozen=True)
 class TrackHealth:
@@ -23,6 +25,8 @@ class TrackHealth:
         T_last_validated: pose of each object when it was last seen well (float64).
         time_since_validated_s: how long ago that was (s).
         looks: in how many windows other poses of it were tried since then.
+        confirmations: windows that speak for the pose that the object started from, or was given by a search
+            (:func:`torchtrack.tracking.validation.verdict.confirmations`).
     """
 
     score: Float[Tensor, "b"]
@@ -34,11 +38,17 @@ class TrackHealth:
     T_last_validated: Float[Tensor, "b 4 4"]
     time_since_validated_s: Float[Tensor, "b"]
     looks: Int[Tensor, "b"]
+    confirmations: Float[Tensor, "b"]
 
     def with_looks(self, looked: Bool[Tensor, "b"] | None) -> "TrackHealth":
         """The same after a window in which objects were looked for; nobody where not given."""
         looks = self.looks if looked is None else self.looks + looked
         return replace(self, looks=torch.where(self.time_since_validated_s == 0, 0, looks))
+
+    @property
+    def references(self) -> References:
+        """What a verdict goes by, and changes."""
+        return References(*(getattr(self, name) for name in References._fields))
 
     @classmethod
     def unknown(cls, T_cam_obj: Float[Tensor, "b 4 4"], dtype: torch.dtype) -> "TrackHealth":
@@ -54,6 +64,7 @@ class TrackHealth:
             T_last_validated=T_cam_obj.clone(),
             time_since_validated_s=zero,
             looks=torch.zeros_like(zero, dtype=torch.int64),
+            confirmations=zero,
         )
 
 
