@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Literal, get_args
 
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import (
     AdaptationConfig,
     AssociationConfig,
@@ -31,8 +32,15 @@ def _default() -> TrackerConfig:
 
 
 def _learned() -> TrackerConfig:
-    """The default, with a network's word on how far each observation is to be believed, not on those of smooth silhouettes alone."""
-    return TrackerConfig(association=AssociationConfig(weighting_network="all"), smoothing=_SMOOTHED)
+    """The default, with a network's word on how far each observation is to be believed, not on those of smooth silhouettes alone.
+
+    It believes less where an object is seen badly, and explains less there: that is no sign of a slow drift.
+    """
+    return TrackerConfig(
+        association=AssociationConfig(weighting_network="all"),
+        relocalization=RelocalizationConfig(slow_drift_below=0),
+        smoothing=_SMOOTHED,
+    )
 
 
 def _paper() -> TrackerConfig:

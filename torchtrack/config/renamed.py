@@ -21,6 +21,7 @@ KEYS = {
         "by_gathering": "by_inlier_ratio",
         "doubted_below": "drift_below",
         "doubt_us": "drift_us",
+        "strayed_to": "slow_drift_below",
         "stands_from": "held_from",
         "adrift_share": "drift_min_ratio",
         "slip_margin": "elsewhere_margin",
@@ -79,7 +80,6 @@ REMOVED: dict[str, dict[str, str]] = {
         "at_start": "what starts is searched for as any other object",
         "new_below": "a new object is searched for as any other",
         "not_validated_below": "what explains little is not looked for where it was last seen well, unless it is lost or off in depth",
-        "slow_drift_below": "what explains less for long, by events that gather as ever, does not drift",
     },
     "validation": {
         "holds_on": "a pose that goes on from the one before is asked for as much as any other",

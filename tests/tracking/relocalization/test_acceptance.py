@@ -119,6 +119,17 @@ def asked_by(test, given, scored=None):
     return torch.stack(list(vars(test(given, flags, scored, CONFIG)).values()))[:, 0], scored
 
 
+SLOWLY = {"is_drift_due": True, "time_since_validated_s": 0.2, "last_score": 0.5, "score": 0.5, "reference_explained_ratio": 0.8}
+
+
+def test_what_drifts_slowly_has_to_explain_nearly_all_elsewhere_and_by_no_fewer_events():
+    given = evidence(**SLOWLY)
+    for test in (acceptance.near_prediction, acceptance.as_last_seen):
+        asked, scored = asked_by(test, given)
+        torch.testing.assert_close(asked, torch.tensor([0.15, 0.72, 0.0, float(scored.count)]))
+    torch.testing.assert_close(asked_by(acceptance.elsewhere, given)[0], torch.tensor([0.15, 0.72, 0.0, 0.0]))
+
+
 def test_what_is_where_it_is_predicted_gives_way_to_what_is_better_by_the_margin():
     torch.testing.assert_close(asked_by(acceptance.near_prediction, evidence(sigma_px=5.0))[0], torch.tensor([0.1, 0.0, 0.0, 0.0]))
 

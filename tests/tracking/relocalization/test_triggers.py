@@ -16,6 +16,7 @@ from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization.triggers import NONE, SEARCHED, Trigger, triggers
+from torchtrack.tracking.validation import status
 from torchtrack.tracking.validation.scored_fit import reference_where_known
 from torchtrack.tracking.validation.status import Status
 
@@ -25,6 +26,16 @@ from torchtrack.tracking.validation.status import Status
 UNREMEMBERED = frozenset({Component.POLARITY_PRIOR, Component.TURNS_FADE})
 SEARCHING = TrackerConfig(corners=CornerConfig(max_corners=32), disabled=UNREMEMBERED)
 NEVER_DRIFTING = SEARCHING.model_copy(update={"disabled": UNREMEMBERED | {Component.DRIFT, Component.SCORE_DROP}})
+# Looks farther away are for what was not seen well for long, or for nothing.
+SLOWLY, NEVER_SLOWLY = (
+    SEARCHING.model_copy(
+        update={
+            "relocalization": RelocalizationConfig(slow_drift_below=share),
+            "disabled": UNREMEMBERED | {Component.SCORE_DROP},
+        }
+    )
+    for share in (0.85, 0.0)
+)
 # Twenty degrees, onto other edges: farther than a pose that is sure of itself is looked for.
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
@@ -48,6 +59,7 @@ ALONE = {
     Trigger.LOW_SCORE: {"score": 0.71, "last_score": 0.71},
     Trigger.SCORE_DROP: {"score": 0.62},
     Trigger.DRIFT: {"is_drift_due": True, "drift_s": 0.051, "sigma_px": 3.9, "matches": 10},
+    Trigger.SLOW_DRIFT: {"is_drift_due": True, "time_since_validated_s": 0.051, "last_score": 0.7},
     Trigger.LOST: {"earlier": int(Trigger.LOST)},
     Trigger.DEPTH_CHANGED: {"earlier": int(Trigger.DEPTH_CHANGED)},
 }
@@ -130,6 +142,24 @@ def test_an_object_drifts_once_it_explained_too_little_for_long_and_it_is_time()
     assert not any(having(Trigger.DRIFT, given, Component.DRIFT))
 
 
+def test_what_is_sure_of_its_place_and_was_not_seen_well_for_long_may_drift_slowly_when_it_is_time():
+    given = evidence(
+        6,
+        last_score=[0.7, 0.8, 0.7, 0.7, 0.7, 0.3],
+        reference_explained_ratio=[0.9] * 5 + [0.3],
+        time_since_validated_s=[0.051, 0.051, 0.049, 0.051, 0.051, 0.051],
+        sigma_px=[1.0, 1.0, 1.0, 6.1, 1.0, 1.0],
+        is_drift_due=[True] * 4 + [False, True],
+    )
+    settings = {"slow_drift_below": 0.85}
+    assert having(Trigger.SLOW_DRIFT, given, **settings) == [True] + [False] * 5
+    assert not any(having(Trigger.SLOW_DRIFT, given, slow_drift_below=0))
+    assert not any(having(Trigger.SLOW_DRIFT, given, Component.DRIFT))
+    # What drifts at once does not drift slowly, nor does what only starts.
+    for other in ({"drift_s": torch.full((6,), 0.1)}, {"is_starting": torch.ones(6, dtype=torch.bool)}):
+        assert not any(having(Trigger.SLOW_DRIFT, replace(given, **other), **settings))
+
+
 def test_what_drifts_but_explains_enough_by_many_events_is_held():
     drifts = {"is_drift_due": True, "drift_s": 0.2, "last_score": 0.3, "reference_explained_ratio": 0.8}
     # Of 0.8 that it explains when seen well, a quarter; four times the least number of events.
@@ -137,6 +167,8 @@ def test_what_drifts_but_explains_enough_by_many_events_is_held():
     given = replace(given, is_starting=torch.tensor([False] * 4 + [True]))
     assert having(Trigger.HELD, given) == [True] + [False] * 4
     assert not any(having(Trigger.HELD, given, Component.HELD))
+    slowly = evidence(is_drift_due=True, time_since_validated_s=0.2, last_score=0.3)
+    assert having(Trigger.SLOW_DRIFT, slowly) == [True] and having(Trigger.HELD, slowly) == [False]
 
 
 def test_of_those_whose_place_is_not_known_events_need_not_gather():
@@ -177,10 +209,26 @@ def test_a_pose_that_slipped_drifts_and_is_relocalized(monkeypatch):
     assert float(still_off.health.drift_s) > 0.05
 
 
-def test_relocalizing_what_slipped_changes_nothing_for_its_neighbour(monkeypatch):
+def test_a_pose_that_drifts_slowly_is_relocalized_though_its_events_were_never_smeared(monkeypatch):
     drifting_soon(monkeypatch, diameters_s=4)
-    _, alone, _ = slipped(SEARCHING, streams=2, displaced=-1)
-    _, neighbours, _ = slipped(SEARCHING, streams=2, displaced=0)
+    monkeypatch.setattr(status, "DRIFT_BELOW", 0)
+    after, results, T_true = slipped(SLOWLY, count=30)
+    lost, without, _ = slipped(NEVER_SLOWLY, count=30)
+    degrees, millimetres = pose_errors(results[-1].T_cam_obj, T_true)
+    assert float(degrees) < 0.5
+    assert float(millimetres) < 1.0
+    assert float(after.health.time_since_validated_s) == 0
+    assert float(pose_errors(without[-1].T_cam_obj, T_true)[0]) > 5
+    assert float(lost.health.time_since_validated_s) > 0.1
+    assert float(after.health.drift_s) == float(lost.health.drift_s) == 0
+
+
+@pytest.mark.parametrize(("config", "count", "drift_below"), [(SEARCHING, 10, 0.6), (SLOWLY, 20, 0)])
+def test_relocalizing_what_slipped_changes_nothing_for_its_neighbour(monkeypatch, config, count, drift_below):
+    drifting_soon(monkeypatch, diameters_s=4)
+    monkeypatch.setattr(status, "DRIFT_BELOW", drift_below)
+    _, alone, _ = slipped(config, count, streams=2, displaced=-1)
+    _, neighbours, _ = slipped(config, count, streams=2, displaced=0)
     # Sums over as many columns as the fullest of the two has are rounded otherwise.
     torch.testing.assert_close(poses_of(alone, 1), poses_of(neighbours, 1), rtol=0, atol=1e-7)
     assert float((poses_of(alone) - poses_of(neighbours)).abs().max()) > 1e-3

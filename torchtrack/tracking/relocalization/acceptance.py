@@ -15,7 +15,7 @@ from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.line_ends import running_on
 from torchtrack.tracking.relocalization.lost_object import LostObject
-from torchtrack.tracking.relocalization.triggers import Trigger, has
+from torchtrack.tracking.relocalization.triggers import DRIFTS, Trigger, has
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.verdict import VALIDATED_FROM
 
@@ -111,9 +111,14 @@ def near_prediction(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: 
     search, starting, reference = config.relocalization, evidence.is_starting, evidence.reference_explained_ratio
     margin = torch.where(starting, _START_MARGIN, search.accept_margin)
     # What is far away has to explain about as much as usual; so has what is reached step by step, while a motion is lost, ever farther away.
-    min_score = torch.where(has(flags, Trigger.DRIFT) | starting, _DRIFT_MIN_RATIO * reference, 0)
+    min_score = torch.where(has(flags, DRIFTS) | starting, _DRIFT_MIN_RATIO * reference, 0)
+    # What is partly hidden explains less, too: nothing but the whole object, seen elsewhere by no fewer events, speaks against that.
+    # A part of its edges does not.
+    slow = has(flags, Trigger.SLOW_DRIFT)
+    margin = torch.where(slow, _ELSEWHERE_MARGIN, margin)
+    min_score = torch.where(slow, search.accept_ratio * reference, min_score)
     min_inlier_ratio = torch.where(starting, scored.inlier_ratio.nan_to_num(0.0) - AS_MUCH, 0)
-    return AcceptanceTest(margin, min_score, min_inlier_ratio, torch.zeros_like(margin))
+    return AcceptanceTest(margin, min_score, min_inlier_ratio, torch.where(slow, _matches(scored), 0))
 
 
 def elsewhere(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
@@ -126,7 +131,9 @@ def elsewhere(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Scored
 def as_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses as the object was last validated: what is explained enough where it is gives way to far more events alone."""
     test = elsewhere(evidence, flags, scored, config)
-    min_matches = torch.where(has(flags, Trigger.HELD), _FAR_MORE * _matches(scored), 0)
+    matches = _matches(scored)
+    at_least = torch.where(has(flags, Trigger.SLOW_DRIFT), matches, 0)
+    min_matches = torch.where(has(flags, Trigger.HELD), _FAR_MORE * matches, at_least)
     return AcceptanceTest(test.margin, test.min_score, test.min_inlier_ratio, min_matches)
 
 

@@ -19,7 +19,7 @@ from torchtrack.tracking.relocalization.looks import Asks, among, in_turn
 from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
 from torchtrack.tracking.relocalization.refine import exchanged, refined
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
-from torchtrack.tracking.relocalization.triggers import Trigger, has
+from torchtrack.tracking.relocalization.triggers import DRIFTS, Trigger, has
 
 
 def relocalize(
@@ -40,8 +40,9 @@ def relocalize(
         sources: of hypotheses, in the order in which they are tried.
     """
     tests = [source.test(evidence, triggers, window.scored, config) for source in sources]
-    drifts = has(triggers, Trigger.DRIFT) & ~has(triggers, Trigger.HELD)
-    widened = with_drift(window.prediction, drifts, evidence.drift_s)
+    drifts = has(triggers, DRIFTS) & ~has(triggers, Trigger.HELD)
+    drift_s = torch.where(has(triggers, Trigger.SLOW_DRIFT), evidence.time_since_validated_s, evidence.drift_s)
+    widened = with_drift(window.prediction, drifts, drift_s)
     sigma_px = torch.where(drifts, widened.sigma_px(window.scored.fit.contours), evidence.sigma_px)
     # Without events no pose is better than another; what is looked for all around may have its own there.
     enough = events.counts() >= config.validation.min_observations

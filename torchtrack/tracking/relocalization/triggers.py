@@ -2,7 +2,8 @@
 
 A pose that slipped onto other edges is sure of itself, and they explain its contours. What gives it away is that events around its
 contours no longer gather on them as they did. An object of which that is so for a while may have drifted off unnoticed, and
-the farther, the longer it lasts.
+the farther, the longer it lasts. So may an object that merely explains less than when it is seen well: as a rule it is partly hidden
+instead, so that a pose elsewhere has to explain nearly all, and no fewer events, to be taken for it.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,6 +42,7 @@ class Trigger(IntFlag):
     LOW_SCORE = auto()
     SCORE_DROP = auto()
     DRIFT = auto()
+    SLOW_DRIFT = auto()
     HELD = auto()
     NOT_VALIDATED = auto()
     DEPTH_CHANGED = auto()
@@ -48,8 +50,10 @@ class Trigger(IntFlag):
 
 
 NONE = Trigger(0)
+# An object that may have drifted off, at once or slowly.
+DRIFTS = Trigger.DRIFT | Trigger.SLOW_DRIFT
 # An object that is looked for around its prediction.
-AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.LOW_SCORE | Trigger.DRIFT
+AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.LOW_SCORE | DRIFTS
 # What calls for a search. An object that is lost is expected where it was last validated, and uncertain there; an object that was not
 # validated for long is uncertain or drifts.
 SEARCHED = AROUND_PREDICTION | Trigger.DEPTH_CHANGED | Trigger.SCORE_DROP
@@ -91,6 +95,22 @@ def is_drifting(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor
     return due & (evidence.drift_s >= 1e-6 * DRIFT_US) if config.uses(Component.DRIFT) else torch.zeros_like(due)
 
 
+def is_drifting_slowly(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """SLOW_DRIFT: objects, sure of their place, that explained less than when seen well for so long that they are looked for farther away.
+
+    The mean follows a drift that is slow, and the covariance forgets the direction that it went in.
+    """
+    due, search = evidence.is_drift_due, config.relocalization
+    if none_of(due):
+        return due
+    if not (config.uses(Component.DRIFT) and search.slow_drift_below):
+        return torch.zeros_like(due)
+    low = evidence.last_score < search.slow_drift_below * evidence.reference_explained_ratio
+    long = evidence.time_since_validated_s >= 1e-6 * DRIFT_US
+    other = is_drifting(evidence, config) | evidence.is_starting
+    return ~other & (due & low & long & (evidence.sigma_px < SCORE_DROP_SIGMA_PX))
+
+
 def is_held(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """HELD: objects that drift, and yet are sure of their place and explain enough there: they are looked for near it alone.
 
@@ -119,7 +139,7 @@ def has_score_dropped(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[
     dropped = evidence.score < SCORE_DROP_BELOW * evidence.mean_score
     if none_of(dropped):
         return dropped
-    return _is_sure(evidence) & ~has(evidence.earlier, Trigger.DRIFT) & dropped & config.uses(Component.SCORE_DROP)
+    return _is_sure(evidence) & ~has(evidence.earlier, DRIFTS) & dropped & config.uses(Component.SCORE_DROP)
 
 
 def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
@@ -127,12 +147,12 @@ def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[T
     if none_of(evidence.is_drift_due):
         return evidence.is_drift_due
     long = (evidence.time_since_validated_s >= 1e-6 * LAST_SEEN_US) & config.uses(Component.LAST_SEEN)
-    return _looks_far(evidence, config) & long & (has(evidence.earlier, Trigger.DRIFT) | (evidence.sigma_px > config.relocalization.wide_sigma_px))
+    return _looks_far(evidence, config) & long & (has(evidence.earlier, DRIFTS) | (evidence.sigma_px > config.relocalization.wide_sigma_px))
 
 
 # First those that others hang on.
 _CONDITIONS: tuple[dict[int, Condition], ...] = (
-    {int(Trigger.DRIFT): is_drifting},
+    {int(Trigger.DRIFT): is_drifting, int(Trigger.SLOW_DRIFT): is_drifting_slowly},
     {
         int(Trigger.UNCERTAIN): is_uncertain,
         int(Trigger.LOW_SCORE): is_scored_low,
