@@ -38,7 +38,7 @@ def _learned() -> TrackerConfig:
     """
     return TrackerConfig(
         association=AssociationConfig(weighting_network="all"),
-        relocalization=RelocalizationConfig(slow_drift_below=0),
+        relocalization=RelocalizationConfig(slow_drift_below=0, not_validated_below=0),
         smoothing=_SMOOTHED,
     )
 

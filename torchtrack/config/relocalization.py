@@ -18,8 +18,14 @@ class RelocalizationConfig(Settings):
     trigger_sigma_px: float = Field(4.0, gt=0, description="Standard deviation of the prediction in the image from which other poses are tried (px).")
     wide_sigma_px: float = Field(10.0, gt=0, description="Standard deviation of the prediction from which it is very uncertain (px).")
     interval_us: int = Field(10_000, ge=0, description="A very uncertain object is searched for once in this time (µs); 0 for in every window.")
+    not_validated_below: float = Field(
+        0.75,
+        ge=0,
+        le=1,
+        description="Share of what an object explains when seen well below which, for 0.1 s, it is looked for all around there; 0 for never.",
+    )
     slow_drift_below: float = Field(
-        0.85, ge=0, le=1, description="Share of what an object explains when seen well below which, as long, it is looked for as well; 0 for never."
+        0.85, ge=0, le=1, description="Share of what an object explains when seen well below which, for 50 ms, it is looked for as well; 0 for never."
     )
     accept_margin: float = Field(0.1, ge=0, le=1, description="By how much the score of a pose near the prediction must be better to be accepted.")
     accept_ratio: float = Field(0.9, ge=0, le=1, description="Share of what an object explains when seen well that is asked of a pose elsewhere.")

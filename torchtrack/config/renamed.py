@@ -15,6 +15,7 @@ KEYS = {
         "slipped_to": "score_drop_below",
         "unseen_us": "last_seen_us",
         "anew_us": "not_validated_us",
+        "anew_below": "not_validated_below",
         "by_events": "by_matches",
         "slip_sigma_px": "score_drop_sigma_px",
         "probation": "tentative",
@@ -79,7 +80,6 @@ REMOVED: dict[str, dict[str, str]] = {
         "realignments": "every pose is aligned once",
         "at_start": "what starts is searched for as any other object",
         "new_below": "a new object is searched for as any other",
-        "not_validated_below": "what explains little is not looked for where it was last seen well, unless it is lost or off in depth",
     },
     "validation": {
         "holds_on": "a pose that goes on from the one before is asked for as much as any other",

@@ -19,7 +19,7 @@ from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.evidence import Schedule
 from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere
 from torchtrack.tracking.relocalization.schedule import schedule
-from torchtrack.tracking.relocalization.triggers import Trigger, has
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, Trigger, has
 from torchtrack.tracking.state import TrackerState
 
 
@@ -74,7 +74,7 @@ def near_objects(tracked: TrackedObjects, expected: Expected, events: NearbyEven
     """
     if tracked.shows_all:
         return events
-    prediction, anew = expected.prediction.detached(), has(expected.scheduled.triggers, Trigger.DEPTH_CHANGED)
+    prediction, anew = expected.prediction.detached(), has(expected.scheduled.triggers, AROUND_LAST_SEEN)
     if not host_sync.none_of(anew):
         prediction = replace(prediction, covariance=anywhere(prediction.covariance, anew))
     return tracked.sensors.near_objects(events, prediction, expected.dt_s, tracked.config)

@@ -10,7 +10,7 @@ from tracked_boxes import in_motion
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization import acceptance
 from torchtrack.tracking.relocalization.acceptance import AcceptanceTest, is_likely, less_by_few_events, likeliest
-from torchtrack.tracking.relocalization.triggers import Trigger, triggers
+from torchtrack.tracking.relocalization.triggers import NONE, Trigger, triggers
 
 CONFIG = TrackerConfig()
 # Ten degrees and some millimetres: edges are several pixels off, farther than the tight gate reaches.
@@ -155,8 +155,14 @@ def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
     assert float(asked_by(acceptance.near_prediction, starting, unknown)[0][2]) <= 0
 
 
-def test_what_changed_its_depth_gives_way_to_far_more_events():
-    asked, scored = asked_by(acceptance.around_last_seen, evidence(earlier=int(Trigger.DEPTH_CHANGED)))
+@pytest.mark.parametrize("also", [NONE, Trigger.FAR_BELOW_REFERENCE])
+def test_what_changed_its_depth_gives_way_to_far_more_events(also):
+    asked, scored = asked_by(acceptance.around_last_seen, evidence(earlier=int(Trigger.DEPTH_CHANGED | also)))
     assert float(asked[0]) == -torch.inf and float(asked[2]) == 0
     assert float(asked[1]) == pytest.approx(0.75 * 0.9)
     assert float(asked[3]) == 2 * float(scored.count)
+
+
+def test_what_is_far_below_its_reference_gives_way_to_nearly_all_by_no_fewer_events():
+    asked, scored = asked_by(acceptance.around_last_seen, evidence(earlier=int(Trigger.FAR_BELOW_REFERENCE)))
+    torch.testing.assert_close(asked, torch.tensor([0.15, 0.81, 0.0, float(scored.count)]))

@@ -17,6 +17,7 @@ from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization import last_seen
 from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere, less_certain, where_last_seen, with_drift
 from torchtrack.tracking.state import joined
+from torchtrack.tracking.validation import status
 from torchtrack.tracking.validation.status import Status
 
 CONFIG = TrackerConfig()
@@ -154,6 +155,25 @@ def test_an_object_that_ran_off_is_found_again_where_it_was_seen_well(name):
     found_m, status = after()
     assert found_m < 5e-3 and status == Status.TRACKING
     assert after(Component.AROUND_LAST_SEEN)[0] > 0.05
+
+
+def test_an_object_that_holds_on_to_other_edges_is_found_again_where_it_was_seen_well(monkeypatch):
+    """Sure of a pose forty degrees off, as near as it was: nowhere else is it looked for so far away."""
+    monkeypatch.setattr(status, "DRIFT_BELOW", 0)
+    disabled = {Component.LAST_SEEN, Component.SCORE_DROP, Component.LOW_SCORE}
+    trajectory, events = moving_box(pose(), 30)
+
+    def after(not_validated_below):
+        search = RelocalizationConfig(not_validated_below=not_validated_below, slow_drift_below=0)
+        tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(relocalization=search, disabled=disabled))
+        state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 8))
+        turned = retract_about(state.T_cam_obj, torch.tensor([[0.0, 0.3, 0.6, 0.0, 0.0, 0.0]], dtype=torch.float64), tracker.centre_obj.double())
+        state, results = follow(tracker, unseen(state, T_cam_obj=turned), windows(events, 30)[8:])
+        true = trajectory.at(torch.tensor([150_000]))[0]
+        return float((results[-1].T_cam_obj[0] - true)[:3, :3].norm())
+
+    assert after(0.75) < 0.02
+    assert after(0.0) > 0.2
 
 
 def test_as_last_seen_it_is_turned_and_as_far_away_as_then_in_the_place_of_now():

@@ -19,7 +19,7 @@ from torchtrack.tracking.relocalization import refine
 from torchtrack.tracking.relocalization.hypotheses import around_prediction, around_prediction_released, sampled_around
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
-from torchtrack.tracking.relocalization.triggers import AROUND_PREDICTION, NONE, Trigger, triggers
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger, triggers
 from torchtrack.tracking.validation.status import Status
 
 LOOP = "torchtrack.tracking.relocalization.relocalize"
@@ -49,7 +49,7 @@ def test_what_is_held_is_looked_for_as_if_its_score_had_dropped_and_not_far_away
 
 
 def test_what_is_called_for_around_the_last_place_comes_last():
-    assert [source.triggers for source in SOURCES if source.comes_last] == [Trigger.DEPTH_CHANGED]
+    assert [source.triggers for source in SOURCES if source.comes_last] == [AROUND_LAST_SEEN]
     assert AROUND_PREDICTION in [source.triggers for source in SOURCES]
 
 

@@ -54,3 +54,16 @@ def test_an_object_is_off_in_depth_far_behind_or_before_where_it_was_seen_well(m
     assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, unseen(away, 0.05), due)
     # What is lost is expected there as it is.
     assert not is_looked_for(Trigger.DEPTH_CHANGED, tracker, changed(away, covariance=uncertain(away)), due)
+
+
+@pytest.mark.parametrize(("score", "is_below"), [(0.6, True), (0.7, False)])
+def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_for_there(score, is_below):
+    tracker, state, *_ = started()
+    low = unseen(state, score=torch.full((1,), score), reference_explained_ratio=torch.full((1,), 0.9))
+    due = state.t_us + 1_000_000
+    assert is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due) == is_below
+    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, state.t_us)
+    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, unseen(low, 0.05), due)
+    assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, changed(low, covariance=uncertain(low)), due)
+    for never in ({"not_validated_below": 0}, {"not_validated_us": 0}, {"hypotheses": 0}):
+        assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due, TrackerConfig(relocalization=RelocalizationConfig(**never)))

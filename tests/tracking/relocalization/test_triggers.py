@@ -30,7 +30,7 @@ NEVER_DRIFTING = SEARCHING.model_copy(update={"disabled": UNREMEMBERED | {Compon
 SLOWLY, NEVER_SLOWLY = (
     SEARCHING.model_copy(
         update={
-            "relocalization": RelocalizationConfig(slow_drift_below=share),
+            "relocalization": RelocalizationConfig(slow_drift_below=share, not_validated_below=0),
             "disabled": UNREMEMBERED | {Component.SCORE_DROP},
         }
     )
@@ -62,6 +62,7 @@ ALONE = {
     Trigger.SLOW_DRIFT: {"is_drift_due": True, "time_since_validated_s": 0.051, "last_score": 0.7},
     Trigger.LOST: {"earlier": int(Trigger.LOST)},
     Trigger.DEPTH_CHANGED: {"earlier": int(Trigger.DEPTH_CHANGED)},
+    Trigger.FAR_BELOW_REFERENCE: {"earlier": int(Trigger.FAR_BELOW_REFERENCE)},
 }
 
 

@@ -140,10 +140,13 @@ def as_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: Sco
 def around_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses all around where the object was last validated.
 
-    A small thing that is all explained says nothing against a pose of which far more events are explained.
+    A small thing that is all explained says nothing against a pose of which far more events are explained. What is partly hidden does.
     """
-    min_score = VALIDATED_FROM * evidence.reference_explained_ratio
-    return AcceptanceTest(torch.full_like(min_score, -torch.inf), min_score, torch.zeros_like(min_score), _FAR_MORE * _matches(scored))
+    changed, search = has(flags, Trigger.DEPTH_CHANGED), config.relocalization
+    margin = torch.where(changed, -torch.inf, _ELSEWHERE_MARGIN)
+    min_score = torch.where(changed, VALIDATED_FROM, search.accept_ratio) * evidence.reference_explained_ratio
+    min_matches = torch.where(changed, _FAR_MORE, 1) * _matches(scored)
+    return AcceptanceTest(margin, min_score, torch.zeros_like(min_score), min_matches)
 
 
 def _matches(scored: ScoredFit) -> Float[Tensor, "b"]:

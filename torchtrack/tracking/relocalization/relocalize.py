@@ -19,7 +19,7 @@ from torchtrack.tracking.relocalization.looks import Asks, among, in_turn
 from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
 from torchtrack.tracking.relocalization.refine import exchanged, refined
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
-from torchtrack.tracking.relocalization.triggers import DRIFTS, Trigger, has
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, DRIFTS, Trigger, has
 
 
 def relocalize(
@@ -46,7 +46,7 @@ def relocalize(
     sigma_px = torch.where(drifts, widened.sigma_px(window.scored.fit.contours), evidence.sigma_px)
     # Without events no pose is better than another; what is looked for all around may have its own there.
     enough = events.counts() >= config.validation.min_observations
-    asking = _asking(window, torch.where(enough, triggers, triggers & int(Trigger.DEPTH_CHANGED)), evidence, sources)
+    asking = _asking(window, torch.where(enough, triggers, triggers & int(AROUND_LAST_SEEN)), evidence, sources)
     looks = in_turn(asking, config.relocalization.objects)
     window = replace(window, looked=among([asks.number for asks in looks], drifts))
     sigmas_px = AsyncValue.to(sigma_px).numbers()

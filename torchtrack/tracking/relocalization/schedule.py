@@ -35,10 +35,11 @@ def is_time(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], *intervals_us: i
 
 
 def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_due: Bool[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:
-    """LOST and DEPTH_CHANGED, of objects that were seen well once, and then not seen well for long.
+    """LOST, DEPTH_CHANGED and FAR_BELOW_REFERENCE, of objects that were seen well once, and then not seen well for long.
 
     LOST: nothing is known of them any more but where they were last seen well, and they are expected there. Others are looked for all
-    around that place.
+    around that place. Those that explain too little are partly hidden, as a rule; but a pose may also have gone along with what hid the
+    object, and hold on to other edges.
     """
     unvalidated = _lacks_validation(state, config)
     if none_of(unvalidated):
@@ -47,7 +48,8 @@ def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_
     due = unvalidated & is_drift_due & ~lost
     now_m, then_m = (objects.depth_m(T.to(objects.intrinsics.dtype)) for T in (state.T_cam_obj, state.health.T_last_validated))
     changed = due & (torch.maximum(now_m / then_m, then_m / now_m) > _DEPTH_FACTOR)
-    return flags_of({int(Trigger.LOST): lost, int(Trigger.DEPTH_CHANGED): changed})
+    below = due & (state.health.score < config.relocalization.not_validated_below * state.health.reference_explained_ratio)
+    return flags_of({int(Trigger.LOST): lost, int(Trigger.DEPTH_CHANGED): changed, int(Trigger.FAR_BELOW_REFERENCE): below})
 
 
 def _lacks_validation(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:

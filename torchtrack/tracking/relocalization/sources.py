@@ -12,7 +12,7 @@ from torchtrack.tracking.relocalization.acceptance import Acceptance
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.lost_object import LostObject
-from torchtrack.tracking.relocalization.triggers import AROUND_PREDICTION, NONE, Trigger
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 
@@ -44,5 +44,5 @@ SOURCES = (
     Source(AROUND_PREDICTION, hypotheses.around_prediction, acceptance.near_prediction, unless=Trigger.HELD),
     Source(Trigger.SCORE_DROP, hypotheses.around_prediction_released, acceptance.elsewhere),
     Source(Trigger.NOT_VALIDATED, hypotheses.as_last_seen, acceptance.as_last_seen),
-    Source(Trigger.DEPTH_CHANGED, hypotheses.around_last_seen, acceptance.around_last_seen, comes_last=True),
+    Source(AROUND_LAST_SEEN, hypotheses.around_last_seen, acceptance.around_last_seen, comes_last=True),
 )

@@ -46,17 +46,20 @@ class Trigger(IntFlag):
     HELD = auto()
     NOT_VALIDATED = auto()
     DEPTH_CHANGED = auto()
+    FAR_BELOW_REFERENCE = auto()
     LOST = auto()
 
 
 NONE = Trigger(0)
 # An object that may have drifted off, at once or slowly.
 DRIFTS = Trigger.DRIFT | Trigger.SLOW_DRIFT
+# An object that is looked for all around where it was last validated.
+AROUND_LAST_SEEN = Trigger.DEPTH_CHANGED | Trigger.FAR_BELOW_REFERENCE
 # An object that is looked for around its prediction.
 AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.LOW_SCORE | DRIFTS
 # What calls for a search. An object that is lost is expected where it was last validated, and uncertain there; an object that was not
 # validated for long is uncertain or drifts.
-SEARCHED = AROUND_PREDICTION | Trigger.DEPTH_CHANGED | Trigger.SCORE_DROP
+SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP
 
 
 def triggers(evidence: TriggerEvidence, config: TrackerConfig) -> Int[Tensor, "b"]:
