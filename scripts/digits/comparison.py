@@ -74,11 +74,11 @@ def _unequal(there: torch.Tensor, here: torch.Tensor) -> str | None:
 
 
 def is_searched_for(windows: Sequence[Numbers], focal_px: float) -> bool:
-    """Whether an object was found again by a search: its centre jumped across the image, and it was tracked at the end.
+    """Whether an object was found again by a search: its centre jumped across the image, and it was not lost at the end.
 
     No prediction is corrected by so much in one window without one.
     """
     place = torch.stack([fields["T_cam_obj"][0, :3, 3] for fields in windows])
     pixels = focal_px * place[:, :2] / place[:, 2:]
     jump = (pixels[2:] - 2 * pixels[1:-1] + pixels[:-2]).norm(dim=1)
-    return float(jump.max()) > 12 and int(windows[-1]["status"][0]) == 0
+    return float(jump.max()) > 12 and int(windows[-1]["status"][0]) <= 1

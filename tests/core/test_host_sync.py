@@ -23,6 +23,8 @@ from torchtrack.tracking.frontend.time_surface import empty_last_event, object_r
 
 COUNT = 6
 CORNERS = TrackerConfig(corners=CornerConfig(max_corners=20))
+# In their first windows boxes are searched for as new ones, once in a while: not in all windows.
+STEADY = TrackerConfig(relocalization=RelocalizationConfig(new_below=0))
 
 
 @pytest.fixture
@@ -206,7 +208,7 @@ def test_a_tracker_that_reads_nothing_finds_the_same(nothing_is_read, monkeypatc
 @pytest.mark.parametrize("reading", [True, False])
 def test_a_steady_step_is_a_step(nothing_is_read, scene, reading):
     starts, stream_index, cameras, cut = scene(COUNT)
-    boxes = Tracker([box_model()] * len(starts), cameras, stream_index=stream_index)
+    boxes = Tracker([box_model()] * len(starts), cameras, STEADY, stream_index)
     with torch.inference_mode():
         state, _ = follow(boxes, boxes.init(torch.stack(starts), 0), cut[:-1])
         if not reading:
@@ -221,7 +223,7 @@ def test_a_steady_step_is_a_step(nothing_is_read, scene, reading):
 @pytest.mark.parametrize("reason", ["in parts", "searched", "far away", "lost"])
 def test_a_steady_step_says_when_it_does_not_hold(nothing_is_read, monkeypatch, reason, reading):
     # Made before anything is patched: other tests share it.
-    boxes, state, _, window, _ = started()
+    boxes, state, _, window, _ = started(config=STEADY)
     monkeypatch.setattr(initialization, "_EVENTS_OF_A_PART", 20)
     *_, wrong = boxes.steady_step(state, *window)
     assert not wrong

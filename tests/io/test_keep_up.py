@@ -140,7 +140,7 @@ def test_in_haste_no_other_poses_are_tried_and_few_to_find_what_is_lost():
     assert 0 < few.relocalization.hypotheses < usual.relocalization.hypotheses
     assert few.relocalization.rotations < usual.relocalization.rotations
     assert not few.uses(Component.SCORE_DROP)
-    assert few.relocalization.slow_drift_below == 0
+    assert few.relocalization.slow_drift_below == few.relocalization.new_below == 0
     assert not none.uses(Component.WINDOW_PARTS) and not few.uses(Component.WINDOW_PARTS)
     assert none.association == few.association == usual.association
 

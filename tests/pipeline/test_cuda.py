@@ -18,8 +18,8 @@ from torchtrack.tracking.validation.status import Status
 COUNT = 8
 # All objects are searched for in all windows.
 SEARCHED = TrackerConfig(relocalization=RelocalizationConfig(trigger_sigma_px=1e-3, hypotheses=4, rotations=10))
-# Nothing is learned: windows are steady.
-ONE_POSE = TrackerConfig(adaptation=AdaptationConfig(learned_points=0))
+# What is new is not looked for elsewhere, and nothing is learned: windows are steady.
+ONE_POSE = TrackerConfig(relocalization=RelocalizationConfig(new_below=0), adaptation=AdaptationConfig(learned_points=0))
 
 
 @pytest.fixture

@@ -225,7 +225,7 @@ def _three_streams(count):
 
 def _three_boxes(**search):
     parts = {"window": WindowConfig(parts=1), "adaptation": AdaptationConfig(learned_points=0)}
-    config = TrackerConfig(relocalization=RelocalizationConfig(**search), **parts)
+    config = TrackerConfig(relocalization=RelocalizationConfig(new_below=0, **search), **parts)
     # A GPU has no kernels of the CPU, whose roundings are others.
     return Tracker([box_model()] * 3, [SMALL_CAMERA] * 3, config, [0, 1, 2], kernels=False)
 

@@ -29,5 +29,5 @@ def _brief(search: RelocalizationConfig) -> RelocalizationConfig:
     """A search for what is very uncertain alone."""
     fewer = {"hypotheses": _HYPOTHESES, "rotations": _ROTATIONS}
     least: dict[str, object] = {name: min(count, getattr(search, name)) for name, count in fewer.items()}
-    none = {"slow_drift_below": 0.0}
+    none = {"slow_drift_below": 0.0, "new_below": 0.0}
     return search.model_copy(update={**least, **none, "trigger_sigma_px": max(search.trigger_sigma_px, search.wide_sigma_px)})

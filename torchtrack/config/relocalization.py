@@ -24,6 +24,9 @@ class RelocalizationConfig(Settings):
         le=1,
         description="Share of what an object explains when seen well below which, for 0.1 s, it is looked for all around there; 0 for never.",
     )
+    new_below: float = Field(
+        0.9, ge=0, le=1, description="For its first windows, an object that explains less is searched for where this much is explained; 0 for never."
+    )
     slow_drift_below: float = Field(
         0.85, ge=0, le=1, description="Share of what an object explains when seen well below which, for 50 ms, it is looked for as well; 0 for never."
     )

@@ -18,6 +18,7 @@ KEYS = {
         "anew_below": "not_validated_below",
         "by_events": "by_matches",
         "slip_sigma_px": "score_drop_sigma_px",
+        "new_share": "new_below",
         "probation": "tentative",
         "by_gathering": "by_inlier_ratio",
         "doubted_below": "drift_below",
@@ -79,7 +80,6 @@ REMOVED: dict[str, dict[str, str]] = {
         "mirrored_below": "no poses mirrored in depth are tried",
         "realignments": "every pose is aligned once",
         "at_start": "what starts is searched for as any other object",
-        "new_below": "a new object is searched for as any other",
     },
     "validation": {
         "holds_on": "a pose that goes on from the one before is asked for as much as any other",

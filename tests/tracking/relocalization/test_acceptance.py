@@ -144,6 +144,13 @@ def test_what_is_held_gives_way_to_far_more_events_as_last_seen():
     torch.testing.assert_close(asked, torch.tensor([0.15, 0.72, 0.0, 2.0 * float(scored.count)]))
 
 
+def test_a_new_object_has_to_be_explained_nearly_all_with_events_that_gather_no_less():
+    given = evidence(is_due=True, reference_explained_ratio=0.5, score=0.8, last_score=0.8, mean_score=0.8)
+    assert triggers(given, CONFIG).tolist() == [Trigger.NEW]
+    asked, scored = asked_by(acceptance.near_prediction, given)
+    torch.testing.assert_close(asked, torch.tensor([0.1, 0.9, float(scored.inlier_ratio) - 0.02, 0.0]))
+
+
 def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
     """Of any two poses, dense texture explains about as much."""
     starting = evidence(is_starting=True)

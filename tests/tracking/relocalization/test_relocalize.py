@@ -169,7 +169,8 @@ def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     searched = []
     monkeypatch.setattr(f"{LOOP}._tried", lambda lost, calls: searched.append(lost.number) or lost.window)
     _, events = moving_box(pose(), 10)
-    tracker = Tracker([box_model()], SMALL_CAMERA)
+    # As a new object it would be, once in a while.
+    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(relocalization=RelocalizationConfig(new_below=0)))
     follow(tracker, tracker.init(pose()[None], 0), windows(events, 10))
     assert len(searched) <= 1
 
@@ -205,7 +206,7 @@ def test_the_work_of_a_window_is_bounded_however_many_are_lost(monkeypatch):
         refine, "align_and_score", lambda rows, offsets, lost: aligned.append((lost.number, len(offsets))) or whole(rows, offsets, lost)
     )
     _, events = moving_box(pose(), 8)
-    config = TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, objects=1))
+    config = TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, new_below=0, objects=1))
     tracker = Tracker([box_model()] * 4, SMALL_CAMERA, config)
     state, _ = follow(tracker, tracker.init(pose()[None].repeat(4, 1, 1), 0), windows(events, 3))
     work, looks = [], torch.zeros(4, dtype=torch.int64)
@@ -226,7 +227,7 @@ def test_the_work_of_a_window_is_bounded_however_many_are_lost(monkeypatch):
 def test_without_enough_events_there_is_nothing_to_search_in(count, times, monkeypatch):
     searched = []
     monkeypatch.setattr(f"{LOOP}._tried", lambda lost, calls: searched.append(lost.number) or lost.window)
-    tracker, state, _, _, _ = started(config=TrackerConfig(relocalization=RelocalizationConfig(interval_us=0)))
+    tracker, state, _, _, _ = started(config=TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, new_below=0)))
     noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
     after, result = tracker.step(changed(state, covariance=1e3 * state.motion.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)
     assert len(searched) == times

@@ -56,6 +56,7 @@ def having(trigger, given, *disabled, **settings):
 
 ALONE = {
     Trigger.UNCERTAIN: {"sigma_px": 4.1},
+    Trigger.NEW: {"is_due": True, "reference_explained_ratio": 0.5, "score": 0.8, "last_score": 0.8, "mean_score": 0.8},
     Trigger.LOW_SCORE: {"score": 0.71, "last_score": 0.71},
     Trigger.SCORE_DROP: {"score": 0.62},
     Trigger.DRIFT: {"is_drift_due": True, "drift_s": 0.051, "sigma_px": 3.9, "matches": 10},
@@ -125,6 +126,17 @@ def test_very_uncertain_objects_wait_until_it_is_time_and_others_do_not():
 
 def test_objects_that_drift_are_searched_for_however_certain_they_are():
     assert having(SEARCHED, evidence(2, sigma_px=0.5, drift_s=[0.1, 0.0], is_drift_due=True)) == [True, False]
+
+
+def test_new_objects_that_leave_much_unexplained_are_searched_for_when_it_is_time():
+    score = torch.tensor([0.8, 0.95, 0.8])
+    given = evidence(3, is_due=[True, True, False], score=score, last_score=score, mean_score=score, reference_explained_ratio=0.5)
+    assert having(Trigger.NEW, given, new_below=0.9) == having(SEARCHED, given, new_below=0.9) == [True, False, False]
+    # Of one that explained about as much when it was seen well, nothing is new.
+    assert not any(having(Trigger.NEW, replace(given, reference_explained_ratio=torch.full((3,), 0.75))))
+    # One window that is a little worse is no reason.
+    assert not any(having(Trigger.NEW, replace(given, last_score=torch.full((3,), 0.95))))
+    assert not any(having(Trigger.NEW, given, new_below=0))
 
 
 def test_what_drifts_or_is_very_uncertain_is_looked_for_as_it_was_last_seen_when_it_is_time():

@@ -117,7 +117,10 @@ def near_prediction(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: 
     slow = has(flags, Trigger.SLOW_DRIFT)
     margin = torch.where(slow, _ELSEWHERE_MARGIN, margin)
     min_score = torch.where(slow, search.accept_ratio * reference, min_score)
-    min_inlier_ratio = torch.where(starting, scored.inlier_ratio.nan_to_num(0.0) - AS_MUCH, 0)
+    # Of a new object, only what explains nearly all is surely better: edges of what hides it explain half.
+    new = has(flags, Trigger.NEW)
+    min_score = torch.where(new, search.new_below, min_score)
+    min_inlier_ratio = torch.where(starting | new, scored.inlier_ratio.nan_to_num(0.0) - AS_MUCH, 0)
     return AcceptanceTest(margin, min_score, min_inlier_ratio, torch.where(slow, _matches(scored), 0))
 
 

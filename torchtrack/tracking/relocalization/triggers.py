@@ -33,12 +33,15 @@ SCORE_DROP_SIGMA_PX = 6.0
 HELD_FROM = 0.25
 # What was not seen well for so long is also looked for as it was then (µs).
 LAST_SEEN_US = 200_000
+# An object is new while what it explains when seen well, which rises with every window, is below this ratio of what it explains.
+_NEW = 0.9
 
 
 class Trigger(IntFlag):
     """Why other poses of an object are tried; what each means is said by the function of its name below."""
 
     UNCERTAIN = auto()
+    NEW = auto()
     LOW_SCORE = auto()
     SCORE_DROP = auto()
     DRIFT = auto()
@@ -56,7 +59,7 @@ DRIFTS = Trigger.DRIFT | Trigger.SLOW_DRIFT
 # An object that is looked for all around where it was last validated.
 AROUND_LAST_SEEN = Trigger.DEPTH_CHANGED | Trigger.FAR_BELOW_REFERENCE
 # An object that is looked for around its prediction.
-AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.LOW_SCORE | DRIFTS
+AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.NEW | Trigger.LOW_SCORE | DRIFTS
 # What calls for a search. An object that is lost is expected where it was last validated, and uncertain there; an object that was not
 # validated for long is uncertain or drifts.
 SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP
@@ -137,6 +140,18 @@ def is_scored_low(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tens
     return _is_near_or_due(evidence, config) & low & config.uses(Component.LOW_SCORE)
 
 
+def is_new(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """NEW: objects that never explained much more than now, and leave much unexplained: the mean does not tell yet that they slip.
+
+    Once in a while only: an object that begins half hidden is new for long.
+    """
+    if none_of(evidence.is_due):
+        return evidence.is_due
+    best = torch.maximum(evidence.score, evidence.last_score)
+    new = ~evidence.is_starting & evidence.is_due & (evidence.reference_explained_ratio < _NEW * best)
+    return new & (best < config.relocalization.new_below)
+
+
 def has_score_dropped(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """SCORE_DROP: objects that are sure of their place, and explain far less all at once."""
     dropped = evidence.score < SCORE_DROP_BELOW * evidence.mean_score
@@ -158,6 +173,7 @@ _CONDITIONS: tuple[dict[int, Condition], ...] = (
     {int(Trigger.DRIFT): is_drifting, int(Trigger.SLOW_DRIFT): is_drifting_slowly},
     {
         int(Trigger.UNCERTAIN): is_uncertain,
+        int(Trigger.NEW): is_new,
         int(Trigger.LOW_SCORE): is_scored_low,
         int(Trigger.SCORE_DROP): has_score_dropped,
         int(Trigger.HELD): is_held,
