@@ -75,15 +75,18 @@ def followed_on(start: Start, T_cam_obj: Float[Tensor, "n 4 4"]) -> Parts[Follow
     windows = list(windows_by_time([start.events.slice_time(start.at_us, start.at_us + FOLLOWED_US)], config.window.duration_us, start.at_us))
     tracker = Tracker([start.model] * count, [start.camera] * count, config, range(count))
     state = first_state(tracker, T_cam_obj.double(), torch.full((count,), start.at_us))
-    scores = []
+    scores, explained = [], []
     for window in windows:
         with torch.inference_mode():
-            state, _ = tracker.step(state, _for_all(window.events, count), window.t_end_us)
+            state, result = tracker.step(state, _for_all(window.events, count), window.t_end_us)
         scores.append(state.health.score)
+        # A pose whose contours are few may explain them all, and yet less of the events than another one.
+        explained.append(state.health.score * result.observation_count)
         yield
-    compared = torch.stack(scores[-max(1, round(_COMPARED * len(scores))) :]).mean(0)
-    best = int(compared.argmax())
-    return Followed(take_part(state, slice(best, best + 1), slice(best, best + 1)), windows, float(compared[best]))
+    last = max(1, round(_COMPARED * len(scores)))
+    score, events = (torch.stack(values[-last:]).mean(0) for values in (scores, explained))
+    best = int(events.argmax())
+    return Followed(take_part(state, slice(best, best + 1), slice(best, best + 1)), windows, float(score[best]))
 
 
 def alone(start: Start) -> Tracker:
