@@ -38,7 +38,8 @@ def test_a_box_is_tracked(name, most_deg, most_mm):
     at_ends = truth.at(torch.tensor([(k + 1) * WINDOW_US for k in range(COUNT)]))
     rotation_deg, translation_mm = pose_errors(poses_of(results), at_ends)
     assert rotation_deg.mean() < most_deg and translation_mm.mean() < most_mm
-    assert all(int(result.status[0]) == Status.TRACKING for result in results)
+    # The first windows have to confirm the pose.
+    assert all(int(result.status[0]) == Status.TRACKING for result in results[3:])
 
 
 @pytest.mark.parametrize("name", ["line", "ls"])

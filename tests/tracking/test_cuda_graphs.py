@@ -11,8 +11,9 @@ from states import changed
 from tracked_boxes import WINDOW_US, follow, moving_box, windows
 
 from torchtrack import Tracker
+from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
-from torchtrack.config.tracker import AdaptationConfig, TrackerConfig, WindowConfig
+from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
@@ -224,8 +225,11 @@ def _three_streams(count):
 
 
 def _three_boxes(**search):
-    parts = {"window": WindowConfig(parts=1), "adaptation": AdaptationConfig(learned_points=0)}
-    config = TrackerConfig(relocalization=RelocalizationConfig(new_below=0, **search), **parts)
+    config = TrackerConfig(
+        relocalization=RelocalizationConfig(new_below=0, **search),
+        adaptation=AdaptationConfig(learned_points=0),
+        disabled={Component.WINDOW_PARTS},
+    )
     # A GPU has no kernels of the CPU, whose roundings are others.
     return Tracker([box_model()] * 3, [SMALL_CAMERA] * 3, config, [0, 1, 2], kernels=False)
 

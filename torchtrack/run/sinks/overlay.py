@@ -16,7 +16,7 @@ from torchtrack.core.events import pad_streams
 from torchtrack.core.windows import EventWindow
 from torchtrack.run.session import Session
 from torchtrack.run.stepping import Step
-from torchtrack.tracking.frontend.bursts import LONGEST_US, update_bursts
+from torchtrack.tracking.frontend.bursts import update_bursts
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
 from torchtrack.tracking.frontend.time_surface import update_last_event
@@ -60,7 +60,7 @@ class _Drawing:
         if self._has_corners:
             return replace(self._maps, last_event_us=last_event_us)
         elapsed_us, events = torch.tensor([window.t_end_us - window.t_start_us]), pad_streams(window.events, 1, t_us)
-        return SensorMaps(last_event_us, update_bursts(self._maps.burst_age_us, elapsed_us, events, LONGEST_US)[0])
+        return SensorMaps(last_event_us, update_bursts(self._maps.burst_age_us, elapsed_us, events))
 
     def _for_display(self, result: StepResult, window: EventWindow) -> StepResult:
         """The result of a step with the corners around its contours and their flow."""

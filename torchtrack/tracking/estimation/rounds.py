@@ -54,9 +54,11 @@ class Fit:
 
 def gate_scale_of(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[Tensor, "b"]:
     """How many times wider than configured the first gate is, for predictions of that standard deviation: at least 1."""
-    first_px = config.association.gates_px[0]
-    widest = max(MAX_GATE_PX / first_px, 1) if config.uses(Component.WIDE_GATES) else 1
-    return (GATE_SIGMAS * sigma_px / first_px).clamp(1, widest)
+    return (GATE_SIGMAS * sigma_px / config.association.gates_px[0]).clamp(1, _widest_scale(config))
+
+
+def _widest_scale(config: TrackerConfig) -> float:
+    return max(MAX_GATE_PX / config.association.gates_px[0], 1) if config.uses(Component.WIDE_GATES) else 1
 
 
 def may_be_anywhere(gate_scale: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
@@ -76,8 +78,7 @@ def usual_index_radius(config: TrackerConfig) -> int:
 
 def widest_index_radius(config: TrackerConfig) -> int:
     """The same for one that hardly anything is known of."""
-    widest = gate_scale_of(torch.full((1,), torch.inf), config)
-    return int(index_radius(widest, config))
+    return int(_widest_scale(config) * max(config.association.gates_px)) + _INDEX_MARGIN_PX
 
 
 def index_for(
