@@ -14,7 +14,6 @@ from torchtrack.run.session import open_session
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.expectation import predicted_after
-from torchtrack.tracking.frontend.bursts import LONGEST_US
 from torchtrack.tracking.frontend.flow import SensorPoints
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.time_surface import update_last_event
@@ -76,7 +75,7 @@ def flow_errors(sequence: Path, duration_us: int) -> dict[str, FlowErrors]:
     maps, samples = first_state(tracker, session.T_cam_obj[:1].double(), torch.tensor([start_us])).maps, {name: [] for name in MODELS}
     for number, end_us in enumerate(range(start_us + WINDOW_US, start_us + duration_us, WINDOW_US)):
         window, t_us, elapsed_us = events.slice_time(end_us - WINDOW_US, end_us), torch.tensor([end_us]), torch.tensor([WINDOW_US])
-        seen, burst_age_us = tracker.sensors.window_events(NearbyEvents(window), maps.burst_age_us, t_us, elapsed_us, LONGEST_US)
+        seen, burst_age_us = tracker.sensors.window_events(NearbyEvents(window), maps.burst_age_us, t_us, elapsed_us)
         maps = replace(maps, last_event_us=update_last_event(maps.last_event_us, window), burst_age_us=burst_age_us)
         if end_us - start_us > WARM_UP_US and number % EVERY == 0:
             for name, sample in at_truth(tracker, seen, maps, t_us, truth).items():

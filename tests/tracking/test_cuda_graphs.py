@@ -203,7 +203,7 @@ def lanes(monkeypatch):
         graphs.CompiledStep, "_lane", lambda self, filled, learns: counted("lane", partial(graphs.steady_lane, self._tracker, learns=learns))
     )
     monkeypatch.setattr(graphs.CompiledStep, "_near", lambda self, state, events, t_us: graphs.NearbyEvents(events))
-    monkeypatch.setattr(graphs, "_in_bursts", lambda opened, filled, t_us, longest_us: (opened, filled))
+    monkeypatch.setattr(graphs, "_in_bursts", lambda opened, filled, t_us: (opened, filled))
     return calls
 
 

@@ -17,7 +17,7 @@ from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization import last_seen
 from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere, less_certain, where_last_seen, with_drift
 from torchtrack.tracking.state import joined
-from torchtrack.tracking.validation import status
+from torchtrack.tracking.validation import verdict
 from torchtrack.tracking.validation.status import Status
 
 CONFIG = TrackerConfig()
@@ -159,7 +159,7 @@ def test_an_object_that_ran_off_is_found_again_where_it_was_seen_well(name):
 
 def test_an_object_that_holds_on_to_other_edges_is_found_again_where_it_was_seen_well(monkeypatch):
     """Sure of a pose forty degrees off, as near as it was: nowhere else is it looked for so far away."""
-    monkeypatch.setattr(status, "DRIFT_BELOW", 0)
+    monkeypatch.setattr(verdict, "DRIFT_BELOW", 0)
     disabled = {Component.LAST_SEEN, Component.SCORE_DROP, Component.LOW_SCORE}
     trajectory, events = moving_box(pose(), 30)
 

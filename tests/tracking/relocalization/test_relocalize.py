@@ -201,9 +201,10 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
 def test_the_work_of_a_window_is_bounded_however_many_are_lost(monkeypatch):
     """Of four that are lost, one is looked for in a window, each in its turn, by as many hypotheses as one that is lost alone."""
     aligned = []
-    whole = refine.align_and_score
+    whole = refine.refined
     monkeypatch.setattr(
-        refine, "align_and_score", lambda rows, offsets, lost: aligned.append((lost.number, len(offsets))) or whole(rows, offsets, lost)
+        "torchtrack.tracking.relocalization.relocalize.refined",
+        lambda hypotheses, lost: aligned.append((lost.number, len(hypotheses.offsets))) or whole(hypotheses, lost),
     )
     _, events = moving_box(pose(), 8)
     config = TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, new_below=0, objects=1))

@@ -65,5 +65,5 @@ def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_
     assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, state.t_us)
     assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, unseen(low, 0.05), due)
     assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, changed(low, covariance=uncertain(low)), due)
-    for never in ({"not_validated_below": 0}, {"not_validated_us": 0}, {"hypotheses": 0}):
-        assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due, TrackerConfig(relocalization=RelocalizationConfig(**never)))
+    for never in ({"relocalization": {"not_validated_below": 0}}, {"disabled": ["around_last_seen"]}, {"relocalization": {"hypotheses": 0}}):
+        assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due, TrackerConfig.model_validate(never))
