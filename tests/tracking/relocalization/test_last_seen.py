@@ -12,6 +12,7 @@ from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, started, win
 
 from torchtrack import Tracker
 from torchtrack.config.components import Component
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization import last_seen
