@@ -19,7 +19,7 @@ from torchtrack.run.interrupt import Interrupt
 from torchtrack.run.session import Session, open_session
 from torchtrack.run.sinks import Sink
 from torchtrack.run.sinks.alignment import AlignmentRecord
-from torchtrack.run.sinks.folder import CONFIG, SUMMARY, OutputFolder
+from torchtrack.run.sinks.folder import CONFIG, FIRST_STILL, SUMMARY, OutputFolder
 from torchtrack.run.sinks.overlay import FirstStill, Overlay
 from torchtrack.run.sinks.poses import PoseFiles
 from torchtrack.run.sinks.record import Record
@@ -102,7 +102,8 @@ class RunOutputs:
         self._open_sink(self._record)
         self._open_sink(PoseFiles(folder, session.labels, self._record))
         part = "" if self._resumed_us is None else f"_from_{self._resumed_us}us"
-        self._open_sink(FirstStill(folder / f"first_window{part}.png", session, config.tracker))
+        if self._resumed_us is None:
+            self._open_sink(FirstStill(folder / FIRST_STILL, session, config.tracker))
         if config.overlay.enabled:
             self._open_sink(Overlay(folder / f"overlay{part}.mp4", session, config.overlay, config.tracker))
         if config.ros.bag:

@@ -12,7 +12,7 @@ from torchtrack.errors import OutputError
 
 SUMMARY, CONFIG, POSES, FIRST_STILL = "summary.json", "config.yaml", "poses.csv", "first_window.png"
 # What a run writes; all else in the folder is the user's own.
-_WRITTEN = (SUMMARY, CONFIG, POSES, "trajectory_*.tum", "poses*.mcap", "overlay*.mp4", "overlay*.png", "first_window*.png")
+_WRITTEN = (SUMMARY, CONFIG, POSES, "trajectory_*.tum", "poses*.mcap", "overlay*.mp4", "overlay*.png", FIRST_STILL)
 _PREVIOUS = ".previous"
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 

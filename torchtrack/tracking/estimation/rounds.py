@@ -58,7 +58,7 @@ def gate_scale_of(sigma_px: Float[Tensor, "b"], config: TrackerConfig) -> Float[
 
 
 def _widest_scale(config: TrackerConfig) -> float:
-    return max(MAX_GATE_PX / config.association.gates_px[0], 1) if config.uses(Component.WIDE_GATES) else 1
+    return max(MAX_GATE_PX / config.association.gates_px[0], 1.0) if config.uses(Component.WIDE_GATES) else 1.0
 
 
 def may_be_anywhere(gate_scale: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
