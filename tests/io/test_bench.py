@@ -35,7 +35,7 @@ def test_medians_and_quartiles_are_told():
     assert result.quartiles == (20.0, 30.0, 40.0)
     assert result.reached
     assert Result("x", "s", (1.0,)).quartiles == (1.0, 1.0, 1.0)
-    assert "| evt3 | 30.0 Mev/s | 20.0 … 40.0 |" in as_markdown(Report("io", "Reading", (result,)), machine())
+    assert "| evt3 | 30.0 Mev/s | 20.0 … 40.0 |  | ≥ 30 | reached |" in as_markdown(Report("io", "Reading", (result,)), machine())
     assert "| missed |" in as_markdown(Report("io", "Reading", (Result("evt3", "Mev/s", (1.0, 2.0), 30.0),)), machine())
 
 

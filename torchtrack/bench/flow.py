@@ -4,7 +4,7 @@ from functools import partial
 from itertools import product
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.bench.results import Report, time_result
@@ -36,24 +36,12 @@ def measure(setup: Setup) -> Report:
         setup.show(name)
         points, maps, true_flow = moving_points(count, setup.device)
         stream = torch.zeros(len(points.mask), dtype=torch.int64, device=setup.device)
-        estimate = partial(_estimate, points, maps, t_us, stream, ideal, config)
+        estimate = partial(torch.inference_mode()(estimate_flow), points, maps, t_us, stream, ideal, config)
         results.append(time_result(name, setup.clock.seconds(estimate, setup.repeats)))
         flow, has_flow = estimate()
         error = (flow - true_flow).norm(dim=-1)[has_flow] / _SPEED_PX_S
         notes.append(f"{name}: {float(has_flow.float().mean()):.0%} have a flow, median error {float(error.median()):.1%} of the speed")
     return Report("flow", f"Flow of corners; {setup.clock.meaning}", tuple(results), tuple(notes))
-
-
-@torch.inference_mode()
-def _estimate(
-    points: SensorPoints,
-    maps: SensorMaps,
-    t_us: Int[Tensor, "1"],
-    stream_index: Int[Tensor, "b"],
-    ideal_pixels: Float[Tensor, "1 h w 2"],
-    config: FlowConfig,
-) -> tuple[Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
-    return estimate_flow(points, maps, t_us, stream_index, ideal_pixels, config)
 
 
 def moving_points(count: int, device: torch.device) -> tuple[SensorPoints, SensorMaps, Float[Tensor, "b n 2"]]:

@@ -12,7 +12,7 @@ from torchtrack.bench.parts import Part
 from torchtrack.bench.results import Report, as_markdown, machine, older_medians, write_results
 from torchtrack.bench.setup import Setup
 from torchtrack.bench.yardstick import Yardstick
-from torchtrack.cli.console import output_console
+from torchtrack.cli.console import error_console, output_console
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.core.atomic import check_writable
 from torchtrack.errors import ConfigError, MissingExtraError
@@ -45,7 +45,7 @@ def bench(part: str, output: Path, compare: Path | None, setup: Setup) -> int:
             except MissingExtraError as error:
                 if part != "all":
                     raise
-                Console(stderr=True, highlight=False, soft_wrap=True).print(f"left out: {name}: {error}", markup=False)
+                error_console().print(f"left out: {name}: {error}", markup=False)
                 continue
             _tell(report, output, setup, older.get(name))
     return ExitCode.DONE

@@ -87,7 +87,7 @@ def _silence() -> None:
 
 def report(text: str, code: int) -> int:
     """Tell one error on stderr, without a traceback; gives the exit code."""
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console = error_console()
     with contextlib.suppress(OSError):
         console.print("error:", style="bold red", end=" ")
         console.print(text, markup=False)
@@ -115,11 +115,16 @@ def starting(*, quiet: bool = False) -> Iterator[None]:
         yield
 
 
+def error_console() -> Console:
+    """Standard error, for text that is shown as it is."""
+    return Console(stderr=True, highlight=False, soft_wrap=True)
+
+
 def tell_failure(text: str) -> None:
     """Tell on stderr what failed while the rest went on."""
-    Console(stderr=True, highlight=False, soft_wrap=True).print(f"failed: {text}", markup=False)
+    error_console().print(f"failed: {text}", markup=False)
 
 
 def tell_warning(text: str) -> None:
     """Tell on stderr what the user should look at."""
-    Console(stderr=True, highlight=False, soft_wrap=True).print(f"warning: {text}", markup=False)
+    error_console().print(f"warning: {text}", markup=False)

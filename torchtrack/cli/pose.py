@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 
-from torchtrack.cli.console import output_console
+from torchtrack.cli.console import error_console, output_console
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.picture import check_picture, write_picture
 from torchtrack.cli.progress import progress_shown, share_of
@@ -197,4 +196,4 @@ def _write(path: Path, text: str) -> None:
 
 def _say(text: str) -> None:
     """On stderr: the terminal's output is the block."""
-    Console(stderr=True, highlight=False, soft_wrap=True).print(text, markup=False)
+    error_console().print(text, markup=False)

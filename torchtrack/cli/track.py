@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from torchtrack.cli.console import OutputLines, output_console, tell_failure, tell_warning
+from torchtrack.cli.console import OutputLines, error_console, output_console, tell_failure, tell_warning
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.progress import progress_shown
 from torchtrack.config.executor import ExecutorName
@@ -103,7 +103,7 @@ def _run_config(config_or_source: str, overrides: Mapping[str, Any]) -> RunConfi
 def run_and_show(config: RunConfig, quiet: bool, resume: bool = False, extra: ExtraOutputs = _NO_EXTRA) -> int:
     """One run, and its table; returns the exit code."""
     only_poses = extra.poses == "-"
-    console = Console(stderr=True, highlight=False, soft_wrap=True) if only_poses else output_console()
+    console = error_console() if only_poses else output_console()
     if resume:
         check_resumable(config)
     check_folder(config.output)
