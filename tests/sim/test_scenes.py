@@ -189,7 +189,8 @@ def test_shipped_scenes_stay_in_view_and_apart(path):
             assert float(low.min()) > 5
             assert bool((high < torch.tensor([world.camera.width - 6.0, world.camera.height - 6.0])).all())
             boxes.append((low, high))
-        for i, (low, high) in enumerate(boxes):
+        # Objects that are to cross do come together.
+        for i, (low, high) in enumerate(boxes if path.stem != "crossing" else []):
             for other_low, other_high in boxes[:i]:
                 apart = ((low > other_high) | (other_low > high)).any(-1)
                 assert float(apart.double().mean()) > 0.9
