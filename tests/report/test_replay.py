@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import random_events
+from kept_steps import KeptSteps
 from tiny_sequence import write_tiny_sequence
 
 from torchtrack.cli.exit_codes import ExitCode
@@ -24,23 +25,10 @@ from torchtrack.run.session import open_session
 from torchtrack.run.sinks.rerun_log import observed_near
 
 
-class Collected:
-    """Keeps the steps of a run."""
-
-    def __init__(self):
-        self.steps = []
-
-    def add(self, step):
-        self.steps.append(step)
-
-    def close(self):
-        pass
-
-
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory):
     """The folder of a run, its settings, and its steps."""
-    folder, steps = tmp_path_factory.mktemp("runs"), Collected()
+    folder, steps = tmp_path_factory.mktemp("runs"), KeptSteps()
     path = write_tiny_sequence(folder, "two", labels=("left", "right"), duration_us=40_000)
     config = RunConfig(source=path, output=folder / "out", preset="causal", overlay={"enabled": False})
     run(config, [steps])

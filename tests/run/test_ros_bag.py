@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from kept_steps import KeptSteps
 from rosbags.rosbag2 import Reader
 from stand_in_ros import STORE
 from tiny_sequence import write_tiny_sequence
@@ -18,24 +19,11 @@ from torchtrack.run.sinks.ros_bag import PoseBag, PosesOfSteps
 from torchtrack.tracking.validation.status import Status
 
 
-class Steps:
-    """A sink that keeps the steps."""
-
-    def __init__(self):
-        self.steps = []
-
-    def add(self, step):
-        self.steps.append(step)
-
-    def close(self):
-        pass
-
-
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory):
     """Folder and steps of a run."""
     folder = tmp_path_factory.mktemp("run")
-    steps = Steps()
+    steps = KeptSteps()
     path = write_tiny_sequence(folder, labels=("left", "right.2"), duration_us=20_000)
     run(RunConfig(source=path, output=folder / "out", overlay={"enabled": False}, ros={"bag": True}), [steps])
     return folder / "out", steps.steps
