@@ -27,8 +27,14 @@ UNREMEMBERED = frozenset({Component.POLARITY_PRIOR, Component.TURNS_FADE})
 SEARCHING = TrackerConfig(corners=CornerConfig(max_corners=32), disabled=UNREMEMBERED)
 NEVER_DRIFTING = SEARCHING.model_copy(update={"disabled": UNREMEMBERED | {Component.DRIFT, Component.SCORE_DROP}})
 # Looks farther away are for what was not seen well for long, or for nothing.
-SLOWLY = SEARCHING.model_copy(
-    update={"relocalization": RelocalizationConfig(not_validated_below=0), "disabled": UNREMEMBERED | {Component.SCORE_DROP}}
+SLOWLY, NEVER_SLOWLY = (
+    SEARCHING.model_copy(
+        update={
+            "relocalization": RelocalizationConfig(slow_drift_below=share, not_validated_below=0),
+            "disabled": UNREMEMBERED | {Component.SCORE_DROP},
+        }
+    )
+    for share in (0.85, 0.0)
 )
 # Twenty degrees, onto other edges: farther than a pose that is sure of itself is looked for.
 SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
@@ -219,10 +225,14 @@ def test_a_pose_that_slipped_drifts_and_is_relocalized(monkeypatch):
 def test_a_pose_that_drifts_slowly_is_relocalized_though_its_events_were_never_smeared(monkeypatch):
     drifting_soon(monkeypatch, diameters_s=4)
     monkeypatch.setattr(verdict, "DRIFT_BELOW", 0)
+    # From nearer it comes back by itself.
+    monkeypatch.setitem(globals(), "SLIPPED", torch.tensor([[0.6, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64))
     after, results, T_true = slipped(SLOWLY, count=30)
+    _, without, _ = slipped(NEVER_SLOWLY, count=30)
     degrees, millimetres = pose_errors(results[-1].T_cam_obj, T_true)
     assert float(degrees) < 0.5
     assert float(millimetres) < 1.0
+    assert float(pose_errors(without[-1].T_cam_obj, T_true)[0]) > 2
     assert float(after.health.time_since_validated_s) == 0
     assert float(after.health.drift_s) == 0
 
