@@ -258,11 +258,11 @@ def places(*positions):
 )
 def test_only_objects_beside_others_are_drawn_and_nothing_else_changes(monkeypatch, positions, drawn):
     asked, models, T = [], [box_model((0.06, 0.08, 0.05))] * len(positions), places(*positions)
-    may_overlap_others = visibility._may_overlap_others
-    monkeypatch.setattr(visibility, "_may_overlap_others", lambda *scene: asked.append(may_overlap_others(*scene)) or asked[-1])
+    may_overlap_others = visibility.may_overlap_others
+    monkeypatch.setattr(visibility, "may_overlap_others", lambda *scene: asked.append(may_overlap_others(*scene)) or asked[-1])
     _, actual = extracted(models, T)
     assert asked[-1].tolist() == drawn
-    monkeypatch.setattr(visibility, "_may_overlap_others", lambda scene, *_: torch.ones_like(scene.stream_index, dtype=torch.bool))
+    monkeypatch.setattr(visibility, "may_overlap_others", lambda scene, *_: torch.ones_like(scene.stream_index, dtype=torch.bool))
     assert torch.equal(actual.mask, extracted(models, T)[1].mask)
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, entries, inverse_depth, lens, placed, turned
+from torchtrack.backends.numba.models import arrays_of
 from torchtrack.backends.numba.parameters import SamplingSettings
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M
@@ -315,8 +316,6 @@ def project(points_obj: Array, T_cam_obj: Array, intrinsics: Array, points_cam: 
             pixels[b, 0, i], pixels[b, 1, i] = x * inverse * fx + cx, y * inverse * fy + cy
 
 
-# What of a model its contour points are sampled from, beside the faces.
-_SAMPLED_FROM = ("is_crease", "is_segment", "edges", "texture_points", "texture_tangents", "texture_normals")
 # What only shows points takes none of the settings that sample them.
 _TO_SHOW = ContourConfig()
 
@@ -343,9 +342,8 @@ def mesh_points_numba(models: Sequence[ContourModel], T_cam_obj: Tensor, intrins
     kind, counts = np.empty((batch, room), np.int64), np.zeros(batch, np.int64)
     seen = as_arrays(T_cam_obj, intrinsics)
     for model in models:
-        of_edges = model.edge_ends, model.face_normals.movedim(0, -1), model.face_offsets.T
-        of_model = as_arrays(model.members, *of_edges, *(getattr(model, name) for name in _SAMPLED_FROM))
-        sample(*of_model, model.texture_spacing_m, *seen, settings, sampled, kind, counts)
+        of_model = arrays_of(model)
+        sample(of_model.members, *of_model.sampled, model.texture_spacing_m, *seen, settings, sampled, kind, counts)
     # One place at least: what selects from contours needs one to point at.
     width = max(int(counts.max()), 1)
     points_obj, tangents_obj = T_cam_obj.new_empty(2, batch, 3, width)

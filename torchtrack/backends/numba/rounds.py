@@ -14,20 +14,21 @@ from torchtrack.backends.numba.geometry import Numbers, at_depth, centre_of, dri
 from torchtrack.backends.numba.index import cells_of
 from torchtrack.backends.numba.matching import (
     AGE,
-    DIRECTION_U,
-    DIRECTION_V,
-    MATCH_AGE,
-    POINT_X,
-    POINT_Y,
-    POINT_Z,
+    BLOCK,
+    NORMAL_U,
+    NORMAL_V,
     ROWS,
     TARGET_U,
     TARGET_V,
     WEIGHT,
     U,
     V,
+    X,
+    Y,
+    Z,
     believe,
     match,
+    room_for,
 )
 from torchtrack.backends.numba.parameters import Cells, DampingSettings, MatchingSettings, RoundSettings, filled
 from torchtrack.backends.numba.solving import damped_step, damping_settings, move, normal_equations, row_of
@@ -44,8 +45,11 @@ from torchtrack.tracking.estimation import rounds
 from torchtrack.tracking.estimation.rounds import Gates, Start
 from torchtrack.tracking.estimation.terms import Linearisation
 
-# Pose and velocity; and their residual, in the rows of a Jacobian.
-UNKNOWNS, _RESIDUAL = 12, 12
+# Pose and velocity; and in the rows that are derived, after their Jacobian, residual and weight.
+UNKNOWNS, _RESIDUAL, _WEIGHT = 12, 12, 13
+# What these are derived from, in rows: contour point, normal, target, age, and how far a match is believed.
+_X, _Y, _Z, _NU, _NV, _TO_U, _TO_V, _AGE, _BELIEVED = range(9)
+_GIVEN = 9
 
 
 @kernel()
@@ -88,8 +92,9 @@ def align(
         gradient, hessian, contour, is_near, is_matched, matches: of the last round; filled.
     """
     count = seen.shape[2]
-    place, rows, weights = np.empty((count, 2)), np.empty((UNKNOWNS + 1, count), seen.dtype), np.empty(count, seen.dtype)
-    votes, centre, step = np.empty((matching.patches**2, 3)), np.empty(3), np.empty(UNKNOWNS)
+    place, rows, weights = np.empty((2, count)), np.empty((UNKNOWNS + 1, count), seen.dtype), np.empty(count, seen.dtype)
+    room, centre, step, used = room_for(seen, matching.patches), np.empty(3), np.empty(UNKNOWNS), np.empty(count + 1, np.int64)
+    given, derived = np.zeros(_GIVEN * BLOCK, seen.dtype), np.empty((UNKNOWNS + 2) * BLOCK, seen.dtype)
     for b in range(len(seen)):
         centre_of(T_cam_obj[b], centre_obj[b], centre)
         moving, of_lens = drift(rounds.compensated * (velocity[b] + offset[b, 6:]), centre), lens(intrinsics[b])
@@ -98,13 +103,20 @@ def align(
             centre_of(T_cam_obj[b], centre_obj[b], centre)
             moving = drift(rounds.compensated * (velocity[b] + offset[b, 6:]), centre)
             match(
-                seen[b], exists[b], place, table[b], nearest_of_cell[b], first[b], cells, entries(T_cam_obj[b]), moving, of_lens,
-                gates_px[r], wider[r, b], subcell_lookup[b], matching, contour[b], is_near[b], is_matched[b], matches[b], votes,
+                seen[b], exists[b], place, table[b], nearest_of_cell[b], first[b], cells, entries(T_cam_obj[b]), moving, of_lens, gates_px[r],
+                wider[r, b], subcell_lookup[b], r == len(gates_px) - 1, matching, contour[b], is_near[b], is_matched[b], matches[b], room,
             )  # fmt: skip
             believe(seen[b], is_matched[b], matches[b], matching)
             pose, scale_px = entries(T_cam_obj[b]), gates_px[r] * wider[r, b]
-            used = _linearise(matches[b], pose, centre_obj[b], centre, of_lens, scale_px, rounds, rows, weights)
-            normal_equations(rows, weights, used, information[b], offset[b], gradient[b], hessian[b])
+            total = _that_count(matches[b, WEIGHT], used)
+            for begin in range(0, total, BLOCK):
+                end = min(begin + BLOCK, total)
+                _lay_out(used[begin:end], seen[b], table[b], contour[b], matches[b], given)
+                _linearise(given, pose, centre_obj[b], centre, of_lens, scale_px, rounds.velocity_in_window, derived)
+                for k in range(UNKNOWNS + 1):
+                    rows[k, begin:end] = derived[k * BLOCK : k * BLOCK + end - begin]
+                weights[begin:end] = derived[_WEIGHT * BLOCK : _WEIGHT * BLOCK + end - begin]
+            normal_equations(rows, weights, total, information[b], offset[b], gradient[b], hessian[b])
             damped_step(gradient[b], hessian[b], damping.damping, damping, step)
             move(T_cam_obj[b], centre_obj[b], offset[b], step)
 
@@ -112,46 +124,56 @@ def align(
 @kernel(fastmath=FAST)
 def _first_place(seen: Array, moving: Numbers, centre: Array, intrinsics: Numbers, place: Array) -> None:
     """Where the first round looks for each observation: carried to the window's end at the depth of the object's centre."""
-    for i in range(len(place)):
+    place_u, place_v = place
+    for i in range(len(place_u)):
         u, v, age = seen[U, i], seen[V, i], seen[AGE, i]
         speed_u, speed_v = at_depth(moving, centre[2], u, v, intrinsics)
-        place[i, 0], place[i, 1] = u + speed_u * age, v + speed_v * age
+        place_u[i], place_v[i] = u + speed_u * age, v + speed_v * age
+
+
+@kernel()
+def _that_count(weights: Array, used: Array) -> np.int64:
+    """Numbers of the matches with any weight, first in ``used``: how many."""
+    total = np.uint64(0)
+    for i in range(len(weights)):
+        used[total] = i
+        total += np.uint64(weights[i] > 0)
+    return np.int64(total)
+
+
+@kernel()
+def _lay_out(used: Array, seen: Array, table: Array, contour: Array, matches: Array, given: Array) -> None:
+    """Lay out a block of matches in rows."""
+    ages, targets_u, targets_v, weights = seen[AGE], matches[TARGET_U], matches[TARGET_V], matches[WEIGHT]
+    for k in range(len(used)):
+        i = np.uint64(used[k])
+        point = table[np.uint64(contour[i])]
+        given[_X * BLOCK + k], given[_Y * BLOCK + k], given[_Z * BLOCK + k] = point[X], point[Y], point[Z]
+        given[_NU * BLOCK + k], given[_NV * BLOCK + k] = point[NORMAL_U], point[NORMAL_V]
+        given[_TO_U * BLOCK + k], given[_TO_V * BLOCK + k] = targets_u[i], targets_v[i]
+        given[_AGE * BLOCK + k], given[_BELIEVED * BLOCK + k] = ages[i], weights[i]
 
 
 @kernel(fastmath=FAST)
 def _linearise(
-    matches: Array,
-    pose: Numbers,
-    centre_obj: Array,
-    centre: Array,
-    intrinsics: Numbers,
-    scale_px: float,
-    rounds: RoundSettings,
-    rows: Array,
-    weights: Array,
-) -> int:
-    """Fill rows of the Jacobian, with residuals, and weights of those that count; how many these are."""
-    used, middle = 0, (centre[0], centre[1], centre[2])
-    for i in range(matches.shape[1]):
-        weight = matches[WEIGHT, i]
-        if not weight > 0:
-            continue
-        px, py, pz = matches[POINT_X, i] - centre_obj[0], matches[POINT_Y, i] - centre_obj[1], matches[POINT_Z, i] - centre_obj[2]
-        nu, nv = matches[DIRECTION_U, i], matches[DIRECTION_V, i]
-        there = (matches[TARGET_U, i] - intrinsics[2]) * nu + (matches[TARGET_V, i] - intrinsics[3]) * nv
+    given: Array, pose: Numbers, centre_obj: Array, centre: Array, intrinsics: Numbers, scale_px: float, velocity_in_window: bool, derived: Array
+) -> None:
+    """Rows of the Jacobian of a block of matches, with residuals and weights."""
+    middle, own = (centre[0], centre[1], centre[2]), (centre_obj[0], centre_obj[1], centre_obj[2])
+    for i in range(BLOCK):
+        px, py, pz = given[_X * BLOCK + i] - own[0], given[_Y * BLOCK + i] - own[1], given[_Z * BLOCK + i] - own[2]
+        nu, nv = given[_NU * BLOCK + i], given[_NV * BLOCK + i]
+        there = (given[_TO_U * BLOCK + i] - intrinsics[2]) * nu + (given[_TO_V * BLOCK + i] - intrinsics[3]) * nv
         row, residual = row_of(pose, px, py, pz, middle, intrinsics, nu, nv, there)
         relative = residual / scale_px
         robust = max(1.0 - relative * relative, 0.0)
-        if robust == 0.0:
-            continue
-        age = matches[MATCH_AGE, i] * rounds.velocity_in_window
-        for k in range(6):
-            rows[k, used] = row[k]
-            # How far it was from where it is at the pose, for each unit of velocity beyond the predicted one.
-            rows[6 + k, used] = -row[k] * age
-        rows[_RESIDUAL, used], weights[used] = residual, weight * robust * robust
-        used += 1
-    return used
+        age = given[_AGE * BLOCK + i] * velocity_in_window
+        derived[i], derived[BLOCK + i], derived[2 * BLOCK + i] = row[0], row[1], row[2]
+        derived[3 * BLOCK + i], derived[4 * BLOCK + i], derived[5 * BLOCK + i] = row[3], row[4], row[5]
+        # How far it was from where it is at the pose, for each unit of velocity beyond the predicted one.
+        derived[6 * BLOCK + i], derived[7 * BLOCK + i], derived[8 * BLOCK + i] = -row[0] * age, -row[1] * age, -row[2] * age
+        derived[9 * BLOCK + i], derived[10 * BLOCK + i], derived[11 * BLOCK + i] = -row[3] * age, -row[4] * age, -row[5] * age
+        derived[_RESIDUAL * BLOCK + i], derived[_WEIGHT * BLOCK + i] = residual, given[_BELIEVED * BLOCK + i] * robust * robust
 
 
 def knows(config: TrackerConfig) -> bool:

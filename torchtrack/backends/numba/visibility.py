@@ -8,6 +8,7 @@ from torch import Tensor
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, entries, inverse_depth, lens, placed, turned
+from torchtrack.backends.numba.models import arrays_of
 from torchtrack.backends.numba.parameters import GridSettings
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.dispatch import accelerates
@@ -231,6 +232,39 @@ def hide_in_buffer(
             hidden[b, i] = hidden[b, i] or behind
 
 
+@kernel()
+def meet(pixels: Array, mask: Array, depth_m: Array, stream_index: Array, diameters_m: Array, beside_px: float, meets: Array) -> None:
+    """Which objects may be before another one of their stream: :func:`torchtrack.tracking.contours.visibility.may_overlap_others`.
+
+    Args:
+        pixels, mask, depth_m: of contours: ``[b, 2, m]``, ``[b, m]`` and ``[b, m]``.
+        meets: ``[b]``, filled.
+    """
+    low, high, close = np.full((len(mask), 2), np.inf, pixels.dtype), np.full((len(mask), 2), -np.inf, pixels.dtype), np.zeros(len(mask), np.bool_)
+    for b in range(len(mask)):
+        for i in range(mask.shape[1]):
+            if mask[b, i]:
+                close[b] |= depth_m[b, i] < diameters_m[b]
+                for k in range(2):
+                    low[b, k], high[b, k] = min(low[b, k], pixels[b, k, i]), max(high[b, k], pixels[b, k, i])
+        low[b] -= beside_px
+    for b in range(len(mask)):
+        meets[b] = False
+        for other in range(len(mask)):
+            apart = low[b, 0] > high[other, 0] or low[b, 1] > high[other, 1] or low[other, 0] > high[b, 0] or low[other, 1] > high[b, 1]
+            is_beside = close[b] or close[other] or not apart
+            meets[b] |= is_beside and other != b and stream_index[b] == stream_index[other]
+
+
+@accelerates(visibility.may_overlap_others)
+def may_overlap_others_numba(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tensor, "b"]:
+    """Point by point."""
+    meets = torch.empty_like(scene.stream_index, dtype=torch.bool)
+    seen = as_arrays(contours.pixels.transpose(1, 2), contours.mask, contours.points_cam[..., 2], scene.stream_index, scene.diameters_m)
+    meet(*seen, visibility.OVERLAP_CELLS * cell_px, meets.numpy())
+    return meets
+
+
 @accelerates(visibility.hidden_by_self)
 def hidden_by_self_numba(scene: Scene, contours: Contours) -> Bool[Tensor, "b m"]:
     """Object by object."""
@@ -238,9 +272,9 @@ def hidden_by_self_numba(scene: Scene, contours: Contours) -> Bool[Tensor, "b m"
     points = as_arrays(contours.points_cam.transpose(1, 2), contours.mask)
     T_cam_obj, tolerance_m = as_arrays(scene.T_cam_obj, visibility.ON_FACE * scene.diameters_m)
     for model in scene.models:
-        if len(model.triangles):
-            members, triangles, normals = as_arrays(model.members, model.triangles, model.triangle_normals)
-            hide_behind_faces(members, T_cam_obj, triangles, normals, tolerance_m, *points, hidden.numpy())
+        of_model = arrays_of(model)
+        if len(of_model.faces[0]):
+            hide_behind_faces(of_model.members, T_cam_obj, *of_model.faces, tolerance_m, *points, hidden.numpy())
     return hidden
 
 
@@ -258,9 +292,10 @@ def hidden_in_buffer_numba(scene: Scene, contours: Contours, drawn: Bool[Tensor,
     steps_per_m, enough = visibility.DEPTH_STEPS_PER_M, visibility.SAMPLES_PER_CELL
     settings = GridSettings(rows, columns, cell_px, height, width, steps_per_m, MIN_DEPTH_M, enough)
     depth, owner = (np.full(streams * rows * columns, value) for value in (visibility.NOTHING, len(drawn)))
+    is_drawn = drawn.numpy()
     for model in scene.models:
-        of_model = as_arrays(model.members, drawn, model.surface_points.T)
-        draw(*of_model, T_cam_obj, intrinsics, diameters_m, stream_index, first, settings, depth, owner)
+        of_model = arrays_of(model)
+        draw(of_model.members, is_drawn, of_model.surface, T_cam_obj, intrinsics, diameters_m, stream_index, first, settings, depth, owner)
     own = as_arrays(exact[:, 0], margin_m)
     hide_in_buffer(points_cam, pixels, normals, mask, *own, stream_index, first, settings, depth, owner, hidden.numpy())
     return hidden

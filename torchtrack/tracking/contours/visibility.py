@@ -31,7 +31,7 @@ _MOST_TESTS = 2**19
 DEPTH_STEPS_PER_M, _OBJECT_BITS = 1e6, 20
 NOTHING = 2**62
 # Images that are farther apart than this have no cell in common.
-_OVERLAP_CELLS = 2
+OVERLAP_CELLS = 2
 # So many surface samples for each cell of the square around an object leave no holes: its outline fills half of it, seen from both sides.
 SAMPLES_PER_CELL = 8
 
@@ -228,12 +228,11 @@ def hidden_in_buffer(scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"],
     return inside & behind.all(1)
 
 
-def _may_overlap_others(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tensor, "b"]:
+@accelerable
+def may_overlap_others(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tensor, "b"]:
     """Which objects may share a cell with another one of their stream: where the boxes around their outlines meet."""
-    if not scene.shared:
-        return torch.zeros_like(scene.stream_index, dtype=torch.bool)
     low, high = bounds(contours.pixels, contours.mask)
-    low = low - _OVERLAP_CELLS * cell_px
+    low = low - OVERLAP_CELLS * cell_px
     # The outline of what reaches behind the camera is not all in its image; then no point is farther away than the diameter.
     close = torch.where(contours.mask, contours.points_cam[..., 2], torch.inf).amin(1) < scene.diameters_m
     meet = ((low[:, None] <= high) & (low <= high[:, None])).all(-1) | close[:, None] | close
@@ -256,7 +255,9 @@ def remove_hidden(contours: Contours, scene: Scene) -> Contours:
     needs_buffer = scene.shared or any(len(model.triangles) == 0 for model in scene.models)
     if needs_buffer:
         exact = _tested_exactly(scene)
-        drawn = ~exact[:, 0] | _may_overlap_others(scene, contours, DEPTH_CELL_PX)
+        drawn = ~exact[:, 0]
+        if scene.shared:
+            drawn = drawn | may_overlap_others(scene, contours, DEPTH_CELL_PX)
         if not host_sync.none_of(drawn):
             hidden = hidden | hidden_in_buffer(scene, contours, drawn, exact)
     return replace(contours, mask=contours.mask & ~hidden)
