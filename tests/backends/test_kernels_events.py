@@ -74,6 +74,10 @@ def test_events_of_several_objects_are_not_copied_for_each():
         assert all(torch.equal(single[name], row[name]) for name in row)
     assert int(events.counts()[3]) == 0
     assert not events.of_object(3).mask.any()
+    some = events.of_objects(torch.tensor([2, 0]))
+    for row, number in enumerate((2, 0)):
+        single, own = entries_of(some, row), entries_of(events.rows(), number)
+        assert all(torch.equal(single[name], own[name]) for name in own)
 
 
 @pytest.mark.parametrize("count", [100, 5000])

@@ -1,12 +1,13 @@
 """What contours are made from: the constant tensors of an object's model."""
 
+import copy
 from collections.abc import Sequence
 from enum import IntEnum
 from math import ceil
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
@@ -80,6 +81,12 @@ class ContourModel(nn.Module):
         triangles = model.triangles if exact else model.triangles[:0]
         self.register_buffer("triangles", triangles.clone())
         self.register_buffer("triangle_normals", _normals(triangles))
+
+    def with_members(self, members: Int[Tensor, "k"]) -> "ContourModel":
+        """The same model of other objects: a shallow copy, which shares all tensors but the list of members."""
+        model = copy.copy(self)
+        model.numbers, model._buffers = tuple(members.tolist()), {**self._buffers, "members": members}
+        return model
 
     def active_edges(self, camera_obj: Float[Tensor, "b 3"]) -> Bool[Tensor, "b e"]:
         """Which edges are contours for a camera at ``camera_obj`` (object frame)."""

@@ -8,7 +8,7 @@ import torch
 from helpers import SMALL_CAMERA, box_model, edge_events, pose, pose_errors
 from printed_plate import PLATE_CAMERA, PLATE_POSE, PRINTED, line_events, plate_model, starting
 from states import changed
-from tracked_boxes import assert_same, follow, merged, moving_box, poses_of, windows
+from tracked_boxes import WIDE_CAMERA, assert_same, follow, merged, moving_box, poses_of, windows
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import AdaptationConfig, ContourConfig, TrackerConfig
@@ -16,7 +16,7 @@ from torchtrack.core.events import concatenate
 from torchtrack.core.lie import rotation_angle_deg
 from torchtrack.object_model import contour_source
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.tracking.adaptation import learned_contours
+from torchtrack.tracking.adaptation import learned_contours, surface_learning
 from torchtrack.tracking.adaptation.learned_contours import TRUSTED_FROM, LearnedContours
 
 COUNT = 24
@@ -94,6 +94,21 @@ def test_an_object_that_its_model_explains_learns_nothing_beside_one_that_lacks_
         assert torch.equal(mine[1], theirs[1])
     # Whether that is still so is looked at all the same.
     assert (after.appearance.learned.model_share != before.appearance.learned.model_share).all()
+
+
+def test_objects_that_are_not_beside_one_to_learn_of_are_left_out_and_change_nothing(monkeypatch):
+    starts = torch.stack([pose(translation=(x_m, 0.0, depth_m)) for x_m, depth_m in ((-0.16, 0.5), (-0.15, 0.7), (0.2, 0.5), (-0.18, 0.8))])
+    events = merged(*(moving_box(start, 4, WIDE_CAMERA, seed=number)[1] for number, start in enumerate(starts[:3])))
+    tracker = Tracker([box_model()] * 4, WIDE_CAMERA)
+    state, _ = follow(tracker, tracker.init(starts, 0), windows(events, 3))
+    before = changed(state, learned=replace(state.appearance.learned, model_share=torch.tensor([0.3, 0.9, 0.9, 0.9])))
+    asked, concerned = [], surface_learning._concerned
+    monkeypatch.setattr(surface_learning, "_concerned", lambda *given: asked.append(concerned(*given)) or asked[-1])
+    after = tracker.step(before, *windows(events, 4)[3])
+    assert asked[0].tolist() == [True, True, False, True]
+    assert not torch.equal(after[0].appearance.learned.drafted[0], before.appearance.learned.drafted[0])
+    monkeypatch.setattr(surface_learning, "_concerned", lambda wanted, _: torch.ones_like(wanted))
+    assert_same(after, tracker.step(before, *windows(events, 4)[3]))
 
 
 def test_an_occluder_that_passes_teaches_nothing(monkeypatch):

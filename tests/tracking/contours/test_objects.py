@@ -52,6 +52,22 @@ def test_contours_of_a_splatted_cloud_are_on_offer_too():
     assert contours.pixels[contours.mask].isfinite().all()
 
 
+# ---- some of the objects
+
+
+def test_some_objects_are_seen_as_among_all():
+    plate, box = box_model(PLATE_EXTENTS_M), box_model()
+    all_of_them = batch_of(plate, box, plate, box, streams=[0, 1, 1, 0])
+    T = torch.stack([pose(translation=(0.0, 0.0, 0.5 + 0.1 * number)) for number in range(4)]).float()
+    chosen = torch.tensor([2, 1])
+    some = all_of_them.rows(chosen)
+    assert [model.members.tolist() for model in some.models] == [[0], [1]]
+    assert (some.stream_index.tolist(), some.diameter_m.tolist()) == ([1, 1], all_of_them.diameter_m[chosen].tolist())
+    ours, theirs = some.contours(T[chosen], CONTOURS), all_of_them.contours(T, CONTOURS)
+    assert all(same_contours(ours, theirs, row, number) for row, number in enumerate((2, 1)))
+    assert all_of_them.models[0].members.tolist() == [0, 2]
+
+
 # ---- copies
 
 

@@ -69,11 +69,22 @@ class LearnedContours:
 
     def but_of(self, chosen: Bool[Tensor, "b"], other: "LearnedContours") -> "LearnedContours":
         """The same, but of some objects what another knows."""
-        of_each = {name: value for name, value in vars(self).items() if torch.is_tensor(value)}
         rows: dict[str, Any] = {
-            name: torch.where(chosen.view(-1, *[1] * (value.dim() - 1)), getattr(other, name), value) for name, value in of_each.items()
+            name: torch.where(chosen.view(-1, *[1] * (value.dim() - 1)), getattr(other, name), value) for name, value in self._of_each().items()
         }
         return replace(self, **rows)
+
+    def rows(self, chosen: Int[Tensor, "k"]) -> "LearnedContours":
+        """What is known of some objects."""
+        return replace(self, **{name: value[chosen] for name, value in self._of_each().items()})
+
+    def with_rows(self, chosen: Int[Tensor, "k"], other: "LearnedContours") -> "LearnedContours":
+        """The same, but of some objects what another knows, of which these are all."""
+        rows: dict[str, Any] = {name: value.index_copy(0, chosen, getattr(other, name)) for name, value in self._of_each().items()}
+        return replace(self, **rows)
+
+    def _of_each(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if torch.is_tensor(value)}
 
     def points(self, least: float) -> LearnedPoints:
         """The learned points with at least that evidence."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -46,6 +46,9 @@ _ON_TO_BESIDE, _SILENT, _MOST_EVIDENCE = 1.5, 0.25, 10.0
 _EVIDENCE_PER_DRAFT = 0.25
 # A contour that moved less across itself need not have fired (px).
 _LEAST_WAY_PX = 0.5
+# Objects whose centres are farther apart in the image than so many of their diameters, and so many pixels, neither hide one another nor share
+# events. One that is nearer to the camera than so many diameters may be anywhere in the image.
+_REACH, _BESIDE_PX, _CLOSE = 0.75, 16.0, 2.0
 # A surface seen at a more grazing angle shows nothing of use (cosine).
 _GRAZING_COSINE = 0.2
 
@@ -69,6 +72,11 @@ class Surroundings:
     window_s: Float[Tensor, "b"]
     contours: Contours
     learning: Bool[Tensor, "b"]
+
+    def rows(self, chosen: Int[Tensor, "k"]) -> "Surroundings":
+        """Some of the objects."""
+        own = self.T_cam_obj[chosen], self.velocity[chosen], self.window_s[chosen]
+        return Surroundings(self.objects.rows(chosen), *own, self.contours.rows(chosen), self.learning[chosen])
 
     @property
     def centre_cam(self) -> Float[Tensor, "b 3"]:
@@ -113,7 +121,24 @@ def learn_after(
     learned = judge_model(learned, scored, velocity, image_size, config, any_count=any_count)
     if wanted is None or host_sync.none_of(wanted):
         return learned
-    return learned.but_of(wanted, learn(learned, around, events.rows(), config))
+    if not host_sync.read_at_once(wanted):
+        return learned.but_of(wanted, learn(learned, around, events.rows(), config))
+    # As a rule, there are few such objects.
+    concerned = _concerned(wanted, around).nonzero()[:, 0]
+    known = learn(learned.rows(concerned), around.rows(concerned), events.of_objects(concerned), config)
+    return learned.with_rows(concerned[wanted[concerned]], known.rows(wanted[concerned]))
+
+
+def _concerned(wanted: Bool[Tensor, "b"], around: Surroundings) -> Bool[Tensor, "b"]:
+    """Objects to learn of, those beside them in the image, and those beside these: whether one hides another hangs on what is beside it."""
+    objects, centre_cam = around.objects, around.centre_cam
+    if not objects.shared:
+        return wanted
+    pixels, reach_px = project(centre_cam[:, None], objects.intrinsics), _REACH * objects.size_px(around.T_cam_obj)
+    is_close = centre_cam[:, 2] < _CLOSE * objects.diameter_m
+    is_next = (pixels - pixels.transpose(0, 1)).norm(dim=-1) < reach_px[:, None] + reach_px + _BESIDE_PX
+    is_next = (is_next | is_close[:, None] | is_close) & (objects.stream_index[:, None] == objects.stream_index)
+    return wanted | (is_next & (wanted | (is_next & wanted).any(1))).any(1)
 
 
 def learn(learned: LearnedContours, around: Surroundings, events: WindowEvents, config: TrackerConfig) -> LearnedContours:

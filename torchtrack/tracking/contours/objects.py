@@ -1,6 +1,5 @@
 """The objects that are handled as one batch: their models, cameras and streams, and their contours at any poses."""
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -103,13 +102,21 @@ class ObjectBatch:
         scene = Scene(self.models, T_cam_obj, self.intrinsics, self.stream_index, self.diameter_m, self.image_shape, self.shared)
         return remove_hidden(contours, scene)
 
+    def rows(self, chosen: Int[Tensor, "k"]) -> "ObjectBatch":
+        """Some of the objects; where they are read on the CPU."""
+        places = [(model, torch.isin(chosen, model.members).nonzero()[:, 0]) for model in self.models]
+        models = [model.with_members(of_model) for model, of_model in places if len(of_model)]
+        own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m, self.stream_index
+        intrinsics, centre_obj, half_extent, diameter_m, stream_index = (value[chosen] for value in own)
+        learned = None if self.learned is None else LearnedPoints(*(value[chosen] for value in vars(self.learned).values()))
+        polarity = None if self.polarity is None else self.polarity[chosen]
+        shape, shared = self.image_shape, self.shared
+        return ObjectBatch(models, intrinsics, centre_obj, half_extent, diameter_m, stream_index, shape, shared, learned, polarity)
+
     def copies(self, number: int, count: int) -> "ObjectBatch":
         """One object many times, each in a stream of its own: copies do not hide one another."""
         streams = torch.arange(count, device=self.stream_index.device)
-        has_it = next(model for model in self.models if number in model.numbers)
-        # A shallow copy shares all tensors but the list of members.
-        model = copy.copy(has_it)
-        model.numbers, model._buffers = tuple(range(count)), {**has_it._buffers, "members": streams}
+        model = next(model for model in self.models if number in model.numbers).with_members(streams)
         own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m
         intrinsics, centre_obj, half_extent, diameter_m = (repeat_row(value, number, count) for value in own)
         learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))

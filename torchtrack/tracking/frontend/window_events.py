@@ -43,6 +43,10 @@ class WindowEvents:
         """The events of one object."""
         return self._with(lambda value: value[number : number + 1])
 
+    def of_objects(self, chosen: Int[Tensor, "k"]) -> "WindowEvents":
+        """The events of some objects, a row for each."""
+        return self._with(lambda value: value[chosen])
+
     def repeated(self, count: int) -> "WindowEvents":
         """The events of one object, for ``count`` of its kind."""
         return self._with(lambda value: value.expand(count, *value.shape[1:]))
@@ -84,6 +88,10 @@ class SharedEvents:
         exists = torch.arange(max(int(self.count.max()), 1)) < self.count[:, None]
         own = torch.where(exists, self.own[:, : exists.shape[1]], 0).long()
         return self.shared.repeated(len(own)).only(own, exists)
+
+    def of_objects(self, chosen: Int[Tensor, "k"]) -> WindowEvents:
+        """The events of some objects, a row for each."""
+        return replace(self, own=self.own[chosen], count=self.count[chosen]).rows()
 
     def counts(self) -> Int[Tensor, "b"]:
         """How many each object has."""
