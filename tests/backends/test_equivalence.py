@@ -16,6 +16,7 @@ from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.window_events import SharedEvents, WindowEvents
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
@@ -169,6 +170,10 @@ def _of(value):
         # The cells that it is laid out in are its own.
         v, u = torch.meshgrid(torch.arange(0.0, 150, 7), torch.arange(0.0, 320, 7), indexing="ij")
         return [value.look_up(torch.stack([u, v], -1).flatten(0, 1).to(value.pixels).expand(len(value.pixels), -1, -1))]
+    if isinstance(value, Corners):
+        # Which comes first does not matter.
+        rows = torch.cat([value.sensor_pixels, value.pixels, value.age_s[..., None], value.polarity[..., None]], -1)
+        return [value.mask.sum(-1), *(torch.tensor(sorted(of_object[mask].tolist())) for of_object, mask in zip(rows, value.mask, strict=True))]
     if isinstance(value, Contours | Matches | Observations):
         of_points = [tensor for tensor in tensors_of(value) if tensor.shape[:2] == value.mask.shape]
         return [value.mask, *(tensor[value.mask] for tensor in of_points)]

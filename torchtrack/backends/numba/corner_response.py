@@ -1,111 +1,142 @@
-"""The corner response of a CPU: kornia's guided filter and Harris response, with their sums taken by shifted slices.
+"""Where the corners of a surface are, row by row: kornia's guided filter and Harris response, as :mod:`torchtrack.tracking.frontend.filters` has them.
 
-kornia's run as convolutions with one channel: a step of the preset `nns` took 15.6 ms with those, and 6.8 ms with these.
+Both take sums of neighbours, which kornia computes as convolutions with one channel: slow on a CPU. Here they are sums of rows, then of
+places along them.
 """
 
 from math import exp
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-from torch.nn.functional import pad
+import numpy as np
 
-from torchtrack.core.dispatch import accelerates
-from torchtrack.tracking.frontend.filters import FILTER_EPS, FILTER_SIZE_PX, HARRIS_K, corner_response
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.tracking.frontend.filters import FILTER_EPS, FILTER_SIZE_PX, HARRIS_K
 
-_HARRIS_WINDOW_PX, _HARRIS_SIGMA_PX = 7, 1.0
+_REACH_PX = FILTER_SIZE_PX // 2
+_PIXELS = FILTER_SIZE_PX**2
+# Weights of kornia's Gaussian window of 7 px along one axis, in the middle and on either side of it.
+_WINDOW_REACH_PX, _SIGMA_PX = 3, 1.0
+_UNNORMALISED = tuple(exp(-0.5 * (step / _SIGMA_PX) ** 2) for step in range(_WINDOW_REACH_PX + 1))
+_WINDOW = tuple(weight / (2 * sum(_UNNORMALISED) - _UNNORMALISED[0]) for weight in _UNNORMALISED)
 # Our sums of the Sobel operator are this many times the gradient.
 _SOBEL_SCALE = 8.0
-# Large temporaries page-fault: surfaces are filtered this many at a time.
-_CHUNK = 8
 
 
-@accelerates(corner_response)
-def sliced_corner_response(surface: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
-    """A few surfaces at a time."""
-    parts = [sliced_harris(sliced_guided_filter(part, FILTER_SIZE_PX, FILTER_EPS)) for part in surface.split(_CHUNK)]
-    return torch.cat(parts) if len(parts) != 1 else parts[0]
+@kernel()
+def _mirrored(place: int, length: int) -> int:
+    """A place along an axis; beyond its ends, the image goes on mirrored."""
+    return -place if place < 0 else (place if place < length else 2 * (length - 1) - place)
 
 
-def _bordered(images: Float[Tensor, "b h w"], reach: tuple[int, int], border: str) -> Tensor:
-    """Images with so many more rows and columns on either side; ``border`` as in ``torch.nn.functional.pad``."""
-    rows, columns = reach
-    return pad(images[:, None], (columns, columns, rows, rows), border)[:, 0]
+@kernel()
+def _mirror(values: Array, reach: int) -> None:
+    """Fill so many places at either end of a row with its mirrored continuation."""
+    last = len(values) - 1
+    for k in range(reach):
+        values[k], values[last - k] = values[2 * reach - k], values[last - 2 * reach + k]
 
 
-def _weighted_shifts(image: Tensor, weights: tuple[float, ...], axis: int) -> Tensor:
-    """Correlation along one axis of an image that is already padded."""
-    length = image.shape[axis] - len(weights) + 1
-    total = image.narrow(axis, 0, length) * weights[0]
-    for shift, weight in enumerate(weights[1:], 1):
-        if weight:
-            total.add_(image.narrow(axis, shift, length), alpha=weight)
-    return total
+@kernel(fastmath=FAST)
+def _sum_of_rows(image: Array, row: int, sums: Array) -> None:
+    """Sums of the rows that a box around one row covers; ``sums`` is longer than a row by the box's reach at either end."""
+    height, width = image.shape
+    inner = sums[_REACH_PX : _REACH_PX + width]
+    inner[:] = image[_mirrored(row - _REACH_PX, height)]
+    for step in range(1 - _REACH_PX, _REACH_PX + 1):
+        other = image[_mirrored(row + step, height)]
+        for u in range(width):
+            inner[u] += other[u]
+    _mirror(sums, _REACH_PX)
 
 
-def separable_filter(
-    image: Float[Tensor, "b h w"], vertical: tuple[float, ...], horizontal: tuple[float, ...], border: str
-) -> Float[Tensor, "b h w"]:
-    """Correlation with the outer product of two odd kernels; ``border`` as in ``torch.nn.functional.pad``."""
-    rows, columns = len(vertical) // 2, len(horizontal) // 2
-    padded = _bordered(image, (rows, columns), border)
-    return _weighted_shifts(_weighted_shifts(padded, vertical, -2), horizontal, -1)
+@kernel(fastmath=FAST)
+def _sums_along(sums: Array, means: Array) -> None:
+    """Means over boxes, from sums over their columns."""
+    share = means.dtype.type(1.0 / _PIXELS)
+    for u in range(len(means)):
+        total = sums[u]
+        for k in range(1, FILTER_SIZE_PX):
+            total += sums[u + k]
+        means[u] = total * share
 
 
-def _sums_along(image: Tensor, size: int, axis: int) -> Tensor:
-    """Sums of an odd number of neighbours along one axis, put together from sums of 1, 2, 4 and so on."""
-    length = image.shape[axis] - size + 1
-    total, taken = image.narrow(axis, 0, length), 1
-    sums, width = image, 1
-    while 2 * width <= size:
-        begins = sums.shape[axis] - width
-        sums, width = sums.narrow(axis, 0, begins) + sums.narrow(axis, width, begins), 2 * width
-        if size & width:
-            total, taken = total + sums.narrow(axis, taken, length), taken + width
-    return total
+@kernel(fastmath=FAST)
+def guided_filter(image: Array, filtered: Array) -> None:
+    """The guided filter of He et al. (2013) with the image as its own guide: smooths, and keeps edges. Fills ``filtered [h, w]``."""
+    height, width = image.shape
+    eps, squares = image.dtype.type(FILTER_EPS), image * image
+    slopes, offsets = np.empty_like(image), np.empty_like(image)
+    sums, means, mean_squares = np.empty(width + 2 * _REACH_PX, image.dtype), np.empty(width, image.dtype), np.empty(width, image.dtype)
+    for v in range(height):
+        _sum_of_rows(image, v, sums)
+        _sums_along(sums, means)
+        _sum_of_rows(squares, v, sums)
+        _sums_along(sums, mean_squares)
+        for u in range(width):
+            variance = mean_squares[u] - means[u] * means[u]
+            slope = variance / (variance + eps)
+            slopes[v, u], offsets[v, u] = slope, means[u] - slope * means[u]
+    for v in range(height):
+        _sum_of_rows(slopes, v, sums)
+        _sums_along(sums, means)
+        _sum_of_rows(offsets, v, sums)
+        _sums_along(sums, mean_squares)
+        for u in range(width):
+            filtered[v, u] = mean_squares[u] + means[u] * image[v, u]
 
 
-def box_mean(images: Float[Tensor, "b h w"], size_px: int) -> Float[Tensor, "b h w"]:
-    """Mean over the square around each pixel; beyond its border an image goes on mirrored."""
-    padded = _bordered(images, (size_px // 2, size_px // 2), "reflect")
-    return _sums_along(_sums_along(padded, size_px, -2), size_px, -1) * size_px**-2
+@kernel(fastmath=FAST)
+def harris(image: Array, response: Array) -> None:
+    """Harris response ``det M - k tr² M`` with Sobel gradients and a Gaussian window; fills ``response [h, w]``."""
+    height, width = image.shape
+    products = np.empty((3, height, width), image.dtype)
+    _gradient_products(image, products)
+    k = image.dtype.type(HARRIS_K)
+    sums, rows = np.empty(width + 2 * _WINDOW_REACH_PX, image.dtype), np.empty((3, width), image.dtype)
+    for v in range(height):
+        for number in range(3):
+            _windowed(products[number], v, sums, rows[number])
+        for u in range(width):
+            uu, vv, uv = rows[0, u], rows[1, u], rows[2, u]
+            trace = uu + vv
+            response[v, u] = uu * vv - uv * uv - k * trace * trace
 
 
-def sliced_guided_filter(surface: Float[Tensor, "b h w"], size_px: int, eps: float) -> Float[Tensor, "b h w"]:
-    """The guided filter of He et al. (2013) with the image as its own guide: smooths, and keeps edges."""
-    average, square = box_mean(torch.cat([surface, surface.square()]), size_px).chunk(2)
-    variance = torch.addcmul(square, average, average, value=-1)
-    slope = variance / (variance + eps)
-    offset = torch.addcmul(average, slope, average, value=-1)
-    mean_slope, mean_offset = box_mean(torch.cat([slope, offset]), size_px).chunk(2)
-    return torch.addcmul(mean_offset, mean_slope, surface)
+@kernel(fastmath=FAST)
+def _gradient_products(image: Array, products: Array) -> None:
+    """Products of the gradient's parts, ``du²``, ``dv²`` and ``du dv``; beyond its border an image goes on with its outermost pixels."""
+    height, width = image.shape
+    scale, two = image.dtype.type(1.0 / _SOBEL_SCALE), image.dtype.type(2.0)
+    smooth, step = np.empty(width + 2, image.dtype), np.empty(width + 2, image.dtype)
+    for v in range(height):
+        above, own, below = image[max(v - 1, 0)], image[v], image[min(v + 1, height - 1)]
+        for u in range(width):
+            smooth[u + 1] = (above[u] + two * own[u] + below[u]) * scale
+            step[u + 1] = (below[u] - above[u]) * scale
+        smooth[0], smooth[-1], step[0], step[-1] = smooth[1], smooth[-2], step[1], step[-2]
+        uu, vv, uv = products[0, v], products[1, v], products[2, v]
+        for u in range(width):
+            du, dv = smooth[u + 2] - smooth[u], step[u] + two * step[u + 1] + step[u + 2]
+            uu[u], vv[u], uv[u] = du * du, dv * dv, du * dv
 
 
-def _harris_window() -> tuple[float, ...]:
-    """Weights of the Gaussian window along one axis."""
-    reach = _HARRIS_WINDOW_PX // 2
-    weights = [exp(-0.5 * (step / _HARRIS_SIGMA_PX) ** 2) for step in range(-reach, reach + 1)]
-    return tuple(weight / sum(weights) for weight in weights)
+@kernel(fastmath=FAST)
+def _windowed(image: Array, row: int, sums: Array, means: Array) -> None:
+    """Means of one row by the Gaussian window; ``sums`` is longer than a row by the window's reach at either end."""
+    height, width = image.shape
+    w0, w1, w2, w3 = (image.dtype.type(_WINDOW[0]), image.dtype.type(_WINDOW[1]), image.dtype.type(_WINDOW[2]), image.dtype.type(_WINDOW[3]))
+    a, b, c, d = image[_mirrored(row - 3, height)], image[_mirrored(row - 2, height)], image[_mirrored(row - 1, height)], image[row]
+    e, f, g = image[_mirrored(row + 1, height)], image[_mirrored(row + 2, height)], image[_mirrored(row + 3, height)]
+    for u in range(width):
+        sums[u + 3] = w0 * d[u] + w1 * (c[u] + e[u]) + w2 * (b[u] + f[u]) + w3 * (a[u] + g[u])
+    _mirror(sums, 3)
+    for u in range(width):
+        means[u] = w0 * sums[u + 3] + w1 * (sums[u + 2] + sums[u + 4]) + w2 * (sums[u + 1] + sums[u + 5]) + w3 * (sums[u] + sums[u + 6])
 
 
-def sliced_harris(image: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
-    """Harris response ``det M - k tr² M`` with Sobel gradients and a 7x7 Gaussian window."""
-    padded = _bordered(image, (1, 1), "replicate")
-    du, dv = _step(_smooth(padded, -2), -1), _step(_smooth(padded, -1), -2)
-    window = _harris_window()
-    scaled = tuple(weight / _SOBEL_SCALE**2 for weight in window)
-    uu, vv, uv = separable_filter(torch.cat([du * du, dv * dv, du * dv]), scaled, window, "reflect").chunk(3)
-    trace = uu + vv
-    return torch.addcmul(torch.addcmul(uu * vv, uv, uv, value=-1), trace, trace, value=-HARRIS_K)
-
-
-def _smooth(image: Tensor, axis: int) -> Tensor:
-    """Weights 1, 2, 1 along one axis."""
-    length = image.shape[axis] - 2
-    return torch.add(image.narrow(axis, 0, length) + image.narrow(axis, 2, length), image.narrow(axis, 1, length), alpha=2)
-
-
-def _step(image: Tensor, axis: int) -> Tensor:
-    """Difference of the neighbours on either side along one axis."""
-    length = image.shape[axis] - 2
-    return image.narrow(axis, 2, length) - image.narrow(axis, 0, length)
+@kernel()
+def corner_responses(surfaces: Array, responses: Array) -> None:
+    """Fill ``responses [b, h, w]``: Harris of what the guided filter leaves of each surface."""
+    filtered = np.empty(surfaces.shape[1:], surfaces.dtype)
+    for b in range(len(surfaces)):
+        guided_filter(surfaces[b], filtered)
+        harris(filtered, responses[b])

@@ -5,7 +5,7 @@ from torchtrack.backends.numba import (
     conclusion,
     contour_table,
     contours,
-    corner_response,
+    corners,
     events,
     filtering,
     flow_agreement,
@@ -17,6 +17,7 @@ from torchtrack.backends.numba import (
     selection,
     silhouette_features,
     solving,
+    time_surface,
     visibility,
 )
 
@@ -25,7 +26,7 @@ __all__ = [
     "conclusion",
     "contour_table",
     "contours",
-    "corner_response",
+    "corners",
     "events",
     "filtering",
     "flow_agreement",
@@ -37,5 +38,6 @@ __all__ = [
     "selection",
     "silhouette_features",
     "solving",
+    "time_surface",
     "visibility",
 ]

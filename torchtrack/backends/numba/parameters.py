@@ -59,6 +59,18 @@ class ArrivalSettings(NamedTuple):
     iterations: int
 
 
+class CornerSettings(NamedTuple):
+    """What :mod:`torchtrack.backends.numba.corners` goes by: constants of :mod:`torchtrack.tracking.frontend.corners`, and settings."""
+
+    relative_threshold: float
+    reach_px: int
+    largest_of_px: int
+    oldest_us: int
+    cell_px: int
+    count: int
+    snap_px: int
+
+
 class AgreementSettings(NamedTuple):
     """What :mod:`torchtrack.backends.numba.flow_agreement` goes by: constants of :mod:`torchtrack.tracking.association.flow_agreement`."""
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.constants import constant
+from torchtrack.core.dispatch import accelerable
 from torchtrack.tracking.frontend.filters import FILTER_SIZE_PX, corner_response
 from torchtrack.tracking.frontend.flow import SensorPoints
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
@@ -21,11 +22,13 @@ from torchtrack.tracking.frontend.time_surface import Regions, at_pixels
 # Least Harris response of a corner, as a share of the region's largest: set with the first corners, and not measured alone.
 RELATIVE_THRESHOLD = 1e-3
 # A corner is moved to the newest event this near (px): its 3x3 pixels.
-_SNAP_PX = 1
-# Sobel, Harris window and local maximum reach this far into a region from its border (px), beside the guided filter.
-_RESPONSE_REACH_PX = 6
+SNAP_PX = 1
+# The guided filter's two sums, and beside them Sobel, Harris window and local maximum, reach this far into a region from its border (px).
+REACH_PX = 2 * (FILTER_SIZE_PX // 2) + 6
+# Longer than anything that is looked at (µs).
+OLDEST_US = 10**9
 # Where cells are smaller than the neighbourhood that a corner is the largest of (px), one in each is asked for, and no more.
-_LARGEST_OF_PX = 5
+LARGEST_OF_PX = 5
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ def select_corners(response: Float[Tensor, "b h w"], regions: Regions, config: C
     _, height, width = response.shape
     cell = config.cell_px
     rows, columns = height // cell, width // cell
-    own = _own_area(response, regions, 2 * (FILTER_SIZE_PX // 2) + _RESPONSE_REACH_PX)
+    own = _own_area(response, regions, REACH_PX)
     # Rows first: along them, what is compared lies side by side in memory.
     score = own[:, : rows * cell, : columns * cell].unflatten(1, (rows, cell)).amax(2).unflatten(2, (columns, cell)).amax(3).flatten(1)
     best, chosen = score.topk(min(config.max_corners, score.shape[1]))
@@ -71,8 +74,8 @@ def select_corners(response: Float[Tensor, "b h w"], regions: Regions, config: C
     u, v = first_u + within % cell, first_v + torch.div(within, cell, rounding_mode="floor")
     strong = best > RELATIVE_THRESHOLD * best[:, :1]
     corners = strong & (best > 0)
-    if cell >= _LARGEST_OF_PX:
-        reach = _LARGEST_OF_PX // 2
+    if cell >= LARGEST_OF_PX:
+        reach = LARGEST_OF_PX // 2
         corners &= best >= _values_around(own, u, v, torch.arange(-reach, reach + 1, device=response.device)).amax(-1)
     return torch.stack([u, v], -1), corners
 
@@ -111,6 +114,7 @@ def snap_to_newest(
     return torch.stack([u, v], -2).gather(-1, best[..., None, :].expand(-1, -1, 2, -1))[..., 0], newest_us[..., 0]
 
 
+@accelerable
 def detect_corners(
     surface: Float[Tensor, "b h w"],
     regions: Regions,
@@ -136,9 +140,9 @@ def detect_corners(
     sensor = local + regions.origin[:, None]
     on_it = torch.minimum(sensor.clamp(min=0), constant((width - 1, height - 1), sensor.dtype, sensor.device))
     mask = mask & (on_it == sensor).all(-1)
-    reach_px = _SNAP_PX if config.uses(Component.CORNER_SNAP) else 0
+    reach_px = SNAP_PX if config.uses(Component.CORNER_SNAP) else 0
     sensor, newest_us = snap_to_newest(on_it, maps.last_event_us, regions.stream_index, reach_px)
-    age_s = ((t_us[stream] - newest_us).clamp(0, 10**9) * 1e-6).to(surface.dtype)
+    age_s = ((t_us[stream] - newest_us).clamp(0, OLDEST_US) * 1e-6).to(surface.dtype)
     pixels = at_pixels(ideal_pixels, stream, sensor[..., 0], sensor[..., 1])
     off_us, on_us = (at_pixels(maps.burst_age_us.flatten(0, 1), 2 * stream + number, sensor[..., 0], sensor[..., 1]) for number in range(2))
     polarity = torch.where(on_us < off_us, 1.0, -1.0).to(age_s.dtype)

@@ -1,6 +1,7 @@
 """From the time surface to where its corners are: kornia's guided filter and Harris response.
 
-On a CPU, ``torchtrack/backends/numba/corner_response.py`` takes their place: kornia's convolutions with one channel are slow there.
+On a CPU, a kernel takes the place of all that looks for corners (``torchtrack/backends/numba/corners.py``): kornia's convolutions with one
+channel are slow there.
 """
 
 import torch
@@ -8,8 +9,6 @@ from jaxtyping import Float
 from kornia.feature import harris_response
 from kornia.filters import guided_blur
 from torch import Tensor
-
-from torchtrack.core.dispatch import accelerable
 
 # Side of the guided filter's window (px, odd), and its regularisation (squared intensity; a surface is from 0 to 1). Both were set with the
 # first corners, and not measured alone.
@@ -19,7 +18,6 @@ HARRIS_K = 0.04
 _CHUNK = 8
 
 
-@accelerable
 def corner_response(surface: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
     """Harris response of the surface after the guided filter of He et al. (2013), with the surface as its own guide."""
     images = surface[:, None]

@@ -18,7 +18,7 @@ from torchtrack.core.padded import bounds
 # Time of a pixel that never fired: far in the past, and its age still fits int64 microseconds.
 NEVER_US = -(2**62)
 # Ages are clamped to this many decay constants: exp(-16) is zero to 1e-7, and exp of large negative numbers is slow.
-_MAX_DECAYS = 16.0
+MAX_DECAYS = 16.0
 # Origins on a grid keep a subsampled filter's phase independent of the other objects' regions (px).
 _GRID_PX = 4
 
@@ -111,6 +111,7 @@ def object_regions(
     return Regions(low, torch.minimum(extent, room), (height, width), stream_index)
 
 
+@accelerable
 def time_surface(
     last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], regions: Regions, tau_s: float, dtype: torch.dtype
 ) -> Float[Tensor, "b rh rw"]:
@@ -121,6 +122,6 @@ def time_surface(
     inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None, :]
     stream = regions.stream_index[:, None, None]
     newest_us = at_pixels(last_event_us, stream, columns.clamp(0, width - 1)[:, None, :], rows.clamp(0, height - 1)[:, :, None])
-    max_age_us = int(_MAX_DECAYS * tau_s * 1e6)
+    max_age_us = int(MAX_DECAYS * tau_s * 1e6)
     age_us = (t_us[stream] - newest_us).to(dtype).clamp_(0, max_age_us)
     return (age_us * (-1e-6 / tau_s)).exp_().mul_(inside & (age_us < max_age_us))
