@@ -28,9 +28,9 @@ def flow_at(
     valid: Array,
 ) -> None:
     """Fill ``flow [b, n, 2]`` and ``valid [b, n]``, which are zero so far; ``around [2, k]`` are the offsets of the pixels that take part."""
-    count = around.shape[1]
-    x, y, t = np.empty(count, flow.dtype), np.empty(count, flow.dtype), np.empty(count, flow.dtype)
-    height, width, known_us = ages_us.shape[2], ages_us.shape[3], settings.long_ago_us - settings.cut_off_us
+    count, reach = around.shape[1], around.max()
+    points, known_us = np.empty((4, count)), settings.long_ago_us - settings.cut_off_us
+    height, width = ages_us.shape[2], ages_us.shape[3]
     for b in range(len(pixels)):
         ages, ideal = ages_us[stream_index[b]], ideal_pixels[stream_index[b]]
         for i in range(pixels.shape[1]):
@@ -42,54 +42,63 @@ def flow_at(
             own_us, used = np.int32(of_polarity[v, u]), 0
             if own_us >= known_us:
                 continue
+            own_x, own_y = ideal[v, u, 0], ideal[v, u, 1]
+            is_within = reach <= u < width - reach and reach <= v < height - reach
             for k in range(count):
                 column, row = u + around[0, k], v + around[1, k]
-                if column < 0 or column >= width or row < 0 or row >= height:
+                if not is_within and (column < 0 or column >= width or row < 0 or row >= height):
                     continue
                 age_us = np.int32(of_polarity[row, column])
-                if age_us >= known_us or abs(own_us - age_us) > settings.span_us:
-                    continue
-                x[used], y[used] = ideal[row, column, 0] - ideal[v, u, 0], ideal[row, column, 1] - ideal[v, u, 1]
-                t[used], used = (own_us - age_us) * 1e-6, used + 1
+                # Written whether it counts or not: a processor would guess many of these branches wrong.
+                points[0, used], points[1, used] = ideal[row, column, 0] - own_x, ideal[row, column, 1] - own_y
+                points[2, used] = (own_us - age_us) * 1e-6
+                used += (age_us < known_us) & (abs(own_us - age_us) <= settings.span_us)
             if used >= settings.min_pixels:
-                flow[b, i, 0], flow[b, i, 1], valid[b, i] = _plane(x[:used], y[:used], t[:used], settings)
+                flow[b, i, 0], flow[b, i, 1], valid[b, i] = _plane(points, used, settings)
 
 
-@kernel(fastmath=FAST)
-def _plane(x: Array, y: Array, t: Array, settings: ArrivalSettings) -> tuple[float, float, bool]:
-    """The flow by a plane fitted to times, and whether there is one: :func:`torchtrack.tracking.frontend.arrival_flow.plane_flow`."""
-    weights = np.ones(len(x), x.dtype)
+@kernel(fastmath=FAST | {"reassoc"})
+def _plane(points: Array, count: int, settings: ArrivalSettings) -> tuple[float, float, bool]:
+    """The flow by a plane fitted to times, and whether there is one: :func:`torchtrack.tracking.frontend.arrival_flow.plane_flow`.
+
+    Args:
+        points: ``[4, k]``, offsets (px), times (s), and room for weights; so many of them count.
+    """
+    x, y, t, weights = points[0], points[1], points[2], points[3]
+    weights[:count] = 1.0
     for iteration in range(settings.iterations + 1):
-        total, mean_x, mean_y, mean_t = 0.0, 0.0, 0.0, 0.0
-        for k in range(len(x)):
+        total, sum_x, sum_y, sum_t = 0.0, 0.0, 0.0, 0.0
+        sum_xx, sum_xy, sum_yy, sum_xt, sum_yt = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(count):
             weight = weights[k]
-            total += weight
-            mean_x, mean_y, mean_t = mean_x + weight * x[k], mean_y + weight * y[k], mean_t + weight * t[k]
-        total = max(total, 1e-6)
-        mean_x, mean_y, mean_t = mean_x / total, mean_y / total, mean_t / total
-        xx, xy, yy, xt, yt = 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(len(x)):
-            dx, dy, dt, weight = x[k] - mean_x, y[k] - mean_y, t[k] - mean_t, weights[k]
-            xx, xy, yy, xt, yt = xx + weight * dx * dx, xy + weight * dx * dy, yy + weight * dy * dy, xt + weight * dx * dt, yt + weight * dy * dt
-        xx, xy, yy, xt, yt = xx / total, xy / total, yy / total, xt / total, yt / total
+            wx, wy = weight * x[k], weight * y[k]
+            total, sum_x, sum_y, sum_t = total + weight, sum_x + wx, sum_y + wy, sum_t + weight * t[k]
+            sum_xx, sum_xy, sum_yy = sum_xx + wx * x[k], sum_xy + wx * y[k], sum_yy + wy * y[k]
+            sum_xt, sum_yt = sum_xt + wx * t[k], sum_yt + wy * t[k]
+        share = 1.0 / max(total, 1e-6)
+        mean_x, mean_y, mean_t = sum_x * share, sum_y * share, sum_t * share
+        xx, xy, yy = sum_xx * share - mean_x * mean_x, sum_xy * share - mean_x * mean_y, sum_yy * share - mean_y * mean_y
+        xt, yt = sum_xt * share - mean_x * mean_t, sum_yt * share - mean_y * mean_t
         determinant = xx * yy - xy * xy
-        bounded = max(determinant, 1e-4)
-        a, b = (yy * xt - xy * yt) / bounded, (xx * yt - xy * xt) / bounded
-        absolute, square = 0.0, 0.0
-        for k in range(len(x)):
-            residual = t[k] - mean_t - a * (x[k] - mean_x) - b * (y[k] - mean_y)
-            absolute, square = absolute + weights[k] * abs(residual), square + weights[k] * residual * residual
+        per = 1.0 / max(determinant, 1e-4)
+        a, b = (yy * xt - xy * yt) * per, (xx * yt - xy * xt) * per
+        c, absolute, square = mean_t - a * mean_x - b * mean_y, 0.0, 0.0
+        for k in range(count):
+            residual = abs(t[k] - c - a * x[k] - b * y[k])
+            absolute, square = absolute + weights[k] * residual, square + weights[k] * residual * residual
         total = max(total, 1.0)
         if iteration == settings.iterations:
-            slope2, spread_px2, used = a * a + b * b, max(min(xx, yy), settings.least_spread_px2), (weights > 0).sum()
+            slope2, spread_px2, used = a * a + b * b, max(min(xx, yy), settings.least_spread_px2), (weights[:count] > 0).sum()
             exact = slope2 * total * spread_px2 > settings.slope_sigmas**2 * square / total
             if used >= settings.min_pixels and determinant > settings.least_determinant and exact and slope2 > settings.least_slope2:
                 return a / slope2, b / slope2, True
             return 0.0, 0.0, False
-        bound = settings.bound * max(absolute / total, settings.least_scale_s)
-        for k in range(len(x)):
-            relative = (t[k] - mean_t - a * (x[k] - mean_x) - b * (y[k] - mean_y)) / bound
-            weights[k] = max(1.0 - relative * relative, 0.0) ** 2 * (abs(a * x[k] + b * y[k]) < settings.plane_s)
+        per_bound = 1.0 / (settings.bound * max(absolute / total, settings.least_scale_s))
+        for k in range(count):
+            along = a * x[k] + b * y[k]
+            relative = (t[k] - c - along) * per_bound
+            weight = max(1.0 - relative * relative, 0.0)
+            weights[k] = weight * weight if abs(along) < settings.plane_s else 0.0
     return 0.0, 0.0, False
 
 

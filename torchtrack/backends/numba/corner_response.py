@@ -1,4 +1,4 @@
-"""Where the corners of a surface are, row by row: kornia's guided filter and Harris response, as :mod:`torchtrack.tracking.frontend.filters` has them.
+"""Where the corners of a surface are, row by row: kornia's guided filter and Harris response, as in ``tracking/frontend/filters.py``.
 
 Both take sums of neighbours, which kornia computes as convolutions with one channel: slow on a CPU. Here they are sums of rows, then of
 places along them.
