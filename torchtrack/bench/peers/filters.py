@@ -1,5 +1,6 @@
 """Guided filter and Harris response of a time surface: ours, kornia's and OpenCV's."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -11,7 +12,7 @@ from kornia.feature import harris_response
 from kornia.filters import guided_blur
 from numpy import ndarray
 
-from torchtrack.backends.numba.corner_response import sliced_guided_filter, sliced_harris
+from torchtrack.backends.numba.corner_response import guided_filter, harris
 from torchtrack.bench.peers.comparison import Comparison, Work
 from torchtrack.bench.surface import WINDOW_US, random_events
 from torchtrack.config.tracker import SurfaceConfig
@@ -31,14 +32,14 @@ def compare(comparison: Comparison) -> None:
     for width, height in SIZES:
         image = surface_image(width, height).to(comparison.setup.device)
         plain, size = image[0].cpu().numpy(), f"{width}x{height}"
-        guided = comparison.time(f"guided filter {size}: torchtrack", partial(sliced_guided_filter, image, FILTER_SIZE_PX, FILTER_EPS))
-        harris = comparison.time(f"Harris {size}: torchtrack", partial(sliced_harris, image))
-        expected = sliced_guided_filter(image, FILTER_SIZE_PX, FILTER_EPS)[0].cpu().numpy()
+        smoothed = comparison.time(f"guided filter {size}: torchtrack", partial(_filtered, guided_filter, plain))
+        response = comparison.time(f"Harris {size}: torchtrack", partial(_filtered, harris, plain))
+        expected = _filtered(guided_filter, plain)
         works = (
-            (guided, "kornia", "kornia", partial(_kornia_guided, image), expected),
-            (guided, "OpenCV", "opencv-contrib-python-headless, in place of opencv-python-headless", partial(_opencv_guided, plain), expected),
-            (harris, "kornia", "kornia", partial(_kornia_harris, image), sliced_harris(image)[0].cpu().numpy()),
-            (harris, "OpenCV", "opencv-python-headless", partial(_opencv_harris, plain), None),
+            (smoothed, "kornia", "kornia", partial(_kornia_guided, image), expected),
+            (smoothed, "OpenCV", "opencv-contrib-python-headless, in place of opencv-python-headless", partial(_opencv_guided, plain), expected),
+            (response, "kornia", "kornia", partial(_kornia_harris, image), _filtered(harris, plain)),
+            (response, "OpenCV", "opencv-python-headless", partial(_opencv_harris, plain), None),
         )
         for ours, name, package, make, result in works:
             full_name = ours.name.replace("torchtrack", name)
@@ -54,6 +55,13 @@ def surface_image(width: int, height: int) -> Float[torch.Tensor, "1 h w"]:
     zeros = torch.zeros(1, 2, dtype=torch.int64)
     regions = Regions(zeros, torch.tensor([[width, height]]), (height, width), zeros[:, 0])
     return time_surface(newest, torch.tensor([WINDOW_US]), regions, _TAU_S, torch.float32)
+
+
+def _filtered(filtering: Callable[[ndarray, ndarray], None], image: ndarray) -> ndarray:
+    """What a kernel makes of an image."""
+    result = np.empty_like(image)
+    filtering(image, result)
+    return result
 
 
 def _compare_images(comparison: Comparison, name: str, ours: ndarray | None, theirs: ndarray) -> None:
