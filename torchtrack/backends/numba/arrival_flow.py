@@ -52,7 +52,7 @@ def flow_at(
                 # Written whether it counts or not: a processor would guess many of these branches wrong.
                 points[0, used], points[1, used] = ideal[row, column, 0] - own_x, ideal[row, column, 1] - own_y
                 points[2, used] = (own_us - age_us) * 1e-6
-                used += (age_us < known_us) & (abs(own_us - age_us) <= settings.span_us)
+                used += 1 if (age_us < known_us) & (abs(own_us - age_us) <= settings.span_us) else 0
             if used >= settings.min_pixels:
                 flow[b, i, 0], flow[b, i, 1], valid[b, i] = _plane(points, used, settings)
 

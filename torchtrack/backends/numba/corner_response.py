@@ -11,8 +11,8 @@ import numpy as np
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.tracking.frontend.filters import FILTER_EPS, FILTER_SIZE_PX, HARRIS_K
 
+# Reach of the guided filter's boxes of 5 px.
 _REACH_PX = FILTER_SIZE_PX // 2
-_PIXELS = FILTER_SIZE_PX**2
 # Weights of kornia's Gaussian window of 7 px along one axis, in the middle and on either side of it.
 _WINDOW_REACH_PX, _SIGMA_PX = 3, 1.0
 _UNNORMALISED = tuple(exp(-0.5 * (step / _SIGMA_PX) ** 2) for step in range(_WINDOW_REACH_PX + 1))
@@ -39,24 +39,19 @@ def _mirror(values: Array, reach: int) -> None:
 def _sum_of_rows(image: Array, row: int, sums: Array) -> None:
     """Sums of the rows that a box around one row covers; ``sums`` is longer than a row by the box's reach at either end."""
     height, width = image.shape
-    inner = sums[_REACH_PX : _REACH_PX + width]
-    inner[:] = image[_mirrored(row - _REACH_PX, height)]
-    for step in range(1 - _REACH_PX, _REACH_PX + 1):
-        other = image[_mirrored(row + step, height)]
-        for u in range(width):
-            inner[u] += other[u]
-    _mirror(sums, _REACH_PX)
+    a, b, c = image[_mirrored(row - 2, height)], image[_mirrored(row - 1, height)], image[row]
+    d, e = image[_mirrored(row + 1, height)], image[_mirrored(row + 2, height)]
+    for u in range(width):
+        sums[u + 2] = a[u] + b[u] + c[u] + d[u] + e[u]
+    _mirror(sums, 2)
 
 
 @kernel(fastmath=FAST)
 def _sums_along(sums: Array, means: Array) -> None:
     """Means over boxes, from sums over their columns."""
-    share = means.dtype.type(1.0 / _PIXELS)
+    share = means.dtype.type(1.0 / FILTER_SIZE_PX**2)
     for u in range(len(means)):
-        total = sums[u]
-        for k in range(1, FILTER_SIZE_PX):
-            total += sums[u + k]
-        means[u] = total * share
+        means[u] = (sums[u] + sums[u + 1] + sums[u + 2] + sums[u + 3] + sums[u + 4]) * share
 
 
 @kernel(fastmath=FAST)

@@ -78,7 +78,7 @@ def _keep_own(response: Array, surface: Array, least: float, extent: Array, reac
 @kernel()
 def _best_of_cells(response: Array, settings: CornerSettings, best: Array, places: Array) -> int:
     """Fill in the largest response of each cell, and where it is, of cells that are strong enough, and of no more than asked for: how many."""
-    cell, most, count = settings.cell_px, response.dtype.type(0), 0
+    cell, largest, count = settings.cell_px, response.dtype.type(0), 0
     columns, nothing = response.shape[1] // cell, response.dtype.type(0)
     of_row, at = np.empty(columns, response.dtype), np.empty((columns, 2), np.int32)
     for row in range(response.shape[0] // cell):
@@ -91,10 +91,10 @@ def _best_of_cells(response: Array, settings: CornerSettings, best: Array, place
         for column in range(columns):
             if of_row[column] > nothing:
                 best[count], places[count, 0], places[count, 1] = of_row[column], at[column, 0], at[column, 1]
-                most, count = max(most, of_row[column]), count + 1
-    bound, kept = response.dtype.type(settings.relative_threshold) * most, 0
-    if count > settings.count:
-        bound = max(bound, -np.partition(-best[:count], settings.count)[settings.count])
+                largest, count = max(largest, of_row[column]), count + 1
+    bound, kept = response.dtype.type(settings.relative_threshold) * largest, 0
+    if count > settings.most:
+        bound = max(bound, -np.partition(-best[:count], settings.most)[settings.most])
     for i in range(count):
         if best[i] > bound:
             best[kept], places[kept], kept = best[i], places[i], kept + 1
@@ -137,7 +137,7 @@ def detect_corners_numba(
     (batch, height, width), cell = surface.shape, config.corners.cell_px
     count = min(config.corners.max_corners, (height // cell) * (width // cell))
     snap_px = reference.SNAP_PX if config.uses(Component.CORNER_SNAP) else 0
-    settings = filled(CornerSettings, reference, cell_px=cell, count=count, snap_px=snap_px)
+    settings = filled(CornerSettings, reference, cell_px=cell, most=count, snap_px=snap_px)
     # Of no surface is anything as little as that.
     oldest = torch.exp(window_s / -config.surface.tau_s) if config.uses(Component.FRESH_CORNERS) else torch.full_like(window_s, -1.0)
     values, responses = surface.contiguous(), torch.empty(surface.shape, dtype=surface.dtype)

@@ -67,7 +67,7 @@ class CornerSettings(NamedTuple):
     largest_of_px: int
     oldest_us: int
     cell_px: int
-    count: int
+    most: int
     snap_px: int
 
 

@@ -1,4 +1,4 @@
-"""The time surface pixel by pixel: :func:`torchtrack.tracking.frontend.time_surface.time_surface`."""
+"""Regions of objects contour by contour, and their time surfaces pixel by pixel: :mod:`torchtrack.tracking.frontend.time_surface`."""
 
 import numpy as np
 import torch
@@ -8,8 +8,50 @@ from torch import Tensor
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.core.dispatch import accelerates
+from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend import time_surface
-from torchtrack.tracking.frontend.time_surface import Regions
+from torchtrack.tracking.frontend.history import BORDER_PX
+from torchtrack.tracking.frontend.sensors import Sensors
+from torchtrack.tracking.frontend.time_surface import GRID_PX, Regions, regions_of
+
+
+@kernel()
+def around(
+    pixels: Array, mask: Array, stream_index: Array, sensor_pixels: Array, size: tuple[int, int, int, int, int], origin: Array, extent: Array
+) -> None:
+    """Rectangles around contours: :func:`torchtrack.tracking.frontend.time_surface.object_regions`.
+
+    Args:
+        size: height and width of the sensor, border of the table ``sensor_pixels [s, bh, bw, 2]``, margin, and grid of the rectangles (px).
+        origin, extent: ``[b, 2]``, filled.
+    """
+    height, width, border_px, margin_px, grid_px = size
+    last_row, last_column = sensor_pixels.shape[1] - 1, sensor_pixels.shape[2] - 1
+    border = pixels.dtype.type(border_px)
+    for b in range(len(pixels)):
+        table, left, top, right, bottom = sensor_pixels[stream_index[b]], np.inf, np.inf, -np.inf, -np.inf
+        for i in range(pixels.shape[1]):
+            if not mask[b, i]:
+                continue
+            column = int(np.rint(min(max(pixels[b, i, 0] + border, 0.0), last_column)))
+            row = int(np.rint(min(max(pixels[b, i, 1] + border, 0.0), last_row)))
+            u, v = table[row, column, 0], table[row, column, 1]
+            if 0 <= u <= width - 1 and 0 <= v <= height - 1:
+                left, top, right, bottom = min(left, u), min(top, v), max(right, u), max(bottom, v)
+        if left > right:
+            left, top, right, bottom = 0.0, 0.0, 0.0, 0.0
+        origin[b, 0] = (int(np.floor(left)) - margin_px) // grid_px * grid_px
+        origin[b, 1] = (int(np.floor(top)) - margin_px) // grid_px * grid_px
+        extent[b, 0], extent[b, 1] = int(np.ceil(right)) + margin_px - origin[b, 0] + 1, int(np.ceil(bottom)) + margin_px - origin[b, 1] + 1
+
+
+@accelerates(Sensors.regions)
+def regions_numba(sensors: Sensors, contours: Contours, margin_px: int) -> Regions:
+    """Contour by contour."""
+    origin, extent = torch.empty(len(contours.mask), 2, dtype=torch.int64), torch.empty(len(contours.mask), 2, dtype=torch.int64)
+    of_contours = as_arrays(contours.pixels, contours.mask, sensors.stream_index, sensors.sensor_pixels)
+    around(*of_contours, (*sensors.image_size, BORDER_PX, margin_px, GRID_PX), *as_arrays(origin, extent))
+    return regions_of(origin, extent, sensors.stream_index)
 
 
 @kernel()

@@ -22,7 +22,7 @@ from torchtrack.tracking.frontend.flow import SensorPoints, estimate_flow
 from torchtrack.tracking.frontend.history import BORDER_PX, History, numbers_of, on_sensor, pixel_numbers
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
-from torchtrack.tracking.frontend.time_surface import at_pixels, object_regions, time_surface
+from torchtrack.tracking.frontend.time_surface import Regions, at_pixels, object_regions, time_surface
 from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 
@@ -121,9 +121,14 @@ class Sensors:
         if config.corners.max_corners == 0:
             return no_corners(contours.pixels)
         margin_px = _ALONG_FLOW_MARGIN_PX if config.association.search == "along_flow" else REGION_MARGIN_PX
-        regions = object_regions(self.on_sensor(contours.pixels), contours.mask, self.stream_index, self.image_size, margin_px, _MAX_REGION_PX)
+        regions = self.regions(contours, margin_px)
         surface = time_surface(maps.last_event_us, t_us, regions, config.surface.tau_s, self.ideal_pixels.dtype)
         return detect_corners(surface, regions, maps, t_us, window_s, self.ideal_pixels, config)
+
+    @accelerable
+    def regions(self, contours: Contours, margin_px: int) -> Regions:
+        """The rectangle of the sensor around each object's contours, with a margin."""
+        return object_regions(self.on_sensor(contours.pixels), contours.mask, self.stream_index, self.image_size, margin_px, _MAX_REGION_PX)
 
     def flow(
         self, points: SensorPoints, maps: SensorMaps, t_us: Int[Tensor, "s"], config: TrackerConfig

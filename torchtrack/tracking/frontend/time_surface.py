@@ -20,7 +20,7 @@ NEVER_US = -(2**62)
 # Ages are clamped to this many decay constants: exp(-16) is zero to 1e-7, and exp of large negative numbers is slow.
 MAX_DECAYS = 16.0
 # Origins on a grid keep a subsampled filter's phase independent of the other objects' regions (px).
-_GRID_PX = 4
+GRID_PX = 4
 
 
 def at_pixels(maps: Shaped[Tensor, "s h w *c"], stream: Int[Tensor, "*#p"], u: Int[Tensor, "*#p"], v: Int[Tensor, "*#p"]) -> Shaped[Tensor, "..."]:
@@ -99,16 +99,21 @@ def object_regions(
     empty = ~inside.any(1, keepdim=True)
     low = torch.where(empty, torch.zeros_like(low), low).floor().long() - margin_px
     high = torch.where(empty, torch.zeros_like(high), high).ceil().long() + margin_px
-    low = torch.div(low, _GRID_PX, rounding_mode="floor") * _GRID_PX
+    low = torch.div(low, GRID_PX, rounding_mode="floor") * GRID_PX
     extent = high - low + 1
     if host_sync.read_at_once(extent):
-        width, height = (-(-extent.amax(0) // 16) * 16).tolist()
-        return Regions(low, extent, (height, width), stream_index)
-    height, width = (-(-min(side + 2 * margin_px + _GRID_PX, largest_px) // 16) * 16 for side in sensor_size)
+        return regions_of(low, extent, stream_index)
+    height, width = (-(-min(side + 2 * margin_px + GRID_PX, largest_px) // 16) * 16 for side in sensor_size)
     room = constant((width, height), extent.dtype, extent.device)
     too_large = (extent - room).clamp(min=0)
-    low = low + torch.div(too_large, 2 * _GRID_PX, rounding_mode="floor") * _GRID_PX
+    low = low + torch.div(too_large, 2 * GRID_PX, rounding_mode="floor") * GRID_PX
     return Regions(low, torch.minimum(extent, room), (height, width), stream_index)
+
+
+def regions_of(origin: Int[Tensor, "b 2"], extent: Int[Tensor, "b 2"], stream_index: Int[Tensor, "b"]) -> Regions:
+    """Rectangles of a size that all of them fit in."""
+    width, height = (-(-extent.amax(0) // 16) * 16).tolist()
+    return Regions(origin, extent, (height, width), stream_index)
 
 
 @accelerable
