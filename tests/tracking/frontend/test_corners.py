@@ -291,3 +291,38 @@ def test_more_regions_than_are_filtered_at_a_time():
     for number in (0, 8, 18):
         single = detect(last, object_regions(pixels[number : number + 1], mask[:1], torch.tensor([0]), (120, 160), 16, 256))
         assert actual(many, number) == actual(single)
+
+
+# ---- kernels
+
+
+@pytest.mark.parametrize("cell_px", [3, 8])
+@pytest.mark.parametrize("most", [7, 2000])
+@pytest.mark.parametrize("without", [(), (Component.FRESH_CORNERS, Component.CORNER_SNAP)])
+def test_kernels_choose_the_corners_that_the_reference_does(cell_px, most, without):
+    """Of objects of two streams, of which some are partly outside the sensor; more corners than are asked for, or fewer."""
+    pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
+    last = torch.full((2, 120, 160), NEVER_US)
+    for stream in range(2):
+        events = random_events(6000, width=160, height=120, duration_us=40_000, seed=stream)
+        last[stream] = update_last_event(last[:1], events)[0]
+    ages = torch.randint(0, 32_000, (2, 2, 120, 160), generator=generator(7)).to(torch.int16)
+    regions = Regions(torch.tensor([[0, 0], [-12, 40], [96, 80]]), torch.tensor([[96, 96], [90, 80], [93, 70]]), (96, 96), torch.tensor([0, 1, 1]))
+    config = TrackerConfig(corners=CornerConfig(max_corners=most, cell_px=cell_px), disabled=frozenset(without))
+    now, window, table = torch.tensor([40_000, 41_000]), torch.tensor([0.02, 0.03], dtype=torch.float64), pixel_table(2, 120, 160, torch.float64)
+
+    def corners():
+        surface = time_surface(last, now, regions, SURFACE.tau_s, torch.float64)
+        return detect_corners(surface, regions, SensorMaps(last, ages), now, window, table, config)
+
+    with torch.inference_mode():
+        ours = corners()
+        with dispatch.backend(wanted=False):
+            theirs = corners()
+    for number in range(3):
+        rows = []
+        for of in (ours, theirs):
+            values = torch.cat([of.sensor_pixels, of.pixels, of.polarity[..., None], of.age_s[..., None]], -1)[number][of.mask[number]]
+            rows.append(torch.tensor(sorted(values.tolist())))
+        assert len(rows[0]) > 0
+        torch.testing.assert_close(rows[0], rows[1], rtol=0, atol=1e-8)
