@@ -321,8 +321,9 @@ def test_kernels_choose_the_corners_that_the_reference_does(cell_px, most, witho
             theirs = corners()
     for number in range(3):
         rows = []
-        for of in (ours, theirs):
-            values = torch.cat([of.sensor_pixels, of.pixels, of.polarity[..., None], of.age_s[..., None]], -1)[number][of.mask[number]]
+        for chosen in (ours, theirs):
+            values = torch.cat([chosen.sensor_pixels, chosen.pixels, chosen.polarity[..., None], chosen.age_s[..., None]], -1)
+            values = values[number][chosen.mask[number]]
             rows.append(torch.tensor(sorted(values.tolist())))
         assert len(rows[0]) > 0
         torch.testing.assert_close(rows[0], rows[1], rtol=0, atol=1e-8)
