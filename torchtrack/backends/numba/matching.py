@@ -83,8 +83,11 @@ def match(
     """
     given, derived, cell, votes = room
     votes[:] = 0.0
-    for begin in range(0, seen.shape[1], BLOCK):
-        end = min(begin + BLOCK, seen.shape[1])
+    count = _places_in_use(exists)
+    # Of many objects, most have far fewer observations than places.
+    contour[count:], is_near[count:], is_matched[count:], matches[:, count:] = 0, False, False, 0.0
+    for begin in range(0, count, BLOCK):
+        end = min(begin + BLOCK, count)
         _look_up(begin, end, seen, exists, place, table, nearest_of_cell, first, cells, subcell_lookup, contour, is_near, given, derived)
         _compare(given, pose, motion, intrinsics, gate_px, wider, settings, derived, cell)
         _vote(end - begin, derived, cell, settings, votes)
@@ -92,7 +95,16 @@ def match(
         _write(begin, end, derived, _TO_WEIGH, matches)
         if is_last:
             _write(begin, end, derived, _THE_REST, matches)
-    _weigh(matches, votes, settings)
+    _weigh(count, matches, votes, settings)
+
+
+@kernel()
+def _places_in_use(exists: Array) -> int:
+    """How many places there are up to the last one with an observation."""
+    for i in range(len(exists), 0, -1):
+        if exists[i - 1]:
+            return i
+    return 0
 
 
 @kernel(fastmath=FAST)
@@ -211,11 +223,11 @@ def _write(begin: int, end: int, derived: Array, rows: tuple[int, ...], matches:
 
 
 @kernel(fastmath=FAST)
-def _weigh(matches: Array, votes: Array, settings: MatchingSettings) -> None:
+def _weigh(count: int, matches: Array, votes: Array, settings: MatchingSettings) -> None:
     """How far each match is to be trusted by those around it; what has no contour point, not at all."""
     gain = 1.0 / (settings.gathered_share - settings.smeared_share)
     as_expected, dark, weights = matches[AS_EXPECTED], matches[DARK], matches[WEIGHT]
-    for i in range(len(weights)):
+    for i in range(count):
         cell = np.uint64(patch(matches[TARGET_U, i], matches[TARGET_V, i], settings.patch_bits, settings.patches))
         on = votes[cell, _ON]
         weight = as_expected[i]
