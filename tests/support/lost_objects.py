@@ -24,6 +24,7 @@ SEEN_WELL = {
     "is_starting": False,
     "is_due": False,
     "is_drift_due": False,
+    "is_near_due": True,
     "earlier": int(NONE),
 }
 

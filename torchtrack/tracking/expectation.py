@@ -56,7 +56,7 @@ def expect(tracked: TrackedObjects, state: TrackerState, events: EventBatch, t_u
     if tracked.config.uses(Component.SPEED_FROM_EVENTS) and not reads.none_of(never_found):
         state = held_back(state, never_found, objects, tracked.sensors.seen(pad_streams(events, tracked.streams, t_us)), dt_s)
     if not reads.none_of(lost):
-        state = LastSeen.from_state(state, objects, t_us, tracked.config).in_place_of(state, lost)
+        state = LastSeen.from_state(state, objects, tracked.config).in_place_of(state, lost)
     return Expected(predicted_after(tracked, state, dt_s, objects), window_s, dt_s, scheduled)
 
 

@@ -117,7 +117,7 @@ def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> t
     window = steady_window(tracked, state, given)
     # A GPU is waited for: a pose that begins to slip is farther off a window later.
     searches = given.reads.ask(has(window.triggers, SEARCHED), False).any()
-    return update(tracked, state, window, relocalized(tracked, state, window, given.t_us) if searches else window.located, given)
+    return update(tracked, state, window, relocalized(tracked, state, window) if searches else window.located, given)
 
 
 def steady_window(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> SteadyWindow:
@@ -128,7 +128,9 @@ def steady_window(tracked: TrackedObjects, state: TrackerState, given: StepInput
     scored = validate(tracked, state, expected, seen, fit)
     is_starting = torch.zeros_like(tracked.stream_index, dtype=torch.bool) if given.is_starting is None else given.is_starting
     evidence = gather_evidence(state, expected.scheduled, scored, seen.sigma_px, is_starting)
-    return SteadyWindow(expected, seen, scored, evidence, triggers(evidence, tracked.config))
+    reasons = triggers(evidence, tracked.config)
+    # A part of a window is taken for the objects that start: what the others come to in it is not kept.
+    return SteadyWindow(expected, seen, scored, evidence, reasons if given.is_starting is None else torch.where(is_starting, reasons, 0))
 
 
 def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, given: StepInput) -> Observed:
@@ -171,9 +173,9 @@ def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, s
     return score_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference)
 
 
-def relocalized(tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, t_us: Int[Tensor, "s"]) -> Relocalized:
+def relocalized(tracked: TrackedObjects, state: TrackerState, window: SteadyWindow) -> Relocalized:
     """Stage 5: other poses for objects that have a trigger, and for no others."""
-    last_seen = LastSeen.from_state(state, tracked.objects, t_us, tracked.config)
+    last_seen = LastSeen.from_state(state, tracked.objects, tracked.config)
     return relocalize(window.located, window.triggers, window.evidence, window.seen.events, last_seen, tracked.config)
 
 
@@ -242,6 +244,6 @@ def looked_for(
 ) -> tuple[TrackerState, StepResult]:
     """State and result of a window of :func:`steady_lane`, with those looked for that have triggers: as :func:`advance` gives them."""
     given = StepInput(events, t_us, learns=learns)
-    next_state, result = update(tracked, state, window, relocalized(tracked, state, window, t_us), given)
+    next_state, result = update(tracked, state, window, relocalized(tracked, state, window), given)
     # What it passes on is in the graph's memory.
     return each_tensor(Tensor.clone, next_state), each_tensor(Tensor.clone, result)

@@ -31,13 +31,12 @@ _WIDEST_PX = 0.2 * (SMALL_CAMERA.width**2 + SMALL_CAMERA.height**2) ** 0.5
 
 def test_the_longer_it_was_not_seen_the_farther_it_is_looked_for_and_one_look_after_the_other():
     tracker, state, *_ = started()
-    first_us = 30_000
     sigma = [
-        LastSeen.from_state(unseen(state, time_since_validated_s), tracker.objects, torch.tensor([first_us + 10_000 * look]), CONFIG)
+        LastSeen.from_state(unseen(state, time_since_validated_s, looks=torch.tensor([look])), tracker.objects, CONFIG)
         .covariance[0]
         .diagonal()
         .sqrt()
-        for time_since_validated_s, look in ((0.1, 0), (0.1, 1), (0.1, 2), (0.2, 2), (5.0, 2))
+        for time_since_validated_s, look in ((0.1, 0), (0.1, 1), (0.1, 2), (0.2, 5), (5.0, 2))
     ]
     assert [float(values[0]) for values in sigma[:3]] == pytest.approx([1 / 3, 2 / 3, 1.0])
     px_per_m = float(tracker.objects.px_per_m(state.health.T_last_validated.float()))
@@ -51,7 +50,7 @@ def test_what_is_lost_rests_where_it_was_seen_well_and_its_neighbour_goes_on():
     both = joined([unseen(state), state])
     both = replace(both, t_us=state.t_us, maps=state.maps)
     both = changed(both, T_cam_obj=moved_away(tracker, both, 0.4), velocity=both.velocity + 1)
-    last_seen = LastSeen.from_state(both, tracker.objects, torch.tensor([30_000]), CONFIG)
+    last_seen = LastSeen.from_state(both, tracker.objects, CONFIG)
     after = last_seen.in_place_of(both, torch.tensor([True, False]))
     assert torch.equal(after.T_cam_obj[0], both.health.T_last_validated[0]) and torch.equal(after.T_cam_obj[1], both.T_cam_obj[1])
     assert not after.velocity[0].any() and torch.equal(after.velocity[1], both.velocity[1])

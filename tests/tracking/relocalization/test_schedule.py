@@ -25,6 +25,30 @@ def test_it_is_time_once_in_every_interval_whatever_the_windows():
     assert torch.equal(of_each[0], due) and of_each[1].all()
 
 
+def times_due(tracker, state, interval_us=10_000):
+    """How often in 0.8 s it is time for an object that was not seen well all the while, by what for."""
+    config = TrackerConfig(relocalization=RelocalizationConfig(interval_us=interval_us))
+    each = []
+    for end_us in range(0, 800_000, 5000):
+        before = changed(state, t_us=state.t_us * 0 + end_us)
+        due = schedule(before, tracker.objects, before.t_us + 5000, config)
+        each.append(torch.cat([due.is_due, due.is_drift_due, due.is_near_due]))
+    return torch.stack(each).sum(0).tolist()
+
+
+@pytest.mark.parametrize(
+    ("unseen_s", "expected"), [(0.0, [80, 16, 160]), (0.09, [80, 16, 160]), (0.11, [40, 16, 40]), (0.5, [10, 10, 10]), (9.0, [5, 5, 5])]
+)
+def test_what_was_not_seen_well_for_twice_as_long_is_looked_for_half_as_often(unseen_s, expected):
+    tracker, state, *_ = started()
+    assert times_due(tracker, unseen(state, unseen_s)) == expected
+
+
+def test_what_is_to_be_looked_for_in_every_window_is_however_long_it_is_lost():
+    tracker, state, *_ = started()
+    assert times_due(tracker, unseen(state, 9.0), interval_us=0) == [160, 16, 160]
+
+
 def is_lost(tracker, state, config=CONFIG):
     return has(schedule(state, tracker.objects, state.t_us, config).triggers, Trigger.LOST).tolist() == [True]
 

@@ -118,6 +118,14 @@ def test_what_is_sure_of_its_place_and_explains_far_less_at_once_has_dropped():
     assert not any(having(Trigger.SCORE_DROP, given, Component.SCORE_DROP))
 
 
+def test_where_looking_has_not_helped_for_long_it_waits_too_of_objects_whose_place_is_known():
+    near = {"is_near_due": [True, False]}
+    low = evidence(2, score=0.5, last_score=0.5, **near)
+    for trigger in (Trigger.LOW_SCORE, Trigger.SCORE_DROP):
+        assert having(trigger, low) == [True, False]
+    assert having(Trigger.UNCERTAIN, evidence(2, sigma_px=4.1, **near), trigger_sigma_px=4.0) == [True, False]
+
+
 def test_very_uncertain_objects_wait_until_it_is_time_and_others_do_not():
     settings = {"trigger_sigma_px": 4.0, "wide_sigma_px": 10.0}
     given = evidence(3, sigma_px=[11.0, 11.0, 9.0], is_due=[False, True, False], score=0.0, last_score=0.0)

@@ -219,6 +219,15 @@ def test_what_is_not_confirmed_is_uncertain_at_best():
     assert stated.tolist() == [Status.UNCERTAIN, Status.TRACKING, Status.LOST, Status.UNCERTAIN]
 
 
+def test_what_is_not_confirmed_is_not_remembered_as_seen_well():
+    known = References(*torch.tensor([0.9, 0.9, 0.8, 90.0, 0.0, 0.4, 0.0])[:, None].expand(7, 2))._replace(confirmations=torch.tensor([2.0, 3.0]))
+    seen = measured(matched=torch.tensor([100, 100]))
+    judged = rules.verdict(seen, known, limits())
+    assert judged.is_certain.tolist() == [False, True]
+    after = rules.remembered(known, seen, judged, torch.full((2,), 0.005), limits())
+    assert after.time_since_validated_s.tolist() == pytest.approx([0.405, 0.0])
+
+
 # ---- the whole, for tensors and for numbers
 
 
@@ -236,7 +245,7 @@ def random_cases(count=300):
     )
     for values in (seen.inlier_ratio, seen.rotated_rad):
         values[torch.rand(count, generator=generator) < 0.1] = torch.nan
-    return seen, References(*(draw(most) for most in (1, 1, 1, 300, 0.1, 1, 3))), draw(0.02)
+    return seen, References(*(draw(most) for most in (1, 1, 1, 300, 0.1, 1, 6))), draw(0.02)
 
 
 @pytest.mark.parametrize("settings", [{}, {"disabled": ["partly_hidden", "match_count"]}, {"validation": {"lost_below": 0.4}}])

@@ -18,11 +18,13 @@ class Schedule:
         triggers: those of :class:`Trigger` that hang on the state alone.
         is_due: objects that it is time for, should they be very uncertain: looking more often does not help where an object is hidden.
         is_drift_due: objects that it is time to look for farther away, should there be reason to.
+        is_near_due: objects that it is time for, should their place be known: always, but where looking has not helped for long.
     """
 
     triggers: Int[Tensor, "b"]
     is_due: Bool[Tensor, "b"]
     is_drift_due: Bool[Tensor, "b"]
+    is_near_due: Bool[Tensor, "b"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class TriggerEvidence:
         time_since_validated_s: how long ago it was last seen well (s).
         looks: in how many windows it was looked for since then.
         is_starting: objects whose motion is not known yet.
-        is_due, is_drift_due: as :class:`Schedule` has them.
+        is_due, is_drift_due, is_near_due: as :class:`Schedule` has them.
         earlier: triggers that are set already.
     """
 
@@ -55,6 +57,7 @@ class TriggerEvidence:
     is_starting: Bool[Tensor, "b"]
     is_due: Bool[Tensor, "b"]
     is_drift_due: Bool[Tensor, "b"]
+    is_near_due: Bool[Tensor, "b"]
     earlier: Int[Tensor, "b"]
 
     def stays_below(self, level: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
@@ -83,5 +86,6 @@ def gather_evidence(
         is_starting=is_starting,
         is_due=window.is_due,
         is_drift_due=window.is_drift_due,
+        is_near_due=window.is_near_due,
         earlier=window.triggers,
     )

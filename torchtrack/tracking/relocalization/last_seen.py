@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -63,15 +63,10 @@ class LastSeen:
     covariance: Float[Tensor, "b 12 12"]
 
     @classmethod
-    def from_state(cls, state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> "LastSeen":
-        """Poses as they were, as uncertain as this window's look asks for.
-
-        Args:
-            t_us: end of the window: it says which look it is.
-        """
+    def from_state(cls, state: TrackerState, objects: ObjectBatch, config: TrackerConfig) -> "LastSeen":
+        """Poses as they were, as uncertain as each object's next look asks for."""
         T_cam_obj = state.health.T_last_validated.to(objects.intrinsics.dtype)
-        look = (t_us // max(config.relocalization.interval_us, 1) % _LOOKS)[objects.stream_index]
-        fraction = (look + 1).double() / _LOOKS
+        fraction = (state.health.looks % _LOOKS + 1).double() / _LOOKS
         height, width = objects.image_size
         across_px = (_SPEED_PX_S * state.health.time_since_validated_s.double()).clamp(max=_DIAGONALS * (height**2 + width**2) ** 0.5)
         across_m, depth_m = across_px / objects.px_per_m(T_cam_obj).double(), _DEPTH_SHARE * objects.depth_m(T_cam_obj).double()

@@ -18,14 +18,34 @@ from torchtrack.tracking.state import TrackerState
 _NOTHING_KNOWN = 0.8
 # Farther away, or nearer, than when it was last seen well by this factor, an object may have been mistaken for others' edges.
 _DEPTH_FACTOR = 1.25
+# What was not seen well for twice as long as this (s) is looked for half as often, for four times as long a quarter as often, and so on.
+_RARER_AFTER_S, _MOST_HALVINGS = 0.05, 4
 # What was not seen well for so long, and is lost or far off in depth, is looked for all around where it was then (µs). Not measured alone.
 _NOT_VALIDATED_US = 100_000
 
 
 def schedule(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], config: TrackerConfig) -> Schedule:
     """What the state alone says of the window that ends at ``t_us``: which objects are lost, and which are looked for all around."""
-    is_due, is_drift_due = is_time(state.t_us, t_us, config.relocalization.interval_us, DRIFT_US)[:, objects.stream_index]
-    return Schedule(_not_validated_for_long(state, objects, is_drift_due, config), is_due, is_drift_due)
+    unseen_s, interval_us = state.health.time_since_validated_s, config.relocalization.interval_us
+    halved = (unseen_s[:, None] >= constant(_HALVED_FROM_S, unseen_s.dtype, unseen_s.device)).sum(1)
+    usual, far = (_is_due(state.t_us, t_us, intervals_us, halved, objects.stream_index) for intervals_us in _intervals_us(interval_us))
+    return Schedule(_not_validated_for_long(state, objects, far, config), usual, far, usual | (halved == 0))
+
+
+_HALVED_FROM_S = tuple(_RARER_AFTER_S * 2**number for number in range(1, _MOST_HALVINGS + 1))
+
+
+def _intervals_us(interval_us: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Once in which time very uncertain objects are looked for, and others farther away, halved so many times."""
+    usual = tuple(interval_us * 2**number for number in range(_MOST_HALVINGS + 1))
+    return usual, tuple(max(each_us, DRIFT_US) for each_us in usual)
+
+
+def _is_due(
+    since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], intervals_us: tuple[int, ...], halved: Int[Tensor, "b"], stream_index: Int[Tensor, "b"]
+) -> Bool[Tensor, "b"]:
+    """Objects that it is time for, each in its own of some intervals."""
+    return is_time(since_us, t_us, *intervals_us)[:, stream_index].gather(0, halved[None])[0]
 
 
 def is_time(since_us: Int[Tensor, "s"], t_us: Int[Tensor, "s"], *intervals_us: int) -> Bool[Tensor, "k s"]:

@@ -157,7 +157,7 @@ def has_score_dropped(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[
     dropped = evidence.score < SCORE_DROP_BELOW * evidence.mean_score
     if none_of(dropped):
         return dropped
-    return _is_sure(evidence) & ~has(evidence.earlier, DRIFTS) & dropped & config.uses(Component.SCORE_DROP)
+    return _is_sure(evidence) & evidence.is_near_due & ~has(evidence.earlier, DRIFTS) & dropped & config.uses(Component.SCORE_DROP)
 
 
 def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
@@ -187,7 +187,7 @@ def _is_sure(evidence: TriggerEvidence) -> Bool[Tensor, "b"]:
 
 
 def _is_near_or_due(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    return evidence.is_due | (evidence.sigma_px <= config.relocalization.wide_sigma_px)
+    return torch.where(evidence.sigma_px <= config.relocalization.wide_sigma_px, evidence.is_near_due, evidence.is_due)
 
 
 def _looks_far(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:

@@ -211,6 +211,8 @@ def verdict(measured: Measured, known: References, limits: Limits) -> Verdict:
     status = where(is_smeared & (status < _UNCERTAIN), _UNCERTAIN, status)
     is_certain = (measured.explained_ratio >= CERTAIN * reference) & (status == _TRACKING)
     is_certain = is_certain & (measured.matched >= limits.certain_count * known.reference_matches)
+    # Until a pose is confirmed, what explains much may be others' edges: where the object was before is not to be forgotten for them.
+    is_certain = is_certain & (known.confirmations >= limits.confirmed_by)
     return Verdict(status, failed, trusted, is_smeared, is_certain)
 
 
