@@ -62,7 +62,8 @@ def searched(lost, test=None, propose=hypotheses.around_prediction):
 
 
 def drifting_soon(monkeypatch, diameters_s=1.5):
-    """What drifts is looked for after 10 ms, and as far as it may have gone by then: a slip of some windows is enough."""
+    """What drifts is looked for after 10 ms, as far as it may have gone by then, and never rarer: a slip of some windows is enough."""
     monkeypatch.setattr(triggers, "DRIFT_US", 10_000)
     monkeypatch.setattr(schedule, "DRIFT_US", 10_000)
+    monkeypatch.setattr(schedule, "_HALVED_FROM_S", (float("inf"),) * len(schedule._HALVED_FROM_S))
     monkeypatch.setattr(last_seen, "_DRIFT_DIAMETERS_S", diameters_s)

@@ -1,7 +1,7 @@
 """What contours are made from: the constant tensors of an object's model."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from math import ceil
 
@@ -82,10 +82,10 @@ class ContourModel(nn.Module):
         self.register_buffer("triangles", triangles.clone())
         self.register_buffer("triangle_normals", _normals(triangles))
 
-    def with_members(self, members: Int[Tensor, "k"]) -> "ContourModel":
-        """The same model of other objects: a shallow copy, which shares all tensors but the list of members."""
+    def with_members(self, members: Int[Tensor, "k"], numbers: Iterable[int]) -> "ContourModel":
+        """The same model of other objects, whose ``numbers`` are the same as ``members``: a shallow copy, which shares all other tensors."""
         model = copy.copy(self)
-        model.numbers, model._buffers = tuple(members.tolist()), {**self._buffers, "members": members}
+        model.numbers, model._buffers = tuple(numbers), {**self._buffers, "members": members}
         return model
 
     def active_edges(self, camera_obj: Float[Tensor, "b 3"]) -> Bool[Tensor, "b e"]:

@@ -105,7 +105,7 @@ class ObjectBatch:
     def rows(self, chosen: Int[Tensor, "k"]) -> "ObjectBatch":
         """Some of the objects; where they are read on the CPU."""
         places = [(model, torch.isin(chosen, model.members).nonzero()[:, 0]) for model in self.models]
-        models = [model.with_members(of_model) for model, of_model in places if len(of_model)]
+        models = [model.with_members(of_model, of_model.tolist()) for model, of_model in places if len(of_model)]
         own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m, self.stream_index
         intrinsics, centre_obj, half_extent, diameter_m, stream_index = (value[chosen] for value in own)
         learned = None if self.learned is None else LearnedPoints(*(value[chosen] for value in vars(self.learned).values()))
@@ -116,7 +116,7 @@ class ObjectBatch:
     def copies(self, number: int, count: int) -> "ObjectBatch":
         """One object many times, each in a stream of its own: copies do not hide one another."""
         streams = torch.arange(count, device=self.stream_index.device)
-        model = next(model for model in self.models if number in model.numbers).with_members(streams)
+        model = next(model for model in self.models if number in model.numbers).with_members(streams, range(count))
         own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m
         intrinsics, centre_obj, half_extent, diameter_m = (repeat_row(value, number, count) for value in own)
         learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))
