@@ -77,6 +77,15 @@ def box_behind_another():
     follow(tracker, tracker.init(starts, 0), windows(events, 2))
 
 
+def box_beside_a_lost_one():
+    """What one explains is taken from the other's events."""
+    starts = torch.stack([pose(), pose(translation=(0.02, 0.0, 0.7))])
+    _, events = moving_box(pose(), 6)
+    tracker = tracker_of(2, dtype=torch.float64)
+    state, _ = follow(tracker, tracker.init(starts, 0), windows(events, 5))
+    follow(tracker, changed(state, time_since_validated_s=torch.tensor([0.0, 0.1], dtype=torch.float64)), windows(events, 6)[5:])
+
+
 def long_window():
     """Of longer windows, events near objects are kept before they are looked at."""
     _, events = moving_box(pose(), 10)
@@ -92,6 +101,7 @@ SCENES = (
     guided_box,
     many_events,
     box_behind_another,
+    box_beside_a_lost_one,
     *(partial(boxes, scene) for scene in (one_box_scene, scene_of_one_stream, scene_of_streams)),
 )
 

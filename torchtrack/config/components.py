@@ -10,6 +10,7 @@ class Component(StrEnum):
     CORNER_SNAP = "corner_snap"
     FRESH_CORNERS = "fresh_corners"
     # association
+    OTHERS_EVENTS = "others_events"
     POLARITY_PRIOR = "polarity_prior"
     DARK_SHIFT = "dark_shift"
     SILHOUETTE_DARK_SHIFT = "silhouette_dark_shift"

@@ -10,6 +10,7 @@ from torchtrack.config.components import Component
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch
 from torchtrack.tracking.adapt import Lesson, learned_after
+from torchtrack.tracking.association.claimed_events import UNSEEN_FROM_S, claimed_pixels, without_claimed
 from torchtrack.tracking.association.flow_agreement import guided_by_flow
 from torchtrack.tracking.association.observations import Observations, corner_observations, filled_up, select_events
 from torchtrack.tracking.association.weighting_features import WeightingInputs, judged
@@ -148,6 +149,7 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     if config.association.search == "along_flow":
         flow, has_flow = sensors.flow(corners.points, maps, t_us, config)
         corners = replace(corners, flow=flow, has_flow=has_flow)
+    events = unclaimed(tracked, state, expected, events, contours, given.reads)
     index = index_for(contours, tracked.image_size, config, gate_scale, radius_px)
     observations, most = corner_observations(corners), config.association.max_events
     if most:
@@ -164,6 +166,19 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
         own = slice(corners.mask.shape[1])
         corners = replace(corners, flow=flow[:, own], has_flow=has_flow[:, own])
     return Observed(events, burst_age_us, contours, index, sigma_px, gate_scale, corners, observations)
+
+
+def unclaimed(
+    tracked: TrackedObjects, state: TrackerState, expected: Expected, events: ObjectEvents, contours: Contours, reads: host_sync.HostReads
+) -> ObjectEvents:
+    """The events; of objects that are not seen well, without those that others explain which are."""
+    unseen_s = state.health.time_since_validated_s
+    is_unseen = unseen_s >= UNSEEN_FROM_S
+    if not (tracked.objects.shared and tracked.config.uses(Component.OTHERS_EVENTS)) or reads.none_of(is_unseen):
+        return events
+    is_seen_well = (unseen_s == 0) & (state.health.mean_score > 0)
+    claimed = claimed_pixels(expected.prediction.detached(), contours, is_seen_well, expected.dt_s)
+    return without_claimed(events, claimed, tracked.stream_index, is_unseen)
 
 
 def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, fit: Fit) -> ScoredFit:

@@ -2,6 +2,7 @@
 
 from torchtrack.backends.numba import (
     arrival_flow,
+    claimed_events,
     conclusion,
     contour_table,
     contours,
@@ -23,6 +24,7 @@ from torchtrack.backends.numba import (
 
 __all__ = [
     "arrival_flow",
+    "claimed_events",
     "conclusion",
     "contour_table",
     "contours",

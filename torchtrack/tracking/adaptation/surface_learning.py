@@ -123,7 +123,10 @@ def learn_after(
         return learned
     if not host_sync.read_at_once(wanted):
         return learned.but_of(wanted, learn(learned, around, events.rows(), config))
-    # As a rule, there are few such objects.
+    # As a rule, there are few such objects, and of what is lost nothing is learned.
+    wanted = wanted & around.learning
+    if host_sync.none_of(wanted):
+        return learned
     concerned = _concerned(wanted, around).nonzero()[:, 0]
     known = learn(learned.rows(concerned), around.rows(concerned), events.of_objects(concerned), config)
     return learned.with_rows(concerned[wanted[concerned]], known.rows(wanted[concerned]))
