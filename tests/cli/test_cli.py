@@ -119,10 +119,23 @@ def test_help(arguments, expected, capsys):
     assert expected in capsys.readouterr().out
 
 
-def test_settings_are_listed(capsys):
+def test_settings_are_listed_a_line_each_on_two_screens(capsys):
     assert command("settings", "track") == 0
+    lines = capsys.readouterr().out.splitlines()
+    keys = [line.split()[0] for line in lines]
+    assert {"tracker.window.duration_us", "objects[].initial_pose.matrix", "limits.*"} <= set(keys)
+    assert len(lines) == len(set(keys)) <= 110
+
+
+def test_settings_of_a_group_are_listed_in_full(capsys):
+    assert command("settings", "track", "limits") == 0
     output = capsys.readouterr().out
-    assert "tracker.window.duration_us" in output and "objects[].initial_pose.matrix" in output
+    assert "limits.mesh_bytes" in output and "[≥ 1]" in output and "tracker." not in output
+
+
+def test_a_group_without_settings_is_an_error(capsys):
+    assert command("settings", "track", "tracker.sorcery") == 2
+    assert "no setting with 'tracker.sorcery' in its name" in capsys.readouterr().err
 
 
 def test_dotted_settings_are_told_from_options():

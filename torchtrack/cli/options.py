@@ -257,10 +257,12 @@ class Model:
 
 @dataclass(frozen=True)
 class Settings:
-    """List every setting of a command: its key, type, default, bounds and meaning."""
+    """List the settings of a command, a line each; those of a group with type, bounds and the whole meaning."""
 
     command: Positional[Literal["track", "evaluate", "demo", "simulate"]] = "track"
     """The command."""
+    group: Positional[str] = ""
+    """A part of their names, such as tracker.motion: these alone, with type, bounds and the whole meaning."""
     markdown: bool = False
     """Print Markdown."""
 
@@ -269,7 +271,7 @@ class Settings:
         from torchtrack.cli.settings import list_settings
 
         refuse_settings(overrides)
-        return list_settings(self.command, markdown=self.markdown)
+        return list_settings(self.command, self.group, markdown=self.markdown)
 
 
 def _given(command: Any, without: tuple[str, ...]) -> dict[str, Any]:
