@@ -36,13 +36,13 @@ def list_settings(command: str, group: str, *, markdown: bool) -> int:
     rows = list(described(_SETTINGS[command]))
     if group:
         table = Table(*_COLUMNS, header_style="bold", box=None)
-        rows = _of_group(rows, group, command)
+        for row in _of_group(rows, group, command):
+            table.add_row(*(escape(cell) for cell in row))
     else:
         # Meanings are cut where a line ends.
         table = Table(Column("setting", no_wrap=True), "default", Column("meaning", no_wrap=True, overflow="ellipsis"), header_style="bold", box=None)
-        rows = [(key, default, meaning) for key, _, default, meaning in _folded(rows, command)]
-    for row in rows:
-        table.add_row(*(escape(cell) for cell in row))
+        for key, _, default, meaning in _folded(rows, command):
+            table.add_row(escape(key), escape(default), escape(meaning))
     output_console().print(table)
     return ExitCode.DONE
 
