@@ -6,10 +6,11 @@ import pytest
 import torch
 import trimesh
 from both_ways import assert_as_close, both_ways
-from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_events, random_pose, random_twist
+from helpers import IMAGE_SIZE, SMALL_CAMERA, box_model, contours_at, generator, moving_objects, pose, random_events, random_pose, random_twist, seen
 from solid_models import ball, l_prism
 
-from torchtrack.config.tracker import ContourConfig, TrackerConfig
+from torchtrack import Tracker
+from torchtrack.config.tracker import ContourConfig, FlowConfig, TrackerConfig
 from torchtrack.core.camera import undistortion_table
 from torchtrack.core.events import EventBatch, concatenate, pad_streams
 from torchtrack.core.image_velocity import MovingObjects
@@ -24,6 +25,7 @@ from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import assemble, reproject
 from torchtrack.tracking.contours.sampling import mesh_contours
 from torchtrack.tracking.contours.visibility import Scene, remove_hidden
+from torchtrack.tracking.frontend.arrival_flow import arrival_flow
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
 from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.frontend.window_events import WindowEvents
@@ -32,6 +34,7 @@ from torchtrack.tracking.relocalization.sampling import score_outlines
 from torchtrack.tracking.validation.measures import fit_measures
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
+BENT_CAMERA = replace(SMALL_CAMERA, distortion_model="plumb_bob", distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
 
 
@@ -171,6 +174,47 @@ def test_which_events_are_chosen(count, kind):
     assert torch.equal(ours.mask, theirs.mask)
     for name in ("pixels", "age_s", "polarity"):
         assert torch.equal(getattr(ours, name)[ours.mask], getattr(theirs, name)[ours.mask])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("count", [150, 300, 5000])
+def test_which_events_are_chosen_beside_corners(share, count):
+    events, contours = window_events(), random_contours()
+    mask = uniform(3, 250, seed=9) < share
+    flow = torch.where(mask[..., None], uniform(3, 250, 2, seed=8), 0)
+    corners = seen(uniform(3, 250, 2, seed=7), age_s=uniform(3, 250, seed=6), polarity=1.0, flow=flow, mask=mask)
+    index, objects = index_contours(contours, IMAGE_SIZE, 7, 2), moving_objects((300.0, -200.0), 3)
+    ours, theirs = both_ways(lambda: select_events(events, index, objects, count, corners))
+    for name in ("mask", "has_flow", "flow"):
+        assert torch.equal(getattr(ours, name), getattr(theirs, name))
+    for name in ("pixels", "age_s", "polarity"):
+        assert torch.equal(getattr(ours, name)[ours.mask], getattr(theirs, name)[ours.mask])
+
+
+# ---- flow
+
+
+@pytest.mark.parametrize("count", [1, 16, 37, 300])
+def test_arrival_flow_at_and_beside_borders(count, dtype):
+    """Of every number of pixels, also those that do not fill a block, and of several streams."""
+    height, width = 12, 15
+    ages = torch.randint(LONG_AGO_US + 1, (2, 2, height, width), generator=generator(1), dtype=torch.int16)
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    ages[:, 1] = (1000 + 400 * u + 90 * v + 300 * uniform(2, height, width, seed=4)).to(torch.int16)
+    table = torch.stack([u, v], -1).to(dtype) + uniform(2, height, width, 2, high=0.2, seed=2, dtype=dtype)
+    pixels = (uniform(3, count, 2, seed=3) * torch.tensor([width, height])).long()
+    polarity = torch.randint(-1, 2, (3, count), generator=generator(5)).to(dtype)
+    given = (pixels, polarity, uniform(3, count, seed=6) < 0.8, ages, torch.tensor([1, 0, 1]), table, FlowConfig(model="arrival"))
+    (flow, valid), (plain_flow, plain_valid) = both_ways(lambda: arrival_flow(*given))
+    assert torch.equal(valid, plain_valid) and (count < 37 or valid.any())
+    torch.testing.assert_close(flow, plain_flow, rtol=TOLERANCE[dtype], atol=TOLERANCE[dtype])
+
+
+def test_sensor_pixels_nearest_to_ideal_ones_and_to_what_lies_beside():
+    sensors = Tracker([box_model()] * 2, [SMALL_CAMERA, BENT_CAMERA], stream_index=[1, 0]).sensors
+    pixels = uniform(2, 500, 2, low=-300, high=500, dtype=torch.float32)
+    ours, theirs = both_ways(lambda: sensors.nearest_pixels(pixels))
+    assert torch.equal(ours, theirs)
 
 
 # ---- events

@@ -26,7 +26,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "flow": ("tracking.frontend.sensors:estimate_flow", "tracking.step:guided_by_flow"),
     "index": ("tracking.step:index_for", "tracking.estimation.rounds:index_for"),
     "window's events": ("tracking.frontend.sensors:Sensors.seen",),
-    "selection": ("tracking.step:select_events", "tracking.step:corner_observations", "tracking.step:filled_up"),
+    "selection": ("tracking.step:select_events", "tracking.step:corner_observations"),
     "association": ("tracking.estimation.rounds:match_nearest", "tracking.estimation.rounds:match_along_flow"),
     "problem": ("tracking.estimation.rounds:_believed", "tracking.estimation.rounds:_problem", "tracking.estimation.rounds:_information"),
     "solver": ("tracking.estimation.rounds:solve_pose",),

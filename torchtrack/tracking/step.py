@@ -12,7 +12,7 @@ from torchtrack.core.events import EventBatch
 from torchtrack.tracking.adapt import Lesson, learned_after
 from torchtrack.tracking.association.claimed_events import UNSEEN_FROM_S, claimed_pixels, without_claimed
 from torchtrack.tracking.association.flow_agreement import guided_by_flow
-from torchtrack.tracking.association.observations import Observations, corner_observations, filled_up, select_events
+from torchtrack.tracking.association.observations import Observations, corner_observations, select_events
 from torchtrack.tracking.association.weighting_features import WeightingInputs, judged
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
@@ -153,7 +153,7 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     index = index_for(contours, tracked.image_size, config, gate_scale, radius_px)
     observations, most = corner_observations(corners), config.association.max_events
     if most:
-        observations = filled_up(observations, select_events(events, index, prediction.moving(compensated=True), most), most)
+        observations = select_events(events, index, prediction.moving(compensated=True), most, observations)
     if tracked.weighting_network is not None:
         history = sensors.history(maps.last_event_us, t_us)
         observations = judged(WeightingInputs(observations, events, prediction, contours, index, history), tracked.weighting_network)
@@ -162,9 +162,9 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
         flow, has_flow = sensors.flow(points, maps, t_us, config)
         observations = replace(observations, flow=flow, has_flow=has_flow)
         observations = guided_by_flow(observations, index, contours, prediction, state.health.time_since_validated_s)
-        # The corners are the first of them.
+        # Corners are in their places; in those that they leave, there are events.
         own = slice(corners.mask.shape[1])
-        corners = replace(corners, flow=flow[:, own], has_flow=has_flow[:, own])
+        corners = replace(corners, flow=flow[:, own] * corners.mask[..., None], has_flow=has_flow[:, own] & corners.mask)
     return Observed(events, burst_age_us, contours, index, sigma_px, gate_scale, corners, observations)
 
 

@@ -137,6 +137,48 @@ def test_values_go_with_their_events(dtype):
 # ---- both
 
 
+def with_corners(corners, near, count):
+    """Corners, and events near a contour, whose ages are their numbers."""
+    number = torch.arange(near, dtype=torch.float64)[None]
+    pixels = torch.stack([torch.full_like(number, 80.0), torch.full_like(number, 60.0)], -1)
+    events = WindowEvents(pixels, number, torch.ones_like(number), torch.ones_like(number, dtype=torch.bool))
+    return select_events(events, index_contours(upright_line(80.0), IMAGE_SIZE, 5, 1), moving_objects((0.0, 0.0)), count, corners)
+
+
+def some_corners(places, missing):
+    place = torch.arange(places, dtype=torch.float64)
+    mask = torch.tensor([[number not in missing for number in range(places)]])
+    flow = torch.where(mask[..., None], torch.tensor([3.0, 4.0], dtype=torch.float64), 0)
+    return seen(torch.stack([place, -place], -1)[None], age_s=-1.0, polarity=-1.0, flow=flow, mask=mask)
+
+
+def test_corners_stay_in_their_places_and_events_take_those_that_they_leave():
+    corners = some_corners(6, missing=(1, 4, 5))
+    both = with_corners(corners, near=4, count=7)
+    assert both.mask.tolist() == [[True] * 7]
+    assert both.age_s.tolist() == [[-1, 0, -1, -1, 1, 2, 3]]
+    assert both.polarity.tolist() == [[-1, 1, -1, -1, 1, 1, 1]]
+    assert both.has_flow.tolist() == [[True, False, True, True, False, False, False]]
+    own = corners.mask[0]
+    for name in ("pixels", "flow"):
+        assert torch.equal(getattr(both, name)[0, :6][own], getattr(corners, name)[0][own])
+    assert (both.flow[~both.has_flow] == 0).all()
+
+
+@pytest.mark.parametrize(("places", "missing", "expected"), [(20, 8, 88), (20, 20, 100), (100, 0, 0), (120, 0, 0), (120, 60, 40)])
+def test_events_make_up_for_corners_that_are_few(places, missing, expected):
+    corners = some_corners(places, missing=range(missing))
+    both = with_corners(corners, near=100, count=100)
+    assert both.mask.shape == (1, max(places, 100))
+    events = both.age_s[0][both.mask[0] & (both.age_s[0] >= 0)].tolist()
+    # Lots fall evenly, but for a few.
+    assert abs(len(events) - expected) <= 3
+    assert events == sorted(events)
+    # They are spread over all that there are.
+    assert expected == 0 or events[-1] >= 95
+    assert int(both.mask.sum()) == places - missing + len(events)
+
+
 def test_joined_observations_are_those_of_both():
     both = join(seen([[[1.0, 2.0]]], age_s=0.1, flow=[3.0, 4.0]), seen([[[5.0, 6.0], [7.0, 8.0]]], polarity=-1.0, mask=[[True, False]]))
     assert both.pixels.tolist() == [[[1, 2], [5, 6], [7, 8]]]

@@ -13,6 +13,15 @@ from torchtrack.core.constants import disc
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.frontend import arrival_flow, bursts
 
+# Pixels whose planes are fitted side by side, and of the pixels around them so many at once: a compiler takes several fits in one step, and their
+# sums stay near. Indices are unsigned, or it would look whether each is negative: four times slower.
+LANES, AT_ONCE = np.uint64(16), np.uint64(6)
+# What is known of each fit, in rows of that length.
+_ROWS = 17
+_TOTAL, _X, _Y, _T, _XX, _XY, _YY, _XT, _YT, _A, _B, _C, _DETERMINANT, _SPREAD, _ABSOLUTE, _SQUARE, _USED = (
+    np.uint64(row) * LANES for row in range(_ROWS)
+)
+
 
 @kernel(fastmath=FAST)
 def flow_at(
@@ -22,83 +31,159 @@ def flow_at(
     ages_us: Array,
     stream_index: Array,
     ideal_pixels: Array,
+    size: tuple[int, int],
     around: Array,
     settings: ArrivalSettings,
     flow: Array,
     valid: Array,
 ) -> None:
-    """Fill ``flow [b, n, 2]`` and ``valid [b, n]``, which are zero so far; ``around [2, k]`` are the offsets of the pixels that take part."""
-    count, reach = around.shape[1], around.max()
-    points, known_us = np.empty((4, count)), settings.long_ago_us - settings.cut_off_us
-    height, width = ages_us.shape[2], ages_us.shape[3]
-    for b in range(len(pixels)):
-        ages, ideal = ages_us[stream_index[b]], ideal_pixels[stream_index[b]]
-        for i in range(pixels.shape[1]):
-            u, v = pixels[b, i, 0], pixels[b, i, 1]
-            if not mask[b, i]:
-                continue
-            is_on = ages[1, v, u] < ages[0, v, u] if polarity[b, i] == 0 else polarity[b, i] > 0
-            of_polarity = ages[1 if is_on else 0]
-            own_us, used = np.int32(of_polarity[v, u]), 0
-            if own_us >= known_us:
-                continue
-            own_x, own_y = ideal[v, u, 0], ideal[v, u, 1]
-            is_within = reach <= u < width - reach and reach <= v < height - reach
-            for k in range(count):
-                column, row = u + around[0, k], v + around[1, k]
-                if not is_within and (column < 0 or column >= width or row < 0 or row >= height):
-                    continue
-                age_us = np.int32(of_polarity[row, column])
-                # Written whether it counts or not: a processor would guess many of these branches wrong.
-                points[0, used], points[1, used] = ideal[row, column, 0] - own_x, ideal[row, column, 1] - own_y
-                points[2, used] = (own_us - age_us) * 1e-6
-                used += 1 if (age_us < known_us) & (abs(own_us - age_us) <= settings.span_us) else 0
-            if used >= settings.min_pixels:
-                flow[b, i, 0], flow[b, i, 1], valid[b, i] = _plane(points, used, settings)
-
-
-@kernel(fastmath=FAST | {"reassoc"})
-def _plane(points: Array, count: int, settings: ArrivalSettings) -> tuple[float, float, bool]:
-    """The flow by a plane fitted to times, and whether there is one: :func:`torchtrack.tracking.frontend.arrival_flow.plane_flow`.
+    """Fill ``flow [b, n, 2]`` and ``valid [b, n]``, which are zero so far.
 
     Args:
-        points: ``[4, k]``, offsets (px), times (s), and room for weights; so many of them count.
+        ages_us, ideal_pixels: ``[s, 2, h*w]`` and ``[s, h*w*2]`` of sensors of ``size``.
+        around: ``[2, k]``, offsets of the pixels that take part.
     """
-    x, y, t, weights = points[0], points[1], points[2], points[3]
-    weights[:count] = 1.0
+    (height, width), count = size, around.shape[1]
+    places = -(-count // int(AT_ONCE)) * int(AT_ONCE * LANES)
+    x, y, later_us = np.zeros(places, ideal_pixels.dtype), np.zeros(places, ideal_pixels.dtype), np.full(places, settings.long_ago_us, np.int32)
+    times_s, counts, weights = np.empty(places), np.empty(places), np.empty(places)
+    number, fits, reach, steps = np.empty(LANES, np.int64), np.empty(_ROWS * LANES), around.max(), around[1] * width + around[0]
+    everywhere, inside = np.ones(count, np.int64), np.empty(count, np.int64)
+    for b in range(len(pixels)):
+        ages, ideal, lanes = ages_us[stream_index[b]], ideal_pixels[stream_index[b]], 0
+        for i in range(pixels.shape[1]):
+            if mask[b, i]:
+                u, v = pixels[b, i, 0], pixels[b, i, 1]
+                own, is_within = v * width + u, reach <= u < width - reach and reach <= v < height - reach
+                if not is_within:
+                    for k in range(count):
+                        inside[k] = 0 <= u + around[0, k] < width and 0 <= v + around[1, k] < height
+                is_on = ages[1, own] < ages[0, own] if polarity[b, i] == 0 else polarity[b, i] > 0
+                _look_around(
+                    own, steps, everywhere if is_within else inside, ages[1 if is_on else 0], ideal, settings, x[lanes:], y[lanes:], later_us[lanes:]
+                )
+                number[lanes], lanes = i, lanes + 1
+            if lanes == LANES or (lanes > 0 and i == pixels.shape[1] - 1):
+                for k in range(places):
+                    times_s[k], counts[k] = later_us[k] * 1e-6, abs(later_us[k]) <= settings.span_us
+                _fit(x, y, times_s, counts, weights, fits, settings)
+                for lane in range(lanes):
+                    flow[b, number[lane], 0], flow[b, number[lane], 1], valid[b, number[lane]] = _normal_flow(fits[lane:], settings)
+                lanes = 0
+
+
+@kernel(fastmath=FAST)
+def _look_around(
+    own: int, steps: Array, inside: Array, ages_us: Array, ideal: Array, settings: ArrivalSettings, x: Array, y: Array, later_us: Array
+) -> None:
+    """Offsets of the pixels around one, and how much later the edge came to it than to them; longer than any that counts where it did not.
+
+    Args:
+        steps, inside: ``[k]``, to those pixels, and which of them are on the sensor.
+        ages_us, ideal: ``[h*w]`` and ``[h*w*2]``.
+        x, y, later_us: filled, every :data:`LANES`-th place.
+    """
+    known_us, own_us, own_x, own_y = settings.long_ago_us - settings.cut_off_us, np.int32(ages_us[own]), ideal[2 * own], ideal[2 * own + 1]
+    for k in range(np.uint64(len(steps))):
+        place, at = np.uint64(own + steps[k] * inside[k]), k * LANES
+        age_us = np.int32(ages_us[place])
+        x[at], y[at] = ideal[place + place] - own_x, ideal[place + place + np.uint64(1)] - own_y
+        later_us[at] = own_us - age_us if (age_us < known_us) & (own_us < known_us) & (inside[k] > 0) else settings.long_ago_us
+
+
+@kernel(fastmath=FAST)
+def _fit(x: Array, y: Array, times_s: Array, counts: Array, weights: Array, fits: Array, settings: ArrivalSettings) -> None:
+    """Planes fitted to times: :func:`torchtrack.tracking.frontend.arrival_flow.plane_flow`.
+
+    Args:
+        x, y, times_s, counts: offsets (px), times (s), and 1 for those that take part, in rows of :data:`LANES`.
+        weights: of each, filled.
+        fits: what is known of each fit, filled.
+    """
+    weights[:] = counts
     for iteration in range(settings.iterations + 1):
-        total, sum_x, sum_y, sum_t = 0.0, 0.0, 0.0, 0.0
-        sum_xx, sum_xy, sum_yy, sum_xt, sum_yt = 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(count):
-            weight = weights[k]
-            wx, wy = weight * x[k], weight * y[k]
-            total, sum_x, sum_y, sum_t = total + weight, sum_x + wx, sum_y + wy, sum_t + weight * t[k]
-            sum_xx, sum_xy, sum_yy = sum_xx + wx * x[k], sum_xy + wx * y[k], sum_yy + wy * y[k]
-            sum_xt, sum_yt = sum_xt + wx * t[k], sum_yt + wy * t[k]
-        share = 1.0 / max(total, 1e-6)
-        mean_x, mean_y, mean_t = sum_x * share, sum_y * share, sum_t * share
-        xx, xy, yy = sum_xx * share - mean_x * mean_x, sum_xy * share - mean_x * mean_y, sum_yy * share - mean_y * mean_y
-        xt, yt = sum_xt * share - mean_x * mean_t, sum_yt * share - mean_y * mean_t
+        _sum(x, y, times_s, weights, fits)
+        _solve(fits)
+        _sum_residuals(x, y, times_s, weights, fits)
+        if iteration < settings.iterations:
+            _weigh(x, y, times_s, counts, fits, settings.bound, settings.least_scale_s, settings.plane_s, weights)
+
+
+@kernel(fastmath=FAST)
+def _sum(x: Array, y: Array, times_s: Array, weights: Array, fits: Array) -> None:
+    """Weighted sums of all that a plane is solved from."""
+    fits[: _YT + LANES] = 0.0
+    for first in range(np.uint64(0), np.uint64(len(x)), AT_ONCE * LANES):
+        for lane in range(LANES):
+            total, sum_x, sum_y, sum_t = fits[_TOTAL + lane], fits[_X + lane], fits[_Y + lane], fits[_T + lane]
+            xx, xy, yy, xt, yt = fits[_XX + lane], fits[_XY + lane], fits[_YY + lane], fits[_XT + lane], fits[_YT + lane]
+            for k in range(AT_ONCE):
+                at = first + k * LANES + lane
+                t, weight = times_s[at], weights[at]
+                wx, wy = weight * x[at], weight * y[at]
+                total, sum_x, sum_y, sum_t = total + weight, sum_x + wx, sum_y + wy, sum_t + weight * t
+                xx, xy, yy, xt, yt = xx + wx * x[at], xy + wx * y[at], yy + wy * y[at], xt + wx * t, yt + wy * t
+            fits[_TOTAL + lane], fits[_X + lane], fits[_Y + lane], fits[_T + lane] = total, sum_x, sum_y, sum_t
+            fits[_XX + lane], fits[_XY + lane], fits[_YY + lane], fits[_XT + lane], fits[_YT + lane] = xx, xy, yy, xt, yt
+
+
+@kernel(fastmath=FAST)
+def _solve(fits: Array) -> None:
+    """The plane ``t = a x + b y + c`` of each fit, and how far its points are spread."""
+    for lane in range(LANES):
+        share = 1.0 / max(fits[_TOTAL + lane], 1e-6)
+        mean_x, mean_y, mean_t = fits[_X + lane] * share, fits[_Y + lane] * share, fits[_T + lane] * share
+        xx, xy = fits[_XX + lane] * share - mean_x * mean_x, fits[_XY + lane] * share - mean_x * mean_y
+        yy, xt = fits[_YY + lane] * share - mean_y * mean_y, fits[_XT + lane] * share - mean_x * mean_t
+        yt = fits[_YT + lane] * share - mean_y * mean_t
         determinant = xx * yy - xy * xy
         per = 1.0 / max(determinant, 1e-4)
         a, b = (yy * xt - xy * yt) * per, (xx * yt - xy * xt) * per
-        c, absolute, square = mean_t - a * mean_x - b * mean_y, 0.0, 0.0
-        for k in range(count):
-            residual = abs(t[k] - c - a * x[k] - b * y[k])
-            absolute, square = absolute + weights[k] * residual, square + weights[k] * residual * residual
-        total = max(total, 1.0)
-        if iteration == settings.iterations:
-            slope2, spread_px2, used = a * a + b * b, max(min(xx, yy), settings.least_spread_px2), (weights[:count] > 0).sum()
-            exact = slope2 * total * spread_px2 > settings.slope_sigmas**2 * square / total
-            if used >= settings.min_pixels and determinant > settings.least_determinant and exact and slope2 > settings.least_slope2:
-                return a / slope2, b / slope2, True
-            return 0.0, 0.0, False
-        per_bound = 1.0 / (settings.bound * max(absolute / total, settings.least_scale_s))
-        for k in range(count):
-            along = a * x[k] + b * y[k]
-            relative = (t[k] - c - along) * per_bound
-            weight = max(1.0 - relative * relative, 0.0)
-            weights[k] = weight * weight if abs(along) < settings.plane_s else 0.0
+        fits[_A + lane], fits[_B + lane], fits[_C + lane] = a, b, mean_t - a * mean_x - b * mean_y
+        fits[_DETERMINANT + lane], fits[_SPREAD + lane] = determinant, min(xx, yy)
+
+
+@kernel(fastmath=FAST)
+def _sum_residuals(x: Array, y: Array, times_s: Array, weights: Array, fits: Array) -> None:
+    """Weighted sums of residuals and of their squares, and how many points have a weight."""
+    fits[_ABSOLUTE:] = 0.0
+    for first in range(np.uint64(0), np.uint64(len(x)), AT_ONCE * LANES):
+        for lane in range(LANES):
+            a, b, c = fits[_A + lane], fits[_B + lane], fits[_C + lane]
+            absolute, square, used = fits[_ABSOLUTE + lane], fits[_SQUARE + lane], fits[_USED + lane]
+            for k in range(AT_ONCE):
+                at = first + k * LANES + lane
+                residual, weight = abs(times_s[at] - c - a * x[at] - b * y[at]), weights[at]
+                absolute, square = absolute + weight * residual, square + weight * residual * residual
+                used += 1.0 if weight > 0 else 0.0
+            fits[_ABSOLUTE + lane], fits[_SQUARE + lane], fits[_USED + lane] = absolute, square, used
+
+
+@kernel(fastmath=FAST)
+def _weigh(
+    x: Array, y: Array, times_s: Array, counts: Array, fits: Array, bound: float, least_scale_s: float, plane_s: float, weights: Array
+) -> None:
+    """Bisquare weights of the residuals, zero for what the plane passes too early or too late."""
+    for first in range(np.uint64(0), np.uint64(len(x)), AT_ONCE * LANES):
+        for lane in range(LANES):
+            a, b, c = fits[_A + lane], fits[_B + lane], fits[_C + lane]
+            per_bound = 1.0 / (bound * max(fits[_ABSOLUTE + lane] / max(fits[_TOTAL + lane], 1.0), least_scale_s))
+            for k in range(AT_ONCE):
+                at = first + k * LANES + lane
+                along = a * x[at] + b * y[at]
+                relative = (times_s[at] - c - along) * per_bound
+                weight = max(1.0 - relative * relative, 0.0)
+                weights[at] = counts[at] * (weight * weight if abs(along) < plane_s else 0.0)
+
+
+@kernel(fastmath=FAST)
+def _normal_flow(fit: Array, settings: ArrivalSettings) -> tuple[float, float, bool]:
+    """The flow by one fit, of every ``LANES``-th place, and whether there is one."""
+    a, b, total, square = fit[_A], fit[_B], max(fit[_TOTAL], 1.0), fit[_SQUARE]
+    slope2, spread_px2 = a * a + b * b, max(fit[_SPREAD], settings.least_spread_px2)
+    exact = slope2 * total * spread_px2 > settings.slope_sigmas**2 * square / total
+    if fit[_USED] >= settings.min_pixels and fit[_DETERMINANT] > settings.least_determinant and exact and slope2 > settings.least_slope2:
+        return a / slope2, b / slope2, True
     return 0.0, 0.0, False
 
 
@@ -116,7 +201,9 @@ def arrival_flow_numba(
     flow, valid = torch.zeros(*mask.shape, 2, dtype=ideal_pixels.dtype), torch.zeros_like(mask)
     around = disc(config.radius_px, torch.int64, mask.device)
     flow_at(
-        *as_arrays(sensor_pixels, polarity, mask, burst_age_us, stream_index, ideal_pixels, around),
+        *as_arrays(sensor_pixels, polarity, mask, burst_age_us.flatten(2), stream_index, ideal_pixels.flatten(1)),
+        (burst_age_us.shape[2], burst_age_us.shape[3]),
+        around.numpy(),
         filled(ArrivalSettings, arrival_flow, bursts, config),
         *as_arrays(flow, valid),
     )

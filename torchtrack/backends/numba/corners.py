@@ -69,10 +69,10 @@ def _keep_own(response: Array, surface: Array, least: float, extent: Array, reac
         if not reach <= v < extent[1] - reach or end_u <= first_u:
             of_row[:] = 0
             continue
-        of_row[:first_u] = 0
-        of_row[end_u:] = 0
-        for u in range(first_u, end_u):
-            of_row[u] = of_row[u] if ages[u] > least else 0
+        of_row[:first_u], of_row[end_u:] = 0, 0
+        own, ages = of_row[first_u:end_u], ages[first_u:end_u]
+        for u in range(len(own)):
+            own[u] = own[u] if ages[u] > least else 0
 
 
 @kernel()

@@ -77,6 +77,9 @@ class AgreementSettings(NamedTuple):
     sigma_share: float
     sigma_px_s: float
     sigma_sine: float
+    least_trust: float
+    usual: float
+    unseen_s: float
 
 
 class RoundSettings(NamedTuple):

@@ -14,6 +14,7 @@ from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.tracking.association import observations
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.index import ContourIndex
+from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.frontend.window_events import GOLDEN_RATIO, ObjectEvents, laid_out
 
 
@@ -33,21 +34,25 @@ def select(
     nearest_of_cell: Array,
     first: Array,
     cells: Cells,
+    count: int,
     fill: float,
     golden_ratio: float,
+    corners: tuple[Array, Array, Array, Array],
     chosen: Array,
     exists: Array,
 ) -> None:
-    """Take events near each object's contours once moved to the window's end, spread evenly in time.
+    """Take events near each object's contours once moved to the window's end, spread evenly in time, and corners, in their places.
 
     Args:
         u, v, age_s, polarity, mask: ``[e, n]``: events of each object, or one row for all.
         number: ``[e, n]`` of each among all of the window, by which lots are drawn.
         own, counts: ``[b, n]`` of the one row, those of each object, and how many these are: ``[b]``; ``[0, 0]`` for all.
+        count: of events that are drawn, and of observations that events make up, where corners are fewer.
+        corners: pixels ``[b, k, 2]``, ages, polarities, and which exist: ``[b, k]``.
         chosen: ``[b, 4, c]`` pixels, ages and polarities; filled as far as there are any, as ``exists [b, c]`` says, and else zero.
     """
-    near = np.empty(mask.shape[1] + 1, np.int64)
-    chosen[:] = 0.0
+    near, (corner_pixels, corner_age_s, corner_polarity, is_corner) = np.empty(mask.shape[1] + 1, np.int64), corners
+    chosen[:], exists[:] = 0.0, False
     for b in range(len(chosen)):
         e = b if len(mask) > 1 else 0
         looked_at = counts[b] if len(own) else mask.shape[1]
@@ -55,15 +60,23 @@ def select(
             u[e], v[e], age_s[e], mask[e], own[b] if len(own) else own.ravel(), looked_at, velocity[b], centre_cam[b], intrinsics[b],
             nearest_of_cell[b], first[b], cells, near,
         )  # fmt: skip
-        drawn = _draw(near, total, number[e], fill, golden_ratio, chosen.shape[2])
-        apart = max(drawn / chosen.shape[2], 1.0)
-        for j in range(chosen.shape[2]):
+        drawn = _draw(near, total, number[e], fill, golden_ratio, count)
+        for k in range(is_corner.shape[1]):
+            if is_corner[b, k]:
+                exists[b, k], chosen[b, 0, k], chosen[b, 1, k] = True, corner_pixels[b, k, 0], corner_pixels[b, k, 1]
+                chosen[b, 2, k], chosen[b, 3, k] = corner_age_s[b, k], corner_polarity[b, k]
+        share, apart, place = (count - is_corner[b].sum()) / max(min(drawn, count), 1), max(drawn / count, 1.0), 0
+        for j in range(count):
             # Spread evenly over what was drawn, should it be more than places.
-            rank = int(j * apart)
-            exists[b, j] = rank < drawn
-            if exists[b, j]:
+            rank, lot = int(j * apart), j * golden_ratio
+            while place < exists.shape[1] and exists[b, place]:
+                place += 1
+            if rank >= drawn or place == exists.shape[1]:
+                break
+            if lot - np.floor(lot) < share:
                 i = near[rank]
-                chosen[b, 0, j], chosen[b, 1, j], chosen[b, 2, j], chosen[b, 3, j] = u[e, i], v[e, i], age_s[e, i], polarity[e, i]
+                chosen[b, 0, place], chosen[b, 1, place] = u[e, i], v[e, i]
+                chosen[b, 2, place], chosen[b, 3, place], exists[b, place] = age_s[e, i], polarity[e, i], True
 
 
 @kernel(fastmath=FAST)
@@ -107,13 +120,22 @@ def _draw(near: Array, total: np.int64, number: Array, fill: float, golden_ratio
 
 
 @accelerates(observations.select_events)
-def select_events_numba(events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int) -> Observations:
+def select_events_numba(
+    events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int, corners: Observations | None = None
+) -> Observations:
     """Event by event."""
     rows, own, counts = laid_out(events)
     number = torch.arange(rows.mask.shape[1]).expand(len(rows.mask), -1) if rows.number is None else rows.number
     batch = len(objects.velocity)
-    chosen, exists = rows.pixels.new_empty(batch, 4, count), torch.empty(batch, count, dtype=torch.bool)
+    corners = observations.corner_observations(no_corners(rows.pixels.expand(batch, -1, -1))) if corners is None else corners
+    places = max(count, corners.mask.shape[1])
+    chosen, exists = rows.pixels.new_empty(batch, 4, places), torch.empty(batch, places, dtype=torch.bool)
     seen = as_arrays(*rows.pixels.unbind(-1), rows.age_s, rows.polarity, rows.mask, number, own, counts)
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics, index.nearest, index.first)
-    select(*seen, *moving, cells_of(index), observations.FILL, GOLDEN_RATIO, chosen.numpy(), exists.numpy())
-    return observations.event_observations(chosen.transpose(1, 2), exists)
+    of_corners = as_arrays(corners.pixels, corners.age_s, corners.polarity, corners.mask)
+    drawing = (count, observations.FILL, GOLDEN_RATIO, tuple(of_corners))
+    select(*seen, *moving, cells_of(index), *drawing, chosen.numpy(), exists.numpy())
+    taken = observations.event_observations(chosen.transpose(1, 2), exists)
+    if len(corners.flow[0]):
+        taken.flow[:, : len(corners.flow[0])], taken.has_flow[:, : len(corners.flow[0])] = corners.flow, corners.has_flow
+    return taken

@@ -55,6 +55,32 @@ def regions_numba(sensors: Sensors, contours: Contours, margin_px: int) -> Regio
 
 
 @kernel()
+def pixels_at(pixels: Array, stream_index: Array, numbers: Array, border_px: int, width: int, nearest: Array) -> None:
+    """Fill ``nearest [b, n, 2]`` with columns and rows of the sensor pixels nearest to ideal ones, ``pixels [b, 2, n]``.
+
+    Args:
+        numbers: ``[s, bh, bw]`` of those pixels, row by row of a sensor so wide.
+    """
+    last_row, last_column, border = numbers.shape[1] - 1, numbers.shape[2] - 1, pixels.dtype.type(border_px)
+    for b in range(len(pixels)):
+        table = numbers[stream_index[b]]
+        for i in range(pixels.shape[2]):
+            column = np.uint64(np.rint(min(max(pixels[b, 0, i] + border, 0.0), last_column)))
+            row = np.uint64(np.rint(min(max(pixels[b, 1, i] + border, 0.0), last_row)))
+            number = np.uint32(table[row, column])
+            nearest[b, i, 0], nearest[b, i, 1] = number % np.uint32(width), number // np.uint32(width)
+
+
+@accelerates(Sensors.nearest_pixels)
+def nearest_pixels_numba(sensors: Sensors, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n 2"]:
+    """Pixel by pixel."""
+    nearest = torch.empty(pixels.shape, dtype=torch.int64)
+    arrays = as_arrays(pixels.transpose(1, 2), sensors.stream_index, sensors.sensor_numbers)
+    pixels_at(*arrays, BORDER_PX, sensors.image_size[1], nearest.numpy())
+    return nearest
+
+
+@kernel()
 def decays(times_us: Array, t_us: Array, origin: Array, stream_index: Array, oldest_us: int, per_us: float, powers: Array) -> None:
     """Fill ``powers [b, rh, rw]`` with what each pixel decays by, as a power of e: minus infinity outside the sensor, and from an age on."""
     height, width = times_us.shape[1:]
@@ -63,13 +89,12 @@ def decays(times_us: Array, t_us: Array, origin: Array, stream_index: Array, old
         first, end = min(max(-left, 0), power.shape[1]), max(min(width - left, power.shape[1]), 0)
         scale, never = power.dtype.type(per_us), power.dtype.type(-np.inf)
         for row in range(len(power)):
-            own = power[row]
-            own[:] = never
-            if not 0 <= top + row < height:
+            power[row] = never
+            if not 0 <= top + row < height or end <= first:
                 continue
-            of_row = times[top + row]
-            for column in range(first, end):
-                age_us = now_us - of_row[left + column]
+            own, of_row = power[row, first:end], times[top + row, left + first : left + end]
+            for column in range(len(own)):
+                age_us = now_us - of_row[column]
                 # No branch: a processor would guess many of them wrong.
                 own[column] = scale * power.dtype.type(max(age_us, 0)) if age_us < oldest_us else never
 
@@ -78,8 +103,9 @@ def decays(times_us: Array, t_us: Array, origin: Array, stream_index: Array, old
 def time_surface_numba(
     last_event_us: Int[Tensor, "s h w"], t_us: Int[Tensor, "s"], regions: Regions, tau_s: float, dtype: torch.dtype
 ) -> Float[Tensor, "b rh rw"]:
-    """Pixel by pixel; the exponential of all at once."""
+    """Pixel by pixel; the exponential of all at once, by NumPy, which takes a third of the time where many pixels never fired."""
     powers = torch.empty(len(regions.origin), *regions.size, dtype=dtype)
     arrays = as_arrays(last_event_us, t_us, regions.origin, regions.stream_index)
     decays(*arrays, int(time_surface.MAX_DECAYS * tau_s * 1e6), -1e-6 / tau_s, powers.numpy())
-    return powers.exp_()
+    np.exp(powers.numpy(), out=powers.numpy())
+    return powers

@@ -38,6 +38,7 @@ USUAL = 5.0
 UNSEEN_S = 0.01
 
 
+@accelerable
 def guided_by_flow(
     observations: Observations, index: ContourIndex, contours: Contours, prediction: Prediction, time_since_validated_s: Float[Tensor, "b"]
 ) -> Observations:
@@ -49,7 +50,6 @@ def guided_by_flow(
     return replace(observations, trust=trust if observations.trust is None else trust * observations.trust)
 
 
-@accelerable
 def flow_disagreement(
     observations: Observations, index: ContourIndex, contours: Contours, prediction: Prediction
 ) -> tuple[Float[Tensor, "b n"], Bool[Tensor, "b n"]]:

@@ -1,10 +1,11 @@
 """What is matched with contours: recent events near them, and corners where there are any."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.image_velocity import MovingObjects
@@ -46,11 +47,15 @@ def corner_observations(corners: Corners) -> Observations:
 
 
 @accelerable
-def select_events(events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int) -> Observations:
+def select_events(events: ObjectEvents, index: ContourIndex, objects: MovingObjects, count: int, corners: Observations | None = None) -> Observations:
     """Events near an object's contours once moved to the window's end: at most ``count``, spread evenly in time.
 
     Which of them are taken hangs on each event's own number, not on how many come before it: a pose that is a little
     different takes almost the same events.
+
+    Args:
+        corners: stay in their places. Of the events, there are then in the places that they leave as many as make up ``count``, where
+            corners are fewer.
     """
     events = events.rows()
     pixels, mask = events.pixels, events.mask
@@ -59,7 +64,8 @@ def select_events(events: ObjectEvents, index: ContourIndex, objects: MovingObje
     share = torch.where(total > count, FILL * count / total, 1.0)
     chosen, exists = events.draw(near, share, count)
     rows = [pixels.transpose(1, 2), events.age_s[:, None], events.polarity[:, None]]
-    return event_observations(take_points(torch.cat(rows, 1).transpose(1, 2), chosen), exists)
+    taken = event_observations(take_points(torch.cat(rows, 1).transpose(1, 2), chosen), exists)
+    return taken if corners is None or corners.mask.shape[1] == 0 else _filled_up(corners, taken, count)
 
 
 def event_observations(values: Float[Tensor, "b c 4"], exists: Bool[Tensor, "b c"]) -> Observations:
@@ -74,13 +80,21 @@ def join(first: Observations, second: Observations) -> Observations:
     return Observations(*(_one_after_the_other(getattr(first, name), getattr(second, name)) for name in names))
 
 
-def filled_up(corners: Observations, events: Observations, count: int) -> Observations:
-    """Corners, and as many events beside them, spread evenly over all that are given, as make up ``count`` where corners are fewer."""
-    if corners.mask.shape[1] == 0:
-        return events
+def _filled_up(corners: Observations, events: Observations, count: int) -> Observations:
+    """Corners, and in the places that they leave as many events, spread evenly over all that are given, as make up ``count``."""
+    own, device = corners.mask.shape[1], events.mask.device
+    places = max(count, own)
     room, given = count - corners.mask.sum(-1, keepdim=True), events.mask.sum(-1, keepdim=True)
-    lot = (torch.arange(events.mask.shape[1], device=events.mask.device) * GOLDEN_RATIO).frac()
-    return join(corners, replace(events, mask=events.mask & (lot < room / given.clamp(min=1))))
+    lot = (torch.arange(events.mask.shape[1], dtype=torch.float64, device=device) * GOLDEN_RATIO).frac()
+    kept = (events.mask & (lot < room.double() / given.clamp(min=1))).cumsum(-1)
+    is_corner = pad(corners.mask, (0, places - own))
+    rank = (~is_corner).cumsum(-1)
+    chosen = torch.searchsorted(kept, rank).clamp(max=events.mask.shape[1] - 1)
+    index, both = torch.where(is_corner, torch.arange(places, device=device), own + chosen), join(corners, events)
+    values = {
+        name: take_points(value, index) if value.dim() == 3 else value.gather(1, index) for name, value in vars(both).items() if name != "trust"
+    }
+    return Observations(**values | {"mask": is_corner | (rank <= kept[:, -1:])})
 
 
 def _one_after_the_other(first: Tensor, second: Tensor) -> Tensor:

@@ -136,6 +136,7 @@ class Sensors:
         """Flow of points of the sensor (px/s), and where there is one; ``maps`` are those at ``t_us``."""
         return estimate_flow(points, maps, t_us, self.stream_index, self.ideal_pixels, config.flow)
 
+    @accelerable
     def nearest_pixels(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n 2"]:
         """Columns and rows of the sensor pixels nearest to ideal ones."""
         number, width = numbers_of(self.sensor_numbers, self.stream_index, pixels).long(), self.image_size[1]
