@@ -176,7 +176,7 @@ def unclaimed(
     is_unseen = unseen_s >= UNSEEN_FROM_S
     if not (tracked.objects.shared and tracked.config.uses(Component.OTHERS_EVENTS)) or reads.none_of(is_unseen):
         return events
-    is_seen_well = (unseen_s == 0) & (state.health.mean_score > 0)
+    is_seen_well = ~is_unseen & (state.health.mean_score > 0)
     claimed = claimed_pixels(expected.prediction.detached(), contours, is_seen_well, expected.dt_s)
     return without_claimed(events, claimed, tracked.stream_index, is_unseen)
 
