@@ -22,6 +22,8 @@ SEEN_WELL = {
     "time_since_validated_s": 0.0,
     "looks": 0,
     "is_starting": False,
+    "confirmations": 4.0,
+    "measured_ratio": 0.9,
     "is_due": False,
     "is_drift_due": False,
     "is_near_due": True,

@@ -30,6 +30,7 @@ class Component(StrEnum):
     HELD = "held"
     LAST_SEEN = "last_seen"
     AROUND_LAST_SEEN = "around_last_seen"
+    UNCONFIRMED = "unconfirmed"
     # how they are compared
     MATCH_COUNT = "match_count"
     INLIER_RATIO = "inlier_ratio"

@@ -137,6 +137,11 @@ class TrackerConfig(Settings):
         """Whether a component takes part."""
         return component not in self.disabled
 
+    @property
+    def searches(self) -> bool:
+        """Whether other poses than the predicted ones are ever tried."""
+        return self.relocalization.hypotheses > 0 and self.solver.prior
+
     @field_serializer("disabled", when_used="json")
     def _in_order(self, disabled: frozenset[Component]) -> list[str]:
         return sorted(disabled)

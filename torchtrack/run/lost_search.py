@@ -25,7 +25,6 @@ from torchtrack.run.first_pose.searching import poses_in_box, projected_box
 from torchtrack.run.first_pose.start import Box, Start, box_of_events
 from torchtrack.run.first_pose.tracked import FOLLOWED_US, alone, followed_on
 from torchtrack.tracking.relocalization.schedule import is_time
-from torchtrack.tracking.relocalization.triggers import searches
 from torchtrack.tracking.state import TrackerState
 from torchtrack.tracking.tracker import Tracker
 
@@ -62,7 +61,7 @@ class LostSearch:
         self._models: Sequence[ObjectModel] = [tracker.object_models[number] for number in numbers]
         self._camera: Camera = tracker.cameras[stream]
         search = tracker.config.relocalization
-        self._after_us = search.everywhere_after_us if searches(tracker.config) else 0
+        self._after_us = search.everywhere_after_us if tracker.config.searches else 0
         self._accept_ratio = search.accept_ratio
         self._table: Float[Tensor, "h w 2"] | None = None
         self._windows: deque[EventWindow] = deque()

@@ -31,11 +31,11 @@ from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_object import Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.tentative import confirm_or_take_back
-from torchtrack.tracking.relocalization.triggers import SEARCHED, has, triggers
+from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, has, triggers
 from torchtrack.tracking.state import StepResult, TrackerState, each_tensor
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, reference_where_known, score_fit
-from torchtrack.tracking.validation.verdict import Limits, confirmed_status
+from torchtrack.tracking.validation.verdict import Limits, confirmed_status, looked_elsewhere
 
 _READS = host_sync.HostReads()
 
@@ -205,8 +205,12 @@ def update(
         next_state, result = confirm_or_take_back(state, next_state, result, prediction, located.gate_scale, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, learns=given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
-    status = confirmed_status(result.status, next_state.health.confirmations, Limits.from_config(config))
-    maps, health = replace(next_state.maps, burst_age_us=seen.burst_age_us), next_state.health.with_looks(located.looked)
+    limits, health = Limits.from_config(config), next_state.health.with_looks(located.looked)
+    if located.looked is not None:
+        found_nothing = located.looked & has(window.triggers, Trigger.UNCONFIRMED)
+        health = replace(health, confirmations=looked_elsewhere(health.confirmations, found_nothing, limits))
+    status = confirmed_status(result.status, health.confirmations, limits)
+    maps = replace(next_state.maps, burst_age_us=seen.burst_age_us)
     return replace(next_state, t_us=given.t_us, maps=maps, health=health), replace(result, t_us=given.t_us, status=status)
 
 

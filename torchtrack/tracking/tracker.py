@@ -26,7 +26,6 @@ from torchtrack.tracking.graphs import CompiledStep
 from torchtrack.tracking.initialization import PARTS, check_poses, first_state, to_be_parted
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.sampling import rehearse
-from torchtrack.tracking.relocalization.triggers import searches
 from torchtrack.tracking.start_check import check_in_view
 from torchtrack.tracking.state import StepResult, TrackerState, choose_rows
 from torchtrack.tracking.step import StepInput, advance, opened
@@ -180,7 +179,7 @@ class Tracker(TrackedObjects):
             if dispatch.may_accelerate(self.intrinsics):
                 # Kernels are compiled, or read from the disk, when they are first called: for a window without events.
                 self._advance(state, EventBatch.empty(), state.t_us + 1)
-                if searches(self.config):
+                if self.config.searches:
                     rehearse(predicted_after(self, state, torch.full_like(self.diameter_m, 1e-6)), self.config)
 
     def _tracked(

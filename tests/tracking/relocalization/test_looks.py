@@ -7,8 +7,8 @@ from torchtrack.tracking.relocalization.triggers import Trigger
 from torchtrack.tracking.validation.health import TrackHealth
 
 
-def asks(number, looks=0, lost_s=0.0, *, stream=0, is_starting=False):
-    return Asks(number, stream, int(Trigger.UNCERTAIN), looks, lost_s, is_starting)
+def asks(number, looks=0, lost_s=0.0, *, stream=0, is_starting=False, flags=Trigger.UNCERTAIN):
+    return Asks(number, stream, int(flags), looks, lost_s, is_starting)
 
 
 def numbers(*asking, most=1):
@@ -37,6 +37,16 @@ def test_streams_do_not_matter_to_one_another():
 def test_all_whose_motion_is_not_known_are_looked_for_beside_the_others():
     starting = [asks(number, is_starting=True) for number in range(3)]
     assert numbers(*starting, asks(3), asks(4)) == [0, 1, 2, 3]
+
+
+def test_what_merely_waits_for_its_confirmation_takes_no_look_from_what_is_lost():
+    """As many more are looked for, and no more than that: the rest waits."""
+    waiting = [asks(number, flags=Trigger.UNCONFIRMED) for number in range(3)]
+    assert numbers(*waiting, asks(3, 5), asks(4, 6)) == [0, 3]
+    assert numbers(*waiting, asks(3, 5), asks(4, 6), most=2) == [0, 1, 3, 4]
+    # What has another reason besides waits for its turn among those that have one.
+    assert numbers(asks(0, 5), asks(1, 6, flags=Trigger.UNCONFIRMED | Trigger.NEW)) == [0]
+    assert numbers(asks(0, 5), asks(1, 6, flags=Trigger.UNCONFIRMED | Trigger.LOST)) == [0, 1]
 
 
 def test_numbers_as_a_mask():

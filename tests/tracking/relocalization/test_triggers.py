@@ -64,6 +64,7 @@ ALONE = {
     Trigger.LOST: {"earlier": int(Trigger.LOST)},
     Trigger.DEPTH_CHANGED: {"earlier": int(Trigger.DEPTH_CHANGED)},
     Trigger.FAR_BELOW_REFERENCE: {"earlier": int(Trigger.FAR_BELOW_REFERENCE)},
+    Trigger.UNCONFIRMED: {"confirmations": 2.0},
 }
 
 
@@ -124,6 +125,18 @@ def test_where_looking_has_not_helped_for_long_it_waits_too_of_objects_whose_pla
     for trigger in (Trigger.LOW_SCORE, Trigger.SCORE_DROP):
         assert having(trigger, low) == [True, False]
     assert having(Trigger.UNCERTAIN, evidence(2, sigma_px=4.1, **near), trigger_sigma_px=4.0) == [True, False]
+
+
+def test_a_pose_is_compared_with_others_in_the_window_that_would_confirm_it():
+    given = evidence(
+        6,
+        confirmations=[1.0, 2.0, 3.0, 4.0, 3.0, 3.0],
+        measured_ratio=[0.9, 0.9, 0.6, 0.9, 0.59, torch.nan],
+    )
+    assert having(Trigger.UNCONFIRMED, given) == [False, True, True, False, False, False]
+    assert not any(having(Trigger.UNCONFIRMED, given, Component.UNCONFIRMED))
+    # Not in a part of a window, of which the motion is not known yet.
+    assert not any(having(Trigger.UNCONFIRMED, evidence(confirmations=3.0, is_starting=True)))
 
 
 def test_very_uncertain_objects_wait_until_it_is_time_and_others_do_not():

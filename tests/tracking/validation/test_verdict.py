@@ -197,7 +197,7 @@ WELL, BARELY, BADLY = {"explained_ratio": 0.7}, {"explained_ratio": 0.55}, {"exp
         ([WELL, BARELY, WELL], 2),
         ([WELL, BADLY, WELL], 1),
         ([BADLY] * 5 + [WELL], 1),
-        ([WELL] * 3 + [BADLY] * 9, 3),
+        ([WELL] * 3 + [BADLY] * 9, 0),
         ([WELL, WELL, {"explained_ratio": 0.05}, WELL], 1),
         ([WELL, WELL, {"matched": 3}, WELL], 3),
         ([WELL] * 5 + [{"is_relocalized": True}], 0),
@@ -208,6 +208,32 @@ def test_a_pose_is_confirmed_by_windows_that_explain_it(windows, expected):
     assert confirmed_after(windows) == expected
 
 
+def test_a_pose_is_confirmed_by_a_look_at_others_and_not_before_windows_enough_speak_for_it():
+    asked, before = limits(), torch.tensor([2.0, 3.0, 3.0, 4.0])
+    after = rules.looked_elsewhere(before, torch.tensor([True, False, True, True]), asked)
+    assert (after >= asked.confirmed_by).tolist() == [False, False, True, True]
+    assert torch.equal(after[:2], before[:2])
+
+
+def test_what_is_confirmed_stays_that_until_a_search_gives_another_pose():
+    confirmed = limits().confirmed_by
+    assert confirmed_after([BADLY] * 9 + [{"explained_ratio": 0.05}], confirmed) == confirmed
+    assert confirmed_after([{"is_relocalized": True}], confirmed) == 0
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"disabled": ["unconfirmed"]},
+        {"relocalization": {"hypotheses": 0}},
+        {"solver": {"prior": False}},
+    ],
+)
+def test_where_no_others_are_looked_at_windows_alone_confirm_a_pose(settings):
+    asked = Limits.from_config(TrackerConfig.model_validate(settings))
+    assert confirmed_after([WELL] * 3 + [BADLY] * 9, asked=asked) == asked.confirmed_by == 3
+
+
 def test_of_corners_alone_no_contour_can_be_explained_and_no_pose_waits_for_that():
     asked = Limits.from_config(TrackerConfig(association=AssociationConfig(max_events=0), corners=CornerConfig(max_corners=9)))
     assert rules.confirmed_status(torch.tensor([Status.TRACKING]), torch.zeros(1), asked).tolist() == [Status.TRACKING]
@@ -215,12 +241,12 @@ def test_of_corners_alone_no_contour_can_be_explained_and_no_pose_waits_for_that
 
 def test_what_is_not_confirmed_is_uncertain_at_best():
     status = torch.tensor([Status.TRACKING, Status.TRACKING, Status.LOST, Status.UNCERTAIN])
-    stated = rules.confirmed_status(status, torch.tensor([2.0, 3.0, 0.0, 3.0]), limits())
+    stated = rules.confirmed_status(status, torch.tensor([3.0, 4.0, 0.0, 4.0]), limits())
     assert stated.tolist() == [Status.UNCERTAIN, Status.TRACKING, Status.LOST, Status.UNCERTAIN]
 
 
 def test_what_is_not_confirmed_is_not_remembered_as_seen_well():
-    known = References(*torch.tensor([0.9, 0.9, 0.8, 90.0, 0.0, 0.4, 0.0])[:, None].expand(7, 2))._replace(confirmations=torch.tensor([2.0, 3.0]))
+    known = References(*torch.tensor([0.9, 0.9, 0.8, 90.0, 0.0, 0.4, 0.0])[:, None].expand(7, 2))._replace(confirmations=torch.tensor([3.0, 4.0]))
     seen = measured(matched=torch.tensor([100, 100]))
     judged = rules.verdict(seen, known, limits())
     assert judged.is_certain.tolist() == [False, True]

@@ -41,6 +41,8 @@ class TriggerEvidence:
         time_since_validated_s: how long ago it was last seen well (s).
         looks: in how many windows it was looked for since then.
         is_starting: objects whose motion is not known yet.
+        confirmations: of each object's pose before the window.
+        measured_ratio: what the fit explains of the moving contour; not a number where hardly anything moves.
         is_due, is_drift_due, is_near_due: as :class:`Schedule` has them.
         earlier: triggers that are set already.
     """
@@ -55,6 +57,8 @@ class TriggerEvidence:
     time_since_validated_s: Float[Tensor, "b"]
     looks: Int[Tensor, "b"]
     is_starting: Bool[Tensor, "b"]
+    confirmations: Float[Tensor, "b"]
+    measured_ratio: Float[Tensor, "b"]
     is_due: Bool[Tensor, "b"]
     is_drift_due: Bool[Tensor, "b"]
     is_near_due: Bool[Tensor, "b"]
@@ -84,6 +88,8 @@ def gather_evidence(
         time_since_validated_s=state.health.time_since_validated_s,
         looks=state.health.looks,
         is_starting=is_starting,
+        confirmations=state.health.confirmations,
+        measured_ratio=scored.measured_ratio,
         is_due=window.is_due,
         is_drift_due=window.is_drift_due,
         is_near_due=window.is_near_due,

@@ -66,15 +66,20 @@ def around_prediction_released(lost: LostObject) -> Hypotheses:
 def as_last_seen(lost: LostObject) -> Hypotheses:
     """Rotated and as far away as when it was last validated, in the place of the image where it is predicted."""
     T_last_seen = lost.last_seen.T_cam_obj[lost.number]
-    return _sampled_elsewhere(lost, where_last_seen(lost.predicted(), T_last_seen), lost.sigma_px)
+    return sampled_elsewhere(lost, where_last_seen(lost.predicted(), T_last_seen), lost.sigma_px)
 
 
 def around_last_seen(lost: LostObject) -> Hypotheses:
     """All around where it was last validated, at rest there."""
     other = lost.last_seen.prediction(lost.number, lost.window.prediction)
     # A look from there is a wide one, however far this one goes.
-    hypotheses = _sampled_elsewhere(lost, other, 2 * lost.config.relocalization.wide_sigma_px)
-    return replace(hypotheses, gate_scale=gate_scale_of(torch.full_like(lost.window.gate_scale[:1], torch.inf), lost.config))
+    hypotheses = sampled_elsewhere(lost, other, 2 * lost.config.relocalization.wide_sigma_px)
+    return replace(hypotheses, gate_scale=anywhere_scale(lost))
+
+
+def anywhere_scale(lost: LostObject) -> Float[Tensor, "1"]:
+    """The scale of the first gate of what may be anywhere."""
+    return gate_scale_of(torch.full_like(lost.window.gate_scale[:1], torch.inf), lost.config)
 
 
 def sampled_around(lost: LostObject, prediction: Prediction, sigma_px: float, outline: Contours) -> Hypotheses:
@@ -91,7 +96,7 @@ def sampled_around(lost: LostObject, prediction: Prediction, sigma_px: float, ou
     return Hypotheses(prediction, offsets, covariance, places, is_wide=sigma_px > search.wide_sigma_px)
 
 
-def _sampled_elsewhere(lost: LostObject, prediction: Prediction, sigma_px: float) -> Hypotheses:
+def sampled_elsewhere(lost: LostObject, prediction: Prediction, sigma_px: float) -> Hypotheses:
     """Sampled around a prediction of the object that is not its own."""
     outline = prediction.objects.contours(prediction.T_cam_obj, lost.config.contours)
     return replace(sampled_around(lost, prediction, sigma_px, outline), replaces_prediction=True)

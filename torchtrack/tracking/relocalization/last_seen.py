@@ -22,6 +22,8 @@ def with_drift(prediction: Prediction, is_adrift: Bool[Tensor, "b"], drift_s: Fl
     """The prediction, of objects that drift so uncertain as if they had moved otherwise, at some constant velocity, for that long."""
     objects = prediction.objects
     speed_m_s = torch.minimum(_DRIFT_PX_S / objects.px_per_m(prediction.T_cam_obj), _DRIFT_DIAMETERS_S * objects.diameter_m).double()
+    # Covariances are constants, also where gradients are recorded.
+    speed_m_s = speed_m_s.detach()
     velocity = rim_and_centre(speed_m_s[:, None], objects.diameter_m.double()[:, None])
     rotated_s, moved_s = (drift_s.clamp(max=longest_s).double()[:, None].expand(-1, 3) for longest_s in (_LONGEST_ROTATION_S, _LONGEST_S))
     # Pose and velocity are off together: such a velocity explains both.

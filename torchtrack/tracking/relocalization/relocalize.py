@@ -43,7 +43,7 @@ def relocalize(
     drifts = has(triggers, DRIFTS) & ~has(triggers, Trigger.HELD)
     drift_s = torch.where(has(triggers, Trigger.SLOW_DRIFT), evidence.time_since_validated_s, evidence.drift_s)
     widened = with_drift(window.prediction, drifts, drift_s)
-    sigma_px = torch.where(drifts, widened.sigma_px(window.scored.fit.contours), evidence.sigma_px)
+    sigma_px = torch.where(drifts, widened.sigma_px(window.scored.fit.contours).detach(), evidence.sigma_px)
     # Without events no pose is better than another; what is looked for all around may have its own there.
     enough = events.counts() >= config.validation.min_observations
     asking = _asking(window, torch.where(enough, triggers, triggers & int(AROUND_LAST_SEEN)), evidence, sources)

@@ -11,7 +11,7 @@ from torchtrack.core.host_sync import none_of
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import MOST_UNCERTAIN
 from torchtrack.tracking.relocalization.evidence import Schedule
-from torchtrack.tracking.relocalization.triggers import DRIFT_US, Trigger, flags_of, searches
+from torchtrack.tracking.relocalization.triggers import DRIFT_US, Trigger, flags_of
 from torchtrack.tracking.state import TrackerState
 
 # A prediction that is so uncertain, as a ratio of the most that predictions become, tells nothing any more.
@@ -71,7 +71,7 @@ def _not_validated_for_long(state: TrackerState, objects: ObjectBatch, is_drift_
 
 
 def _lacks_validation(state: TrackerState, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    if not (config.uses(Component.AROUND_LAST_SEEN) and searches(config)):
+    if not (config.uses(Component.AROUND_LAST_SEEN) and config.searches):
         return torch.zeros_like(state.health.time_since_validated_s, dtype=torch.bool)
     return (state.health.time_since_validated_s >= 1e-6 * _NOT_VALIDATED_US) & (state.health.mean_score > 0)
 

@@ -7,7 +7,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.tracking.relocalization import acceptance, hypotheses
+from torchtrack.tracking.relocalization import acceptance, hypotheses, rivals
 from torchtrack.tracking.relocalization.acceptance import Acceptance
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
@@ -46,4 +46,5 @@ SOURCES = (
     # What is lost is predicted there already.
     Source(Trigger.NOT_VALIDATED, hypotheses.as_last_seen, acceptance.as_last_seen, unless=Trigger.LOST),
     Source(AROUND_LAST_SEEN, hypotheses.around_last_seen, acceptance.around_last_seen, comes_last=True),
+    Source(Trigger.UNCONFIRMED, rivals.turned_far, rivals.explains_far_more, comes_last=True),
 )

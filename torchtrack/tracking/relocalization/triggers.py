@@ -51,6 +51,7 @@ class Trigger(IntFlag):
     DEPTH_CHANGED = auto()
     FAR_BELOW_REFERENCE = auto()
     LOST = auto()
+    UNCONFIRMED = auto()
 
 
 NONE = Trigger(0)
@@ -62,12 +63,12 @@ AROUND_LAST_SEEN = Trigger.DEPTH_CHANGED | Trigger.FAR_BELOW_REFERENCE
 AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.NEW | Trigger.LOW_SCORE | DRIFTS
 # What calls for a search. An object that is lost is expected where it was last validated, and uncertain there; an object that was not
 # validated for long is uncertain or drifts.
-SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP
+SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP | Trigger.UNCONFIRMED
 
 
 def triggers(evidence: TriggerEvidence, config: TrackerConfig) -> Int[Tensor, "b"]:
     """The :class:`Trigger` bits of each object; none where other poses are never tried."""
-    if not searches(config):
+    if not config.searches:
         return torch.zeros_like(evidence.earlier)
     for conditions in _CONDITIONS:
         flags = flags_of({bit: condition(evidence, config) for bit, condition in conditions.items()})
@@ -168,6 +169,16 @@ def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[T
     return _looks_far(evidence, config) & long & (has(evidence.earlier, DRIFTS) | (evidence.sigma_px > config.relocalization.wide_sigma_px))
 
 
+def is_unconfirmed(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """UNCONFIRMED: objects whose pose has windows enough that speak for it, this one among them: it is confirmed once no other explains far more."""
+    limits = Limits.from_config(config)
+    waits = (evidence.confirmations >= limits.speaking_windows - 1) & (evidence.confirmations < limits.confirmed_by)
+    if none_of(waits) or limits.confirmed_by == limits.speaking_windows:
+        return torch.zeros_like(waits)
+    # What hardly moves is not a number, and says nothing.
+    return waits & ~evidence.is_starting & (evidence.measured_ratio >= limits.confirmed_from)
+
+
 # First those that others hang on.
 _CONDITIONS: tuple[dict[int, Condition], ...] = (
     {int(Trigger.DRIFT): is_drifting, int(Trigger.SLOW_DRIFT): is_drifting_slowly},
@@ -178,6 +189,7 @@ _CONDITIONS: tuple[dict[int, Condition], ...] = (
         int(Trigger.SCORE_DROP): has_score_dropped,
         int(Trigger.HELD): is_held,
         int(Trigger.NOT_VALIDATED): is_not_validated,
+        int(Trigger.UNCONFIRMED): is_unconfirmed,
     },
 )
 
@@ -192,11 +204,3 @@ def _is_near_or_due(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Te
 
 def _looks_far(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     return evidence.is_drift_due & config.uses(Component.DRIFT)
-
-
-# ---- what else hangs on the same settings
-
-
-def searches(config: TrackerConfig) -> bool:
-    """Whether other poses are ever tried."""
-    return config.relocalization.hypotheses > 0 and config.solver.prior

@@ -49,7 +49,8 @@ class Limits(NamedTuple):
         certain_count: as :data:`CERTAIN_COUNT`, or zero where numbers of observations are not compared.
         drift_below: as :data:`DRIFT_BELOW`.
         confirmed_from: as :data:`CONFIRMED_FROM`, no less than ``uncertain_below``.
-        confirmed_by: as :data:`CONFIRMED_BY`; no windows where corners alone are observed, which lie on little of a contour.
+        speaking_windows: as :data:`CONFIRMED_BY`; none where corners alone are observed, which lie on little of a contour.
+        confirmed_by: these, and a look at other poses that found none that explains far more, where other poses are tried.
     """
 
     uncertain_below: float
@@ -64,12 +65,15 @@ class Limits(NamedTuple):
     certain_count: float
     drift_below: float
     confirmed_from: float
+    speaking_windows: float
     confirmed_by: float
 
     @classmethod
     def from_config(cls, config: TrackerConfig) -> "Limits":
         """By a tracker's settings."""
         validation = config.validation
+        speaking_windows = CONFIRMED_BY if config.association.max_events else 0.0
+        looks = config.searches and config.uses(Component.UNCONFIRMED) and speaking_windows > 0.0
         return cls(
             uncertain_below=validation.uncertain_below,
             lost_below=validation.lost_below,
@@ -83,7 +87,8 @@ class Limits(NamedTuple):
             certain_count=CERTAIN_COUNT if config.uses(Component.MATCH_COUNT) else 0.0,
             drift_below=DRIFT_BELOW,
             confirmed_from=max(CONFIRMED_FROM, validation.uncertain_below),
-            confirmed_by=CONFIRMED_BY if config.association.max_events else 0.0,
+            speaking_windows=speaking_windows,
+            confirmed_by=speaking_windows + looks,
         )
 
 
@@ -223,15 +228,20 @@ def seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"] | Int[Tensor, 
 
 
 def confirmations(before: Float[Tensor, "b"], measured: Measured, judged: Verdict, limits: Limits) -> Float[Tensor, "b"]:
-    """Windows that speak for the pose that a run started from, or that a search gave; :data:`CONFIRMED_BY` of them are enough for good.
+    """Windows that speak for the pose that a run started from, or that a search gave; with :func:`looked_elsewhere`, enough of them are for good.
 
     What does not move says nothing, and what failed begins anew.
     """
     explained, asked = measured.explained_ratio, limits.confirmed_from
     speaks_for = where(explained >= asked, 1.0, where(explained < asked - _CLEARLY, -1.0, 0.0))
-    so_far = clamp(before + where(measured.is_moving, speaks_for, 0.0), 0.0, limits.confirmed_by)
+    so_far = clamp(before + where(measured.is_moving, speaks_for, 0.0), 0.0, limits.speaking_windows)
     begins_anew = judged.failed & (judged.status != _TOO_FEW_EVENTS)
     return where(measured.is_relocalized, 0.0, where(before >= limits.confirmed_by, before, where(begins_anew, 0.0, so_far)))
+
+
+def looked_elsewhere(confirmations: Float[Tensor, "b"], looked: Bool[Tensor, "b"], limits: Limits) -> Float[Tensor, "b"]:
+    """Confirmations after a look at other poses of those that ``looked`` says, which found none: enough, where windows enough speak for the pose."""
+    return where(looked & (confirmations >= limits.speaking_windows), limits.confirmed_by, confirmations)
 
 
 def confirmed_status(status: Int[Tensor, "b"], confirmations: Float[Tensor, "b"], limits: Limits) -> Int[Tensor, "b"]:
