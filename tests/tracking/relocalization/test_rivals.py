@@ -51,15 +51,16 @@ def chosen(rivals, from_prior_rad=0.1):
     ("rival", "accepted"),
     [
         ((0.9, 500, 0.7), True),
-        # 1.2 times as much
-        ((0.75, 440, 0.61), False),
+        # 1.5 times as much
+        ((0.84, 480, 0.625), False),
         # far more of one, less of another
         ((0.95, 390, 0.9), False),
         ((0.69, 900, 0.9), False),
         ((0.95, 900, 0.59), False),
         # as much of two is no less
-        ((0.95, 400, 0.6), True),
-        ((0.7, 400, 0.8), True),
+        ((0.95, 480, 0.6), True),
+        ((1.0, 400, 0.72), True),
+        ((0.7, 700, 0.6), True),
         ((torch.nan, 900, 0.9), False),
         ((0.9, 900, torch.nan), False),
     ],
