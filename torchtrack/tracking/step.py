@@ -172,12 +172,11 @@ def unclaimed(
     tracked: TrackedObjects, state: TrackerState, expected: Expected, events: ObjectEvents, contours: Contours, reads: host_sync.HostReads
 ) -> ObjectEvents:
     """The events; of objects that are not seen well, without those that others explain which are."""
-    unseen_s = state.health.time_since_validated_s
-    is_unseen = unseen_s >= UNSEEN_FROM_S
-    if not (tracked.objects.shared and tracked.config.uses(Component.OTHERS_EVENTS)) or reads.none_of(is_unseen):
+    prediction, is_unseen = expected.prediction.detached(), state.health.time_since_validated_s >= UNSEEN_FROM_S
+    if not (prediction.objects.shared and tracked.config.uses(Component.OTHERS_EVENTS)) or reads.none_of(is_unseen):
         return events
     is_seen_well = ~is_unseen & (state.health.mean_score > 0)
-    claimed = claimed_pixels(expected.prediction.detached(), contours, is_seen_well, expected.dt_s)
+    claimed = claimed_pixels(prediction, contours, is_seen_well, expected.dt_s)
     return without_claimed(events, claimed, tracked.stream_index, is_unseen)
 
 

@@ -49,10 +49,15 @@ class MotionState:
 
 def initial_covariance(diameter_m: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 12 12"]:
     """Covariance of a pose that is given, and of a velocity that is not known (float64)."""
-    diameter_m = diameter_m.double()[:, None]
-    shift_m, speed_m_s = config.initial_shift * diameter_m, torch.full_like(diameter_m, config.initial_speed_m_s)
-    sigma = torch.cat([rim_and_centre(shift_m, diameter_m), rim_and_centre(speed_m_s, diameter_m)], -1)
-    return torch.diag_embed(sigma.square())
+    wide_m = diameter_m.double()[:, None]
+    return covariance_at_rest(rim_and_centre(config.initial_shift * wide_m, wide_m), diameter_m, config)
+
+
+def covariance_at_rest(pose_sigma: Float[Tensor, "b 6"], diameter_m: Float[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 12 12"]:
+    """Covariance of a pose with these standard deviations (rad, m), and of a velocity that is not known (float64)."""
+    wide_m = diameter_m.double()[:, None]
+    rate = rim_and_centre(torch.full_like(wide_m, config.initial_speed_m_s), wide_m)
+    return torch.diag_embed(torch.cat([pose_sigma, rate], -1).square())
 
 
 def rim_and_centre(way_m: Float[Tensor, "b 1"], diameter_m: Float[Tensor, "b 1"]) -> Float[Tensor, "b 6"]:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.contours.objects import ObjectBatch
-from torchtrack.tracking.motion.model import rim_and_centre
+from torchtrack.tracking.motion.model import covariance_at_rest, rim_and_centre
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.state import TrackerState
 
@@ -74,9 +74,7 @@ class LastSeen:
         across_m, depth_m = across_px / objects.px_per_m(T_cam_obj).double(), _DEPTH_SHARE * objects.depth_m(T_cam_obj).double()
         rotation_rad = torch.full_like(depth_m, _ROTATION_RAD)
         pose = fraction[:, None] * torch.stack([rotation_rad, rotation_rad, rotation_rad, across_m, across_m, depth_m], 1)
-        diameter_m = objects.diameter_m.double()[:, None]
-        rate = rim_and_centre(torch.full_like(diameter_m, config.motion.initial_speed_m_s), diameter_m)
-        return cls(state.health.T_last_validated, torch.diag_embed(torch.cat([pose, rate], 1).square()))
+        return cls(state.health.T_last_validated, covariance_at_rest(pose, objects.diameter_m, config.motion))
 
     def in_place_of(self, state: TrackerState, lost: Bool[Tensor, "b"]) -> TrackerState:
         """The state with objects that are ``lost`` at rest where they were last seen well."""

@@ -12,7 +12,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.tracking.motion.model import rim_and_centre
+from torchtrack.tracking.motion.model import covariance_at_rest
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import Choice, is_likely
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
@@ -34,11 +34,10 @@ _FAR_MORE = 1.6
 def turned(prediction: Prediction, config: TrackerConfig) -> Prediction:
     """The prediction, of an object alone, as uncertain as what was put in its place but turned wrong."""
     objects = prediction.objects
-    diameter_m, depth_m = objects.diameter_m.double()[:, None], objects.depth_m(prediction.T_cam_obj).double()[:, None]
-    rotation_rad, across_m = torch.full_like(depth_m, _TURNED_RAD), _ACROSS_DIAMETERS * diameter_m
-    pose = [rotation_rad, rotation_rad, rotation_rad, across_m, across_m, _DEPTH_SHARE * depth_m]
-    rate = rim_and_centre(torch.full_like(diameter_m, config.motion.initial_speed_m_s), diameter_m)
-    return replace(prediction, covariance=torch.diag_embed(torch.cat([*pose, rate], 1).square()))
+    across_m, depth_m = _ACROSS_DIAMETERS * objects.diameter_m.double(), _DEPTH_SHARE * objects.depth_m(prediction.T_cam_obj).double()
+    rotation_rad = torch.full_like(depth_m, _TURNED_RAD)
+    pose = torch.stack([rotation_rad, rotation_rad, rotation_rad, across_m, across_m, depth_m], 1)
+    return replace(prediction, covariance=covariance_at_rest(pose, objects.diameter_m, config.motion))
 
 
 def turned_far(lost: LostObject) -> Hypotheses:
