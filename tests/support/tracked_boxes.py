@@ -69,9 +69,14 @@ def moving_box(T_start, count, camera=SMALL_CAMERA, *, seed=0, stream=0, **motio
     return trajectory, edge_events(trajectory, camera, seed=seed, stream=stream)
 
 
-@cache
 def started(dtype=torch.float32, config=None, count=5):
     """A tracker in full motion: it, its state and its last result, the next window's events, and the true poses."""
+    return _started(dtype, config, count, (config or TrackerConfig()).uses(Component.UNCONFIRMED))
+
+
+@cache
+def _started(dtype, config, count, takes_look):
+    """Kept apart by whether tests of the caller's folder take the look before a pose is confirmed (``takes_look``), which is patched."""
     trajectory, events = moving_box(pose(), count + 1)
     tracker = Tracker([box_model()], SMALL_CAMERA, config, dtype=dtype)
     state, results = follow(tracker, tracker.init(pose()[None], 0), windows(events, count))

@@ -9,10 +9,13 @@ from torchtrack.config.tracker import TrackerConfig
 _WITH_IT = {"relocalization", "validation"}
 
 
-@pytest.fixture(autouse=True)
-def no_look_before_confirmation(request, monkeypatch):
-    """Leaves out :attr:`Component.UNCONFIRMED`."""
+@pytest.fixture(autouse=True, scope="module")
+def no_look_before_confirmation(request):
+    """Leaves out :attr:`Component.UNCONFIRMED`, for fixtures of a module too."""
     if request.path.parent.name in _WITH_IT:
+        yield
         return
     uses = TrackerConfig.uses
-    monkeypatch.setattr(TrackerConfig, "uses", lambda config, component: component != Component.UNCONFIRMED and uses(config, component))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrackerConfig, "uses", lambda config, component: component != Component.UNCONFIRMED and uses(config, component))
+        yield
