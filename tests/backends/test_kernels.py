@@ -27,7 +27,10 @@ from torchtrack.tracking.contours.sampling import mesh_contours
 from torchtrack.tracking.contours.visibility import Scene, remove_hidden
 from torchtrack.tracking.frontend.arrival_flow import arrival_flow
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.sensor_view import SensorPoints, SensorView
 from torchtrack.tracking.frontend.tiles import SensorTiles
+from torchtrack.tracking.frontend.time_surface import empty_last_event
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.sampling import score_outlines
@@ -204,8 +207,9 @@ def test_arrival_flow_at_and_beside_borders(count, dtype):
     table = torch.stack([u, v], -1).to(dtype) + uniform(2, height, width, 2, high=0.2, seed=2, dtype=dtype)
     pixels = (uniform(3, count, 2, seed=3) * torch.tensor([width, height])).long()
     polarity = torch.randint(-1, 2, (3, count), generator=generator(5)).to(dtype)
-    given = (pixels, polarity, uniform(3, count, seed=6) < 0.8, ages, torch.tensor([1, 0, 1]), table, FlowConfig(model="arrival"))
-    (flow, valid), (plain_flow, plain_valid) = both_ways(lambda: arrival_flow(*given))
+    points = SensorPoints(pixels, torch.zeros_like(polarity), polarity, uniform(3, count, seed=6) < 0.8)
+    view = SensorView(SensorMaps(empty_last_event(2, height, width), ages), torch.zeros(2).long(), table, torch.tensor([1, 0, 1]))
+    (flow, valid), (plain_flow, plain_valid) = both_ways(lambda: arrival_flow(points, view, FlowConfig(model="arrival")))
     assert torch.equal(valid, plain_valid) and (count < 37 or valid.any())
     torch.testing.assert_close(flow, plain_flow, rtol=TOLERANCE[dtype], atol=TOLERANCE[dtype])
 

@@ -19,6 +19,7 @@ from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.frontend.bursts import no_bursts
 from torchtrack.tracking.frontend.corners import detect_corners
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.sensor_view import SensorView
 from torchtrack.tracking.frontend.time_surface import empty_last_event, object_regions, time_surface, update_last_event
 
 COUNT = 6
@@ -145,7 +146,8 @@ def corners_of(pixels, largest_px):
     mask, stream = torch.ones(pixels.shape[:2], dtype=torch.bool), torch.zeros(len(pixels), dtype=torch.int64)
     regions = object_regions(pixels, mask, stream, (120, 160), 12, largest_px)
     surface = time_surface(last, now, regions, 0.03, torch.float32)
-    return regions, detect_corners(surface, regions, SensorMaps(last, no_bursts(*last.shape)), now, torch.tensor([0.01]), table, CORNERS)
+    view = SensorView(SensorMaps(last, no_bursts(*last.shape)), now, table, stream)
+    return regions, detect_corners(surface, regions, view, torch.tensor([0.01]), CORNERS)
 
 
 def test_regions_of_one_size_give_the_same_corners(nothing_is_read):

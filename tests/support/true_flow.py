@@ -14,7 +14,8 @@ from torchtrack.run.session import open_session
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.expectation import predicted_after
-from torchtrack.tracking.frontend.flow import SensorPoints
+from torchtrack.tracking.frontend.flow import estimate_flow
+from torchtrack.tracking.frontend.sensor_view import SensorPoints
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.initialization import first_state
@@ -100,9 +101,9 @@ def at_truth(tracker, seen, maps, t_us, truth):
     away_px = ((pixels - observed.pixels[0] - moving * observed.age_s[0, :, None]) * normals).sum(-1).abs()
     speed = (normals * moving).sum(-1)
     chosen = observed.mask[0] & (nearest[0] >= 0) & (away_px < NEAR_PX) & (speed.abs() > LEAST_SPEED_PX_S)
-    result = {}
+    result, view = {}, tracker.sensors.view(maps, t_us)
     for name, model in MODELS.items():
-        flow, has_flow = tracker.sensors.flow(points, maps, t_us, tracker.config.model_copy(update={"flow": model}))
+        flow, has_flow = estimate_flow(points, view, model)
         ratio = (flow[0] * normals).sum(-1) / speed
         cosine = torch.nn.functional.cosine_similarity(flow[0], moving, dim=-1)
         result[name] = ratio[chosen], torch.rad2deg(cosine.clamp(-1, 1).acos())[chosen], has_flow[0][chosen]

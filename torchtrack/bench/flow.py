@@ -11,8 +11,9 @@ from torchtrack.bench.results import Report, time_result
 from torchtrack.bench.setup import Setup
 from torchtrack.config.tracker import FlowConfig
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US
-from torchtrack.tracking.frontend.flow import SensorPoints, estimate_flow
+from torchtrack.tracking.frontend.flow import estimate_flow
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.sensor_view import SensorPoints, SensorView
 from torchtrack.tracking.frontend.time_surface import NEVER_US
 
 # Both models; the paper's with the settings of its preset.
@@ -36,7 +37,7 @@ def measure(setup: Setup) -> Report:
         setup.show(name)
         points, maps, true_flow = moving_points(count, setup.device)
         stream = torch.zeros(len(points.mask), dtype=torch.int64, device=setup.device)
-        estimate = partial(torch.inference_mode()(estimate_flow), points, maps, t_us, stream, ideal, config)
+        estimate = partial(torch.inference_mode()(estimate_flow), points, SensorView(maps, t_us, ideal, stream), config)
         results.append(time_result(name, setup.clock.seconds(estimate, setup.repeats)))
         flow, has_flow = estimate()
         error = (flow - true_flow).norm(dim=-1)[has_flow] / _SPEED_PX_S

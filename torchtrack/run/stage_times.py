@@ -23,7 +23,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "visibility": ("tracking.contours.objects:remove_hidden",),
     "surface": ("tracking.step:update_last_event", "tracking.frontend.sensors:time_surface"),
     "corners": ("tracking.frontend.sensors:Sensors.corners", "tracking.frontend.sensors:detect_corners"),
-    "flow": ("tracking.frontend.sensors:estimate_flow", "tracking.step:guided_by_flow"),
+    "flow": ("tracking.step:estimate_flow", "tracking.step:guided_by_flow"),
     "index": ("tracking.step:index_for", "tracking.estimation.rounds:index_for"),
     "window's events": ("tracking.frontend.sensors:Sensors.seen",),
     "selection": ("tracking.step:select_events", "tracking.step:corner_observations"),

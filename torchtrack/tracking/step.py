@@ -20,7 +20,8 @@ from torchtrack.tracking.estimation.rounds import Fit, align, gate_scale_of, ind
 from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import Expected, expect, near_objects
 from torchtrack.tracking.frontend.corners import Corners
-from torchtrack.tracking.frontend.flow import SensorPoints
+from torchtrack.tracking.frontend.flow import estimate_flow
+from torchtrack.tracking.frontend.sensor_view import SensorPoints
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.frontend.window_events import ObjectEvents
@@ -144,10 +145,10 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
     gate_scale = gate_scale_of(sigma_px, config)
     # Asked for here: a GPU answers while corners are looked for.
     radius_px = given.reads.ask_within(index_radius(gate_scale, config), usual_index_radius(config), widest_index_radius(config))
-    maps = replace(maps, burst_age_us=burst_age_us)
-    corners = sensors.corners(contours, maps, t_us, expected.window_s, config)
+    view = sensors.view(replace(maps, burst_age_us=burst_age_us), t_us)
+    corners = sensors.corners(contours, view, expected.window_s, config)
     if config.association.search == "along_flow":
-        flow, has_flow = sensors.flow(corners.points, maps, t_us, config)
+        flow, has_flow = estimate_flow(corners.points, view, config.flow)
         corners = replace(corners, flow=flow, has_flow=has_flow)
     events = unclaimed(tracked, state, expected, events, contours, given.reads)
     index = index_for(contours, tracked.image_size, config, gate_scale, radius_px)
@@ -159,7 +160,7 @@ def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, gi
         observations = judged(WeightingInputs(observations, events, prediction, contours, index, history), tracked.weighting_network)
     if config.association.search == "guided":
         points = SensorPoints(sensors.nearest_pixels(observations.pixels), observations.age_s, observations.polarity, observations.mask)
-        flow, has_flow = sensors.flow(points, maps, t_us, config)
+        flow, has_flow = estimate_flow(points, view, config.flow)
         observations = replace(observations, flow=flow, has_flow=has_flow)
         observations = guided_by_flow(observations, index, contours, prediction, state.health.time_since_validated_s)
         # Corners are in their places; in those that they leave, there are events.

@@ -9,6 +9,9 @@ from helpers import generator
 from torchtrack.config.tracker import FlowConfig
 from torchtrack.tracking.frontend.arrival_flow import MIN_PIXELS, SPAN_US, arrival_flow, plane_flow
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US, no_bursts
+from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.sensor_view import SensorPoints, SensorView
+from torchtrack.tracking.frontend.time_surface import empty_last_event
 
 WIDTH, HEIGHT = 60, 50
 MIDDLE = (30, 25)
@@ -39,8 +42,10 @@ def flow_at(pixels, ages, *, polarity=1.0, mask=True, streams=None, scale=1.0, c
     """Flow of one or more pixels per object, and where there is one."""
     sensor = torch.tensor(pixels)
     streams = torch.zeros(len(sensor), dtype=torch.int64) if streams is None else torch.tensor(streams)
-    given = torch.full(sensor.shape[:2], polarity, dtype=dtype), torch.full(sensor.shape[:2], mask)
-    return arrival_flow(sensor, *given, ages, streams, table(len(ages), scale, dtype), config)
+    polarities = torch.full(sensor.shape[:2], polarity, dtype=dtype)
+    points = SensorPoints(sensor, torch.zeros_like(polarities), polarities, torch.full(sensor.shape[:2], mask))
+    maps = SensorMaps(empty_last_event(len(ages), HEIGHT, WIDTH), ages)
+    return arrival_flow(points, SensorView(maps, torch.zeros(len(ages)).long(), table(len(ages), scale, dtype), streams), config)
 
 
 @pytest.mark.parametrize("angle_deg", [0, 30, 90, 135, 250])

@@ -11,6 +11,7 @@ from torchtrack.tracking.frontend.bursts import no_bursts
 from torchtrack.tracking.frontend.corners import detect_corners, no_corners, select_corners, snap_to_newest
 from torchtrack.tracking.frontend.filters import corner_response
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.sensor_view import SensorView
 from torchtrack.tracking.frontend.sensors import REGION_MARGIN_PX
 from torchtrack.tracking.frontend.time_surface import NEVER_US, Regions, empty_last_event, object_regions, time_surface, update_last_event
 
@@ -44,7 +45,8 @@ def detect(last_event_us, regions, *, most=32, without=(), window_s=1.0, surface
     window = torch.full((streams,), window_s, dtype=dtype)
     table = pixel_table(streams, height, width, dtype)
     config = TrackerConfig(surface=surface_config, corners=CornerConfig(max_corners=most), disabled=frozenset(without))
-    return detect_corners(surface, regions, SensorMaps(last_event_us, no_bursts(streams, height, width)), now, window, table, config)
+    view = SensorView(SensorMaps(last_event_us, no_bursts(streams, height, width)), now, table, regions.stream_index)
+    return detect_corners(surface, regions, view, window, config)
 
 
 def actual(corners, number=0):
@@ -211,7 +213,8 @@ def test_corners_have_the_polarity_of_the_edge_that_came_last():
     ages[0, 1, :45], ages[0, 0, :45] = 2_000, 4_000
     ages[0, 1, 45:], ages[0, 0, 45:] = 5_000, 1_000
     surface = time_surface(last, torch.tensor([NOW_US]), region(96, 96), SURFACE.tau_s, torch.float32)
-    corners = detect_corners(surface, region(96, 96), SensorMaps(last, ages), torch.tensor([NOW_US]), torch.ones(1), pixel_table(1, 96, 96), CORNERS)
+    view = SensorView(SensorMaps(last, ages), torch.tensor([NOW_US]), pixel_table(1, 96, 96), torch.tensor([0]))
+    corners = detect_corners(surface, region(96, 96), view, torch.ones(1), CORNERS)
     above = corners.sensor_pixels[..., 1] < 45
     assert (corners.polarity[corners.mask & above] == 1).all() and (corners.polarity[corners.mask & ~above] == -1).all()
     assert bool((corners.mask & above).any()) and bool((corners.mask & ~above).any())
@@ -239,8 +242,8 @@ def test_ideal_pixels_come_from_the_table_of_the_stream():
     last = square_of_events(30, 30, 60, 60)
     table = pixel_table(1, 96, 96) * 2 + 1
     surface = time_surface(last, torch.tensor([NOW_US]), region(96, 96), SURFACE.tau_s, torch.float32)
-    maps = SensorMaps(last, no_bursts(1, 96, 96))
-    corners = detect_corners(surface, region(96, 96), maps, torch.tensor([NOW_US]), torch.ones(1), table, CORNERS)
+    view = SensorView(SensorMaps(last, no_bursts(1, 96, 96)), torch.tensor([NOW_US]), table, torch.tensor([0]))
+    corners = detect_corners(surface, region(96, 96), view, torch.ones(1), CORNERS)
     assert corners.mask.any()
     torch.testing.assert_close(corners.pixels, corners.sensor_pixels * 2.0 + 1)
 
@@ -313,7 +316,7 @@ def test_kernels_choose_the_corners_that_the_reference_does(cell_px, most, witho
 
     def corners():
         surface = time_surface(last, now, regions, SURFACE.tau_s, torch.float64)
-        return detect_corners(surface, regions, SensorMaps(last, ages), now, window, table, config)
+        return detect_corners(surface, regions, SensorView(SensorMaps(last, ages), now, table, regions.stream_index), window, config)
 
     with torch.inference_mode():
         ours = corners()

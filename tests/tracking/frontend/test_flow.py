@@ -9,8 +9,10 @@ from helpers import generator
 
 from torchtrack.config.tracker import FlowConfig
 from torchtrack.tracking.frontend.bursts import no_bursts
-from torchtrack.tracking.frontend.flow import SensorPoints, estimate_flow, irls_flow, newest_events_around
+from torchtrack.tracking.frontend.corners import OLDEST_US
+from torchtrack.tracking.frontend.flow import estimate_flow, irls_flow, newest_events_around
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.sensor_view import SensorPoints, SensorView
 from torchtrack.tracking.frontend.time_surface import empty_last_event
 
 NOW_US = 50_000_000
@@ -47,8 +49,17 @@ def events_around(pixels, last_event_us, *, scale=1.0, streams=None, config=None
     """Offsets, times and mask of the events around the newest events at sensor pixels, one or more per object."""
     sensor = torch.tensor(pixels)
     streams = torch.zeros(len(sensor), dtype=torch.int64) if streams is None else torch.tensor(streams)
-    event_us = last_event_us[streams[:, None], sensor[..., 1], sensor[..., 0]]
-    return newest_events_around(sensor, event_us, last_event_us, streams, table(len(last_event_us), scale=scale), config or IRLS)
+    # As of corners: of what never fired, the age is cut off.
+    age_us = (NOW_US - last_event_us[streams[:, None], sensor[..., 1], sensor[..., 0]]).clamp(max=OLDEST_US)
+    points = SensorPoints(sensor, age_us * 1e-6, torch.zeros(age_us.shape), torch.ones(age_us.shape, dtype=torch.bool))
+    return newest_events_around(points, view_of(last_event_us, table(len(last_event_us), scale=scale), streams), config or IRLS)
+
+
+def view_of(last_event_us, ideal_pixels, streams=None):
+    """The sensors of one object, or of one in each of the streams that are given."""
+    streams = torch.tensor([0]) if streams is None else streams
+    maps = SensorMaps(last_event_us, no_bursts(*last_event_us.shape))
+    return SensorView(maps, torch.full((len(last_event_us),), NOW_US), ideal_pixels, streams)
 
 
 def flow_at(pixels, last_event_us, **kwargs):
@@ -177,9 +188,8 @@ def test_only_the_trail_behind_the_event_counts():
 def test_an_event_that_is_not_the_newest_of_its_pixel_has_its_own_time():
     last = empty_last_event(1, 50, 60)
     last[0, 25, 30], last[0, 25, 29], last[0, 25, 31] = NOW_US, NOW_US - 9000, NOW_US - 2000
-    _, times_s, mask = newest_events_around(
-        torch.tensor([[[30, 25]]]), torch.tensor([[NOW_US - 4000]]), last, torch.tensor([0]), table(), FlowConfig(radius_px=3)
-    )
+    points = points_at([(30, 25)], [4000], [True], torch.float64)
+    _, times_s, mask = newest_events_around(points, view_of(last, table()), FlowConfig(radius_px=3))
     assert times_s[mask].tolist() == pytest.approx([-5e-3])
 
 
@@ -229,9 +239,9 @@ def points_at(pixels, ages_us, mask, dtype):
 
 def test_corners_get_their_flow_from_their_own_event_on(dtype):
     """The edge is at 30 px now; what lies 10 px behind fired 25 ms ago, and has the same flow."""
-    maps = SensorMaps(sweeping_edge((1.0, 0.0), 400.0), no_bursts(1, 50, 60))
+    view = view_of(sweeping_edge((1.0, 0.0), 400.0), table().to(dtype))
     points = points_at([(30, 25), (20, 25), (30, 12)], [0, 25_000, 0], [True, True, False], dtype)
-    flow, has_flow = estimate_flow(points, maps, torch.tensor([NOW_US]), torch.tensor([0]), table().to(dtype), IRLS)
+    flow, has_flow = estimate_flow(points, view, IRLS)
     assert has_flow.tolist() == [[True, True, False]]
     assert flow.dtype == dtype
     assert flow[0, :2].tolist() == [pytest.approx([400.0, 0.0], abs=1.0)] * 2
@@ -240,7 +250,7 @@ def test_corners_get_their_flow_from_their_own_event_on(dtype):
 
 def test_the_model_says_which_map_is_looked_at(dtype):
     """No burst is known, so that nothing has arrived anywhere."""
-    maps = SensorMaps(sweeping_edge((1.0, 0.0), 400.0), no_bursts(1, 50, 60))
+    view = view_of(sweeping_edge((1.0, 0.0), 400.0), table().to(dtype))
     points = points_at([(30, 25)], [0], [True], dtype)
     for config, expected in ((IRLS, True), (FlowConfig(model="arrival"), False)):
-        assert estimate_flow(points, maps, torch.tensor([NOW_US]), torch.tensor([0]), table().to(dtype), config)[1].tolist() == [[expected]]
+        assert estimate_flow(points, view, config)[1].tolist() == [[expected]]

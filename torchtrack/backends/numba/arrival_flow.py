@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
@@ -12,6 +12,7 @@ from torchtrack.config.tracker import FlowConfig
 from torchtrack.core.constants import disc
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.frontend import arrival_flow, bursts
+from torchtrack.tracking.frontend.sensor_view import SensorPoints, SensorView
 
 # Pixels whose planes are fitted side by side, and of the pixels around them so many at once: a compiler takes several fits in one step, and their
 # sums stay near. Indices are unsigned, or it would look whether each is negative: four times slower.
@@ -188,20 +189,13 @@ def _normal_flow(fit: Array, settings: ArrivalSettings) -> tuple[float, float, b
 
 
 @accelerates(arrival_flow.arrival_flow)
-def arrival_flow_numba(
-    sensor_pixels: Int[Tensor, "b n 2"],
-    polarity: Float[Tensor, "b n"],
-    mask: Bool[Tensor, "b n"],
-    burst_age_us: Int[Tensor, "s 2 h w"],
-    stream_index: Int[Tensor, "b"],
-    ideal_pixels: Float[Tensor, "s h w 2"],
-    config: FlowConfig,
-) -> tuple[Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
+def arrival_flow_numba(points: SensorPoints, view: SensorView, config: FlowConfig) -> tuple[Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
     """Pixel by pixel."""
-    flow, valid = torch.zeros(*mask.shape, 2, dtype=ideal_pixels.dtype), torch.zeros_like(mask)
+    mask, burst_age_us = points.mask, view.maps.burst_age_us
+    flow, valid = torch.zeros(*mask.shape, 2, dtype=view.ideal_pixels.dtype), torch.zeros_like(mask)
     around = disc(config.radius_px, torch.int64, mask.device)
     flow_at(
-        *as_arrays(sensor_pixels, polarity, mask, burst_age_us.flatten(2), stream_index, ideal_pixels.flatten(1)),
+        *as_arrays(points.sensor_pixels, points.polarity, mask, burst_age_us.flatten(2), view.stream_index, view.ideal_pixels.flatten(1)),
         (burst_age_us.shape[2], burst_age_us.shape[3]),
         around.numpy(),
         filled(ArrivalSettings, arrival_flow, bursts, config),

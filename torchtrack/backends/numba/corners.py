@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
@@ -14,7 +14,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.frontend import corners as reference
 from torchtrack.tracking.frontend.corners import Corners
-from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.sensor_view import SensorView
 from torchtrack.tracking.frontend.time_surface import Regions
 
 
@@ -125,16 +125,10 @@ def _newest_around(newest_us: Array, u: int, v: int, reach: int) -> tuple[int, i
 
 @accelerates(reference.detect_corners)
 def detect_corners_numba(
-    surface: Float[Tensor, "b h w"],
-    regions: Regions,
-    maps: SensorMaps,
-    t_us: Int[Tensor, "s"],
-    window_s: Float[Tensor, "s"],
-    ideal_pixels: Float[Tensor, "s sensor_h sensor_w 2"],
-    config: TrackerConfig,
+    surface: Float[Tensor, "b h w"], regions: Regions, view: SensorView, window_s: Float[Tensor, "s"], config: TrackerConfig
 ) -> Corners:
     """The response row by row, the rest cell by cell."""
-    (batch, height, width), cell = surface.shape, config.corners.cell_px
+    (batch, height, width), cell, maps = surface.shape, config.corners.cell_px, view.maps
     count = min(config.corners.max_corners, (height // cell) * (width // cell))
     snap_px = reference.SNAP_PX if config.uses(Component.CORNER_SNAP) else 0
     settings = filled(CornerSettings, reference, cell_px=cell, most=count, snap_px=snap_px)
@@ -142,10 +136,10 @@ def detect_corners_numba(
     oldest = torch.exp(window_s / -config.surface.tau_s) if config.uses(Component.FRESH_CORNERS) else torch.full_like(window_s, -1.0)
     values, responses = surface.contiguous(), torch.empty(surface.shape, dtype=surface.dtype)
     corner_responses(*as_arrays(values, responses))
-    pixels, ideal = torch.zeros(batch, count, 2, dtype=torch.int64), ideal_pixels.new_zeros(batch, count, 2)
+    pixels, ideal = torch.zeros(batch, count, 2, dtype=torch.int64), view.ideal_pixels.new_zeros(batch, count, 2)
     age_s, polarity, mask = surface.new_zeros(batch, count), surface.new_zeros(batch, count), torch.zeros(batch, count, dtype=torch.bool)
     of_regions = as_arrays(regions.origin, regions.extent, regions.stream_index)
-    of_maps = as_arrays(t_us, maps.last_event_us, maps.burst_age_us, ideal_pixels)
+    of_maps = as_arrays(view.t_us, maps.last_event_us, maps.burst_age_us, view.ideal_pixels)
     filled_in = as_arrays(pixels, ideal, age_s, mask, polarity)
     choose(*as_arrays(responses, values, oldest), tuple(of_regions), tuple(of_maps), settings, tuple(filled_in))
     return Corners(pixels, ideal, age_s, mask, torch.zeros_like(ideal), torch.zeros_like(mask), polarity)

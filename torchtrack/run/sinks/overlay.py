@@ -17,6 +17,7 @@ from torchtrack.core.windows import EventWindow
 from torchtrack.run.session import Session
 from torchtrack.run.stepping import Step
 from torchtrack.tracking.frontend.bursts import update_bursts
+from torchtrack.tracking.frontend.flow import estimate_flow
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
 from torchtrack.tracking.frontend.time_surface import update_last_event
@@ -65,8 +66,9 @@ class _Drawing:
     def _for_display(self, result: StepResult, window: EventWindow) -> StepResult:
         """The result of a step with the corners around its contours and their flow."""
         window_s, t_us = torch.tensor([1e-6 * (window.t_end_us - window.t_start_us)]), torch.tensor([window.t_end_us])
-        corners = self._sensors.corners(result.contours, self._maps, t_us, window_s, self._config)
-        flow, has_flow = self._sensors.flow(corners.points, self._maps, t_us, self._config)
+        view = self._sensors.view(self._maps, t_us)
+        corners = self._sensors.corners(result.contours, view, window_s, self._config)
+        flow, has_flow = estimate_flow(corners.points, view, self._config.flow)
         return replace(result, corners=replace(corners, flow=flow, has_flow=has_flow))
 
 

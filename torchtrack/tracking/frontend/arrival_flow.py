@@ -9,13 +9,14 @@ closely, of the other one, does not mix in. A plane ``t = a u + b v + c`` is fit
 """
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import FlowConfig
 from torchtrack.core.constants import disc
 from torchtrack.core.dispatch import accelerable
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US
+from torchtrack.tracking.frontend.sensor_view import SensorPoints, SensorView
 from torchtrack.tracking.frontend.time_surface import at_pixels
 
 # Pixels that the edge came to within this time may take part, before or after (µs); fewer than so many give no flow.
@@ -37,30 +38,19 @@ LEAST_SLOPE2 = 1e-9
 
 
 @accelerable
-def arrival_flow(
-    sensor_pixels: Int[Tensor, "b n 2"],
-    polarity: Float[Tensor, "b n"],
-    mask: Bool[Tensor, "b n"],
-    burst_age_us: Int[Tensor, "s 2 h w"],
-    stream_index: Int[Tensor, "b"],
-    ideal_pixels: Float[Tensor, "s h w 2"],
-    config: FlowConfig,
-) -> tuple[Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
-    """Normal flow (ideal px/s) at sensor pixels, and where there is one; zero elsewhere.
+def arrival_flow(points: SensorPoints, view: SensorView, config: FlowConfig) -> tuple[Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
+    """Normal flow (ideal px/s) at points of the sensor, and where there is one; zero elsewhere.
 
     Args:
-        sensor_pixels: columns and rows, on the sensor.
-        polarity: of the edge, 1 or -1; of what has none, 0, that of the newest burst.
-        mask: which entries exist.
-        burst_age_us: ages of the newest burst of every pixel, first off, then on (:mod:`torchtrack.tracking.frontend.bursts`).
-        stream_index: the stream of each object.
-        ideal_pixels: undistortion table of each stream.
+        points: those whose polarity is not known have that of the newest burst.
+        view: of its maps, that of bursts is looked at (:mod:`torchtrack.tracking.frontend.bursts`).
     """
-    height, width = burst_age_us.shape[2:]
-    stream, (u, v) = stream_index[:, None], sensor_pixels.unbind(-1)
-    by_polarity = burst_age_us.flatten(0, 1)
+    height, width = view.maps.burst_age_us.shape[2:]
+    stream, (u, v) = view.stream_index[:, None], points.sensor_pixels.unbind(-1)
+    # First off, then on.
+    by_polarity = view.maps.burst_age_us.flatten(0, 1)
     off_us, on_us = (at_pixels(by_polarity, 2 * stream + number, u, v).int() for number in range(2))
-    is_on = torch.where(polarity == 0, on_us < off_us, polarity > 0)
+    is_on = torch.where(points.polarity == 0, on_us < off_us, points.polarity > 0)
     own_us = torch.where(is_on, on_us, off_us)
     du, dv = disc(config.radius_px, torch.int64, u.device)
     around_u, around_v = u[..., None] + du, v[..., None] + dv
@@ -68,8 +58,9 @@ def arrival_flow(
     around_u, around_v = around_u.clamp(0, width - 1), around_v.clamp(0, height - 1)
     around_us = at_pixels(by_polarity, (2 * stream + is_on)[..., None], around_u, around_v).int()
     later_us = own_us[..., None] - around_us
-    counts = inside & (later_us.abs() <= SPAN_US) & (around_us < LONG_AGO_US - CUT_OFF_US) & (mask & (own_us < LONG_AGO_US - CUT_OFF_US))[..., None]
-    offsets = at_pixels(ideal_pixels, stream[..., None], around_u, around_v) - at_pixels(ideal_pixels, stream, u, v)[..., None, :]
+    own_is_known = points.mask & (own_us < LONG_AGO_US - CUT_OFF_US)
+    counts = inside & (later_us.abs() <= SPAN_US) & (around_us < LONG_AGO_US - CUT_OFF_US) & own_is_known[..., None]
+    offsets = at_pixels(view.ideal_pixels, stream[..., None], around_u, around_v) - at_pixels(view.ideal_pixels, stream, u, v)[..., None, :]
     return plane_flow(offsets, later_us.to(offsets.dtype) * 1e-6, counts, config.iterations)
 
 

@@ -15,8 +15,7 @@ from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerable
 from torchtrack.tracking.frontend.filters import FILTER_SIZE_PX, corner_response
-from torchtrack.tracking.frontend.flow import SensorPoints
-from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.sensor_view import SensorPoints, SensorView
 from torchtrack.tracking.frontend.time_surface import Regions, at_pixels
 
 # Least Harris response of a corner, as a share of the region's largest: set with the first corners, and not measured alone.
@@ -116,22 +115,15 @@ def snap_to_newest(
 
 @accelerable
 def detect_corners(
-    surface: Float[Tensor, "b h w"],
-    regions: Regions,
-    maps: SensorMaps,
-    t_us: Int[Tensor, "s"],
-    window_s: Float[Tensor, "s"],
-    ideal_pixels: Float[Tensor, "s sensor_h sensor_w 2"],
-    config: TrackerConfig,
+    surface: Float[Tensor, "b h w"], regions: Regions, view: SensorView, window_s: Float[Tensor, "s"], config: TrackerConfig
 ) -> Corners:
     """Corners of each object's region: filtered surface, Harris, even selection, snapped to the newest event.
 
     Args:
-        maps: of the sensors at ``t_us``.
+        surface: time surface of the regions.
         window_s: length of the window of each stream; only pixels that fired within it are corners.
-        ideal_pixels: undistortion table of each stream.
     """
-    response, stream = corner_response(surface), regions.stream_index[:, None]
+    maps, response, stream = view.maps, corner_response(surface), regions.stream_index[:, None]
     if config.uses(Component.FRESH_CORNERS):
         # Before the choice: what is too old takes no place.
         response = torch.where(surface > torch.exp(window_s / -config.surface.tau_s)[stream, None], response, 0)
@@ -142,8 +134,8 @@ def detect_corners(
     mask = mask & (on_it == sensor).all(-1)
     reach_px = SNAP_PX if config.uses(Component.CORNER_SNAP) else 0
     sensor, newest_us = snap_to_newest(on_it, maps.last_event_us, regions.stream_index, reach_px)
-    age_s = ((t_us[stream] - newest_us).clamp(0, OLDEST_US) * 1e-6).to(surface.dtype)
-    pixels = at_pixels(ideal_pixels, stream, sensor[..., 0], sensor[..., 1])
+    age_s = ((view.t_us[stream] - newest_us).clamp(0, OLDEST_US) * 1e-6).to(surface.dtype)
+    pixels = at_pixels(view.ideal_pixels, stream, sensor[..., 0], sensor[..., 1])
     off_us, on_us = (at_pixels(maps.burst_age_us.flatten(0, 1), 2 * stream + number, sensor[..., 0], sensor[..., 1]) for number in range(2))
     polarity = torch.where(on_us < off_us, 1.0, -1.0).to(age_s.dtype)
     return Corners(sensor, pixels, age_s, mask, torch.zeros_like(pixels), torch.zeros_like(mask), polarity)

@@ -1,15 +1,13 @@
 """From corners and events to their flow: iteratively reweighted least squares with bisquare weights (Eq. 6-11), or arrival flow."""
 
-from dataclasses import dataclass
-
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import FlowConfig
 from torchtrack.core.constants import disc
 from torchtrack.tracking.frontend.arrival_flow import arrival_flow
-from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.sensor_view import SensorPoints, SensorView
 from torchtrack.tracking.frontend.time_surface import at_pixels
 
 # b of the bisquare weight (Eq. 8), in units of the residual's scale: the paper's.
@@ -21,37 +19,27 @@ _MIN_SCALE_PX = 0.3
 
 
 def newest_events_around(
-    sensor_pixels: Int[Tensor, "b n 2"],
-    event_us: Int[Tensor, "b n"],
-    last_event_us: Int[Tensor, "s h w"],
-    stream_index: Int[Tensor, "b"],
-    ideal_pixels: Float[Tensor, "s h w 2"],
-    config: FlowConfig,
+    points: SensorPoints, view: SensorView, config: FlowConfig
 ) -> tuple[Float[Tensor, "b n k 2"], Float[Tensor, "b n k"], Bool[Tensor, "b n k"]]:
-    """Offsets (ideal px) and times (s, at most 0) of the events around each corner, relative to its own.
+    """Offsets (ideal px) and times (s, at most 0) of the events around each point, relative to its own.
 
     The paper sums over all events of the window; we take the newest event of each pixel, which needs no search, keeps
     memory constant at any event rate, and lets slow edges look back further than the window.
-
-    Args:
-        sensor_pixels: sensor pixel (u, v) of each corner.
-        event_us: time of the event there (µs).
-        last_event_us: newest event time of every pixel (µs).
-        ideal_pixels: undistortion table of each stream.
     """
+    last_event_us, (own_u, own_v) = view.maps.last_event_us, points.sensor_pixels.unbind(-1)
+    event_us = view.t_us[view.stream_index, None] - (points.age_s.double() * 1e6).round().long()
     _, height, width = last_event_us.shape
     du, dv = disc(config.radius_px, torch.int64, last_event_us.device)
-    u = sensor_pixels[..., 0, None] + du
-    v = sensor_pixels[..., 1, None] + dv
+    u, v = own_u[..., None] + du, own_v[..., None] + dv
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     u, v = u.clamp(0, width - 1), v.clamp(0, height - 1)
-    stream = stream_index[:, None, None]
+    stream = view.stream_index[:, None, None]
     span_us = int(SPAN_S * 1e6)
     age_us = (event_us[..., None] - at_pixels(last_event_us, stream, u, v)).clamp(-1, span_us + 1)
-    # Newer events belong to what follows: only the trail behind a corner is its motion.
+    # Newer events belong to what follows: only the trail behind a point is its motion.
     mask = inside & (age_us >= 0) & (age_us <= span_us)
-    here = at_pixels(ideal_pixels, stream[..., 0], sensor_pixels[..., 0], sensor_pixels[..., 1])
-    return at_pixels(ideal_pixels, stream, u, v) - here[..., None, :], age_us.to(here.dtype) * -1e-6, mask
+    here = at_pixels(view.ideal_pixels, stream[..., 0], own_u, own_v)
+    return at_pixels(view.ideal_pixels, stream, u, v) - here[..., None, :], age_us.to(here.dtype) * -1e-6, mask
 
 
 def irls_flow(
@@ -85,40 +73,10 @@ def _weighted_flow(offsets: Float[Tensor, "*b 2 k"], times_s: Float[Tensor, "*b 
     return (offsets @ weighted_time) / lever.clamp(min=1e-12)
 
 
-@dataclass(frozen=True)
-class SensorPoints:
-    """Corners and events on the sensor, padded.
-
-    Args:
-        sensor_pixels: integer sensor pixels (u, v).
-        age_s: time from the event there to the window's end (s).
-        polarity: of the event, 1 or -1; 0 where it is not known.
-        mask: which entries exist.
-    """
-
-    sensor_pixels: Int[Tensor, "b n 2"]
-    age_s: Float[Tensor, "b n"]
-    polarity: Float[Tensor, "b n"]
-    mask: Bool[Tensor, "b n"]
-
-
-def estimate_flow(
-    points: SensorPoints,
-    maps: SensorMaps,
-    t_us: Int[Tensor, "s"],
-    stream_index: Int[Tensor, "b"],
-    ideal_pixels: Float[Tensor, "s h w 2"],
-    config: FlowConfig,
-) -> tuple[Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
-    """Flow of each point (ideal px/s) by the model that is set, and where there is one; zero elsewhere.
-
-    Args:
-        maps: of the sensors at ``t_us``.
-    """
+def estimate_flow(points: SensorPoints, view: SensorView, config: FlowConfig) -> tuple[Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
+    """Flow of each point (ideal px/s) by the model that is set, and where there is one; zero elsewhere."""
     if config.model == "arrival":
-        return arrival_flow(points.sensor_pixels, points.polarity, points.mask, maps.burst_age_us, stream_index, ideal_pixels, config)
-    event_us = t_us[stream_index, None] - (points.age_s.double() * 1e6).round().long()
-    around = newest_events_around(points.sensor_pixels, event_us, maps.last_event_us, stream_index, ideal_pixels, config)
-    flow, valid = irls_flow(*around, config)
+        return arrival_flow(points, view, config)
+    flow, valid = irls_flow(*newest_events_around(points, view, config), config)
     has_flow = valid & points.mask
     return torch.where(has_flow[..., None], flow, 0), has_flow

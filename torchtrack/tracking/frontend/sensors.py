@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -18,9 +18,9 @@ from torchtrack.core.events import PaddedEvents, check_on_sensor, pad_streams
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.bursts import update_bursts
 from torchtrack.tracking.frontend.corners import Corners, detect_corners, no_corners
-from torchtrack.tracking.frontend.flow import SensorPoints, estimate_flow
 from torchtrack.tracking.frontend.history import BORDER_PX, History, numbers_of, on_sensor, pixel_numbers
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.sensor_view import SensorView
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 from torchtrack.tracking.frontend.time_surface import Regions, at_pixels, object_regions, time_surface
 from torchtrack.tracking.frontend.window_events import ObjectEvents, WindowEvents
@@ -116,25 +116,23 @@ class Sensors:
         each = [value.expand(len(self.stream_index), *value.shape[1:]) if streams == 1 else value[self.stream_index] for value in values]
         return WindowEvents(each[0], each[1], each[2], each[3], None if number is None else number.expand_as(each[1]))
 
-    def corners(self, contours: Contours, maps: SensorMaps, t_us: Int[Tensor, "s"], window_s: Float[Tensor, "s"], config: TrackerConfig) -> Corners:
-        """Corners of the time surface around each object's contours, without their flow; ``maps`` are those at ``t_us``."""
+    def view(self, maps: SensorMaps, t_us: Int[Tensor, "s"]) -> SensorView:
+        """What the sensors show at the end of a window; ``maps`` are those at ``t_us``."""
+        return SensorView(maps, t_us, self.ideal_pixels, self.stream_index)
+
+    def corners(self, contours: Contours, view: SensorView, window_s: Float[Tensor, "s"], config: TrackerConfig) -> Corners:
+        """Corners of the time surface around each object's contours, without their flow."""
         if config.corners.max_corners == 0:
             return no_corners(contours.pixels)
         margin_px = _ALONG_FLOW_MARGIN_PX if config.association.search == "along_flow" else REGION_MARGIN_PX
         regions = self.regions(contours, margin_px)
-        surface = time_surface(maps.last_event_us, t_us, regions, config.surface.tau_s, self.ideal_pixels.dtype)
-        return detect_corners(surface, regions, maps, t_us, window_s, self.ideal_pixels, config)
+        surface = time_surface(view.maps.last_event_us, view.t_us, regions, config.surface.tau_s, self.ideal_pixels.dtype)
+        return detect_corners(surface, regions, view, window_s, config)
 
     @accelerable
     def regions(self, contours: Contours, margin_px: int) -> Regions:
         """The rectangle of the sensor around each object's contours, with a margin."""
         return object_regions(self.on_sensor(contours.pixels), contours.mask, self.stream_index, self.image_size, margin_px, _MAX_REGION_PX)
-
-    def flow(
-        self, points: SensorPoints, maps: SensorMaps, t_us: Int[Tensor, "s"], config: TrackerConfig
-    ) -> tuple[Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
-        """Flow of points of the sensor (px/s), and where there is one; ``maps`` are those at ``t_us``."""
-        return estimate_flow(points, maps, t_us, self.stream_index, self.ideal_pixels, config.flow)
 
     @accelerable
     def nearest_pixels(self, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n 2"]:
