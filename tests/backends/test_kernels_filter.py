@@ -17,6 +17,7 @@ from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.motion.predict import forecast
+from torchtrack.tracking.relocalization.lost_object import Relocalized
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.health import TentativeTrack
 from torchtrack.tracking.validation.scored_fit import ScoredFit
@@ -153,7 +154,7 @@ def conclusions(config, dtype, spoil=lambda scored: None):
     spoil(scored)
     gate_scale = torch.tensor([1.0, 1.5, 3.0, 1.0, 1.0, 2.5, 1.2]).to(dtype)
     dt_s = uniform(OBJECTS, low=1e-3, high=2e-2, seed=11).to(dtype)
-    return lambda: conclude(state, prediction, gate_scale, scored, no_corners(scored.fit.contours.pixels), dt_s, tracker.config)
+    return lambda: conclude(state, Relocalized(scored, prediction, gate_scale), no_corners(scored.fit.contours.pixels), dt_s, tracker.config)
 
 
 CONCLUDED = {
@@ -211,7 +212,8 @@ def test_what_is_not_concluded_is_left_as_it_was():
     scored = random_find(tracker, prediction, torch.float64)
     dt_s = torch.full((OBJECTS,), 5e-3).double()
     with torch.inference_mode():
-        after, _ = conclude(state, prediction, torch.ones_like(dt_s), scored, no_corners(scored.fit.contours.pixels), dt_s, tracker.config)
+        located = Relocalized(scored, prediction, torch.ones_like(dt_s))
+        after, _ = conclude(state, located, no_corners(scored.fit.contours.pixels), dt_s, tracker.config)
     for ours, theirs in zip(tensors_of(state), before, strict=True):
         assert torch.equal(ours, theirs)
     assert isinstance(after.tentative, TentativeTrack)

@@ -5,7 +5,7 @@ from helpers import IMAGE_SIZE, moving_objects
 
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import AssociationConfig, TrackerConfig
-from torchtrack.tracking.association.nearest import contour_table, match_nearest
+from torchtrack.tracking.association.nearest import Gate, contour_table, match_nearest
 from torchtrack.tracking.contours.index import index_contours
 
 UNSHIFTED = frozenset({Component.DARK_SHIFT, Component.SILHOUETTE_DARK_SHIFT})
@@ -24,4 +24,4 @@ def nearest(observations, contours, *, velocity=(0.0, 0.0), believed=None, gate_
     believed = torch.as_tensor(velocity if believed is None else believed, dtype=dtype)
     table = contour_table(contours, index or index_contours(contours, IMAGE_SIZE, 8, cell_px))
     place = observations.pixels + believed * observations.age_s[..., None]
-    return match_nearest(observations, table, place, moving, gate_px, matching(**settings))
+    return match_nearest(observations, table, place, moving, Gate(gate_px), matching(**settings))

@@ -17,7 +17,7 @@ from torchtrack.core.camera import Camera
 from torchtrack.core.events import concatenate, pad_streams
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.association.observations import select_events
-from torchtrack.tracking.estimation.rounds import align, gate_scale_of, index_for
+from torchtrack.tracking.estimation.rounds import Start, align, gate_scale_of, index_for
 from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.validation.scored_fit import score_fit
 
@@ -97,9 +97,8 @@ def in_motion(config=None, displaced=None, dtype=torch.float32):
     tight = gate_scale_of(torch.zeros(1, dtype=dtype), tracker.config)
     index = index_for(contours, tracker.image_size, tracker.config, tight)
     observations = select_events(seen, index, prediction.moving(compensated=True), 1000)
-    scored = score_fit(
-        prediction, align(prediction, contours, index, tight, observations, tracker.config), tracker.config, torch.ones(1, dtype=dtype)
-    )
+    fit = align(Start(prediction, contours, index, tight), observations, tracker.config)
+    scored = score_fit(prediction, fit, tracker.config, torch.ones(1, dtype=dtype))
     return tracker, prediction, seen, scored, trajectory.at(torch.tensor([end_us]))
 
 

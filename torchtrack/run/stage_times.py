@@ -28,7 +28,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "window's events": ("tracking.frontend.sensors:Sensors.seen",),
     "selection": ("tracking.step:select_events", "tracking.step:corner_observations"),
     "association": ("tracking.estimation.rounds:match_nearest", "tracking.estimation.rounds:match_along_flow"),
-    "problem": ("tracking.estimation.rounds:_believed", "tracking.estimation.rounds:_problem", "tracking.estimation.rounds:_information"),
+    "problem": ("tracking.estimation.rounds:_believed", "tracking.estimation.rounds:_problem", "tracking.estimation.rounds:prior_information"),
     "solver": ("tracking.estimation.rounds:solve_pose",),
     "rounds": ("tracking.estimation.rounds:align_rounds",),
     "reprojection": ("tracking.estimation.rounds:reproject", "tracking.update:reproject"),

@@ -16,7 +16,7 @@ from torchtrack.tracking.association.observations import Observations, corner_ob
 from torchtrack.tracking.association.weighting_features import WeightingInputs, judged
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.estimation.rounds import Fit, align, gate_scale_of, index_for, index_radius, usual_index_radius, widest_index_radius
+from torchtrack.tracking.estimation.rounds import Fit, Start, align, gate_scale_of, index_for, index_radius, usual_index_radius, widest_index_radius
 from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import Expected, expect, near_objects
 from torchtrack.tracking.frontend.corners import Corners
@@ -126,8 +126,8 @@ def steady_window(tracked: TrackedObjects, state: TrackerState, given: StepInput
     """Stages 1 to 4, of all objects alike, and which of them have triggers."""
     expected = expect(tracked, state, given.events.events, given.t_us, given.reads)
     seen = observe(tracked, state, expected, given)
-    fit = align(expected.prediction, seen.contours, seen.index, seen.gate_scale, seen.observations, tracked.config, extra_terms=given.extra_terms)
-    scored = validate(tracked, state, expected, seen, fit)
+    start = Start(expected.prediction, seen.contours, seen.index, seen.gate_scale, extra_terms=given.extra_terms)
+    scored = validate(tracked, state, expected, seen, align(start, seen.observations, tracked.config))
     is_starting = torch.zeros_like(tracked.stream_index, dtype=torch.bool) if given.is_starting is None else given.is_starting
     evidence = gather_evidence(state, expected.scheduled, scored, seen.sigma_px, is_starting)
     reasons = triggers(evidence, tracked.config)
@@ -200,7 +200,7 @@ def update(
     """Stage 6: the filter's update, statuses, and what is learned."""
     config, expected, seen = tracked.config, window.expected, window.seen
     scored, prediction = located.scored, located.prediction.detached()
-    next_state, result = conclude(state, located.prediction, located.gate_scale, scored, seen.corners, expected.dt_s, config)
+    next_state, result = conclude(state, located, seen.corners, expected.dt_s, config)
     if config.uses(Component.TENTATIVE):
         next_state, result = confirm_or_take_back(state, next_state, result, prediction, located.gate_scale, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, learns=given.learns)

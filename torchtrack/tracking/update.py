@@ -19,6 +19,7 @@ from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import MotionState, fade, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.lost_object import Relocalized
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.health import TrackHealth
 from torchtrack.tracking.validation.measures import visible_ratio
@@ -28,23 +29,18 @@ from torchtrack.tracking.validation.verdict import Limits, Measured, Verdict, re
 
 
 def conclude(
-    state: TrackerState,
-    prediction: Prediction,
-    gate_scale: Float[Tensor, "b"],
-    scored: ScoredFit,
-    corners: Corners,
-    dt_s: Float[Tensor, "b"],
-    config: TrackerConfig,
+    state: TrackerState, located: Relocalized, corners: Corners, dt_s: Float[Tensor, "b"], config: TrackerConfig
 ) -> tuple[TrackerState, StepResult]:
     """Judge every object, go on as predicted where it failed, and make the next state.
 
     Args:
         state: before the window; its times are those of the state and the result that are returned.
-        gate_scale: of each object's first gate.
+        located: what the window gave.
         dt_s: length of the window.
     """
-    motion, health, covariance, status = judged_objects(state, prediction, gate_scale, scored, dt_s, config)
-    contours = _where_they_are(scored.fit, motion.T_cam_obj, status >= int(Status.LOST), prediction.objects.intrinsics)
+    scored = located.scored
+    motion, health, covariance, status = judged_objects(state, located, dt_s, config)
+    contours = _where_they_are(scored.fit, motion.T_cam_obj, status >= int(Status.LOST), located.prediction.objects.intrinsics)
     result = StepResult(state.t_us, motion.T_cam_obj, covariance, status, scored.explained_ratio, contours, corners, scored.count)
     appearance = replace(state.appearance, darker_outside=_darker_outside(state, scored, status, dt_s, config))
     return replace(state, motion=motion, health=replace(health, score=scored.score), appearance=appearance), result
@@ -63,11 +59,10 @@ Judgement = tuple[MotionState, TrackHealth, Float[Tensor, "b 6 6"], Int[Tensor, 
 
 
 @accelerable
-def judged_objects(
-    state: TrackerState, prediction: Prediction, gate_scale: Float[Tensor, "b"], scored: ScoredFit, dt_s: Float[Tensor, "b"], config: TrackerConfig
-) -> Judgement:
+def judged_objects(state: TrackerState, located: Relocalized, dt_s: Float[Tensor, "b"], config: TrackerConfig) -> Judgement:
     """What every object's pose is worth, and where it goes on from there: arguments as those of :func:`conclude`."""
-    measured, known, limits = measured_of(prediction, gate_scale, scored), state.health.references, Limits.from_config(config)
+    prediction, scored = located.prediction, located.scored
+    measured, known, limits = measured_of(located), state.health.references, Limits.from_config(config)
     judged = verdict(measured, known, limits)
     T_cam_obj = _corrected_pose(state.T_cam_obj, prediction, scored, judged.failed, config)
     velocity, covariance = _updated_motion(prediction, scored, judged, dt_s, config)
@@ -77,8 +72,9 @@ def judged_objects(
     return MotionState(T_cam_obj, velocity, covariance), health, left_covariance(covariance[:, :6, :6], centre_cam), judged.status
 
 
-def measured_of(prediction: Prediction, gate_scale: Float[Tensor, "b"], scored: ScoredFit) -> Measured:
-    """What is judged of a fit."""
+def measured_of(located: Relocalized) -> Measured:
+    """What is judged of what a window gave."""
+    scored, prediction = located.scored, located.prediction
     rotated_rad, moved_m = scored.fit.solution.from_prior[:, :6].unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
     return Measured(
         explained_ratio=scored.explained_ratio,
@@ -86,7 +82,7 @@ def measured_of(prediction: Prediction, gate_scale: Float[Tensor, "b"], scored: 
         inlier_ratio=scored.inlier_ratio,
         reference_inlier_ratio=scored.reference_inlier_ratio,
         in_view=visible_ratio(scored.fit.contours, prediction.objects.image_size),
-        gate_scale=gate_scale,
+        gate_scale=located.gate_scale,
         rotated_rad=rotated_rad,
         moved_diameters=moved_m / prediction.objects.diameter_m,
         matched=scored.count,

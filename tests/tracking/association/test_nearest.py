@@ -14,7 +14,7 @@ from torchtrack.core.lie import retract_about
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
 from torchtrack.tracking.association.along_flow import match_along_flow
 from torchtrack.tracking.association.matches import both_coordinates
-from torchtrack.tracking.association.nearest import contour_table, match_nearest
+from torchtrack.tracking.association.nearest import Gate, contour_table, match_nearest
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.association.weights import DARK_SHIFT_PX, LEAST_TRUST, concentration, on_and_around, patch, patch_sums
 from torchtrack.tracking.contours.index import index_contours
@@ -191,7 +191,7 @@ def test_an_index_of_an_earlier_pose_still_finds_the_contours():
     assert first.mask.all()
     assert place[0, 0].tolist() == pytest.approx([80.5, 60.0])
     table = contour_table(upright_line(87.0), index)
-    second = match_nearest(seen([[[86.5, 60.0]]]), table, place, moving_objects((0.0, 0.0)), 3.0, matching())[0]
+    second = match_nearest(seen([[[86.5, 60.0]]]), table, place, moving_objects((0.0, 0.0)), Gate(3.0), matching())[0]
     assert second.mask.all()
     assert second.contour.tolist() == [[40]]
 
@@ -266,10 +266,10 @@ def test_events_of_a_moving_box_are_all_matched_within_a_pixel():
     place = observations.pixels + 5e-3 * object_plane_velocity(observations.pixels, velocity, T_now[:, :3, 3], intrinsics)
     inside = ((earlier.pixels > 0) & (earlier.pixels < torch.tensor([199, 149]))).all(-1)
     assert int(inside.sum()) > 200
-    matches, _ = match_nearest(observations, table, place, objects, 1.5, matching())
+    matches, _ = match_nearest(observations, table, place, objects, Gate(1.5), matching())
     assert float(matches.mask[inside].double().mean()) > 0.97
     still = replace(objects, velocity=torch.zeros_like(velocity))
-    uncompensated, _ = match_nearest(observations, table, observations.pixels, still, 1.5, matching())
+    uncompensated, _ = match_nearest(observations, table, observations.pixels, still, Gate(1.5), matching())
     residual = [
         ((contours.pixels[0][m.contour[0]] - m.targets[0]) * m.directions[0]).sum(-1)[m.mask[0]].abs().mean() for m in (matches, uncompensated)
     ]

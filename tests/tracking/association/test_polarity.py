@@ -20,7 +20,7 @@ from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.sim.scenes import SceneConfig
 from torchtrack.sim.simulation import simulate
 from torchtrack.tracking.adapt import objects_as_known
-from torchtrack.tracking.association.nearest import contour_table, match_nearest
+from torchtrack.tracking.association.nearest import Gate, contour_table, match_nearest
 from torchtrack.tracking.association.polarity import (
     expected_polarity,
     is_asked,
@@ -119,7 +119,7 @@ def matched(dark, *, expected=1.0, kind=ContourKind.SMOOTH):
     polarity = None if expected is None else torch.zeros(1, 8, dtype=torch.float64).index_fill(1, torch.tensor([RIGHT]), expected)
     table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1), polarity)
     observations = seen(places, polarity=torch.tensor(dark, dtype=torch.float64)[None])
-    return contours, match_nearest(observations, table, places, moving_objects((500.0, 0.0)), 3.0, matching(polarity=True))[0]
+    return contours, match_nearest(observations, table, places, moving_objects((500.0, 0.0)), Gate(3.0), matching(polarity=True))[0]
 
 
 @pytest.mark.parametrize("kind", [ContourKind.SMOOTH, ContourKind.CREASE])

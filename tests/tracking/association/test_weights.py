@@ -6,7 +6,7 @@ from helpers import IMAGE_SIZE, generator, moving_objects, seen, upright_line
 from nearest_cases import matching
 
 from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.tracking.association.nearest import contour_table, match_nearest
+from torchtrack.tracking.association.nearest import Gate, contour_table, match_nearest
 from torchtrack.tracking.association.weights import on_and_around, patch, patch_sums, polarity_agreement
 from torchtrack.tracking.contours.index import index_contours
 
@@ -77,7 +77,7 @@ def weights_on_a_line(polarity, *, speed=500.0, kind=ContourKind.CREASE, polarit
     places = torch.stack([torch.full_like(v, 80.0), v], -1)[None]
     observations = seen(places, polarity=torch.tensor(polarity, dtype=torch.float64)[None])
     table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1))
-    return match_nearest(observations, table, places, moving_objects((speed, 0.0)), 3.0, matching(polarity=polarity_counts))[0].weights[0]
+    return match_nearest(observations, table, places, moving_objects((speed, 0.0)), Gate(3.0), matching(polarity=polarity_counts))[0].weights[0]
 
 
 @pytest.mark.parametrize("kind", [ContourKind.SMOOTH, ContourKind.CREASE])

@@ -25,7 +25,7 @@ from torchtrack.tracking import tracker as tracker_module
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.estimation.implicit_gradient import newton_step, with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import offset_from_prior, robust_cost, solve_pose
-from torchtrack.tracking.estimation.rounds import align, gate_scale_of, index_for
+from torchtrack.tracking.estimation.rounds import Start, align, gate_scale_of, index_for
 from torchtrack.tracking.estimation.terms import ContourDistance, CostTerm, LinearisedTerm, Place, Prior
 from torchtrack.tracking.validation.status import Status
 
@@ -268,7 +268,7 @@ def test_rounds_of_matching_take_a_further_term():
     poses = []
     for extra_terms in ((), (pairs,)):
         with torch.inference_mode():
-            fit = align(prediction, contours, index, tight, observations, tracker.config, extra_terms=extra_terms)
+            fit = align(Start(prediction, contours, index, tight, extra_terms=extra_terms), observations, tracker.config)
         poses.append(fit.solution.T_cam_obj)
     torch.testing.assert_close(poses[0], alone.fit.solution.T_cam_obj, rtol=0, atol=1e-9)
     assert float(pose_errors(poses[0], T_said)[1]) > 0.2

@@ -17,11 +17,10 @@ from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking import update
 from torchtrack.tracking.motion import model
 from torchtrack.tracking.motion.model import MotionState
-from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.lost_object import Relocalized
 from torchtrack.tracking.state import TrackerState
 from torchtrack.tracking.validation import verdict
 from torchtrack.tracking.validation.measures import visible_ratio
-from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.verdict import Limits, Measured, References
 
 _UNKNOWNS = 12
@@ -165,14 +164,14 @@ def _to_left(covariance: Array, centre_cam: Array, left: Array) -> None:
         left[k, 5] += x * b - y * a
 
 
-@accelerates(update.judged_objects, supports=lambda state, prediction, gate_scale, scored, dt_s, config: config.solver.prior)
-def judged_objects_numba(
-    state: TrackerState, prediction: Prediction, gate_scale: Float[Tensor, "b"], scored: ScoredFit, dt_s: Float[Tensor, "b"], config: TrackerConfig
-) -> update.Judgement:
+@accelerates(update.judged_objects, supports=lambda state, located, dt_s, config: config.solver.prior)
+def judged_objects_numba(state: TrackerState, located: Relocalized, dt_s: Float[Tensor, "b"], config: TrackerConfig) -> update.Judgement:
     """Object by object."""
+    prediction, scored = located.prediction, located.scored
     objects, solution, batch, health = prediction.objects, scored.fit.solution, len(dt_s), state.health
     in_view = visible_ratio(scored.fit.contours, objects.image_size)
-    measured = torch.stack([scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, in_view, gate_scale])
+    ratios = scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, in_view
+    measured = torch.stack([*ratios, located.gate_scale])
     flags = torch.stack([~scored.measured_ratio.isnan(), scored.is_relocalized])
     remembered = torch.stack(health.references)
     T_last_validated = health.T_last_validated.clone(memory_format=torch.contiguous_format)

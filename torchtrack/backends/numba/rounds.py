@@ -188,10 +188,10 @@ def align_rounds_numba(
     start: Start, table: ContourTable, observations: Observations, gates: Gates, config: TrackerConfig
 ) -> tuple[Linearisation, MatchesWithCues, Contours]:
     """Observation by observation, all rounds of an object at once."""
-    prediction, information = start.prediction, start.information
+    prediction, information = start.prediction, rounds.prior_information(start.prediction, config)
     objects, (batch, count) = prediction.objects, observations.mask.shape
     # What the kernel writes to lies row by row in memory: of anything else it would be given a copy.
-    T_cam_obj, offset = (value.clone(memory_format=torch.contiguous_format) for value in (start.begin.T_cam_obj, start.offset))
+    T_cam_obj, offset = (value.clone(memory_format=torch.contiguous_format) for value in (start.begin.T_cam_obj, start.from_prior(information)))
     gradient, hessian = offset.new_empty(offset.shape), offset.new_empty(information.shape)
     contour = torch.empty(batch, count, dtype=torch.int64)
     is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool)

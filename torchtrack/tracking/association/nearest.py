@@ -66,15 +66,23 @@ def contour_table(contours: Contours, index: ContourIndex, polarity: Float[Tenso
     return ContourTable(torch.cat([value.transpose(1, 2) for value in values], 1), index, ((silhouette | texture) & contours.mask).any(1))
 
 
+@dataclass(frozen=True)
+class Gate:
+    """How far from contours observations are matched, in one round.
+
+    Args:
+        px: as configured.
+        wider: by how much it, and all that is measured against contours, is wider for each object; by nothing where not given.
+        subcell_lookup: objects whose contours are looked up between the cells of the index; none where not given.
+    """
+
+    px: float
+    wider: Float[Tensor, "b"] | None = None
+    subcell_lookup: Bool[Tensor, "b"] | None = None
+
+
 def match_nearest(
-    observations: Observations,
-    table: ContourTable,
-    place: Float[Tensor, "b n 2"],
-    objects: MovingObjects,
-    gate_px: float,
-    config: TrackerConfig,
-    wider: Float[Tensor, "b"] | None = None,
-    subcell_lookup: Bool[Tensor, "b"] | None = None,
+    observations: Observations, table: ContourTable, place: Float[Tensor, "b n 2"], objects: MovingObjects, gate: Gate, config: TrackerConfig
 ) -> tuple[MatchesWithCues, Float[Tensor, "b n 2"]]:
     """Match each observation with its nearest contour point, as far as the gate; distances count along the normal.
 
@@ -82,11 +90,9 @@ def match_nearest(
         table: of the contours, as they were indexed at some pose.
         place: where to look for each observation among the contours as indexed; returned anew for the next round.
         objects: at the current poses; a velocity of zero switches motion compensation off.
-        wider: by how much the gate, and all that is measured against contours, is wider for each object.
-        subcell_lookup: objects whose contours are looked up between the cells of the index; none where not given.
     """
-    wider = torch.ones_like(place[:, 0, 0]) if wider is None else wider
-    nearest_index = table.index.look_up(place, subcell_lookup)
+    wider = torch.ones_like(place[:, 0, 0]) if gate.wider is None else gate.wider
+    nearest_index = table.index.look_up(place, gate.subcell_lookup)
     points_obj, normals, indexed, silhouette, oriented, expected = table.take(contour := nearest_index.clamp(min=0))
     pixels, velocity = objects.show(points_obj)
     dark = observations.polarity * leading_side(vecdot(normals, velocity))
@@ -94,7 +100,7 @@ def match_nearest(
     targets = torch.addcmul(carried, normals, (dark * dark_shift_px(silhouette, config))[..., None], value=-1)
     difference = pixels - targets
     near = observations.mask & (nearest_index >= 0)
-    matched = near & (vecdot(difference, difference) < (gate_px * wider)[:, None].square())
+    matched = near & (vecdot(difference, difference) < (gate.px * wider)[:, None].square())
     offsets = vecdot(difference, normals) / wider[:, None]
     as_expected, dark = agreeing(dark * expected), dark * oriented
     weights = match_weights(offsets, targets, near, dark, as_expected, config.association)

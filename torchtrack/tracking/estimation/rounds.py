@@ -8,15 +8,14 @@ from torch import Tensor
 
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core.constants import constant
+from torchtrack.core.constants import constant, once
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.host_sync import AsyncValue
 from torchtrack.tracking.association.along_flow import match_along_flow
 from torchtrack.tracking.association.matches import MatchesWithCues, both_coordinates
-from torchtrack.tracking.association.nearest import ContourTable, contour_table, match_nearest
+from torchtrack.tracking.association.nearest import ContourTable, Gate, contour_table, match_nearest
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.index import INDEX_CELL_PX, ContourIndex, index_contours
-from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.implicit_gradient import with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
@@ -92,57 +91,33 @@ def index_for(
     return index_contours(contours, image_size, radius_px or AsyncValue.to(index_radius(gate_scale, config)), INDEX_CELL_PX)
 
 
-def align(
-    prediction: Prediction,
-    contours: Contours,
-    index: ContourIndex,
-    gate_scale: Float[Tensor, "b"],
-    observations: Observations,
-    config: TrackerConfig,
-    offset: Float[Tensor, "b 12"] | None = None,
-    extra_terms: tuple[CostTerm, ...] = (),
-) -> Fit:
-    """Match and solve, one round per gate.
-
-    Gradients are those of the last round's problem at its solution: what came before chose the matches, which do not bend.
-
-    Args:
-        prediction: what the prior draws to.
-        contours: visible contours where the rounds begin, and ``index`` of them.
-        gate_scale: of each object's first gate; it is taken back by the last.
-        offset: of the beginning from the prediction: pose and velocity; none when not given.
-        extra_terms: of the cost, beside contour distances and prior.
-    """
-    objects, matching = prediction.objects, config.association
-    information = _information(prediction, config)
-    begin = prediction if offset is None else prediction.moved(offset)
-    offset = torch.zeros_like(information[:, 0]) if offset is None else offset
-    table = contour_table(contours, index, objects.polarity)
-    gates = Gates(gate_scale, _narrowing(gate_scale, len(matching.gates_px)), _needs_subcell_lookup(objects, begin, table, gate_scale, config))
-    start = Start(prediction, begin, offset, information, contours, index, extra_terms)
-    solution, matches, contours = align_rounds(start, table, observations, gates, config)
-    return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
-
-
 @dataclass(frozen=True)
 class Start:
     """Where the rounds of an alignment begin.
 
     Args:
         prediction: what the prior draws to.
-        begin: where they begin, and ``offset`` of that from the prediction.
-        information: of the prior.
-        contours: visible there, and ``index`` of them.
-        extra_terms: of every round's cost.
+        contours: visible where the rounds begin, and ``index`` of them.
+        gate_scale: of each object's first gate; it is taken back by the last.
+        offset: of the beginning from the prediction: pose and velocity; none when not given.
+        extra_terms: of every round's cost, beside contour distances and prior.
     """
 
     prediction: Prediction
-    begin: Prediction
-    offset: Float[Tensor, "b k"]
-    information: Float[Tensor, "b k k"]
     contours: Contours
     index: ContourIndex
+    gate_scale: Float[Tensor, "b"]
+    offset: Float[Tensor, "b 12"] | None = None
     extra_terms: tuple[CostTerm, ...] = ()
+
+    @once
+    def begin(self) -> Prediction:
+        """The objects where the rounds begin."""
+        return self.prediction if self.offset is None else self.prediction.moved(self.offset)
+
+    def from_prior(self, information: Float[Tensor, "b k k"]) -> Float[Tensor, "b k"]:
+        """The offset, in the unknowns that the prior has information of."""
+        return torch.zeros_like(information[:, 0]) if self.offset is None else self.offset
 
 
 @dataclass(frozen=True)
@@ -150,14 +125,24 @@ class Gates:
     """How far observations are looked for from contours.
 
     Args:
-        gate_scale: of each object's first gate.
         wider: by how much each round's gate is wider, for each object.
         subcell_lookup: objects whose contours are looked up between the cells of the index.
     """
 
-    gate_scale: Float[Tensor, "b"]
     wider: Float[Tensor, "r b"]
     subcell_lookup: Bool[Tensor, "b"]
+
+
+def align(start: Start, observations: Observations, config: TrackerConfig) -> Fit:
+    """Match and solve, one round per gate.
+
+    Gradients are those of the last round's problem at its solution: what came before chose the matches, which do not bend.
+    """
+    objects = start.prediction.objects
+    table = contour_table(start.contours, start.index, objects.polarity)
+    gates = Gates(_narrowing(start.gate_scale, len(config.association.gates_px)), _needs_subcell_lookup(start, table, config))
+    solution, matches, contours = align_rounds(start, table, observations, gates, config)
+    return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
 
 
 @accelerable
@@ -169,13 +154,13 @@ def align_rounds(
     Args:
         table: of the contours where the rounds begin.
     """
-    prediction, begin, offset, contours = start.prediction, start.begin, start.offset, start.contours
-    objects, matching = prediction.objects, config.association
-    place = _first_place(begin, observations, config)
+    prediction, begin, contours = start.prediction, start.begin, start.contours
+    objects, matching, information = prediction.objects, config.association, prior_information(prediction, config)
+    offset, place = start.from_prior(information), _first_place(begin, observations, config)
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, gates.wider, strict=True)):
         if number and config.contours.source == "splat":
             contours = objects.contours(begin.T_cam_obj, config.contours)
-            index = index_for(contours, objects.image_size, config, gates.gate_scale, start.index.radius_px)
+            index = index_for(contours, objects.image_size, config, start.gate_scale, start.index.radius_px)
             table = contour_table(contours, index, objects.polarity)
             place = _first_place(begin, observations, config)
         moving = begin.moving(compensated=matching.motion_compensation)
@@ -183,26 +168,24 @@ def align_rounds(
             contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
             matches = match_along_flow(observations, contours, moving, gate_px)
         else:
-            matches, place = match_nearest(observations, table, place, moving, gate_px, config, wider, gates.subcell_lookup)
+            matches, place = match_nearest(observations, table, place, moving, Gate(gate_px, wider, gates.subcell_lookup), config)
         matches = _believed(matches, observations, config)
-        problem = _problem(start, matches, offset, gate_px * wider, config)
+        problem = _problem(start, information, matches, offset, gate_px * wider, config)
         solution = solve_pose(problem, begin.T_cam_obj, config.solver, offset)
         begin, offset = prediction.at(solution.T_cam_obj, solution.from_prior), solution.from_prior
     return with_gradient(problem, solution, config.solver), matches, contours
 
 
-def _needs_subcell_lookup(
-    objects: ObjectBatch, begin: Prediction, table: ContourTable, gate_scale: Float[Tensor, "b"], config: TrackerConfig
-) -> Bool[Tensor, "b"]:
+def _needs_subcell_lookup(start: Start, table: ContourTable, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """Of which objects contours are looked up between the cells of the index: small ones, and those that show texture or smooth silhouettes.
 
     Others of plain faces are not: their models may lack texture, whose events then find the nearest edge all the more surely.
     """
     if not config.uses(Component.SUBCELL_LOOKUP):
         return torch.zeros_like(table.not_plain)
-    subcell_lookup = (objects.size_px(begin.T_cam_obj).detach() < FINE_BELOW_PX) | table.not_plain
+    subcell_lookup = (start.prediction.objects.size_px(start.begin.T_cam_obj).detach() < FINE_BELOW_PX) | table.not_plain
     # One that may be far off would settle on the first edges that it is nearest to.
-    return subcell_lookup & (gate_scale <= 1)
+    return subcell_lookup & (start.gate_scale <= 1)
 
 
 def _narrowing(gate_scale: Float[Tensor, "b"], rounds: int) -> Float[Tensor, "r b"]:
@@ -218,7 +201,7 @@ def _first_place(begin: Prediction, observations: Observations, config: TrackerC
     return begin.carried(observations.pixels, observations.age_s)
 
 
-def _information(prediction: Prediction, config: TrackerConfig) -> Tensor:
+def prior_information(prediction: Prediction, config: TrackerConfig) -> Float[Tensor, "b k k"]:
     """Information of the prediction in the solver's chart, for observations of unit weight: of pose and velocity, or none of the pose."""
     if not config.solver.prior:
         return prediction.velocity.new_zeros(len(prediction.velocity), 6, 6)
@@ -234,7 +217,14 @@ def _believed(matches: MatchesWithCues, observations: Observations, config: Trac
     return replace(matches, mask=matches.mask & enough, weights=weights * enough)
 
 
-def _problem(start: Start, matches: MatchesWithCues, offset: Float[Tensor, "b k"], gate_px: Float[Tensor, "b"], config: TrackerConfig) -> PoseProblem:
+def _problem(
+    start: Start,
+    information: Float[Tensor, "b k k"],
+    matches: MatchesWithCues,
+    offset: Float[Tensor, "b k"],
+    gate_px: Float[Tensor, "b"],
+    config: TrackerConfig,
+) -> PoseProblem:
     """The least squares problem of one round; objects without a match stay where they are."""
     prediction = start.prediction
     rows = both_coordinates(matches) if config.association.residual == "point" else matches
@@ -247,7 +237,7 @@ def _problem(start: Start, matches: MatchesWithCues, offset: Float[Tensor, "b k"
         centre_obj=prediction.objects.centre_obj,
         scale_px=gate_px,
         T_prior=prediction.T_cam_obj,
-        prior_information=start.information,
+        prior_information=information,
         window=_window_terms(rows, offset, config) if config.solver.prior else None,
         extra_terms=start.extra_terms,
     )

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchtrack.core import host_sync
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.estimation.rounds import Fit, align, index_for
+from torchtrack.tracking.estimation.rounds import Fit, Start, align, index_for
 from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.relocalization.acceptance import Choice
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
@@ -26,7 +26,7 @@ def refined(hypotheses: Hypotheses, lost: LostObject) -> ScoredFit:
     index = index_for(contours, rows.objects.image_size, config, tight)
     events = lost.events.repeated(len(offsets))
     observations = select_events(events, index, begin.moving(compensated=True), config.association.max_events)
-    fit = align(rows, contours, index, tight, observations, config, offsets)
+    fit = align(Start(rows, contours, index, tight, offsets), observations, config)
     tried = score_fit(rows, fit, config, torch.zeros_like(tight), scored.reference_inlier_ratio[number].expand_as(tight))
     return replace(tried, is_relocalized=torch.ones_like(tried.is_relocalized))
 
