@@ -74,6 +74,36 @@ class Window:
     velocity: Float[Tensor, "b 6"]
 
 
+@dataclass(frozen=True)
+class LineFit:
+    """The poses after the last round.
+
+    Args:
+        solution: the solver's last linearisation.
+        contours: at the poses.
+        matches: of the last round.
+    """
+
+    solution: Linearisation
+    contours: Contours
+    matches: Matches
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What each object's pose is worth.
+
+    Args:
+        status: as :class:`torchtrack.tracking.validation.status.Status`.
+        quality: share of the moving contour that events explain.
+        is_taken: poses that are taken; the others go on as predicted.
+    """
+
+    status: Int[Tensor, "b"]
+    quality: Float[Tensor, "b"]
+    is_taken: Bool[Tensor, "b"]
+
+
 def nearest_lines(
     pixels: Float[Tensor, "b n 2"], contours: Contours, gate_px: float, apart_px: float = 0.0
 ) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
@@ -160,7 +190,7 @@ class EventLineTracker(Tracker):
         weight: float,
         apart_px: float,
         extra_terms: tuple[CostTerm, ...] = (),
-    ) -> tuple[Linearisation, Contours, Matches]:
+    ) -> LineFit:
         """Associate and solve, one round per gate, with the lines extracted anew for the second.
 
         Args:
@@ -196,7 +226,7 @@ class EventLineTracker(Tracker):
             solution = solve_pose(self._problem(window, matches, information, gate_px, extra_terms), T_cam_obj, self.config.solver)
             T_cam_obj = solution.T_cam_obj
             contours = reproject(contours, T_cam_obj, self.intrinsics)
-        return solution, contours, matches
+        return LineFit(solution, contours, matches)
 
     def _problem(self, window: Window, matches: Matches, information: Tensor, gate_px: float, extra_terms: tuple[CostTerm, ...]) -> PoseProblem:
         """Distances of events from their lines, and the prediction; objects without a match stay where they are."""
@@ -214,12 +244,11 @@ class EventLineTracker(Tracker):
             extra_terms=extra_terms,
         )
 
-    def _judge(
-        self, window: Window, solution: Linearisation, contours: Contours, matches: Matches
-    ) -> tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]]:
-        """Status and quality of each object, and which poses are taken."""
+    def _judge(self, window: Window, fit: LineFit) -> Judged:
+        """What each object's pose is worth."""
+        contours, matches = fit.contours, fit.matches
         share = explained_ratio(contours, matches, self._contour_velocity(window, contours), self.image_size, self.config)
-        step = lie.small_difference_about(window.T_start, solution.T_cam_obj, self.centre_obj)
+        step = lie.small_difference_about(window.T_start, fit.solution.T_cam_obj, self.centre_obj)
         in_view = visible_ratio(contours, self.image_size)
         rotated_rad, moved_m = step.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
         scale, yes, no = torch.ones_like(share), torch.ones_like(share, dtype=torch.bool), torch.zeros_like(share, dtype=torch.bool)
@@ -230,16 +259,14 @@ class EventLineTracker(Tracker):
             is_relocalized=no,
         )
         status = judge(measured, torch.zeros_like(share), Limits.from_config(self.config))
-        return status, share, status < int(Status.TOO_FEW_EVENTS)
+        return Judged(status, share, status < int(Status.TOO_FEW_EVENTS))
 
     def _close(
         self,
         state: TrackerState,
         window: Window,
-        solution: Linearisation,
-        contours: Contours,
-        matches: Matches,
-        judged: tuple[Int[Tensor, "b"], Float[Tensor, "b"], Bool[Tensor, "b"]],
+        fit: LineFit,
+        judged: Judged,
         velocity: Float[Tensor, "b 6"],
         covariance: Float[Tensor, "b 6 6"],
     ) -> tuple[TrackerState, StepResult]:
@@ -248,19 +275,18 @@ class EventLineTracker(Tracker):
         Args:
             covariance: of each pose, turned about its centre (float64).
         """
-        status, share, taken = judged
-        T_cam_obj = lie.orthonormalise(torch.where(taken[:, None, None], solution.T_cam_obj, window.T_start).double())
-        contours = reproject(contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
+        T_cam_obj = lie.orthonormalise(torch.where(judged.is_taken[:, None, None], fit.solution.T_cam_obj, window.T_start).double())
+        contours = reproject(fit.contours, T_cam_obj.to(velocity.dtype), self.intrinsics)
         centre_cam = lie.transform_points(T_cam_obj, self.centre_obj[:, None].double())[:, 0]
         result = StepResult(
             t_us=window.t_us,
             T_cam_obj=T_cam_obj,
             covariance=left_covariance(covariance, centre_cam),
-            status=status,
-            quality=share,
+            status=judged.status,
+            quality=judged.quality,
             contours=contours,
             corners=no_corners(contours.pixels),
-            observation_count=matches.mask.sum(-1),
+            observation_count=fit.matches.mask.sum(-1),
         )
         motion = replace(state.motion, T_cam_obj=T_cam_obj, velocity=velocity)
         return replace(state, t_us=window.t_us, motion=motion, maps=replace(state.maps, last_event_us=window.last_event_us)), result

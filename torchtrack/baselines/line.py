@@ -51,13 +51,13 @@ class LineTracker(EventLineTracker):
         predicted = predicted_covariance(state.motion.covariance, window.duration_s.double())
         eye = torch.eye(6, dtype=predicted.dtype, device=predicted.device).expand(len(predicted), 6, 6)
         information = solve_positive(predicted[:, :6, :6], eye)[0]
-        solved = self._solve_rounds(window, events, information.to(state.velocity.dtype), _EVENT_PX**-2, _APART_PX, extra_terms)
-        judged = self._judge(window, *solved)
-        taken = judged[2]
-        correction, covariance = corrected(predicted, information, solved[0])
+        fit = self._solve_rounds(window, events, information.to(state.velocity.dtype), _EVENT_PX**-2, _APART_PX, extra_terms)
+        judged = self._judge(window, fit)
+        taken = judged.is_taken
+        correction, covariance = corrected(predicted, information, fit.solution)
         velocity = window.velocity + torch.where(taken[:, None], correction, 0).to(window.velocity.dtype)
         kept = torch.where(taken[:, None, None], covariance, predicted)
-        next_state, result = self._close(state, window, *solved, judged, velocity, kept[:, :6, :6])
+        next_state, result = self._close(state, window, fit, judged, velocity, kept[:, :6, :6])
         return replace(next_state, motion=replace(next_state.motion, covariance=kept)), result
 
 

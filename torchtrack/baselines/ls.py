@@ -28,10 +28,10 @@ class LeastSquaresTracker(EventLineTracker):
     ) -> tuple[TrackerState, StepResult]:
         window = self._open(state, events, t_us, state.velocity)
         nothing = torch.zeros(len(state.velocity), 6, 6, dtype=state.velocity.dtype, device=state.velocity.device)
-        solved = self._solve_rounds(window, events, nothing, weight=1.0, apart_px=0.0, extra_terms=extra_terms)
-        judged = self._judge(window, *solved)
-        moved = lie.small_difference_about(state.T_cam_obj, solved[0].T_cam_obj.double(), self.centre_obj.double()).to(state.velocity.dtype)
+        fit = self._solve_rounds(window, events, nothing, weight=1.0, apart_px=0.0, extra_terms=extra_terms)
+        judged = self._judge(window, fit)
+        moved = lie.small_difference_about(state.T_cam_obj, fit.solution.T_cam_obj.double(), self.centre_obj.double()).to(state.velocity.dtype)
         mixed = torch.lerp(state.velocity, moved / window.duration_s.clamp(min=1e-6)[:, None], _VELOCITY_GAIN)
         # A pose that was not taken says nothing of the motion: it is not carried on for long.
-        velocity = torch.where(judged[2][:, None], mixed, 0.5 * state.velocity)
-        return self._close(state, window, *solved, judged, velocity, inverse(solved[0].hessian.double()))
+        velocity = torch.where(judged.is_taken[:, None], mixed, 0.5 * state.velocity)
+        return self._close(state, window, fit, judged, velocity, inverse(fit.solution.hessian.double()))

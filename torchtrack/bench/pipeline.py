@@ -1,6 +1,7 @@
 """How long a step of the tracker takes, with the preset ``default`` and its windows: few and many objects, many events."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,6 +26,30 @@ _CHUNK = 100_000
 _Part = tuple[list[Result], str]
 
 
+@dataclass(frozen=True)
+class _Case:
+    """A scene whose steps are timed, and how it is tracked.
+
+    Args:
+        name: of the scene.
+        median_ms, p95_ms: targets of the median, and of the step that 95 % are faster than; none where not given.
+        streams: that all have this scene.
+    """
+
+    name: str
+    scene: Scene
+    median_ms: float | None = None
+    p95_ms: float | None = None
+    streams: int = 1
+    compiled: bool = False
+    kernels: bool = True
+
+    @property
+    def full_name(self) -> str:
+        """With how it is tracked."""
+        return _named(self.name, self.compiled) if self.kernels else f"{self.name}, without kernels"
+
+
 def measure(setup: Setup) -> Report:
     """Time of a step, and what it depends on.
 
@@ -40,48 +65,38 @@ def _of_sequence(setup: Setup) -> Iterator[_Part]:
     if setup.sequence is not None:
         scene = read(setup.sequence)
         for compiled in setup.ways:
-            yield _latency(setup, f"{setup.sequence.stem}, {len(scene.models)} objects", scene, compiled=compiled)
+            yield _latency(setup, _Case(f"{setup.sequence.stem}, {len(scene.models)} objects", scene, compiled=compiled))
 
 
 def _of_scenes(setup: Setup) -> Iterator[_Part]:
     kind = setup.device.type
     for shape in SHAPES:
         for compiled in setup.ways:
-            yield _latency(setup, f"1 object ({shape})", simulated((shape,)), *ONE_OBJECT_MS[kind], compiled=compiled)
+            yield _latency(setup, _Case(f"1 object ({shape})", simulated((shape,)), *ONE_OBJECT_MS[kind], compiled=compiled))
     for count, columns, streams, target_ms in MANY[kind]:
         name = f"{count * streams} objects" + (f" in {streams} streams" if streams > 1 else "")
         # On a CPU, graphs gain little where kernels work on many objects.
         for compiled in setup.ways if kind == "cuda" else (False,):
-            yield _latency(setup, name, simulated(shapes_of(count), columns), target_ms, streams=streams, compiled=compiled)
+            yield _latency(setup, _Case(name, simulated(shapes_of(count), columns), target_ms, streams=streams, compiled=compiled))
     if kind == "cpu" and backend_is_installed():
-        yield _latency(setup, f"1 object ({SHAPES[0]})", simulated(SHAPES[:1]), kernels=False)
+        yield _latency(setup, _Case(f"1 object ({SHAPES[0]})", simulated(SHAPES[:1]), kernels=False))
         count, columns, _, _ = MANY[kind][0]
-        yield _latency(setup, f"{count} objects", simulated(shapes_of(count), columns), kernels=False)
+        yield _latency(setup, _Case(f"{count} objects", simulated(shapes_of(count), columns), kernels=False))
     yield _outside(setup)
     for compiled in setup.ways:
         yield _real_time(setup, compiled)
 
 
-def _latency(
-    setup: Setup,
-    name: str,
-    scene: Scene,
-    median_ms: float | None = None,
-    p95_ms: float | None = None,
-    *,
-    streams: int = 1,
-    compiled: bool = False,
-    kernels: bool = True,
-) -> _Part:
+def _latency(setup: Setup, case: _Case) -> _Part:
     """Median and 95 % of the time of a step, each once per repeat, and how well it tracked."""
-    name = _named(name, compiled) if kernels else f"{name}, without kernels"
+    name = case.full_name
     setup.show(name)
-    run = started(scene, setup.device, streams, compiled=compiled, kernels=kernels)
+    run = started(case.scene, setup.device, case.streams, compiled=case.compiled, kernels=case.kernels)
     quality = run.quality(setup.clock)
     repeats = [run.latencies(setup.clock) for _ in range(setup.repeats)]
     median, p95 = ([float(value) for value in np.quantile(repeats, share, axis=1)] for share in (0.5, 0.95))
-    results = [time_result(f"{name}, median", median, median_ms), time_result(f"{name}, 95 %", p95, p95_ms)]
-    return results, f"{name}: {scene.mev_per_s:.1f} Mev/s, {quality}"
+    results = [time_result(f"{name}, median", median, case.median_ms), time_result(f"{name}, 95 %", p95, case.p95_ms)]
+    return results, f"{name}: {case.scene.mev_per_s:.1f} Mev/s, {quality}"
 
 
 def _named(name: str, compiled: bool) -> str:
