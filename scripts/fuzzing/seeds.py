@@ -23,7 +23,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch
-from torchtrack.io import Trajectory, write_sequence, write_tum
+from torchtrack.io import LabelledMesh, Trajectory, write_sequence, write_tum
 from torchtrack.io.convert import WRITERS, convert
 
 WIDTH, HEIGHT = 64, 48
@@ -179,20 +179,9 @@ def _trajectory(count: int = 9) -> Trajectory:
 
 
 def _sequence(folder: Path) -> Made:
-    batch = events()
     path = folder / "scene.npz"
-    write_sequence(
-        path,
-        x=batch.x.numpy(),
-        y=batch.y.numpy(),
-        t_us=batch.t_us.numpy(),
-        polarity=batch.polarity.numpy(),
-        camera=CAMERA,
-        labels=("box",),
-        meshes=[trimesh.creation.box((0.12, 0.1, 0.08))],
-        trajectories=[_trajectory()],
-        meta={"made": "by hand"},
-    )
+    box = LabelledMesh("box", trimesh.creation.box((0.12, 0.1, 0.08)), _trajectory())
+    write_sequence(path, events(), CAMERA, [box], {"made": "by hand"})
     return _alone(path)
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck, gradgradcheck
 
 from torchtrack.core import lie
-from torchtrack.errors import PoseError
+from torchtrack.core.pose_checks import check_pose
 
 BATCHES = [(), (1,), (5,), (2, 3), (0,)]
 TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-13}
@@ -46,7 +46,7 @@ def test_so3_exp_agrees_with_scipy(angle, batch):
 @pytest.mark.parametrize("angle", ANGLES.values(), ids=ANGLES)
 def test_exp_gives_rigid_motions_that_log_undoes(angle, batch, dtype):
     T = lie.se3_exp(twists(angle, *batch, dtype=dtype))
-    lie.check_pose(T, tolerance=TOLERANCE[dtype] * 2)
+    check_pose(T, tolerance=TOLERANCE[dtype] * 2)
     assert T.shape == (*batch, 4, 4)
     again = lie.se3_exp(lie.se3_log(T))
     assert far_from(again, T) < 20 * TOLERANCE[dtype]
@@ -185,53 +185,3 @@ def test_float32_gradients_agree_with_float64(angle):
         (lie.se3_exp(xi) * weights).sum().backward()
         gradients.append(xi.grad.double())
     torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-3)
-
-
-# ---- check_pose
-
-
-def bad(change) -> torch.Tensor:
-    T = random_pose(3)
-    change(T)
-    return T
-
-
-def scale(T):
-    T[1, :3, :3] *= 1.01
-
-
-def reflect(T):
-    T[1, :3, 0] *= -1
-
-
-def not_a_number(T):
-    T[2, 0, 3] = float("nan")
-
-
-def infinite(T):
-    T[2, 0, 0] = float("inf")
-
-
-def transpose(T):
-    T[:] = T.transpose(-1, -2).clone()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [(scale, "not a rotation"), (reflect, "reflection"), (not_a_number, "NaN"), (infinite, "infinite"), (transpose, "last row")],
-)
-def test_check_pose_says_what_is_wrong(change, message):
-    with pytest.raises(PoseError, match=message) as caught:
-        lie.check_pose(bad(change), "T_start")
-    assert str(caught.value).startswith("T_start: ")
-
-
-@pytest.mark.parametrize("shape", [(4,), (3, 4), (2, 4, 3), (3, 3)])
-def test_check_pose_wants_4x4_matrices(shape):
-    with pytest.raises(PoseError, match=r"expected matrices of shape \[..., 4, 4\]"):
-        lie.check_pose(torch.zeros(shape))
-
-
-@pytest.mark.parametrize("batch", BATCHES)
-def test_check_pose_accepts_poses(batch, dtype):
-    lie.check_pose(random_pose(*batch, dtype=dtype))

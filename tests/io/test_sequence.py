@@ -1,6 +1,7 @@
 """Sequences: what the shared ones hold, round trips, and every way in which one can be wrong."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,11 +14,12 @@ from PIL import Image
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import concatenate
 from torchtrack.errors import CalibrationError, EventDataError, MissingFileError, PoseError, TorchtrackWarning, UnknownFormatError
-from torchtrack.io import Trajectory, read_sequence, write_sequence
+from torchtrack.io import LabelledMesh, Trajectory, read_sequence, write_sequence
 
 CAMERA = Camera(60.0, 61.0, 31.5, 23.5, 64, 48)
 LENS = Camera(60.0, 61.0, 31.5, 23.5, 64, 48, "plumb_bob", (-0.1, 0.02, 0.001, 0.0, 0.0))
 TIMES = torch.tensor([0, 5_000, 10_000])
+EVENTS = random_events(500, width=64, height=48)
 
 
 def textured_box() -> trimesh.Trimesh:
@@ -30,18 +32,17 @@ def textured_box() -> trimesh.Trimesh:
 
 def contents(objects: int = 1, camera: Camera = CAMERA) -> dict:
     """Arguments of write_sequence."""
-    events = random_events(500, width=64, height=48)
     return {
-        "x": events.x.numpy(),
-        "y": events.y.numpy(),
-        "t_us": events.t_us.numpy(),
-        "polarity": events.polarity.numpy(),
+        "events": EVENTS,
         "camera": camera,
-        "labels": [f"object{i}" for i in range(objects)],
-        "meshes": [trimesh.creation.box((0.1, 0.2, 0.1 + 0.1 * i)) for i in range(objects)],
-        "trajectories": [Trajectory(TIMES, random_pose(3, seed=i)) for i in range(objects)],
+        "objects": [labelled(f"object{i}", height_m=0.1 + 0.1 * i, seed=i) for i in range(objects)],
         "meta": {"speed": "slow", "seed": 3},
     }
+
+
+def labelled(label, height_m=0.1, t_us=TIMES, seed=0) -> LabelledMesh:
+    """A box and three true poses."""
+    return LabelledMesh(label, trimesh.creation.box((0.1, 0.2, height_m)), Trajectory(t_us, random_pose(3, seed=seed)))
 
 
 @pytest.fixture
@@ -109,13 +110,13 @@ def test_what_is_written_is_read(tmp_path, objects, camera):
     assert (sequence.name, sequence.camera, sequence.meta) == ("scene", camera, given["meta"])
     events = concatenate(sequence.events.chunks(100))
     for name in ("x", "y", "t_us", "polarity"):
-        assert getattr(events, name).tolist() == given[name].tolist()
-    for of_object, label, mesh, path in zip(sequence.objects, given["labels"], given["meshes"], given["trajectories"], strict=True):
-        assert of_object.label == label
+        assert torch.equal(getattr(events, name), getattr(EVENTS, name))
+    for of_object, expected in zip(sequence.objects, given["objects"], strict=True):
+        assert of_object.label == expected.label
         assert of_object.textured_path is None
-        assert torch.equal(of_object.ground_truth.t_us, path.t_us)
-        assert torch.equal(of_object.ground_truth.T_cam_obj, path.T_cam_obj)
-        np.testing.assert_allclose(trimesh.load_mesh(of_object.mesh_path).extents, mesh.extents, atol=1e-6)
+        assert torch.equal(of_object.ground_truth.t_us, expected.trajectory.t_us)
+        assert torch.equal(of_object.ground_truth.T_cam_obj, expected.trajectory.T_cam_obj)
+        np.testing.assert_allclose(trimesh.load_mesh(of_object.mesh_path).extents, expected.mesh.extents, atol=1e-6)
     assert len(list((tmp_path / "new").iterdir())) == 1 + objects
 
 
@@ -133,9 +134,9 @@ def test_it_has_the_layout_of_the_shared_sequences(tmp_path):
 
 def test_textured_models_lie_beside_it(tmp_path):
     box = textured_box()
-    given = contents(2)
-    given["meshes"][1] = box
-    write_sequence(tmp_path / "scene.npz", **given, textured=[None, box])
+    plain, given = labelled("object0"), contents()
+    given["objects"] = [plain, LabelledMesh("object1", box, plain.trajectory, textured=box)]
+    write_sequence(tmp_path / "scene.npz", **given)
     first, second = read_sequence(tmp_path / "scene.npz").objects
     assert first.textured_path is None
     assert second.model_path("textured").name == "scene_object1_textured.glb"
@@ -237,14 +238,12 @@ def test_unsorted_events_are_found_as_they_are_streamed(written):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"x": np.full(500, 64)}, EventDataError, "outside the sensor of 64x48"),
-        ({"x": np.zeros(3, dtype=int)}, EventDataError, "one length"),
-        ({"t_us": np.arange(500)[::-1].copy()}, EventDataError, "time goes back"),
-        ({"labels": ["a/b", "c"]}, EventDataError, "labels go into file names"),
-        ({"labels": ["a", "a"]}, EventDataError, "each must differ"),
-        ({"labels": ["a"]}, EventDataError, "got 1 labels, 2 meshes, 2 trajectories"),
-        ({"labels": [], "meshes": [], "trajectories": []}, EventDataError, "every object needs"),
-        ({"trajectories": [Trajectory(TIMES, random_pose(3)), Trajectory(TIMES + 1, random_pose(3))]}, PoseError, "must share their times"),
+        ({"events": replace(EVENTS, x=torch.full_like(EVENTS.x, 64))}, EventDataError, "outside the sensor of 64x48"),
+        ({"events": replace(EVENTS, t_us=EVENTS.t_us.flip(0))}, EventDataError, "time goes back"),
+        ({"objects": [labelled("a/b"), labelled("c")]}, EventDataError, "labels go into file names"),
+        ({"objects": [labelled("a"), labelled("a")]}, EventDataError, "each must differ"),
+        ({"objects": []}, EventDataError, "scene.npz' needs at least one object"),
+        ({"objects": [labelled("a"), labelled("b", t_us=TIMES + 1)]}, PoseError, "must share their times"),
     ],
 )
 def test_what_write_sequence_refuses_leaves_nothing_behind(tmp_path, change, error, message):
@@ -268,5 +267,5 @@ def test_a_failure_while_writing_leaves_what_was_there(written, monkeypatch):
 
     monkeypatch.setattr(np, "savez", full_disk)
     with pytest.raises(OSError, match="disk full"):
-        write_sequence(path, **{**contents(2), "meshes": [trimesh.creation.icosphere(1, 0.1)] * 2})
+        write_sequence(path, **{**contents(), "objects": [labelled("object0", height_m=0.3), labelled("object1", height_m=0.3)]})
     assert {file.name: file.read_bytes() for file in path.parent.iterdir()} == before

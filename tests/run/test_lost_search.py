@@ -46,8 +46,9 @@ def scene():
     """Events of a bracket that goes away and comes back turned by 130°, with some noise all the while; where it is at the end."""
     before, after = true_poses(GONE_US, step_us=250), turned(true_poses(END_US - BACK_US, step_us=250), 130.0, BACK_US)
     rng = np.random.default_rng(0)
-    noise = rng.integers(0, CAMERA.width, 900), rng.integers(0, CAMERA.height, 900), np.arange(900) * 1000
-    x, y, t_us = (np.concatenate(values) for values in zip(*(box_events(l_prism(), path) for path in (before, after)), noise, strict=True))
+    noise = {"x": rng.integers(0, CAMERA.width, 900), "y": rng.integers(0, CAMERA.height, 900), "t_us": np.arange(900) * 1000}
+    seen = [box_events(l_prism(), path) for path in (before, after)]
+    x, y, t_us = (np.concatenate([*(getattr(batch, name) for batch in seen), values]) for name, values in noise.items())
     order = np.argsort(t_us, kind="stable")
     x, y, t_us = (torch.from_numpy(values[order].astype(np.int64)) for values in (x, y, t_us))
     events = EventBatch(x.short(), y.short(), t_us, torch.arange(len(t_us)) % 2 == 0, torch.zeros(len(t_us), dtype=torch.int32))

@@ -6,7 +6,8 @@ import torch
 from pydantic import ValidationError
 
 from torchtrack.core.camera import Camera
-from torchtrack.core.lie import check_pose, rotation_angle_deg, se3_exp, so3_log
+from torchtrack.core.lie import rotation_angle_deg, se3_exp, so3_log
+from torchtrack.core.pose_checks import check_pose
 from torchtrack.io.trajectory import Trajectory, write_tum
 from torchtrack.sim.frames import frame_motion, frame_times
 from torchtrack.sim.meshes import make_mesh

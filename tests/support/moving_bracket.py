@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-import numpy as np
 import torch
 from solid_models import l_prism
 from tiny_sequence import CAMERA, box_events, true_poses
 
-from torchtrack.io import Trajectory, write_sequence
+from torchtrack.io import LabelledMesh, Trajectory, write_sequence
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.rotational_symmetry import rotation_group
 
@@ -17,9 +16,7 @@ AT_US = 20_000
 def write_bracket(folder: Path) -> torch.Tensor:
     """``bracket.npz`` and ``in_mm.stl`` in a folder; gives the pose at ``AT_US``."""
     mesh, trajectory = l_prism(), true_poses(120_000, step_us=250)
-    x, y, t_us = box_events(mesh, trajectory)
-    arrays = {"x": x, "y": y, "t_us": t_us, "polarity": np.arange(len(t_us)) % 2}
-    write_sequence(folder / "bracket.npz", **arrays, camera=CAMERA, labels=("bracket",), meshes=[mesh], trajectories=[trajectory], meta={})
+    write_sequence(folder / "bracket.npz", box_events(mesh, trajectory), CAMERA, [LabelledMesh("bracket", mesh, trajectory)])
     mesh.copy().apply_scale(1000).export(folder / "in_mm.stl")
     return pose_at(trajectory, AT_US)
 

@@ -7,8 +7,9 @@ import torch
 import trimesh
 
 from torchtrack.core.camera import Camera, project
+from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import se3_exp, so3_exp, transform_points
-from torchtrack.io import Trajectory, write_sequence
+from torchtrack.io import LabelledMesh, Trajectory, write_sequence
 
 CAMERA = Camera(fx=150.0, fy=150.0, cx=59.5, cy=44.5, width=120, height=90)
 
@@ -25,8 +26,8 @@ def true_poses(duration_us: int, step_us: int = 500) -> Trajectory:
     return Trajectory(t_us, se3_exp(1e-6 * t_us.double()[:, None] * velocity) @ start)
 
 
-def box_events(mesh: trimesh.Trimesh, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, y and t of an event wherever a point on an edge comes to a new pixel."""
+def box_events(mesh: trimesh.Trimesh, trajectory: Trajectory) -> EventBatch:
+    """An event wherever a point on an edge comes to a new pixel, brighter and darker in turn."""
     ends = torch.from_numpy(mesh.vertices[mesh.face_adjacency_edges[mesh.face_adjacency_angles > 0.5]].copy())
     along = torch.linspace(0, 1, 60, dtype=torch.float64)[:, None]
     points = (ends[:, :1] * (1 - along) + ends[:, 1:] * along).reshape(-1, 3)
@@ -37,25 +38,13 @@ def box_events(mesh: trimesh.Trimesh, trajectory: Trajectory) -> tuple[np.ndarra
     inside = ((pixels >= 0) & (pixels < torch.tensor([CAMERA.width, CAMERA.height]))).all(-1)[step + 1, point]
     step, point = step[inside] + 1, point[inside]
     x, y = pixels[step, point].unbind(-1)
-    return x.numpy(), y.numpy(), trajectory.t_us[step].numpy()
+    return EventBatch.from_numpy(x.numpy(), y.numpy(), trajectory.t_us[step].numpy(), np.arange(len(step)) % 2)
 
 
 def write_tiny_sequence(folder: Path, name: str = "tiny", labels: tuple[str, ...] = ("box",), duration_us: int = 60_000) -> Path:
     """``NAME.npz`` in ``folder``; objects after the first have the same mesh and motion."""
     mesh = trimesh.creation.box((0.12, 0.1, 0.08))
     trajectory = true_poses(duration_us)
-    x, y, t_us = box_events(mesh, trajectory)
     path = folder / f"{name}.npz"
-    write_sequence(
-        path,
-        x=x,
-        y=y,
-        t_us=t_us,
-        polarity=np.arange(len(t_us)) % 2,
-        camera=CAMERA,
-        labels=labels,
-        meshes=[mesh] * len(labels),
-        trajectories=[trajectory] * len(labels),
-        meta={},
-    )
+    write_sequence(path, box_events(mesh, trajectory), CAMERA, [LabelledMesh(label, mesh, trajectory) for label in labels])
     return path

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 import trimesh
 
-from torchtrack.core.lie import check_pose
+from torchtrack.core.pose_checks import check_pose
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.viz.model_views import draw_model, view_contours, view_poses

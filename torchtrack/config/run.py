@@ -12,8 +12,8 @@ from torchtrack.config.presets import PresetName, preset
 from torchtrack.config.settings import ConfigPath, Settings
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import DistortionModel
-from torchtrack.core.lie import check_pose, quaternion_problem
 from torchtrack.core.limits import Limits, current_limits
+from torchtrack.core.pose_checks import check_pose, quaternion_problem
 from torchtrack.core.pose_types import as_pose_matrices
 
 Models = Literal["textured", "geometry"]

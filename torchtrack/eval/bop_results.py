@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.core.atomic import atomic_path
-from torchtrack.core.lie import check_pose
+from torchtrack.core.pose_checks import check_pose
 from torchtrack.errors import PoseError
 from torchtrack.io import Trajectory
 

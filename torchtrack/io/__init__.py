@@ -17,6 +17,7 @@ from torchtrack.io.sequence import Sequence, SequenceObject, is_sequence, read_s
 from torchtrack.io.trajectory import Trajectory, read_tum, write_tum
 
 if TYPE_CHECKING:
+    from torchtrack.io.sequence_writer import LabelledMesh as LabelledMesh
     from torchtrack.io.sequence_writer import write_sequence as write_sequence
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "EventInfo",
     "EventSource",
     "EventStream",
+    "LabelledMesh",
     "NpzEvents",
     "Sequence",
     "SequenceObject",
@@ -43,6 +45,6 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Load the writer of sequences on first use: it needs the library of meshes, which takes more memory than reading does."""
-    if name == "write_sequence":
+    if name in ("LabelledMesh", "write_sequence"):
         return getattr(import_module("torchtrack.io.sequence_writer"), name)
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

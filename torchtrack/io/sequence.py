@@ -19,9 +19,8 @@ A ``NAME_LABEL_textured.glb`` beside it is the same object with its texture.
 import json
 import os
 import zipfile
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,9 +35,6 @@ from torchtrack.io.npz import NpzEvents, keys_of, open_archive, read_array
 from torchtrack.io.sequence_types import Sequence, SequenceObject
 from torchtrack.io.trajectory import Trajectory
 from torchtrack.io.zip_archive import is_zip
-
-if TYPE_CHECKING:
-    from torchtrack.io.sequence_writer import write_sequence as write_sequence
 
 _LONGEST_LABEL = 200
 _EXTRA = ("velocity", "occluder_poses", "occluder_labels")
@@ -150,10 +146,3 @@ def _sequence_object(path: Path, label: str, mesh_file: str, ground_truth: Traje
         )
     textured = path.with_name(f"{path.stem}_{label}_textured.glb")
     return SequenceObject(label, mesh_path, textured if textured.is_file() else None, ground_truth)
-
-
-def __getattr__(name: str) -> Any:
-    """Load the writer on first use: it needs the library of meshes, which takes more memory than reading does."""
-    if name == "write_sequence":
-        return getattr(import_module("torchtrack.io.sequence_writer"), name)
-    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -12,15 +12,14 @@ from torch import Tensor
 from torchtrack.config.events import TimeUnit
 from torchtrack.core.atomic import atomic_path
 from torchtrack.core.lie import (
-    check_pose,
     continuous_quaternions,
     quaternion_from_rotation,
-    quaternion_problem,
     rotation_angle_deg,
     rotation_from_quaternion,
     se3_interpolate,
 )
 from torchtrack.core.limits import check_limit
+from torchtrack.core.pose_checks import check_pose, quaternion_problem
 from torchtrack.errors import PoseError
 from torchtrack.io.pose_times import pose_times_us
 from torchtrack.io.seconds import format_seconds

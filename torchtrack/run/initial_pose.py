@@ -5,7 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.config.run import ObjectConfig, PoseConfig
-from torchtrack.core.lie import check_pose, rotation_from_quaternion
+from torchtrack.core.lie import rotation_from_quaternion
+from torchtrack.core.pose_checks import check_pose
 from torchtrack.errors import ConfigError
 from torchtrack.io import Trajectory, read_trajectory
 

@@ -10,8 +10,8 @@ import trimesh
 from torchtrack.core.atomic import atomic_path
 from torchtrack.errors import EventDataError
 from torchtrack.io.container import ContainerWriter
-from torchtrack.io.sequence import write_sequence
 from torchtrack.io.sequence_types import SequenceObject
+from torchtrack.io.sequence_writer import LabelledMesh, write_sequence
 from torchtrack.object_model.loading import join_parts
 from torchtrack.sim.scenes import Model
 from torchtrack.sim.simulation import SimulatedSequence
@@ -38,21 +38,13 @@ def write(sequence: SimulatedSequence, path: str | Path) -> Path:
     if path.suffix in _HDF5:
         _write_container(sequence, path)
         return path
-    events, objects = sequence.events, len(sequence.labels)
-    write_sequence(
-        path,
-        x=events.x.numpy(),
-        y=events.y.numpy(),
-        t_us=events.t_us.numpy(),
-        polarity=events.polarity.numpy().astype(np.uint8),
-        camera=sequence.camera,
-        labels=sequence.labels,
-        meshes=[_bare(model) for model in sequence.models[:objects]],
-        trajectories=sequence.trajectories[:objects],
-        meta=sequence.meta,
-        textured=[_printed(model) for model in sequence.models[:objects]],
-        extra=_extra_arrays(sequence) | {"source": sequence.source.numpy().astype(np.int16)},
-    )
+    # Occluders come after the objects, and have no label among these.
+    objects = [
+        LabelledMesh(label, _bare(model), trajectory, _printed(model))
+        for label, model, trajectory in zip(sequence.labels, sequence.models, sequence.trajectories, strict=False)
+    ]
+    extra = _extra_arrays(sequence) | {"source": sequence.source.numpy().astype(np.int16)}
+    write_sequence(path, sequence.events, sequence.camera, objects, sequence.meta, extra)
     return path
 
 

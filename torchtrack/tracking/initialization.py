@@ -14,6 +14,7 @@ from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.events import EventBatch, stream_bounds
 from torchtrack.core.lie import transform_points
+from torchtrack.core.pose_checks import check_pose
 from torchtrack.errors import PoseError
 from torchtrack.tracking.adaptation.appearance import Appearance
 from torchtrack.tracking.adaptation.learned_contours import LearnedContours
@@ -148,7 +149,7 @@ def check_poses(T_cam_obj: Tensor, centre_obj: Float[Tensor, "b 3"], names: Sequ
         names: of the objects.
     """
     T_cam_obj = T_cam_obj.detach()
-    lie.check_pose(T_cam_obj)
+    check_pose(T_cam_obj)
     if T_cam_obj.shape != (len(centre_obj), 4, 4):
         raise PoseError(f"expected one initial pose per object, shape {[len(centre_obj), 4, 4]}, got {list(T_cam_obj.shape)}.")
     depth = lie.transform_points(T_cam_obj, centre_obj.to(T_cam_obj.dtype)[:, None])[:, 0, 2]

@@ -11,7 +11,8 @@ from torchtrack.config.load import load, read_yaml
 from torchtrack.config.run import ObjectConfig, PoseConfig, RunConfig
 from torchtrack.config.settings import Settings
 from torchtrack.core.camera import Camera, undistort
-from torchtrack.core.lie import check_pose, quaternion_from_rotation
+from torchtrack.core.lie import quaternion_from_rotation
+from torchtrack.core.pose_checks import check_pose
 from torchtrack.errors import ConfigError
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.settings import METRES_PER_UNIT
