@@ -7,7 +7,8 @@ from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.parameters import ArrivalSettings, filled
+from torchtrack.backends.numba.filling import filled
+from torchtrack.backends.numba.parameters import ArrivalSettings
 from torchtrack.config.tracker import FlowConfig
 from torchtrack.core.constants import disc
 from torchtrack.core.dispatch import accelerates

@@ -8,7 +8,8 @@ from torch import Tensor
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.backends.numba.corner_response import corner_responses
-from torchtrack.backends.numba.parameters import CornerSettings, filled
+from torchtrack.backends.numba.filling import filled
+from torchtrack.backends.numba.parameters import CornerSettings
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerates

@@ -9,10 +9,11 @@ from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.filling import filled
 from torchtrack.backends.numba.geometry import Numbers, across, at_depth, drift, inverse_depth, lens
 from torchtrack.backends.numba.index import cells_of
 from torchtrack.backends.numba.look_up import nearest
-from torchtrack.backends.numba.parameters import AgreementSettings, Cells, filled
+from torchtrack.backends.numba.parameters import AgreementSettings, Cells
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.association import flow_agreement
 from torchtrack.tracking.association.observations import Observations

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.contours import at
+from torchtrack.backends.numba.outlines import at
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.relocalization import correlation, edge_search

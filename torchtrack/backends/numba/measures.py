@@ -7,9 +7,10 @@ from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.filling import filled
 from torchtrack.backends.numba.geometry import across, drift, inverse_depth, lens
 from torchtrack.backends.numba.matching import patch
-from torchtrack.backends.numba.parameters import QualitySettings, filled
+from torchtrack.backends.numba.parameters import QualitySettings
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerates
 from torchtrack.core.image_velocity import MovingObjects

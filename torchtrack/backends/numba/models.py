@@ -15,7 +15,7 @@ class ModelArrays(NamedTuple):
 
     Args:
         members: numbers of the objects that have it.
-        sampled: what contour points are sampled from, in the order that :func:`torchtrack.backends.numba.contours.sample` takes it.
+        sampled: what contour points are sampled from, in the order that :func:`torchtrack.backends.numba.sampling.sample` takes it.
         faces: triangles and their normals; none of dense meshes.
         surface: samples of the surface, ``[3, n]``.
     """

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.filling import filled
 from torchtrack.backends.numba.geometry import Numbers, at_depth, centre_of, drift, entries, lens
 from torchtrack.backends.numba.index import cells_of
 from torchtrack.backends.numba.matching import (
@@ -30,7 +31,7 @@ from torchtrack.backends.numba.matching import (
     match,
     room_for,
 )
-from torchtrack.backends.numba.parameters import Cells, DampingSettings, MatchingSettings, RoundSettings, filled
+from torchtrack.backends.numba.parameters import Cells, DampingSettings, MatchingSettings, RoundSettings
 from torchtrack.backends.numba.solving import damped_step, damping_settings, move, normal_equations, row_of
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig

@@ -1,4 +1,4 @@
-"""Regions of objects contour by contour, and their time surfaces pixel by pixel: :mod:`torchtrack.tracking.frontend.time_surface`."""
+"""Newest times event by event, regions of objects contour by contour, and their surfaces pixel by pixel: :mod:`tracking.frontend.time_surface`."""
 
 import numpy as np
 import torch
@@ -8,6 +8,7 @@ from torch import Tensor
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.core.dispatch import accelerates
+from torchtrack.core.events import EventBatch, check_on_sensor, stream_bounds
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend import time_surface
 from torchtrack.tracking.frontend.history import BORDER_PX
@@ -55,29 +56,35 @@ def regions_numba(sensors: Sensors, contours: Contours, margin_px: int) -> Regio
 
 
 @kernel()
-def pixels_at(pixels: Array, stream_index: Array, numbers: Array, border_px: int, width: int, nearest: Array) -> None:
-    """Fill ``nearest [b, n, 2]`` with columns and rows of the sensor pixels nearest to ideal ones, ``pixels [b, 2, n]``.
+def newest(x: Array, y: Array, t_us: Array, bounds: Array, times_us: Array) -> bool:
+    """Bring maps of newest times ``[s, h, w]`` up, if all events are on the sensor, and tell whether they are.
 
     Args:
-        numbers: ``[s, bh, bw]`` of those pixels, row by row of a sensor so wide.
+        x, y, t_us: ``[e]``, one stream after the other; ``bounds [s + 1]``, where each begins, and where the last one ends.
     """
-    last_row, last_column, border = numbers.shape[1] - 1, numbers.shape[2] - 1, pixels.dtype.type(border_px)
-    for b in range(len(pixels)):
-        table = numbers[stream_index[b]]
-        for i in range(pixels.shape[2]):
-            column = np.uint64(np.rint(min(max(pixels[b, 0, i] + border, 0.0), last_column)))
-            row = np.uint64(np.rint(min(max(pixels[b, 1, i] + border, 0.0), last_row)))
-            number = np.uint32(table[row, column])
-            nearest[b, i, 0], nearest[b, i, 1] = number % np.uint32(width), number // np.uint32(width)
+    right, bottom, end = np.uint32(0), np.uint32(0), bounds[len(times_us)]
+    # Looked at before: several events at once, and none of the writes waits for it.
+    for i in range(end):
+        # Unsigned, a negative number is a large one.
+        right, bottom = max(right, np.uint32(x[i])), max(bottom, np.uint32(y[i]))
+    if end > 0 and not (right < times_us.shape[2] and bottom < times_us.shape[1]):
+        return False
+    width = np.uint32(times_us.shape[2])
+    for s in range(len(times_us)):
+        times = times_us[s].ravel()
+        for i in range(np.uint64(bounds[s]), np.uint64(bounds[s + 1])):
+            place = np.uint64(np.uint32(y[i]) * width + np.uint32(x[i]))
+            times[place] = max(times[place], t_us[i])
+    return True
 
 
-@accelerates(Sensors.nearest_pixels)
-def nearest_pixels_numba(sensors: Sensors, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n 2"]:
-    """Pixel by pixel."""
-    nearest = torch.empty(pixels.shape, dtype=torch.int64)
-    arrays = as_arrays(pixels.transpose(1, 2), sensors.stream_index, sensors.sensor_numbers)
-    pixels_at(*arrays, BORDER_PX, sensors.image_size[1], nearest.numpy())
-    return nearest
+@accelerates(time_surface.update_last_event)
+def update_last_event_numba(last_event_us: Int[Tensor, "s h w"], events: EventBatch) -> Int[Tensor, "s h w"]:
+    """One event after the other."""
+    updated = last_event_us.clone(memory_format=torch.contiguous_format)
+    if not newest(*as_arrays(events.x, events.y, events.t_us, stream_bounds(events, len(updated)), updated)):
+        check_on_sensor(events, width=last_event_us.shape[2], height=last_event_us.shape[1])
+    return updated
 
 
 @kernel()

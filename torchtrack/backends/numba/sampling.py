@@ -1,10 +1,9 @@
-"""Contour points of a mesh, and where they show: :func:`torchtrack.tracking.contours.sampling.mesh_contours` and ``assemble``, object by object."""
+"""Contour points of a mesh: :func:`torchtrack.tracking.contours.sampling.mesh_points`, object by object."""
 
 from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
@@ -16,17 +15,12 @@ from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.dispatch import accelerates
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
-from torchtrack.tracking.contours import points
-from torchtrack.tracking.contours.points import MIN_PX_PER_M, Contours
 from torchtrack.tracking.contours.sampling import MAX_ACTIVE_EDGES, MIN_TEXTURE_COSINE, SPACING_PX, mesh_points
-from torchtrack.tracking.relocalization import sampling
-from torchtrack.tracking.relocalization.event_image import BORDER_PX
 
 # Rows of a model's table of edges, and of the points sampled on them.
 _START, _VECTOR, _DIRECTION, _TURNING, _KIND = 0, 3, 6, 9, 12
 _POINT, _TANGENT = 0, 3
-SAMPLED = 6
-_LEAST_LENGTH2 = 1e-18
+_SAMPLED = 6
 
 
 @kernel(fastmath=FAST)
@@ -55,7 +49,7 @@ def sample(
         members: numbers of the objects.
         edge_ends, face_normals, face_offsets, is_crease, is_segment, edges: of the model's edges, as :class:`contour_source.ContourModel`
             has them, but for those of faces, ``[2, 3, e]`` and ``[2, e]``; so are those of texture.
-        sampled, kind: ``[b, SAMPLED, n]`` and ``[b, n]``, with room enough; filled as far as ``counts [b]`` says.
+        sampled, kind: ``[b, _SAMPLED, n]`` and ``[b, n]``, with room enough; filled as far as ``counts [b]`` says.
     """
     active, length, depths = np.empty(len(edge_ends), np.int64), np.empty(len(edge_ends)), np.empty((len(edge_ends), 2))
     camera_obj = np.empty(3)
@@ -210,118 +204,8 @@ def gather(sampled: Array, kind: Array, counts: Array, points_obj: Array, tangen
                 tangents_obj[b, k, i] = sampled[b, _TANGENT + k, i] if exists else 0.0
 
 
-@kernel(fastmath=FAST)
-def show(
-    points_obj: Array,
-    tangents_obj: Array,
-    mask: Array,
-    T_cam_obj: Array,
-    intrinsics: Array,
-    settings: SamplingSettings,
-    points_cam: Array,
-    pixels: Array,
-    normals: Array,
-    shown: Array,
-) -> None:
-    """Contour points at a pose, with their normals in the image; those behind the camera or without a normal are not ``shown [b, m]``.
-
-    Args:
-        points_obj, tangents_obj: ``[b, 3, m]``, of which ``mask [b, m]`` count.
-        points_cam, pixels, normals: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``; filled.
-    """
-    for b in range(len(mask)):
-        pose, of_lens = entries(T_cam_obj[b]), lens(intrinsics[b])
-        fx, fy, cx, cy = of_lens
-        for i in range(mask.shape[1]):
-            x, y, z = placed(pose, points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i])
-            points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i] = x, y, z
-            inverse = inverse_depth(z)
-            pixels[b, 0, i], pixels[b, 1, i] = x * inverse * fx + cx, y * inverse * fy + cy
-            ax, ay, az = turned(pose, tangents_obj[b, 0, i], tangents_obj[b, 1, i], tangents_obj[b, 2, i])
-            u, v, length = normal_of(ax - x * inverse * az, ay - y * inverse * az, inverse, of_lens)
-            normals[b, 0, i], normals[b, 1, i] = u, v
-            shown[b, i] = mask[b, i] and length > settings.least_px_per_m and z > settings.least_depth_m
-
-
-@kernel(fastmath=FAST)
-def normal_of(across_x: float, across_y: float, inverse: float, of_lens: Numbers) -> tuple[float, float, float]:
-    """Unit normal of a projected tangent, and how long the tangent is there (px/m): :func:`torchtrack.tracking.contours.points.image_normals`.
-
-    Args:
-        across_x, across_y: the tangent across the line of sight.
-        inverse: one over the depth.
-    """
-    u, v = across_x * inverse * of_lens[0], across_y * inverse * of_lens[1]
-    length = np.sqrt(max(u * u + v * v, _LEAST_LENGTH2))
-    return -v / length, u / length, length
-
-
-@kernel(fastmath=FAST)
-def score_outlines(
-    points_obj: Array,
-    tangents_obj: Array,
-    mask: Array,
-    T_cam_obj: Array,
-    intrinsics: Array,
-    settings: SamplingSettings,
-    image: Array,
-    border_px: int,
-    beside_px: float,
-    scores: Array,
-) -> None:
-    """How much denser events are on contours at some poses than beside them: :func:`torchtrack.tracking.relocalization.sampling.score_outlines`.
-
-    Args:
-        points_obj, tangents_obj, mask: ``[n, 3, m]`` and ``[n, m]`` of each pose; or one row for all.
-        T_cam_obj: ``[n, 4, 4]``.
-        intrinsics: ``[4]``.
-        image: ``[h, w]``, with a border.
-        scores: ``[n]``, filled.
-    """
-    of_lens, flat, height, width = lens(intrinsics), image.ravel(), float(image.shape[0]), float(image.shape[1])
-    for n in range(len(scores)):
-        row, pose, total, count = n if len(mask) > 1 else 0, entries(T_cam_obj[n]), 0.0, 0
-        for i in range(mask.shape[1]):
-            x, y, z = placed(pose, points_obj[row, 0, i], points_obj[row, 1, i], points_obj[row, 2, i])
-            inverse = inverse_depth(z)
-            ax, ay, az = turned(pose, tangents_obj[row, 0, i], tangents_obj[row, 1, i], tangents_obj[row, 2, i])
-            nu, nv, length = normal_of(ax - x * inverse * az, ay - y * inverse * az, inverse, of_lens)
-            if mask[row, i] and length > settings.least_px_per_m and z > settings.least_depth_m:
-                u, v = x * inverse * of_lens[0] + of_lens[2], y * inverse * of_lens[1] + of_lens[3]
-                outer = at(flat, width, height, u + beside_px * nu, v + beside_px * nv, border_px)
-                inner = at(flat, width, height, u - beside_px * nu, v - beside_px * nv, border_px)
-                total += at(flat, width, height, u, v, border_px) - 0.5 * (outer + inner)
-                count += 1
-        scores[n] = total / max(count, 1)
-
-
-@kernel(fastmath=FAST)
-def at(image: Array, width: float, height: float, u: float, v: float, border_px: int) -> float:
-    """What an image with its border, row by row, has at a pixel: :func:`torchtrack.tracking.relocalization.event_image.look_up`."""
-    column, row = np.rint(u) + border_px, np.rint(v) + border_px
-    # What is not a number is looked up at the first pixel. No branch, of which a processor would guess many wrong.
-    column, row = min(column if column >= 0 else 0.0, width - 1.0), min(row if row >= 0 else 0.0, height - 1.0)
-    return image[np.uint64(row * width + column)]
-
-
-@kernel(fastmath=FAST)
-def project(points_obj: Array, T_cam_obj: Array, intrinsics: Array, points_cam: Array, pixels: Array) -> None:
-    """Points in the camera's frame, and their pixels: ``[b, 3, m]`` and ``[b, 2, m]``, filled."""
-    for b in range(len(points_obj)):
-        pose, (fx, fy, cx, cy) = entries(T_cam_obj[b]), lens(intrinsics[b])
-        for i in range(points_obj.shape[2]):
-            x, y, z = placed(pose, points_obj[b, 0, i], points_obj[b, 1, i], points_obj[b, 2, i])
-            inverse = inverse_depth(z)
-            points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i] = x, y, z
-            pixels[b, 0, i], pixels[b, 1, i] = x * inverse * fx + cx, y * inverse * fy + cy
-
-
-# What only shows points takes none of the settings that sample them.
-_TO_SHOW = ContourConfig()
-
-
-def sampling_settings(config: ContourConfig = _TO_SHOW) -> SamplingSettings:
-    """What a kernel goes by that samples contours, or only shows what was sampled."""
+def sampling_settings(config: ContourConfig) -> SamplingSettings:
+    """What the kernel goes by."""
     return SamplingSettings(
         most_edges=MAX_ACTIVE_EDGES,
         max_edge_points=config.max_edge_points,
@@ -329,7 +213,6 @@ def sampling_settings(config: ContourConfig = _TO_SHOW) -> SamplingSettings:
         texture=int(ContourKind.TEXTURE),
         least_cosine=MIN_TEXTURE_COSINE,
         least_depth_m=MIN_DEPTH_M,
-        least_px_per_m=MIN_PX_PER_M,
     )
 
 
@@ -338,7 +221,7 @@ def mesh_points_numba(models: Sequence[ContourModel], T_cam_obj: Tensor, intrins
     """Edge by edge."""
     settings, batch = sampling_settings(config), len(T_cam_obj)
     room = settings.max_edge_points + max(len(model.texture_points) for model in models)
-    sampled = T_cam_obj.new_empty(batch, SAMPLED, room).numpy()
+    sampled = T_cam_obj.new_empty(batch, _SAMPLED, room).numpy()
     kind, counts = np.empty((batch, room), np.int64), np.zeros(batch, np.int64)
     seen = as_arrays(T_cam_obj, intrinsics)
     for model in models:
@@ -350,42 +233,3 @@ def mesh_points_numba(models: Sequence[ContourModel], T_cam_obj: Tensor, intrins
     kinds, mask = torch.empty(batch, width, dtype=torch.int64), torch.empty(batch, width, dtype=torch.bool)
     gather(sampled, kind, counts, *as_arrays(points_obj, tangents_obj, kinds, mask))
     return points_obj.transpose(1, 2), tangents_obj.transpose(1, 2), kinds, mask
-
-
-@accelerates(points.projected)
-def projected_numba(
-    points_obj: Float[Tensor, "b m 3"], T_cam_obj: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 4"]
-) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m 2"]]:
-    """Point by point."""
-    rows = points_obj.transpose(1, 2)
-    points_cam, pixels = rows.new_empty(rows.shape), rows.new_empty(len(rows), 2, rows.shape[2])
-    project(*as_arrays(rows, T_cam_obj, intrinsics, points_cam, pixels))
-    return points_cam.transpose(1, 2), pixels.transpose(1, 2)
-
-
-@accelerates(points.assemble)
-def assemble_numba(
-    points_obj: Float[Tensor, "b m 3"],
-    tangents_obj: Float[Tensor, "b m 3"],
-    kind: Int[Tensor, "b m"],
-    mask: Bool[Tensor, "b m"],
-    T_cam_obj: Float[Tensor, "b 4 4"],
-    intrinsics: Float[Tensor, "b 4"],
-) -> Contours:
-    """Point by point."""
-    rows, tangents = points_obj.transpose(1, 2), tangents_obj.transpose(1, 2)
-    points_cam, pixels, normals, is_shown = rows.new_empty(rows.shape), *rows.new_empty(2, len(mask), 2, mask.shape[1]), torch.empty_like(mask)
-    show(*as_arrays(rows, tangents, mask, T_cam_obj, intrinsics), sampling_settings(), *as_arrays(points_cam, pixels, normals, is_shown))
-    return Contours(points_obj, tangents_obj, kind, is_shown, *(value.transpose(1, 2) for value in (points_cam, pixels, normals)))
-
-
-@accelerates(sampling.score_outlines)
-def score_outlines_numba(
-    outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"], image: Float[Tensor, "h w"]
-) -> Float[Tensor, "n"]:
-    """Point by point."""
-    scores = image.new_empty(len(T_cam_obj))
-    given = as_arrays(outlines.points_obj.transpose(1, 2), outlines.tangents_obj.transpose(1, 2), outlines.mask)
-    seen = as_arrays(T_cam_obj, intrinsics[0])
-    score_outlines(*given, *seen, sampling_settings(), *as_arrays(image), BORDER_PX, sampling.AROUND_PX, scores.numpy())
-    return scores

@@ -1,0 +1,170 @@
+"""From a window's events to what each object sees of them: :class:`torchtrack.tracking.frontend.sensors.Sensors`, event by event."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.bursts import age_all, fire
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.tiles import divide, numbers_near_numba
+from torchtrack.core.dispatch import accelerates
+from torchtrack.core.events import PaddedEvents, of_streams
+from torchtrack.tracking.frontend.bursts import LONG_AGO_US, LONGEST_US
+from torchtrack.tracking.frontend.history import BORDER_PX
+from torchtrack.tracking.frontend.sensors import Sensors
+from torchtrack.tracking.frontend.tiles import TILE_BITS, NearbyEvents
+from torchtrack.tracking.frontend.window_events import ObjectEvents, SharedEvents, WindowEvents
+
+# Rows of what an object sees of an event.
+PIXELS, AGE, POLARITY = 0, 2, 3
+SEEN = 4
+
+
+@kernel(fastmath=FAST)
+def see(x: Array, y: Array, age_us: Array, polarity: Array, mask: Array, ideal_pixels: Array, stream_index: Array, seen: Array) -> None:
+    """Events of several streams as each object's camera saw them.
+
+    Args:
+        x, y, age_us, polarity, mask: ``[s, e]`` of a window.
+        ideal_pixels: ``[s, h, w, 2]``.
+        stream_index: ``[b]``; of one stream, ``[1]`` is enough for all that see it.
+        seen: ``[SEEN, b, e]``, filled; zero where there is nothing.
+    """
+    width = np.uint64(ideal_pixels.shape[2])
+    for b in range(len(stream_index)):
+        s = stream_index[b]
+        ideal = ideal_pixels[s].reshape(-1, 2)
+        for i in range(seen.shape[2]):
+            if not mask[s, i]:
+                for k in range(SEEN):
+                    seen[k, b, i] = 0.0
+                continue
+            pixel = np.uint64(y[s, i]) * width + np.uint64(x[s, i])
+            seen[PIXELS, b, i], seen[PIXELS + 1, b, i] = ideal[pixel, 0], ideal[pixel, 1]
+            seen[AGE, b, i] = age_us[s, i] * 1e-6
+            seen[POLARITY, b, i] = 1.0 if polarity[s, i] else -1.0
+
+
+@kernel(fastmath=FAST)
+def see_kept(
+    kept: Array,
+    x: Array,
+    y: Array,
+    t_us: Array,
+    polarity: Array,
+    end_us: int,
+    elapsed_us: int,
+    longest_us: int,
+    long_ago_us: int,
+    ideal_pixels: Array,
+    before: Array,
+    ages: Array,
+    seen: Array,
+    exists: Array,
+) -> None:
+    """Some events of one stream as its camera saw them, and the map of bursts brought up to the window's end.
+
+    As :func:`torchtrack.backends.numba.bursts.update_bursts` and :func:`see` one after the other, without anything written in between.
+
+    Args:
+        kept: numbers of the events, ``[n]``.
+        ideal_pixels: ``[h, w, 2]``; ``before`` and ``ages [2, h, w]``.
+        seen, exists: ``[SEEN, n]`` and ``[n]``, filled; where there are more places, with zeros.
+    """
+    width, brighter = np.uint64(ideal_pixels.shape[1]), np.uint64(ideal_pixels.shape[0] * ideal_pixels.shape[1])
+    aged, ideal = ages.ravel(), ideal_pixels.reshape(-1, 2)
+    u, v, age_s, sign = seen[PIXELS], seen[PIXELS + 1], seen[AGE], seen[POLARITY]
+    age_all(before.ravel(), np.int16(elapsed_us), np.int16(long_ago_us - elapsed_us), aged)
+    for j in range(len(kept)):
+        i = np.uint64(kept[j])
+        pixel, age = np.uint64(y[i]) * width + np.uint64(x[i]), end_us - t_us[i]
+        fire(aged, pixel + np.uint64(polarity[i]) * brighter, min(age, long_ago_us), True, elapsed_us, longest_us)
+        u[j], v[j], age_s[j] = ideal[pixel, 0], ideal[pixel, 1], age * 1e-6
+        sign[j], exists[j] = 2.0 * polarity[i] - 1.0, True
+    for j in range(len(kept), len(exists)):
+        exists[j] = False
+        seen[:, j] = 0.0
+
+
+@kernel()
+def pixels_at(pixels: Array, stream_index: Array, numbers: Array, border_px: int, width: int, nearest: Array) -> None:
+    """Fill ``nearest [b, n, 2]`` with columns and rows of the sensor pixels nearest to ideal ones, ``pixels [b, 2, n]``.
+
+    Args:
+        numbers: ``[s, bh, bw]`` of those pixels, row by row of a sensor so wide.
+    """
+    last_row, last_column, border = numbers.shape[1] - 1, numbers.shape[2] - 1, pixels.dtype.type(border_px)
+    for b in range(len(pixels)):
+        table = numbers[stream_index[b]]
+        for i in range(pixels.shape[2]):
+            column = np.uint64(np.rint(min(max(pixels[b, 0, i] + border, 0.0), last_column)))
+            row = np.uint64(np.rint(min(max(pixels[b, 1, i] + border, 0.0), last_row)))
+            number = np.uint32(table[row, column])
+            nearest[b, i, 0], nearest[b, i, 1] = number % np.uint32(width), number // np.uint32(width)
+
+
+@accelerates(Sensors.seen, supports=lambda sensors, window, number=None: number is None)
+def seen_numba(sensors: Sensors, window: PaddedEvents, number: Int[Tensor, "e"] | None = None) -> WindowEvents:
+    """Event by event."""
+    batch = len(sensors.stream_index)
+    # What all see alike is written once.
+    own = sensors.stream_index[:1] if len(sensors.ideal_pixels) == 1 else sensors.stream_index
+    seen = sensors.ideal_pixels.new_empty(SEEN, len(own), window.mask.shape[1])
+    arrays = as_arrays(window.x, window.y, window.age_us, window.polarity, window.mask, sensors.ideal_pixels)
+    see(*arrays, *as_arrays(own), seen.numpy())
+    return _of_rows(seen.expand(-1, batch, -1), window.mask[own].expand(batch, -1))
+
+
+def _are_chosen(sensors: Sensors, nearby: NearbyEvents, burst_age_us: Tensor, t_us: Tensor, elapsed_us: Tensor) -> bool:
+    """Whether the events that count are still to be chosen by their tiles, in a window short enough for ages of bursts to tell what began in it."""
+    return nearby.near_tiles is not None and int(elapsed_us) < LONG_AGO_US
+
+
+@accelerates(Sensors.window_events, supports=_are_chosen)
+def window_events_numba(
+    sensors: Sensors,
+    nearby: NearbyEvents,
+    burst_age_us: Int[Tensor, "s 2 h w"],
+    t_us: Int[Tensor, "s"],
+    elapsed_us: Int[Tensor, "s"],
+) -> tuple[ObjectEvents, Int[Tensor, "s 2 h w"]]:
+    """The events in tiles near each object, as it saw them, and the bursts' ages with them, event by event."""
+    near, tiles_of = nearby.near_tiles, sensors.tiles
+    if near is None or tiles_of is None:
+        raise ValueError("a kernel chooses events by their tiles: there have to be some.")
+    events = of_streams(nearby.events, 1)
+    kept, batch = numbers_near_numba(tiles_of, events, near), len(near)
+    # One place at least: what selects from events needs one to point at.
+    numbers = kept if len(kept) else np.zeros(1, np.int64)
+    places = len(numbers)
+    seen, ages_us = sensors.ideal_pixels.new_empty(SEEN, 1, places), torch.empty(burst_age_us.shape, dtype=burst_age_us.dtype)
+    exists, of_bursts = torch.empty(1, places, dtype=torch.bool), (int(elapsed_us), LONGEST_US, LONG_AGO_US)
+    of_events = as_arrays(events.x, events.y, events.t_us, events.polarity)
+    maps = as_arrays(sensors.ideal_pixels[0], burst_age_us[0], ages_us[0])
+    see_kept(kept, *of_events, int(t_us), *of_bursts, *maps, *as_arrays(seen[:, 0], exists[0]))
+    shared = replace(_of_rows(seen, exists), number=torch.from_numpy(numbers[None]))
+    if batch == 1:
+        return shared, ages_us
+    # Only what is written of this is ever looked at.
+    own, counts = torch.empty(batch, places + 1, dtype=torch.int32), torch.empty(batch, dtype=torch.int64)
+    divide(kept, *of_events[:2], *as_arrays(near), TILE_BITS, tiles_of.columns, *as_arrays(own, counts))
+    return SharedEvents(shared, own, counts), ages_us
+
+
+def _of_rows(seen: Float[Tensor, "4 b e"], exists: Bool[Tensor, "b e"]) -> WindowEvents:
+    """Events by their rows: pixels, ages and polarities."""
+    age_s, polarity = seen[AGE:].unbind()
+    return WindowEvents(seen[:AGE].permute(1, 2, 0), age_s, polarity, exists)
+
+
+@accelerates(Sensors.nearest_pixels)
+def nearest_pixels_numba(sensors: Sensors, pixels: Float[Tensor, "b n 2"]) -> Int[Tensor, "b n 2"]:
+    """Pixel by pixel."""
+    nearest = torch.empty(pixels.shape, dtype=torch.int64)
+    arrays = as_arrays(pixels.transpose(1, 2), sensors.stream_index, sensors.sensor_numbers)
+    pixels_at(*arrays, BORDER_PX, sensors.image_size[1], nearest.numpy())
+    return nearest

@@ -1,0 +1,163 @@
+"""Which events can have to do with which object: :mod:`torchtrack.tracking.frontend.tiles`, tile by tile and event by event."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import Numbers, entries, lens, placed
+from torchtrack.backends.numba.parameters import TileSettings
+from torchtrack.core.camera import MIN_DEPTH_M
+from torchtrack.core.dispatch import accelerates
+from torchtrack.core.events import EventBatch, check_on_sensor
+from torchtrack.tracking.frontend import tiles
+from torchtrack.tracking.frontend.tiles import TILE_BITS, SensorTiles
+from torchtrack.tracking.motion.prediction import Prediction
+
+# Events that are looked at together: what is found of them stays in the processor's nearest memory.
+_BLOCK = 1024
+
+
+@kernel(fastmath=FAST)
+def near_tiles(
+    middle: Array,
+    reach_px: Array,
+    velocity: Array,
+    variance: Array,
+    T_cam_obj: Array,
+    window_s: Array,
+    centre_obj: Array,
+    half_extent: Array,
+    diameter_m: Array,
+    intrinsics: Array,
+    tiles: TileSettings,
+    near: Array,
+) -> None:
+    """Tiles that anything can be seen in that is near an object: :meth:`torchtrack.tracking.frontend.tiles.SensorTiles.near`.
+
+    Args:
+        middle, reach_px: ``[t, 2]`` and ``[t]``.
+        velocity, variance: ``[b, 6]``, and of the pose, ``[b, 6]``.
+        near: ``[b, t]``, filled.
+    """
+    for b in range(len(near)):
+        rim_m = 0.5 * diameter_m[b]
+        turning = np.sqrt((velocity[b, :3] ** 2).sum())
+        speed_m_s = np.sqrt((velocity[b, 3:] ** 2).sum())
+        turned, moved = np.sqrt(variance[b, :3].max()), np.sqrt(variance[b, 3:].max())
+        within_m = (speed_m_s + rim_m * turning) * window_s[b] + tiles.sigmas * (moved + rim_m * turned)
+        pose, of_lens = entries(T_cam_obj[b]), lens(intrinsics[b])
+        left, top, right, bottom = _around(pose, centre_obj[b], half_extent[b], of_lens, within_m, tiles.least_depth_m)
+        for t in range(len(middle)):
+            u, v, away_px = middle[t, 0], middle[t, 1], reach_px[t] + tiles.margin_px
+            near[b, t] = u + away_px >= left and u - away_px <= right and v + away_px >= top and v - away_px <= bottom
+
+
+@kernel(fastmath=FAST)
+def _around(
+    pose: Numbers, centre_obj: Array, half_extent: Array, intrinsics: Numbers, within_m: float, least_depth_m: float
+) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom of all pixels that any point so close to an object's bounding box may be seen at."""
+    left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
+    for corner in range(8):
+        # Each axis one way or the other, by a bit of the number.
+        x, y, z = placed(
+            pose,
+            centre_obj[0] + half_extent[0] * ((corner & 1) * 2.0 - 1.0),
+            centre_obj[1] + half_extent[1] * ((corner & 2) - 1.0),
+            centre_obj[2] + half_extent[2] * ((corner & 4) * 0.5 - 1.0),
+        )
+        # Written so that what is not a number, or may lie beside or behind the camera, is near everywhere.
+        if not z - within_m > least_depth_m:
+            return -np.inf, -np.inf, np.inf, np.inf
+        # No point of a ball is farther from its middle along an axis of the image: by the derivative of x/z along any way in it.
+        around, slope_u, slope_v = within_m / (z - within_m), x / z, y / z
+        u, across = intrinsics[0] * slope_u + intrinsics[2], intrinsics[0] * np.sqrt(1.0 + slope_u * slope_u) * around
+        v, down = intrinsics[1] * slope_v + intrinsics[3], intrinsics[1] * np.sqrt(1.0 + slope_v * slope_v) * around
+        left, right = min(left, u - across), max(right, u + across)
+        top, bottom = min(top, v - down), max(bottom, v + down)
+    return left, top, right, bottom
+
+
+@kernel()
+def keep(x: Array, y: Array, is_near: Array, tile_bits: int, columns: int, width: int, height: int, kept: Array) -> np.int64:
+    """Numbers of the events in tiles near any object: how many; -1 where any event is outside the sensor.
+
+    Args:
+        kept: ``[e + 1]``, filled as far as there are any, and a zero after them.
+        is_near: ``[t]``, tiles near any object.
+    """
+    count, tiles = np.uint64(0), np.empty(_BLOCK, np.uint32)
+    for first in range(0, len(x), _BLOCK):
+        if not _tiles_of(x[first : first + _BLOCK], y[first : first + _BLOCK], tile_bits, columns, width, height, tiles):
+            return np.int64(-1)
+        for i in range(first, min(first + _BLOCK, len(x))):
+            # Products in the place of branches, of which a processor would guess many wrong.
+            kept[count] = i
+            count += np.uint64(is_near[np.uint64(tiles[i - first])])
+    kept[count] = 0
+    return np.int64(count)
+
+
+@kernel()
+def _tiles_of(x: Array, y: Array, tile_bits: int, columns: int, width: int, height: int, tiles: Array) -> bool:
+    """The tile of each event, several at once, and whether all are on the sensor."""
+    right, bottom = np.uint32(0), np.uint32(0)
+    for i in range(len(x)):
+        # Unsigned, a negative number is a large one.
+        u, v = np.uint32(x[i]), np.uint32(y[i])
+        right, bottom = max(right, u), max(bottom, v)
+        tiles[i] = (u >> np.uint32(tile_bits)) + (v >> np.uint32(tile_bits)) * np.uint32(columns)
+    return bool(right < width and bottom < height)
+
+
+@kernel()
+def divide(kept: Array, x: Array, y: Array, near: Array, tile_bits: int, columns: int, own: Array, counts: Array) -> None:
+    """Which of the events that are kept are near each object.
+
+    Args:
+        kept: numbers of the events, ``[n]``.
+        near: ``[b, t]``, tiles near each object.
+        own, counts: ``[b, n + 1]`` places among those that are kept, and how many of them there are: ``[b]``; filled.
+    """
+    tile = np.empty(len(kept), np.uint32)
+    for j in range(len(kept)):
+        i = np.uint64(kept[j])
+        tile[j] = _tile(x[i], y[i], tile_bits, columns)
+    for b in range(len(near)):
+        of_object, places, count = near[b], own[b], np.uint64(0)
+        for j in range(len(tile)):
+            places[count] = j
+            count += np.uint64(of_object[np.uint64(tile[j])])
+        counts[b] = count
+
+
+@kernel()
+def _tile(x: int, y: int, tile_bits: int, columns: int) -> np.uint64:
+    """The tile that a pixel lies in; unsigned, as an index needs no look then whether it is negative."""
+    return np.uint64(x >> tile_bits) + np.uint64(y >> tile_bits) * np.uint64(columns)
+
+
+@accelerates(tiles.SensorTiles.near)
+def near_numba(sensor: SensorTiles, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
+    """Tile by tile."""
+    objects = prediction.objects
+    near = torch.empty(len(window_s), len(sensor.middle), dtype=torch.bool)
+    variance = prediction.covariance.diagonal(dim1=-2, dim2=-1)[:, :6]
+    moving = as_arrays(prediction.velocity, variance, prediction.T_cam_obj, window_s)
+    own = as_arrays(objects.centre_obj, objects.half_extent, objects.diameter_m, objects.intrinsics)
+    settings = TileSettings(tiles.SIGMAS, margin_px + tiles.SLACK_PX, MIN_DEPTH_M)
+    near_tiles(*as_arrays(sensor.middle, sensor.reach_px), *moving, *own, settings, near.numpy())
+    return near
+
+
+@accelerates(tiles.SensorTiles.numbers_near)
+def numbers_near_numba(sensor: SensorTiles, events: EventBatch, near: Bool[Tensor, "b t"]) -> np.ndarray:
+    """Event by event."""
+    kept = np.empty(len(events) + 1, np.int64)
+    count = int(keep(*as_arrays(events.x, events.y, near.any(0)), TILE_BITS, sensor.columns, sensor.width, sensor.height, kept))
+    if count < 0:
+        check_on_sensor(events, sensor.width, sensor.height)
+    return kept[:count]
