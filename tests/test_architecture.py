@@ -38,8 +38,8 @@ ORDER = (
     ("cli",),
     ("__main__",),
 )
-# A function that needs more is two, or its arguments are one thing without a name.
-MOST_ARGUMENTS = 8
+# A function that needs more is two, or its arguments are one thing without a name. A tracker's are a user's options, most of them left out.
+MOST_ARGUMENTS, OF_USERS = 7, {"tracking.tracker.__init__"}
 PLACES = {name: place for place, names in enumerate(ORDER) for name in names}
 
 
@@ -98,7 +98,7 @@ def functions(module: str) -> Iterator[tuple[str, int]]:
 def test_no_function_of_tracking_takes_too_many_arguments():
     taken = {name: count for module in MODULES if module.startswith("tracking") for name, count in functions(module)}
     assert len(taken) > 300
-    assert {name: count for name, count in taken.items() if count > MOST_ARGUMENTS} == {}
+    assert {name for name, count in taken.items() if count > MOST_ARGUMENTS} == OF_USERS
 
 
 def test_no_module_is_imported_in_a_circle():
