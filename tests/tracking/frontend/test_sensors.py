@@ -90,5 +90,5 @@ def test_without_corners_none_are_looked_for():
     config = TrackerConfig(corners=CornerConfig(max_corners=0))
     tracker = Tracker([box_model()], SMALL_CAMERA, config)
     contours = tracker.objects.contours(pose()[None].float(), config.contours)
-    nothing = SensorMaps.empty(1, tracker.image_size, torch.device("cpu"))
-    assert tracker.sensors.corners(contours, nothing, NOW_US[:1], torch.tensor([5e-3]), config).mask.shape == (1, 0)
+    nothing = tracker.sensors.view(SensorMaps.empty(1, tracker.image_size, torch.device("cpu")), NOW_US[:1])
+    assert tracker.sensors.corners(contours, nothing, torch.tensor([5e-3]), config).mask.shape == (1, 0)
