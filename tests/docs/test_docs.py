@@ -91,6 +91,7 @@ def test_python_that_needs_data_names_what_is_there(code):
         assert hasattr(import_module(module), name), f"{module}.{name}"
 
 
+@torch.no_grad()
 def test_the_cost_term_draws_a_pose_to_where_it_says():
     """Half a millimetre beside the truth, where events alone leave it."""
     (code,), shown = blocks("python cost-term"), {}

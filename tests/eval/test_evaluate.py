@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 import trimesh
+from elsewhere import Elsewhere
 from helpers import random_pose
 from pydantic import ValidationError
 from tiny_sequence import write_tiny_sequence
@@ -123,9 +124,13 @@ def test_a_sequence_that_fails_is_reported_and_the_rest_completes(folder, tmp_pa
     assert len(json.loads((tmp_path / "out" / "metrics.json").read_text())) == 2
 
 
-def test_processes_give_the_same_as_one(folder, tmp_path):
+def test_processes_give_the_same_as_one(folder, tmp_path, monkeypatch):
+    """What stands in for processes, all but that they are new; an evaluation in new ones is in ``tests/cli/test_many.py``."""
+    elsewhere = Elsewhere()
+    monkeypatch.setattr("torchtrack.run.executor.run_in_processes", elsewhere)
     alone = evaluate(EvaluateConfig(paths=(folder,), jobs=1, output=tmp_path / "alone"))
     shared = evaluate(EvaluateConfig(paths=(folder,), jobs=2, output=tmp_path / "shared"))
+    assert elsewhere.jobs == [2]
     # Peaks of a sequence this short are not known, and so not equal to themselves.
     assert [finite(result.metrics.as_dict()) for result in alone.results] == [finite(result.metrics.as_dict()) for result in shared.results]
 

@@ -59,7 +59,8 @@ def test_a_stage_that_fails_is_counted_too():
 
 
 def test_every_stage_of_a_step_is_timed_and_the_step_is_the_same():
-    tracker, state, _, (events, end_us), _ = started(config=ALONG_FLOW)
+    with torch.no_grad():
+        tracker, state, _, (events, end_us), _ = started(config=ALONG_FLOW)
     expected = tracker.step(state, events, end_us)[1]
     times = StageTimes(time.perf_counter)
     with timed(times):

@@ -289,7 +289,7 @@ def test_a_step_takes_a_further_term(name):
         T_said = retract_about(trajectory.at(torch.tensor([end_us])), torch.tensor([[0.0, 0, 0, 5e-4, 0, 0]]).double(), tracker.centre_obj)
         pairs = pairs_at(T_said, replace(problem_at(T_said), centre_obj=tracker.centre_obj), 40, weight=1e6)
         results = [tracker.step(state, last, end_us, extra_terms=extra_terms)[1] for extra_terms in ((), (pairs,))]
-    assert_same(results[0], tracker.step(state, last, end_us)[1])
+        assert_same(results[0], tracker.step(state, last, end_us)[1])
     millimetres = [float(pose_errors(result.T_cam_obj, T_said)[1]) for result in results]
     assert millimetres[0] > 0.2 and millimetres[1] < 0.01
     assert int(results[1].status[0]) == Status.TRACKING

@@ -142,6 +142,7 @@ def test_an_object_that_ran_off_is_found_again_where_it_was_seen_well(name):
     lost = LOST[name]
     trajectory, events = moving_box(pose(), 30)
 
+    @torch.no_grad()
     def after(*disabled):
         tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(disabled=frozenset(disabled)))
         state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 8))
@@ -163,6 +164,7 @@ def test_an_object_that_holds_on_to_other_edges_is_found_again_where_it_was_seen
     disabled = {Component.LAST_SEEN, Component.SCORE_DROP, Component.LOW_SCORE}
     trajectory, events = moving_box(pose(), 30)
 
+    @torch.no_grad()
     def after(not_validated_below):
         search = RelocalizationConfig(not_validated_below=not_validated_below, slow_drift_below=0)
         tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(relocalization=search, disabled=disabled))
@@ -176,6 +178,7 @@ def test_an_object_that_holds_on_to_other_edges_is_found_again_where_it_was_seen
     assert after(0.0) > 0.2
 
 
+@torch.no_grad()
 def test_as_last_seen_it_is_turned_and_as_far_away_as_then_in_the_place_of_now():
     _, prediction, *_ = in_motion(dtype=torch.float64)
     prediction, then = replace(prediction, T_cam_obj=random_pose(1, seed=1)), random_pose(seed=2)
@@ -187,6 +190,7 @@ def test_as_last_seen_it_is_turned_and_as_far_away_as_then_in_the_place_of_now()
     assert torch.equal(other.covariance, prediction.covariance) and torch.equal(other.velocity, prediction.velocity)
 
 
+@torch.no_grad()
 def runs_on(config, change, count=8):
     """Results of a box in full motion whose state was changed, and its true poses; windows end when it is time to look far away."""
     tracker = Tracker([box_model()], SMALL_CAMERA, config)
@@ -220,6 +224,7 @@ def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(monkeypatch, as_las
     assert (float(degrees) < 1) == as_last_seen
 
 
+@torch.no_grad()
 def test_where_an_object_was_last_seen_well_is_remembered_and_not_where_it_was_not():
     tracker, trajectory, events = Tracker([box_model()], SMALL_CAMERA), *moving_box(pose(), 8)
     state = tracker.init(pose()[None], 0)

@@ -121,6 +121,7 @@ def test_a_search_leaves_what_it_was_given_as_it_was():
 # ---- in the tracker
 
 
+@torch.no_grad()
 def displaced_runs(config, covariance_scale, count=10, displaced=DISPLACED):
     """Runs on from full motion with the pose displaced and its covariance scaled; results, and the true pose at their end."""
     tracker = Tracker([box_model()], SMALL_CAMERA, config)
@@ -165,6 +166,7 @@ def test_without_hypotheses_or_a_prior_nothing_is_searched_for(config, monkeypat
     assert searched == []
 
 
+@torch.no_grad()
 def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     searched = []
     monkeypatch.setattr(f"{LOOP}._tried", lambda lost, calls: searched.append(lost.number) or lost.window)
@@ -175,6 +177,7 @@ def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     assert len(searched) <= 1
 
 
+@torch.no_grad()
 def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
     """Bit for bit: the first and last object of three are as if the one between had not been searched for."""
     starts = pose()[None].repeat(3, 1, 1)
@@ -198,6 +201,7 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
     assert not torch.equal(poses_of(runs["with"], 1), poses_of(runs["without"], 1))
 
 
+@torch.no_grad()
 def test_the_work_of_a_window_is_bounded_however_many_are_lost(monkeypatch):
     """Of four that are lost, one is looked for in a window, each in its turn, by as many hypotheses as one that is lost alone."""
     aligned = []
@@ -225,6 +229,7 @@ def test_the_work_of_a_window_is_bounded_however_many_are_lost(monkeypatch):
 
 
 @pytest.mark.parametrize(("count", "times"), [(0, 0), (29, 0), (200, 1)])
+@torch.no_grad()
 def test_without_enough_events_there_is_nothing_to_search_in(count, times, monkeypatch):
     searched = []
     # The look at its rivals is made at its start.

@@ -213,6 +213,7 @@ def test_of_those_whose_place_is_not_known_events_need_not_gather():
 # ---- what comes of it
 
 
+@torch.no_grad()
 def slipped(config, count=10, streams=1, displaced=0):
     """Runs on from full motion with the pose of one object off, though all is sure of itself; the states before and after, and results."""
     tracks = [moving_box(pose(), count + 10, seed=stream, stream=stream) for stream in range(streams)]
