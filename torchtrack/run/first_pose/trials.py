@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d
 
+from torchtrack.core.neighbours import largest_around
 from torchtrack.errors import PoseError
 from torchtrack.object_model.rotational_symmetry import RotationGroup
 from torchtrack.run.first_pose.event_lines import EventLines, direction_of, near_events
@@ -203,5 +204,5 @@ def covered_share(pixels: Float[Tensor, "n m 2"], mask: Bool[Tensor, "n m"], lin
     u, v = (pixels / cell_px).floor().nan_to_num(-1.0).unbind(-1)
     inside = mask & (u >= 0) & (u < side) & (v >= 0) & (v < side)
     place = torch.where(inside, v * side + u, 0).long()
-    drawn = torch.zeros(len(pixels), side * side).scatter_reduce(1, place, inside.float(), "amax").view(-1, 1, side, side)
-    return (max_pool2d(drawn, 3, 1, 1)[:, 0] * weights).sum((1, 2))
+    drawn = torch.zeros(len(pixels), side * side).scatter_reduce(1, place, inside.float(), "amax").view(-1, side, side)
+    return (largest_around(drawn, 1) * weights).sum((1, 2))

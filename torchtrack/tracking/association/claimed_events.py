@@ -10,10 +10,10 @@ from dataclasses import replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerable
+from torchtrack.core.neighbours import largest_around
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.window_events import ObjectEvents
 from torchtrack.tracking.motion.prediction import Prediction
@@ -45,8 +45,7 @@ def claimed_pixels(
     stream = torch.where(exists, prediction.objects.stream_index[:, None, None], streams)
     passed_by = torch.zeros(streams + 1, height, width, dtype=torch.bool, device=window_s.device)
     passed_by[stream, v, u] = True
-    side = 2 * CLAIMED_WITHIN_PX + 1
-    return max_pool2d(passed_by[:-1].float()[:, None], side, 1, CLAIMED_WITHIN_PX)[:, 0] > 0
+    return largest_around(passed_by[:-1].float(), CLAIMED_WITHIN_PX) > 0
 
 
 @accelerable

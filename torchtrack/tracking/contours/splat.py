@@ -6,11 +6,12 @@ import torch
 from jaxtyping import Bool, Float
 from kornia.filters import gaussian_blur2d, spatial_gradient
 from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize
+from torch.nn.functional import normalize
 
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.lie import transform_points
+from torchtrack.core.neighbours import largest_around
 from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.tracking.contours.points import Contours, assemble
@@ -21,9 +22,7 @@ _CLOSING_RADIUS_PX = 3
 
 def _close(occupied: Float[Tensor, "b h w"], radius: int) -> Float[Tensor, "b h w"]:
     """Morphological closing with a square of side ``2 radius + 1``."""
-    side = 2 * radius + 1
-    dilated = max_pool2d(occupied[:, None], side, 1, radius)
-    return -max_pool2d(-dilated, side, 1, radius)[:, 0]
+    return -largest_around(-largest_around(occupied, radius), radius)
 
 
 def _silhouette(pixels: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Tensor]:
@@ -40,8 +39,8 @@ def _silhouette(pixels: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Ten
 def boundary_points(pixels: Float[Tensor, "b n 2"], valid: Bool[Tensor, "b n"], radius: int) -> tuple[Bool[Tensor, "b n"], Float[Tensor, "b n 2"]]:
     """Which projected points lie on the boundary of the closed point cloud, and the boundary's normal at each."""
     mask, cell = _silhouette(pixels, valid, radius)
-    eroded = -max_pool2d(-mask[:, None], 3, 1, 1)[:, 0]
-    near_boundary = max_pool2d((mask - eroded)[:, None], 3, 1, 1)[:, 0]
+    eroded = -largest_around(-mask, 1)
+    near_boundary = largest_around(mask - eroded, 1)
     gradient = spatial_gradient(gaussian_blur2d(mask[:, None], (9, 9), (2.0, 2.0)))[:, 0]
     on_boundary = (near_boundary.flatten(1).gather(1, cell) > 0) & valid
     normals = torch.stack([gradient[:, axis].flatten(1).gather(1, cell) for axis in range(2)], -1)

@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.fft import irfft2, rfft2
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerable
+from torchtrack.core.neighbours import largest_around
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.view_sphere import outlines_by_view
@@ -127,6 +128,5 @@ def _blurred(cells: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
 def peaks(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
     """The highest cells of each map, none of which is close to a higher one, and which they are; of cells that are allowed alone."""
     fit = torch.where(allowed, fit, NONE)
-    highest = fit >= max_pool2d(fit[:, None], 2 * APART + 1, 1, APART)[:, 0]
-    best, place = torch.where(highest, fit, NONE).flatten(1).topk(SHIFTS)
+    best, place = torch.where(fit >= largest_around(fit, APART), fit, NONE).flatten(1).topk(SHIFTS)
     return best, place

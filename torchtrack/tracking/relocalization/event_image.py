@@ -1,7 +1,5 @@
 """The events of a window as an image with a border, in which poses are looked for."""
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -23,13 +21,6 @@ def event_density(pixels: Float[Tensor, "1 e 2"], mask: Bool[Tensor, "1 e"], ima
     image = image.scatter_add(0, v * width + u, inside.to(pixels.dtype)).view(height, width)
     rows = image[:-2] + image[1:-1] + image[2:]
     return pad(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:], (1, 1, 1, 1))
-
-
-def of_neighbours(image: Float[Tensor, "h w"], combine: Callable[[Tensor, Tensor], Tensor]) -> Float[Tensor, "h w"]:
-    """What the 3x3 pixels around every pixel come to, such as their sum; zero is beyond the rim. On a CPU, pooling takes many times longer."""
-    rows = pad(image, (1, 1, 1, 1))
-    columns = combine(combine(rows[:-2], rows[1:-1]), rows[2:])
-    return combine(combine(columns[:, :-2], columns[:, 1:-1]), columns[:, 2:])
 
 
 def look_up(image: Float[Tensor, "h w"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:

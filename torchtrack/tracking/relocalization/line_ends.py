@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.core import host_sync
+from torchtrack.core.neighbours import largest_around
 from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.relocalization.event_image import event_density, look_up, of_neighbours
+from torchtrack.tracking.relocalization.event_image import event_density, look_up
 
 # Contour points that are looked at, at most.
 _POINTS = 256
@@ -34,7 +35,7 @@ def running_on(contours: Contours, places: tuple[Float[Tensor, "1 e 2"], Bool[Te
         image_size: height and width (px).
     """
     # Larger than zero where there is an event two pixels away or nearer.
-    fired = of_neighbours(event_density(*places, image_size), torch.maximum)
+    fired = largest_around(event_density(*places, image_size), 1)
     chosen, exists = select_ranked(contours.mask, _POINTS)
     pixels, normals = take_points(contours.pixels, chosen), take_points(contours.normals, chosen)
     along = torch.stack([-normals[..., 1], normals[..., 0]], -1)

@@ -15,11 +15,12 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.lie import difference_about
+from torchtrack.core.neighbours import over_3x3
 from torchtrack.tracking.contours.points import Contours, assemble
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.correlation import kept_rotations, shifted
 from torchtrack.tracking.relocalization.edge_search import FAR_PX, NEAR_PX, pulled
-from torchtrack.tracking.relocalization.event_image import event_density, look_up, of_neighbours
+from torchtrack.tracking.relocalization.event_image import event_density, look_up
 from torchtrack.tracking.relocalization.view_sphere import outlines_at, thinned
 
 # Poses sampled near a prediction, at most, and for each of ``relocalization.rotations``. Their score alone is taken, which costs little.
@@ -71,7 +72,7 @@ def _anywhere(
     steps = draw_offsets(covariance, config.relocalization.rotations)[:, :6].to(prediction.velocity.dtype)
     sigma_m = covariance.diagonal()[3:5].mean().sqrt().to(steps.dtype)
     steps, outlines = shifted(prediction, steps, sigma_m, places, config)
-    around = of_neighbours(enough, torch.add) / 9
+    around = over_3x3(enough, torch.add) / 9
     onto = (around, covariance[:6, :6])
     poses = pulled(prediction, prediction.poses_at(steps), outlines, *onto, FAR_PX)
     count = max(kept_rotations(config) // _KEPT_PER_PULLED, config.relocalization.hypotheses)
