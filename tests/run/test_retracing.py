@@ -141,20 +141,49 @@ def test_where_it_was_not_lost_yet_a_pose_has_to_explain_clearly_more(followed):
     assert all(after[at] is strayed[at] for at in (0, 1, 2, 3))
 
 
-def test_what_is_hidden_is_not_followed(followed):
-    tracker, steps, _ = followed
-    lost = lost_for_a_while(steps, tracker)
-    hidden = [replace(step, window=replace(step.window, events=step.window.events[:0])) if 10 <= at < 15 else step for at, step in enumerate(lost)]
+def hidden_for_a_while(steps, tracker, number=0, since=FIRST):
+    """Lost, and without events in the middle of that."""
+    lost = [astray(step, number, tracker) if since <= at < SEEN - 4 else step for at, step in enumerate(steps)]
+    return [replace(step, window=replace(step.window, events=step.window.events[:0])) if 10 <= at < 15 else step for at, step in enumerate(lost)]
+
+
+def test_while_it_is_hidden_it_is_on_its_way_and_stays_lost(followed):
+    tracker, steps, trajectory = followed
+    hidden = hidden_for_a_while(steps, tracker)
     with torch.inference_mode():
         after = retraced(hidden, 0, Gap(FIRST, SEEN), tracker.alone(0))
+    assert all(after[at] is hidden[at] for at in (*range(FIRST), *range(SEEN, COUNT)))
+    assert errors_m(after, trajectory)[FIRST:SEEN].max() < 1e-3 < errors_m(hidden, trajectory)[FIRST : SEEN - 4].min()
+    lost = [int(step.result.status[0]) >= int(Status.LOST) for step in after]
+    assert all(lost[FIRST:12]) and not any(lost[15:])
+    for ours, theirs in zip(after[FIRST:12], hidden[FIRST:12], strict=True):
+        assert torch.equal(ours.state.T_cam_obj, ours.result.T_cam_obj)
+        assert torch.equal(ours.state.motion.covariance, theirs.state.motion.covariance)
+    velocity = torch.stack([step.state.velocity[0] for step in after])
+    torch.testing.assert_close(velocity[FIRST:12], velocity[FIRST - 1].expand(12 - FIRST, 6), rtol=0.3, atol=0.1)
+
+
+def test_contours_of_what_is_hidden_are_where_it_is(followed):
+    tracker, steps, _ = followed
+    with torch.inference_mode():
+        result = retraced(hidden_for_a_while(steps, tracker), 0, Gap(FIRST, SEEN), tracker.alone(0))[10].result
+    R, t = result.T_cam_obj[0, :3, :3], result.T_cam_obj[0, :3, 3]
+    torch.testing.assert_close(result.contours.points_cam[0].double(), result.contours.points_obj[0].double() @ R.T + t, rtol=0, atol=1e-5)
+
+
+def test_what_was_lost_from_the_first_step_on_has_no_way(followed):
+    tracker, steps, _ = followed
+    hidden = hidden_for_a_while(steps, tracker, since=0)
+    with torch.inference_mode():
+        after = retraced(hidden, 0, Gap(0, SEEN), tracker.alone(0))
     assert all(after[at] is hidden[at] for at in range(12))
-    assert all(after[at] is not hidden[at] for at in range(15, SEEN))
 
 
+@pytest.mark.parametrize("hide", [lost_for_a_while, hidden_for_a_while])
 @pytest.mark.parametrize("number", [0, 1])
-def test_nothing_changes_for_its_neighbour(two, number):
+def test_nothing_changes_for_its_neighbour(two, number, hide):
     tracker, steps = two
-    lost = lost_for_a_while(steps, tracker, number)
+    lost = hide(steps, tracker, number)
     with torch.inference_mode():
         after = retraced(lost, number, Gap(FIRST, SEEN), tracker.alone(number))
     assert any(ours is not theirs for ours, theirs in zip(after, lost, strict=True))
@@ -232,8 +261,8 @@ def test_track_follows_objects_back_where_the_tracker_is_set_so():
 
 
 def test_objects_are_followed_back_in_recordings_alone():
-    assert preset("default").smoothing.retrace_s == preset("learned").smoothing.retrace_s == 0.5
-    assert preset("causal").smoothing.retrace_s == 0
+    assert {preset(name).smoothing.retrace_s for name in ("default", "learned", "guided", "nns")} == {1.0}
+    assert {preset(name).smoothing.retrace_s for name in ("causal", "paper", "line", "ls")} == {0.0}
 
 
 def test_what_has_no_filter_cannot_be_followed_back():

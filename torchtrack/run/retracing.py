@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.core.events import EventBatch
+from torchtrack.core.lie import difference_about, retract_about
 from torchtrack.core.windows import EventWindow
 from torchtrack.run.stepping import Step
 from torchtrack.tracking.contours.points import Contours, reproject
@@ -31,6 +32,8 @@ _HIDDEN_S = 0.01
 _SAME_PX = 2.0
 # By how much more a pose has to explain than one of a window in which the object was not lost yet.
 _MARGIN = 0.1
+# A share of the time that an object was hidden for, in which it moves on straight.
+_SHORT = 1e-4
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,8 @@ class Gap:
 def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> list[Step]:
     """Consecutive steps, with other poses of the object ``number`` in and before a gap, as far as it can be followed back.
 
-    From where it was lost on, what leads there from where it is seen well is believed; before that, what explains clearly more.
+    From where it was lost on, what leads there from where it is seen well is believed; before that, what explains clearly more. Where it can't
+    be followed, because it is hidden, it is put on its way between the poses before and after that.
 
     Args:
         steps: without maps of events.
@@ -57,7 +61,7 @@ def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> li
         gap: where it was lost.
         alone: a tracker of this object alone.
     """
-    changed, since_us = list(steps), steps[gap.seen].window.t_end_us
+    changed, since_us, earliest = list(steps), steps[gap.seen].window.t_end_us, gap.seen
     back = followed_back(steps[gap.seen].state, number, [step.window for step in steps[1 : gap.seen + 1]], alone)
     for at, (state, result) in zip(reversed(range(gap.seen)), back, strict=True):
         before = steps[at]
@@ -69,8 +73,43 @@ def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> li
         if at < gap.first and not float(before.state.health.time_since_validated_s[number]) and _apart_px(before, number, result, alone) < _SAME_PX:
             break
         if at >= gap.first or float(state.health.score[0]) > float(before.state.health.score[number]) + _MARGIN:
-            changed[at] = _with_object(before, number, state, result)
+            changed[at], earliest = _with_object(before, number, state, result), at
+    first = earliest
+    while first and int(changed[first - 1].result.status[number]) >= int(Status.LOST):
+        first -= 1
+    if 0 < first < earliest:
+        changed[first - 1 : earliest + 1] = _on_its_way(changed[first - 1 : earliest + 1], number, alone)
     return changed
+
+
+def _on_its_way(steps: Sequence[Step], number: int, alone: Tracker) -> list[Step]:
+    """Consecutive steps, with the object in all but the first and the last on its way between these two: a cubic with their poses and velocities.
+
+    Nothing was seen of it there: it stays lost, and as uncertain as it was. A prediction from the first of them comes to rest; a straight
+    way was up to 25 degrees off where this one was 4.
+    """
+    own, centre = slice(number, number + 1), alone.centre_obj.double()
+    T_begin, T_end = (step.state.T_cam_obj[own] for step in (steps[0], steps[-1]))
+    t_s = 1e-6 * torch.tensor([step.window.t_end_us - steps[0].window.t_end_us for step in steps], dtype=torch.float64, device=centre.device)
+    leaving, arriving = (t_s[-1] * step.state.velocity[own].double() for step in (steps[0], steps[-1]))
+    way = difference_about(T_begin, T_end, centre)
+    # In coordinates about where it begins.
+    arriving = (difference_about(T_begin, retract_about(T_end, _SHORT * arriving, centre), centre) - way) / _SHORT
+    s = (t_s[1:-1] / t_s[-1])[:, None]
+    offsets = s * (1 - s) ** 2 * leaving + s**2 * (3 - 2 * s) * way + s**2 * (s - 1) * arriving
+    T_between = retract_about(T_begin.expand(len(s), 4, 4), offsets, centre)
+    velocity = difference_about(torch.cat([T_begin, T_between[:-1]]), T_between, centre) / t_s.diff()[:-1, None]
+    between = zip(steps[1:-1], T_between.split(1), velocity.split(1), strict=True)
+    return [steps[0], *(_unseen_at(step, number, T, v.to(alone.intrinsics.dtype), alone) for step, T, v in between), steps[-1]]
+
+
+def _unseen_at(step: Step, number: int, T_cam_obj: Float[Tensor, "1 4 4"], velocity: Float[Tensor, "1 6"], alone: Tracker) -> Step:
+    """The step with the object in another place, of which nothing was seen."""
+    motion, result = step.state.motion, step.result
+    motion = replace(motion, T_cam_obj=_row(motion.T_cam_obj, number, T_cam_obj), velocity=_row(motion.velocity, number, velocity))
+    contours = result.contours.rows(torch.tensor([number], device=velocity.device))
+    contours = _with_contours(result.contours, number, reproject(contours, T_cam_obj.to(velocity.dtype), alone.intrinsics))
+    return replace(step, state=replace(step.state, motion=motion), result=replace(result, T_cam_obj=motion.T_cam_obj, contours=contours))
 
 
 def followed_back(state: TrackerState, number: int, windows: Sequence[EventWindow], alone: Tracker) -> Iterator[tuple[TrackerState, StepResult]]:
@@ -148,17 +187,17 @@ def _with_object(step: Step, number: int, state: TrackerState, result: StepResul
         covariance=_row(forward.covariance, number, result.covariance),
         status=_row(forward.status, number, result.status),
         quality=_row(forward.quality, number, result.quality),
-        contours=_contours(forward, number, result),
+        contours=_with_contours(forward.contours, number, result.contours),
         observation_count=_row(forward.observation_count, number, result.observation_count),
     )
     return replace(step, state=state, result=result)
 
 
-def _contours(forward: StepResult, number: int, result: StepResult) -> Contours:
-    """The contours of a result, with those of one object from another."""
-    count = max(forward.contours.mask.shape[1], result.contours.mask.shape[1])
-    own, other = forward.contours.widened(count), result.contours.widened(count)
-    return Contours(*(_row(value, number, getattr(other, name)) for name, value in vars(own).items()))
+def _with_contours(all_of_them: Contours, number: int, of_one: Contours) -> Contours:
+    """Contours, with those of one object in the place of its own."""
+    count = max(all_of_them.mask.shape[1], of_one.mask.shape[1])
+    before, other = all_of_them.widened(count), of_one.widened(count)
+    return Contours(*(_row(value, number, getattr(other, name)) for name, value in vars(before).items()))
 
 
 def _row(values: Tensor, number: int, row: Tensor) -> Tensor:
