@@ -12,6 +12,7 @@ from torchtrack import Tracker, preset
 from torchtrack.config.tracker import SmoothingConfig, TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.core.windows import EventWindow
+from torchtrack.run import retrace
 from torchtrack.run.refine import Refinement, refined_steps
 from torchtrack.run.retrace import Retracer
 from torchtrack.run.retracing import Gap, in_reverse, retraced
@@ -198,7 +199,8 @@ def test_nothing_changes_for_its_neighbour(two, number, hide):
         assert torch.equal(ours.result.contours.pixels[other][: len(mask)][mask], theirs.result.contours.pixels[other][mask])
 
 
-def test_every_step_comes_once_and_in_order_and_the_lost_ones_with_better_poses(followed):
+def test_every_step_comes_once_and_in_order_and_the_lost_ones_with_better_poses(followed, monkeypatch):
+    monkeypatch.setattr(retrace, "HIDDEN_FOR_S", 0.0)
     tracker, steps, trajectory = followed
     retracer, lost = retracer_of(tracker, RETRACED), lost_for_a_while(steps, tracker)
     given = [(at, due) for at, step in enumerate(lost) for due in retracer.add(step)]
@@ -210,6 +212,15 @@ def test_every_step_comes_once_and_in_order_and_the_lost_ones_with_better_poses(
     # Twelve windows are held: those at the start of the gap are gone by the time the object is seen well.
     assert errors_m(after, trajectory)[SEEN - 10 : SEEN].max() < 1e-3
     assert all(step.state.maps.last_event_us.numel() == 0 for step in after)
+
+
+def test_the_way_of_what_was_hidden_reaches_farther_than_it_is_followed_back(followed):
+    tracker, steps, trajectory = followed
+    retracer = retracer_of(tracker, TrackerConfig(smoothing=SmoothingConfig(retrace_s=0.03)))
+    after = [due for step in hidden_for_a_while(steps, tracker) for due in retracer.add(step)] + retracer.rest()
+    lost = [int(step.result.status[0]) >= int(Status.LOST) for step in after]
+    assert all(lost[FIRST:14]) and not any(lost[15:])
+    assert errors_m(after, trajectory)[FIRST:SEEN].max() < 1e-3
 
 
 def test_an_object_that_is_never_lost_stays_as_it_was(followed):
@@ -261,7 +272,7 @@ def test_track_follows_objects_back_where_the_tracker_is_set_so():
 
 
 def test_objects_are_followed_back_in_recordings_alone():
-    assert {preset(name).smoothing.retrace_s for name in ("default", "learned", "guided", "nns")} == {1.0}
+    assert {preset(name).smoothing.retrace_s for name in ("default", "learned", "guided", "nns")} == {0.5}
     assert {preset(name).smoothing.retrace_s for name in ("causal", "paper", "line", "ls")} == {0.0}
 
 

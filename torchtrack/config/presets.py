@@ -23,7 +23,7 @@ PresetName = Literal["default", "causal", "learned", "guided", "paper", "line", 
 
 
 # What comes later than this tells hardly anything of a pose, and few objects are out of sight for longer.
-_SMOOTHED = SmoothingConfig(lag_s=0.05, retrace_s=1.0)
+_SMOOTHED = SmoothingConfig(lag_s=0.05, retrace_s=0.5)
 
 
 def _default() -> TrackerConfig:

@@ -16,6 +16,8 @@ from torchtrack.tracking.validation.status import Status
 
 # Where objects were lost and found is looked at for so many windows at a time.
 _AT_ONCE = 10
+# Poses of what was hidden, and can't be followed any farther, are known from before that if it was for no longer (s).
+HIDDEN_FOR_S = 0.5
 # In the first windows in which it is seen well, an object still comes to where it is: from so many on it is followed back.
 _SEEN_WINDOWS = 4
 
@@ -36,7 +38,7 @@ class _Lost:
 class Retracer:
     """Takes the steps of a run as they come, and gives each on once nothing that is found later changes it.
 
-    In memory are the events and results of ``smoothing.retrace_s``; states have no maps of events, which take far more.
+    In memory are the events and results of ``smoothing.retrace_s`` and :data:`HIDDEN_FOR_S`; states have no maps of events, which take far more.
 
     Args:
         objects: what is tracked.
@@ -57,7 +59,7 @@ class Retracer:
         self._held.append(replace(step, state=step.state.without_maps()))
         if len(self._held) >= self._looked_at + _AT_ONCE:
             self._look()
-        due_us = step.window.t_end_us - 1e6 * self._config.smoothing.retrace_s
+        due_us = step.window.t_end_us - 1e6 * (self._config.smoothing.retrace_s + HIDDEN_FOR_S)
         # With one that was looked at, the next ones begin.
         return self._given_on(min(sum(held.window.t_end_us <= due_us for held in self._held), self._looked_at - 1))
 
@@ -96,7 +98,13 @@ class Retracer:
             elif is_seen and number in self._lost:
                 self._lost[number].seen += 1
                 if self._lost[number].seen == _SEEN_WINDOWS:
-                    self._held = retraced(self._held, number, Gap(self._lost.pop(number).first, at), self._tracker(number))
+                    gap = Gap(self._lost.pop(number).first, at, self._farthest(at))
+                    self._held = retraced(self._held, number, gap, self._tracker(number))
+
+    def _farthest(self, at: int) -> int:
+        """The step that is followed back to from one, at most."""
+        since_us = self._held[at].window.t_end_us - 1e6 * self._config.smoothing.retrace_s
+        return sum(step.window.t_end_us < since_us for step in self._held)
 
     def _tracker(self, number: int) -> Tracker:
         if number not in self._trackers:

@@ -43,10 +43,12 @@ class Gap:
     Args:
         first: the first step in which it was lost, or found in another place than was to be expected.
         seen: the step in which it is seen well again.
+        farthest: the step that it is followed back to, at most.
     """
 
     first: int
     seen: int
+    farthest: int = 0
 
 
 def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> list[Step]:
@@ -62,8 +64,8 @@ def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> li
         alone: a tracker of this object alone.
     """
     changed, since_us, earliest = list(steps), steps[gap.seen].window.t_end_us, gap.seen
-    back = followed_back(steps[gap.seen].state, number, [step.window for step in steps[1 : gap.seen + 1]], alone)
-    for at, (state, result) in zip(reversed(range(gap.seen)), back, strict=True):
+    back = followed_back(steps[gap.seen].state, number, [step.window for step in steps[gap.farthest + 1 : gap.seen + 1]], alone)
+    for at, (state, result) in zip(reversed(range(gap.farthest, gap.seen)), back, strict=True):
         before = steps[at]
         if int(result.status[0]) >= int(Status.LOST):
             if since_us - before.window.t_end_us > 1e6 * _HIDDEN_S:
