@@ -60,7 +60,7 @@ def tensors_of(value):
 
 def assert_same(first, second):
     for ours, theirs in zip(tensors_of(first), tensors_of(second), strict=True):
-        assert torch.equal(ours, theirs) or (torch.isnan(ours) == torch.isnan(theirs)).all()
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=0, equal_nan=True)
 
 
 def moving_box(T_start, count, camera=SMALL_CAMERA, *, seed=0, stream=0, **motion):

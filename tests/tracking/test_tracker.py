@@ -27,11 +27,13 @@ from torchtrack.config.tracker import (
     TrackerConfig,
 )
 from torchtrack.config.validation import ValidationConfig
+from torchtrack.core import dispatch
 from torchtrack.core.camera import project
 from torchtrack.core.events import EventBatch
 from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.errors import ModelError, PoseError
 from torchtrack.object_model import ObjectModel
+from torchtrack.tracking.frontend.flow import estimate_flow
 from torchtrack.tracking.frontend.time_surface import NEVER_US
 from torchtrack.tracking.initialization import first_state
 from torchtrack.tracking.motion.model import COAST_S
@@ -161,7 +163,7 @@ def test_flow_that_matching_makes_no_use_of_is_estimated_where_it_is_asked_for()
     tracker, state, result, _, _ = started(config=TrackerConfig(corners=CornerConfig(max_corners=32)))
     assert result.corners.mask.any()
     assert not result.corners.has_flow.any()
-    flow, has_flow = tracker.sensors.flow(result.corners.points, state.maps, state.t_us, tracker.config)
+    flow, has_flow = estimate_flow(result.corners.points, tracker.sensors.view(state.maps, state.t_us), tracker.config.flow)
     assert has_flow.any()
     assert (flow[has_flow].norm(dim=-1) > 0).all()
 
@@ -207,7 +209,7 @@ def test_nothing_is_remembered_that_nobody_asks_for():
 def test_gradients_make_no_difference_and_none_is_recorded(mode):
     tracker, state, _, (events, end_us), _ = started()
     expected = tracker.step(state, events, end_us)[1]
-    with mode():
+    with mode(), dispatch.backend(wanted=False):
         result = tracker.step(state, events, end_us)[1]
     assert_same(result, expected)
     assert not any(tensor.requires_grad for tensor in tensors_of(result))
