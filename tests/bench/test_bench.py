@@ -8,7 +8,7 @@ import pytest
 import torch
 from tiny_sequence import write_tiny_sequence
 
-from torchtrack.bench import flow, graphs, io, lost, peers, pipeline, scaling, scene, sim, solver, stages, surface
+from torchtrack.bench import flow, graphs, io, lost, peers, pipeline, presets, scaling, scene, sim, solver, stages, surface
 from torchtrack.bench.clock import Clock
 from torchtrack.bench.plots import Plot, draw
 from torchtrack.bench.results import Report, Result, as_markdown, machine, older_medians, plain, time_result
@@ -52,6 +52,7 @@ def tiny(monkeypatch):
             "SOON": 1,
         },
         graphs: {"SCENES": {"cpu": ((1, 1, 1), (2, 2, 1))}, "WINDOWS": 1},
+        presets: {"SHAPES": ("lbracket",), "MOST": {"guided": 1.5, "nns": None}, "DURATION_S": 0.02, "WARM_UP": 1},
         stages: {"SHAPES": ("lbracket",), "MANY": ((2, 2),)},
         solver: {"TARGETS_MS": {1: 2.0, 3: None}},
         surface: {"WINDOWS": ((64, 48, 500),)},
@@ -107,6 +108,15 @@ def test_lost(tiny, simulator, tmp_path):
         assert ratio["figures"][0] == pytest.approx(figures[hidden] / figures[none])
         assert ratio["target"] == most and ratio["lower_is_better"]
     assert "in 100% of its windows" in content["notes"][0]
+
+
+def test_presets(tiny, simulator, tmp_path):
+    assert bench("presets", tmp_path) == ExitCode.DONE
+    entries = {entry["name"]: entry for entry in written(tmp_path, "presets")["results"]}
+    assert [*entries][:3] == ["lbracket, default", "lbracket, guided", "lbracket, nns"]
+    ratio, plain = entries["lbracket, guided over default"], entries["lbracket, nns over default"]
+    assert ratio["figures"][0] == pytest.approx(entries["lbracket, guided"]["figures"][0] / entries["lbracket, default"]["figures"][0])
+    assert (ratio["target"], ratio["unit"], plain["target"]) == (1.5, "times", None)
 
 
 def test_a_sequence_in_place_of_simulated_scenes(tiny, tmp_path, capsys):
@@ -179,7 +189,7 @@ def test_all_parts_but_those_whose_libraries_are_missing(tiny, simulator, tmp_pa
     def without(setup):
         raise MissingExtraError("numba", "sim", "the simulator")
 
-    for part in (pipeline, lost, graphs, scaling, peers):
+    for part in (pipeline, presets, lost, graphs, scaling, peers):
         monkeypatch.setattr(part, "measure", without)
     assert bench("all", tmp_path) == ExitCode.DONE
     assert {path.name for path in tmp_path.glob("*.json")} == {f"bench_{part}.json" for part in ("stages", "solver", "surface", "flow", "io", "sim")}

@@ -2,4 +2,4 @@
 
 from typing import Literal
 
-Part = Literal["pipeline", "lost", "stages", "graphs", "solver", "surface", "flow", "io", "sim", "scaling", "peers"]
+Part = Literal["pipeline", "presets", "lost", "stages", "graphs", "solver", "surface", "flow", "io", "sim", "scaling", "peers"]

@@ -105,8 +105,9 @@ class Bench:
     """Measure the speed of a part; write JSON, Markdown and plots, with medians, quartiles and targets."""
 
     part: Positional[Literal[Part, "all"]]
-    """pipeline: a step of the tracker. stages: what it is made of. solver, surface, flow: these alone. scaling: with objects and streams.
-    peers: other libraries beside ours. io: reading events. sim: rendering and making events. all: those whose libraries are installed."""
+    """pipeline: a step of the tracker. presets: by others than default. stages: what it is made of. solver, surface, flow: these alone.
+    lost: with an object lost. graphs: where one fails. scaling: with objects and streams. peers: other libraries beside ours. io: reading events.
+    sim: rendering and making events. all: those whose libraries are installed."""
     output: Annotated[str, arg(aliases=["-o"], metavar="DIR")]
     """Folder for the results."""
     repeats: Annotated[int, arg(metavar="N")] = 7
