@@ -192,7 +192,8 @@ def test_a_tracker_that_reads_nothing_finds_the_same(nothing_is_read, monkeypatc
     monkeypatch.setattr(initialization, "_EVENTS_OF_A_PART", 20)
     monkeypatch.setattr(initialization, "MAX_UNKNOWN_PX", max_unknown_px)
     starts, stream_index, cameras, cut = scene(COUNT)
-    boxes = Tracker([box_model()] * len(starts), cameras, config, stream_index, dtype=torch.float64)
+    # Kernels are not for what reads nothing.
+    boxes = Tracker([box_model()] * len(starts), cameras, config, stream_index, dtype=torch.float64, kernels=False)
     begin = boxes.init(torch.stack(starts), 0)
     with torch.inference_mode():
         _, exact = follow(boxes, begin, cut)

@@ -270,20 +270,13 @@ def in_own_process(backend, device="cpu"):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_a_compiler_takes_a_step_as_one_graph():
-    stated = in_own_process("eager")
+def test_a_step_is_one_graph_and_its_compiled_poses_are_those_of_a_step():
+    """Without a C++ compiler it is made a graph all the same, which runs as it is."""
+    has_compiler = shutil.which("g++") or shutil.which("clang++")
+    stated = in_own_process("inductor" if has_compiler else "eager")
     assert stated["prepared"] == stated["graphs"] == 1
     assert stated["took"] >= COUNT // 4
-    assert stated["apart"] < 1e-6
-    assert stated["status"] == 0
-
-
-@pytest.mark.skipif(shutil.which("g++") is None and shutil.which("clang++") is None, reason="needs a C++ compiler")
-def test_compiled_poses_are_those_of_a_step():
-    stated = in_own_process("inductor")
-    assert stated["graphs"] == 1
-    assert stated["took"] >= COUNT // 4
-    assert stated["apart"] < 1e-5
+    assert stated["apart"] < (1e-5 if has_compiler else 1e-6)
     assert stated["status"] == 0
 
 
