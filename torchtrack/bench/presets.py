@@ -27,8 +27,10 @@ def measure(setup: Setup) -> Report:
     Raises:
         MissingExtraError: if scenes are to be simulated, and the simulator's libraries are not installed.
     """
-    scenes = {shape: simulated((shape,), duration_s=DURATION_S) for shape in SHAPES} if setup.sequence is None else {}
-    scenes |= {setup.sequence.stem: read(setup.sequence)} if setup.sequence is not None else {}
+    if setup.sequence is not None:
+        scenes = {setup.sequence.stem: read(setup.sequence)}
+    else:
+        scenes = {shape: simulated((shape,), duration_s=DURATION_S) for shape in SHAPES}
     results: list[Result] = []
     for name, scene in scenes.items():
         setup.show(name)

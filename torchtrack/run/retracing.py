@@ -55,7 +55,7 @@ def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> li
     """Consecutive steps, with other poses of the object ``number`` in and before a gap, as far as it can be followed back.
 
     From where it was lost on, what leads there from where it is seen well is believed; before that, what explains clearly more. Where it can't
-    be followed, because it is hidden, it is put on its way between the poses before and after that.
+    be followed, because it is hidden, its poses are interpolated between those before and after that.
 
     Args:
         steps: without maps of events.
@@ -80,12 +80,12 @@ def retraced(steps: Sequence[Step], number: int, gap: Gap, alone: Tracker) -> li
     while first and int(changed[first - 1].result.status[number]) >= int(Status.LOST):
         first -= 1
     if 0 < first < earliest:
-        changed[first - 1 : earliest + 1] = _on_its_way(changed[first - 1 : earliest + 1], number, alone)
+        changed[first - 1 : earliest + 1] = _interpolated(changed[first - 1 : earliest + 1], number, alone)
     return changed
 
 
-def _on_its_way(steps: Sequence[Step], number: int, alone: Tracker) -> list[Step]:
-    """Consecutive steps, with the object in all but the first and the last on its way between these two: a cubic with their poses and velocities.
+def _interpolated(steps: Sequence[Step], number: int, alone: Tracker) -> list[Step]:
+    """Consecutive steps, with the object's poses in all but the first and the last interpolated: a cubic with poses and velocities of these two.
 
     Nothing was seen of it there: it stays lost, and as uncertain as it was. A prediction from the first of them comes to rest; a straight
     way was up to 25 degrees off where this one was 12, on a scene with a bar.
@@ -102,10 +102,10 @@ def _on_its_way(steps: Sequence[Step], number: int, alone: Tracker) -> list[Step
     T_between = retract_about(T_begin.expand(len(s), 4, 4), offsets, centre)
     velocity = difference_about(torch.cat([T_begin, T_between[:-1]]), T_between, centre) / t_s.diff()[:-1, None]
     between = zip(steps[1:-1], T_between.split(1), velocity.split(1), strict=True)
-    return [steps[0], *(_unseen_at(step, number, T, v.to(alone.intrinsics.dtype), alone) for step, T, v in between), steps[-1]]
+    return [steps[0], *(_with_pose(step, number, T, v.to(alone.intrinsics.dtype), alone) for step, T, v in between), steps[-1]]
 
 
-def _unseen_at(step: Step, number: int, T_cam_obj: Float[Tensor, "1 4 4"], velocity: Float[Tensor, "1 6"], alone: Tracker) -> Step:
+def _with_pose(step: Step, number: int, T_cam_obj: Float[Tensor, "1 4 4"], velocity: Float[Tensor, "1 6"], alone: Tracker) -> Step:
     """The step with the object in another place, of which nothing was seen."""
     motion, result = step.state.motion, step.result
     motion = replace(motion, T_cam_obj=_row(motion.T_cam_obj, number, T_cam_obj), velocity=_row(motion.velocity, number, velocity))
