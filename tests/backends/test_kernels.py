@@ -146,12 +146,13 @@ def test_of_no_contours_nothing_is_found():
         assert (index.look_up(contours.pixels)[1] == -1).all()
 
 
+@pytest.mark.parametrize("of_texture", [True, False])
 @pytest.mark.parametrize("polarity", [None, uniform(3, 8, low=-1)])
-def test_the_table_of_contours(polarity, dtype):
+def test_the_table_of_contours(polarity, of_texture, dtype):
     contours, polarity = random_contours(dtype=dtype), None if polarity is None else polarity.to(dtype)
     contours = replace(contours, points_cam=contours.points_cam + uniform(*contours.mask.shape, 1, seed=5, dtype=dtype))
     index = index_contours(contours, IMAGE_SIZE, 7, 2)
-    ours, theirs = both_ways(lambda: contour_table(contours, index, polarity).rows)
+    ours, theirs = both_ways(lambda: contour_table(contours, index, polarity, of_texture=of_texture).rows)
     counts = contours.mask[:, None].expand_as(ours)
     torch.testing.assert_close(ours[counts], theirs[counts], rtol=1e-5, atol=1e-5)
 
@@ -255,7 +256,7 @@ def random_matches(batch=3, count=900):
     offsets, near = uniform(batch, count, low=-6, high=6, seed=1), uniform(batch, count, seed=2) < 0.7
     zeros, points = torch.zeros_like(offsets), torch.zeros(batch, count, 3).double()
     targets, directions = uniform(batch, count, 2, high=180, seed=3), uniform(batch, count, 2, low=-1, seed=4)
-    stated = uniform(batch, count, low=0.5, seed=5), torch.where(near, 1.0, -1.0).double()
+    stated = uniform(batch, count, low=0.5, seed=5), torch.where(near, 1.0, -1.0).double(), zeros + 1
     return MatchesWithCues(zeros.long(), near, uniform(batch, count, seed=6), zeros, points, targets, directions, offsets, near, *stated)
 
 

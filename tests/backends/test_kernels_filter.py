@@ -136,13 +136,14 @@ def random_find(tracker, prediction, dtype):
     of_each = [uniform(OBJECTS, 50, low=low, seed=seed).to(dtype) for low, seed in ((0, 28), (-1, 29))]
     matches = MatchesWithCues(
         *(exists.long(), exists, of_each[0], nothing, nothing[..., None].expand(-1, -1, 3), pairs, sides, of_each[1]),
-        *(exists, torch.ones_like(nothing), of_each[1].sign()),
+        *(exists, torch.ones_like(nothing), of_each[1].sign(), torch.ones_like(nothing)),
     )
     solution = Linearisation(T_cam_obj, offset.to(dtype), hessian.to(dtype), offset.to(dtype))
     measured, inlier_ratio = uniform(OBJECTS, low=0.3, seed=23).to(dtype), uniform(OBJECTS, seed=24).to(dtype)
     measured[0], measured[1], measured[5], inlier_ratio[2] = 0.05, 0.3, torch.nan, torch.nan
     elsewhere = torch.arange(OBJECTS) % 3 == 0
-    stated = measured, torch.ones_like(measured), count, inlier_ratio, uniform(OBJECTS, seed=26).to(dtype)
+    reference_inlier_ratio, apart, required_spread = (uniform(OBJECTS, seed=seed).to(dtype) for seed in (26, 30, 31))
+    stated = measured, torch.ones_like(measured), count, inlier_ratio, reference_inlier_ratio, apart, required_spread
     return ScoredFit(Fit(solution, contours, matches), *stated, elsewhere)
 
 

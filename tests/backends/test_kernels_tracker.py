@@ -30,6 +30,8 @@ SETTINGS = {
     "no polarity": {"association": {"polarity": False}},
     "no compensation": {"association": {"motion_compensation": False}},
     "one gate": {"association": {"gates_px": (5.0,)}},
+    "nothing in common": {"disabled": ["common_error"]},
+    "no texture polarity": {"disabled": ["texture_polarity"]},
     "no dark shift": {"disabled": ["dark_shift"]},
     "corners": {"corners": {"max_corners": 64}},
     "guided": {"corners": {"max_corners": 64}, "association": {"search": "guided"}},

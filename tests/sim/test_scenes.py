@@ -214,7 +214,7 @@ def boxes_of_trial():
 def test_the_trial_has_many_objects_in_many_scenes_of_each_kind(boxes_of_trial):
     kinds = [config.name.split("_")[0] for config, _, _ in boxes_of_trial]
     assert sum(len(config.objects) for config, _, _ in boxes_of_trial) >= 60
-    assert len(set(kinds)) == 12 and all(kinds.count(kind) >= 2 for kind in kinds)
+    assert len(set(kinds)) == 13 and all(kinds.count(kind) >= 2 for kind in kinds)
     assert len({config.seed for config, _, _ in boxes_of_trial}) == len(boxes_of_trial)
 
 

@@ -22,4 +22,5 @@ def matches_at(targets, near=None, offsets=0.0):
         *place,
         dark=zeros,
         as_expected=ones,
+        effective=ones,
     )

@@ -12,8 +12,10 @@ class Component(StrEnum):
     # association
     OTHERS_EVENTS = "others_events"
     POLARITY_PRIOR = "polarity_prior"
+    TEXTURE_POLARITY = "texture_polarity"
     DARK_SHIFT = "dark_shift"
     SILHOUETTE_DARK_SHIFT = "silhouette_dark_shift"
+    COMMON_ERROR = "common_error"
     WIDE_GATES = "wide_gates"
     SUBCELL_LOOKUP = "subcell_lookup"
     # motion
@@ -35,4 +37,5 @@ class Component(StrEnum):
     MATCH_COUNT = "match_count"
     INLIER_RATIO = "inlier_ratio"
     LINE_ENDS = "line_ends"
+    ALL_DIRECTIONS = "all_directions"
     TENTATIVE = "tentative"

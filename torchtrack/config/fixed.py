@@ -77,12 +77,13 @@ SWITCHES: dict[str, dict[str, Component]] = {
     "association": {
         "fine_unless_plain": Component.SUBCELL_LOOKUP,
         "polarity_prior_s": Component.POLARITY_PRIOR,
+        "texture_polarity": Component.TEXTURE_POLARITY,
         "dark_shift_px": Component.DARK_SHIFT,
         "silhouette_dark_shift_px": Component.SILHOUETTE_DARK_SHIFT,
     },
-    "solver": {"velocity_in_window": Component.VELOCITY_IN_WINDOW},
+    "solver": {"velocity_in_window": Component.VELOCITY_IN_WINDOW, "common_px": Component.COMMON_ERROR},
     "motion": {"speed_from_events": Component.SPEED_FROM_EVENTS, "turn_s": Component.TURNS_FADE},
-    "validation": {"partly_hidden": Component.PARTLY_HIDDEN},
+    "validation": {"partly_hidden": Component.PARTLY_HIDDEN, "all_directions": Component.ALL_DIRECTIONS},
     "relocalization": {
         "low_score_below": Component.LOW_SCORE,
         "score_drop_below": Component.SCORE_DROP,

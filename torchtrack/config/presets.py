@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Literal, get_args
 
+from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import (
     AdaptationConfig,
@@ -24,6 +25,8 @@ PresetName = Literal["default", "causal", "learned", "guided", "paper", "line", 
 
 # What comes later than this tells hardly anything of a pose, and few objects are out of sight for longer.
 _SMOOTHED = SmoothingConfig(lag_s=0.05, retrace_s=0.5)
+# Of methods of others: all edges count alike, and nothing is made of the directions that they face.
+_ALL_ALIKE = frozenset({Component.COMMON_ERROR, Component.ALL_DIRECTIONS})
 
 
 def _default() -> TrackerConfig:
@@ -67,6 +70,7 @@ def _paper() -> TrackerConfig:
         motion=MotionConfig(model="hold", without_events="hold"),
         adaptation=AdaptationConfig(learned_points=0),
         validation=ValidationConfig(min_observations=6),
+        disabled=_ALL_ALIKE,
     )
 
 
@@ -78,6 +82,7 @@ def _lines(loss: Literal["tukey", "none"]) -> TrackerConfig:
         association=AssociationConfig(gates_px=(5.0, 3.0, 2.0), max_events=1500, weighting_network="none"),
         solver=SolverConfig(iterations=3, loss=loss, damping=1e-4, prior=False),
         adaptation=AdaptationConfig(learned_points=0),
+        disabled=_ALL_ALIKE,
     )
 
 

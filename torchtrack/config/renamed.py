@@ -58,7 +58,6 @@ REMOVED: dict[str, dict[str, str]] = {
         "mid_window": "contours are those that show at the window's end",
     },
     "association": {
-        "texture_polarity": "no polarity is expected of texture",
         "burst_px": "events count at their own times, however late in a burst",
         "burst_us": "events count at their own times, however late in a burst",
         "pixel_latency": "events count at their own times, however late in a burst",
@@ -68,7 +67,6 @@ REMOVED: dict[str, dict[str, str]] = {
         "acceleration_in_window": "the velocity is the same all along a window",
         "silhouette_offset_px": "smooth silhouettes lie where their model has them",
         "swelling_px": "smooth silhouettes lie where their model has them",
-        "common_px": "observations of a smooth silhouette count each for itself",
     },
     "motion": {
         "acceleration_px": "no acceleration is estimated",
@@ -83,7 +81,6 @@ REMOVED: dict[str, dict[str, str]] = {
     },
     "validation": {
         "holds_on": "a pose that goes on from the one before is asked for as much as any other",
-        "all_directions": "a pose may be held by parallel lines alone",
     },
 }
 

@@ -35,6 +35,7 @@ from torchtrack.tracking.relocalization.tentative import confirm_or_take_back
 from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, has, triggers
 from torchtrack.tracking.state import StepResult, TrackerState, each_tensor
 from torchtrack.tracking.update import conclude
+from torchtrack.tracking.validation.measures import required_spread
 from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, reference_where_known, score_fit
 from torchtrack.tracking.validation.verdict import Limits, confirmed_status, looked_elsewhere
 
@@ -183,9 +184,10 @@ def unclaimed(
 
 def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, seen: Observed, fit: Fit) -> ScoredFit:
     """Stage 4, after the alignment: what each pose explains of its contours, and of the events around them."""
-    config = tracked.config
-    reference = reference_where_known(seen.sigma_px, state.health.reference_inlier_ratio, config.relocalization)
-    return score_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference)
+    config, health = tracked.config, state.health
+    reference = reference_where_known(seen.sigma_px, health.reference_inlier_ratio, config.relocalization)
+    spread = required_spread(health.reference_normal_spread, health.time_since_validated_s, config)
+    return score_fit(expected.prediction.detached(), fit, config, explained_at_rest(seen.gate_scale), reference, spread)
 
 
 def relocalized(tracked: TrackedObjects, state: TrackerState, window: SteadyWindow) -> Relocalized:

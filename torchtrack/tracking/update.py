@@ -25,7 +25,7 @@ from torchtrack.tracking.validation.health import TrackHealth
 from torchtrack.tracking.validation.measures import visible_ratio
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import Status
-from torchtrack.tracking.validation.verdict import Limits, Measured, Verdict, remembered, verdict
+from torchtrack.tracking.validation.verdict import Limits, Measured, Verdict, remembered, seen_well, verdict
 
 
 def conclude(
@@ -43,7 +43,8 @@ def conclude(
     contours = _where_they_are(scored.fit, motion.T_cam_obj, status >= int(Status.LOST), located.prediction.objects.intrinsics)
     result = StepResult(state.t_us, motion.T_cam_obj, covariance, status, scored.explained_ratio, contours, corners, scored.count)
     appearance = replace(state.appearance, darker_outside=_darker_outside(state, scored, status, dt_s, config))
-    return replace(state, motion=motion, health=replace(health, score=scored.score), appearance=appearance), result
+    health = replace(health, score=scored.score, reference_normal_spread=_normal_spread(health, scored))
+    return replace(state, motion=motion, health=health, appearance=appearance), result
 
 
 def _where_they_are(fit: Fit, T_cam_obj: Float[Tensor, "b 4 4"], failed: Bool[Tensor, "b"], intrinsics: Float[Tensor, "b 4"]) -> Contours:
@@ -113,6 +114,12 @@ def _darker_outside(
     # Chosen, not multiplied: what is not a number would stay.
     weights = torch.where(known[:, None] & (matches.offsets.abs() < ON_CONTOUR_PX), matches.weights, 0)
     return polarity.remembered(state.appearance.darker_outside, matches.directions, matches.dark, weights, dt_s)
+
+
+def _normal_spread(health: TrackHealth, scored: ScoredFit) -> Float[Tensor, "b"]:
+    """How far apart the directions of contours are when objects are seen well, with a window more."""
+    spread = health.reference_normal_spread
+    return torch.where(health.time_since_validated_s == 0, seen_well(spread, scored.normal_spread), spread)
 
 
 def _updated_motion(

@@ -70,13 +70,13 @@ def test_patches_are_sixteen_pixels_wide_and_wrap_around():
 # ---- on contours that move
 
 
-def weights_on_a_line(polarity, *, speed=500.0, kind=ContourKind.CREASE, polarity_counts=True):
+def weights_on_a_line(polarity, *, speed=500.0, kind=ContourKind.CREASE, polarity_counts=True, of_texture=True):
     """Weights of observations on the line at 80 px, which moves across itself at ``speed`` px/s."""
     contours = upright_line(80.0, kind=kind)
     v = 32 + 15 * torch.rand(len(polarity), generator=generator(), dtype=torch.float64)
     places = torch.stack([torch.full_like(v, 80.0), v], -1)[None]
     observations = seen(places, polarity=torch.tensor(polarity, dtype=torch.float64)[None])
-    table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1))
+    table = contour_table(contours, index_contours(contours, IMAGE_SIZE, 8, 1), of_texture=of_texture)
     return match_nearest(observations, table, places, moving_objects((speed, 0.0)), Gate(3.0), matching(polarity=polarity_counts))[0].weights[0]
 
 
@@ -88,7 +88,17 @@ def test_events_of_the_wrong_polarity_count_least_on_the_edges_of_a_mesh(kind, s
     assert float(weights[30:].max()) < 0.1
 
 
-@pytest.mark.parametrize("kind", [ContourKind.SEGMENT, ContourKind.SPLAT, ContourKind.LEARNED, ContourKind.TEXTURE])
+@pytest.mark.parametrize("speed", [500.0, -500.0])
+def test_the_darker_side_of_texture_is_known_whatever_the_majority_says(speed):
+    # Normals point to the darker side: it becomes brighter there where texture moves along its normal.
+    right = 1.0 if speed > 0 else -1.0
+    weights = weights_on_a_line([-right] * 30 + [right] * 3 + [0.0], kind=ContourKind.TEXTURE, speed=speed)
+    assert float(weights[:30].max()) < 0.1
+    assert (weights[30:] == 1).all()
+    assert (weights_on_a_line([-right] * 30, kind=ContourKind.TEXTURE, speed=speed, of_texture=False) == 1).all()
+
+
+@pytest.mark.parametrize("kind", [ContourKind.SEGMENT, ContourKind.SPLAT, ContourKind.LEARNED])
 def test_contours_whose_normals_may_point_either_way_have_no_majority(kind):
     assert (weights_on_a_line([1.0] * 30 + [-1.0] * 3, kind=kind) == 1).all()
 

@@ -67,15 +67,18 @@ def _fill_one(
         is_oriented = is_smooth or kind[i] == settings.crease
         table[i, SMOOTH], table[i, ORIENTED] = is_smooth, is_oriented
         not_plain = not_plain or is_smooth or kind[i] == settings.texture
+        table[i, EXPECTED] = settings.of_texture and kind[i] == settings.texture
         if is_oriented and len(polarity):
             table[i, EXPECTED] = polarity[octant(normals[0, i], normals[1, i])]
     return not_plain
 
 
 @accelerates(nearest_contours.contour_table)
-def contour_table_numba(contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None) -> ContourTable:
+def contour_table_numba(
+    contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_texture: bool = True
+) -> ContourTable:
     """Point by point."""
-    settings = TableSettings(int(ContourKind.SMOOTH), int(ContourKind.CREASE), int(ContourKind.TEXTURE))
+    settings = TableSettings(int(ContourKind.SMOOTH), int(ContourKind.CREASE), int(ContourKind.TEXTURE), of_texture)
     table, not_plain = contours.points_obj.new_empty(*contours.mask.shape, COLUMNS), torch.empty_like(contours.mask[:, 0])
     points, normals, indexed = (value.transpose(1, 2) for value in (contours.points_obj, contours.normals, index.pixels))
     expected = normals.new_empty(len(table), 0) if polarity is None else polarity

@@ -14,8 +14,8 @@ X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, SMOOTH, ORIENTED, EXPECTED = 
 COLUMNS = 10
 # Rows of a match.
 WEIGHT, MATCH_AGE, POINT_X, POINT_Y, POINT_Z, TARGET_U, TARGET_V, DIRECTION_U, DIRECTION_V = range(9)
-OFFSET, DARK, AS_EXPECTED = range(9, 12)
-ROWS = 12
+OFFSET, DARK, AS_EXPECTED, EFFECTIVE = range(9, 13)
+ROWS = 13
 # Patches of the image: votes of the observations in each.
 _ON, _NEAR, _VOTES = range(3)
 # Observations that are matched together. What is known of them lies in rows of this length, in one piece of memory: so a compiler sees that no row
@@ -25,7 +25,7 @@ BLOCK = 128
 _GIVEN_U, _GIVEN_V, _GIVEN_AGE, _GIVEN_POLARITY = range(COLUMNS, COLUMNS + 4)
 _PLACE_U, _PLACE_V, _IS_NEAR, _IS_MATCHED = range(ROWS, ROWS + 4)
 # What weights hang on is known after each round, the rest after the last.
-_TO_WEIGH, _THE_REST = (TARGET_U, TARGET_V, DARK, AS_EXPECTED), (MATCH_AGE, POINT_X, POINT_Y, POINT_Z, DIRECTION_U, DIRECTION_V, OFFSET)
+_TO_WEIGH, _THE_REST = (TARGET_U, TARGET_V, DARK, AS_EXPECTED, EFFECTIVE), (MATCH_AGE, POINT_X, POINT_Y, POINT_Z, DIRECTION_U, DIRECTION_V, OFFSET)
 
 
 @kernel()
@@ -182,6 +182,8 @@ def _compare(
         derived[DIRECTION_U * BLOCK + i], derived[DIRECTION_V * BLOCK + i] = nu, nv
         derived[OFFSET * BLOCK + i], derived[DARK * BLOCK + i] = (du * nu + dv * nv) / wider, dark * given[ORIENTED * BLOCK + i]
         derived[AS_EXPECTED * BLOCK + i] = is_near * _agreeing(dark * given[EXPECTED * BLOCK + i], settings)
+        # Until it is known how many lie around it: whether it has an error in common with them.
+        derived[EFFECTIVE * BLOCK + i] = given[SMOOTH * BLOCK + i]
         # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
         next_u, next_v = carried_u - (u - given[INDEXED_U * BLOCK + i]), carried_v - (v - given[INDEXED_V * BLOCK + i])
         place_u, place_v = derived[_PLACE_U * BLOCK + i], derived[_PLACE_V * BLOCK + i]
@@ -226,7 +228,7 @@ def _write(begin: int, end: int, derived: Array, rows: tuple[int, ...], matches:
 def _weigh(count: int, matches: Array, votes: Array, settings: MatchingSettings) -> None:
     """How far each match is to be trusted by those around it; what has no contour point, not at all."""
     gain = 1.0 / (settings.gathered_share - settings.smeared_share)
-    as_expected, dark, weights = matches[AS_EXPECTED], matches[DARK], matches[WEIGHT]
+    as_expected, dark, weights, effective = matches[AS_EXPECTED], matches[DARK], matches[WEIGHT], matches[EFFECTIVE]
     for i in range(count):
         cell = np.uint64(patch(matches[TARGET_U, i], matches[TARGET_V, i], settings.patch_bits, settings.patches))
         on = votes[cell, _ON]
@@ -237,6 +239,7 @@ def _weigh(count: int, matches: Array, votes: Array, settings: MatchingSettings)
         if settings.polarity:
             weight *= _agreeing(dark[i] * votes[cell, _VOTES] / (on + 2.0), settings)
         weights[i] = weight
+        effective[i] = 1.0 / (1.0 + on * effective[i] * settings.common_variance)
 
 
 @kernel(fastmath=FAST)
@@ -249,4 +252,4 @@ def believe(seen: Array, is_matched: Array, matches: Array, settings: MatchingSe
     enough = total >= settings.min_observations
     for i in range(len(is_matched)):
         is_matched[i] = is_matched[i] and enough
-        matches[WEIGHT, i] *= enough
+        matches[WEIGHT, i] *= enough * matches[EFFECTIVE, i]

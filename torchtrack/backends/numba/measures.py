@@ -31,24 +31,28 @@ def measure(
     centre_cam: Array,
     intrinsics: Array,
     targets: Array,
+    directions: Array,
     offsets: Array,
     is_near: Array,
     as_expected: Array,
     settings: QualitySettings,
     explained: Array,
     inliers: Array,
+    spread: Array,
 ) -> None:
-    """Of the contour that should fire, the ratio with observations on it; of the observations near it, the ratio on it.
+    """Of the contour that should fire, the ratio with observations on it; of the observations near it, the ratio on it, and how normals spread.
 
     Args:
         points_cam, pixels, normals, mask: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``, ``[b, m]``.
         velocity: ``[b, 6]``, about ``centre_cam [b, 3]``.
-        targets, offsets, is_near, as_expected: of matches: ``[b, 2, n]`` and ``[b, n]``.
+        targets, directions, offsets, is_near, as_expected: of matches: ``[b, 2, n]`` and ``[b, n]``.
         explained, inliers: ``[b]``, filled; not a number where too little is there to tell.
+        spread: ``[b]``, filled: :func:`torchtrack.tracking.validation.measures.normal_spread`.
     """
     counts = np.empty((settings.patches**2, 2))
     for b in range(len(mask)):
         inliers[b] = _count(targets[b], offsets[b], is_near[b], as_expected[b], settings, counts)
+        spread[b] = _normal_spread(directions[b], offsets[b], is_near[b], settings.on_contour_px)
         motion, of_lens = drift(velocity[b], centre_cam[b]), lens(intrinsics[b])
         total, count = 0, 0
         for i in range(mask.shape[1]):
@@ -82,6 +86,19 @@ def _count(targets: Array, offsets: Array, is_near: Array, as_expected: Array, s
             if away < settings.on_contour_px:
                 counts[cell, 0] += as_expected[i]
     return on / near if near >= settings.min_observations else np.nan
+
+
+@kernel()
+def _normal_spread(directions: Array, offsets: Array, is_near: Array, on_contour_px: float) -> float:
+    """How far the normals are spread of the contours of an object that something lies on."""
+    count, cosine, sine = 0, 0.0, 0.0
+    for i in range(len(offsets)):
+        if is_near[i] and abs(offsets[i]) < on_contour_px:
+            u, v = directions[0, i], directions[1, i]
+            count += 1
+            cosine += u * u - v * v
+            sine += 2.0 * u * v
+    return 0.5 * (count - np.sqrt(cosine * cosine + sine * sine)) / max(count, 1)
 
 
 @kernel(fastmath=FAST)
@@ -183,17 +200,17 @@ def sigma_px_numba(prediction: Prediction, contours: Contours) -> Float[Tensor, 
 @accelerates(measures.fit_measures)
 def fit_measures_numba(
     contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: TrackerConfig
-) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"]]:
+) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """Point by point."""
-    explained, inliers = contours.pixels.new_empty(2, len(contours.mask))
+    explained, inliers, spread = contours.pixels.new_empty(3, len(contours.mask))
     shown = as_arrays(*(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask)
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
-    matched = as_arrays(matches.targets.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
+    matched = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
     height, width = image_size
     least = measures.min_on_contour(config)
     settings = filled(QualitySettings, config.validation, measures, weights, height=height, width=width, min_on_contour=least)
-    measure(*shown, *moving, *matched, settings, explained.numpy(), inliers.numpy())
-    return explained, inliers
+    measure(*shown, *moving, *matched, settings, explained.numpy(), inliers.numpy(), spread.numpy())
+    return explained, inliers, spread
 
 
 @accelerates(measures.visible_ratio)

@@ -36,6 +36,7 @@ class MatchingSettings(NamedTuple):
     patch_bits: int
     patches: int
     min_observations: int
+    common_variance: float
 
 
 class ArrivalSettings(NamedTuple):
@@ -137,11 +138,17 @@ class IndexSettings(NamedTuple):
 
 
 class TableSettings(NamedTuple):
-    """Numbers of kinds of contours that :mod:`torchtrack.backends.numba.contour_table` goes by."""
+    """What :mod:`torchtrack.backends.numba.contour_table` goes by.
+
+    Args:
+        silhouette, crease, texture: numbers of kinds of contours.
+        of_texture: whether anything is expected of texture.
+    """
 
     silhouette: int
     crease: int
     texture: int
+    of_texture: bool
 
 
 class GridSettings(NamedTuple):

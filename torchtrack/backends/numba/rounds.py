@@ -197,18 +197,24 @@ def align_rounds_numba(
     contour = torch.empty(batch, count, dtype=torch.int64)
     is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool)
     matches = torch.empty(batch, ROWS, count, dtype=offset.dtype)
-    step_px, silhouette_px = weights.dark_shifts_px(config)
     align(
         *as_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
         cells_of(table.index),
         *as_arrays(prediction.velocity, information, objects.intrinsics, objects.centre_obj),
         *as_arrays(constant(config.association.gates_px, offset.dtype, offset.device), gates.wider, gates.subcell_lookup),
-        filled(MatchingSettings, config.association, config.validation, weights, dark_shift_px=step_px, silhouette_dark_shift_px=silhouette_px),
+        _matching_settings(config),
         RoundSettings(config.association.motion_compensation, config.uses(Component.VELOCITY_IN_WINDOW)),
         damping_settings(config.solver, information),
         *as_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
     )
     return Linearisation(T_cam_obj, gradient, hessian, offset), _matches(contour, is_near, is_matched, matches), start.contours
+
+
+def _matching_settings(config: TrackerConfig) -> MatchingSettings:
+    """What matching goes by."""
+    step_px, silhouette_px = weights.dark_shifts_px(config)
+    derived = {"dark_shift_px": step_px, "silhouette_dark_shift_px": silhouette_px, "common_variance": weights.common_variance(config)}
+    return filled(MatchingSettings, config.association, config.validation, weights, **derived)
 
 
 def _seen(observations: Observations) -> Float[Tensor, "b 5 n"]:
@@ -217,10 +223,10 @@ def _seen(observations: Observations) -> Float[Tensor, "b 5 n"]:
     return torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.polarity, trust], 1)
 
 
-def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 12 n"]) -> MatchesWithCues:
+def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 13 n"]) -> MatchesWithCues:
     """The matches as the pipeline knows them."""
-    weights, age_s, points, targets, directions, *rest = rows.split((1, 1, 3, 2, 2, 1, 1, 1), 1)
-    offsets, dark, as_expected = (value[:, 0] for value in rest)
+    weights, age_s, points, targets, directions, *rest = rows.split((1, 1, 3, 2, 2, 1, 1, 1, 1), 1)
+    offsets, dark, as_expected, effective = (value[:, 0] for value in rest)
     points_obj, targets, directions = (value.transpose(1, 2) for value in (points, targets, directions))
     geometry = weights[:, 0], age_s[:, 0], points_obj, targets, directions, offsets
-    return MatchesWithCues(contour, is_matched, *geometry, is_near, as_expected, dark)
+    return MatchesWithCues(contour, is_matched, *geometry, is_near, as_expected, dark, effective)

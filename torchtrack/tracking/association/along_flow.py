@@ -36,4 +36,4 @@ def match_along_flow(observations: Observations, contours: Contours, objects: Mo
     offsets = torch.where(mask, ((take_points(contours.pixels, contour) - targets) * take_points(contours.normals, contour)).sum(-1), 0)
     all_of_it = torch.ones_like(offsets)
     geometry = observations.age_s, points_obj, targets, directions, offsets, mask
-    return MatchesWithCues(contour, mask, all_of_it, *geometry, all_of_it, dark=torch.zeros_like(offsets))
+    return MatchesWithCues(contour, mask, all_of_it, *geometry, all_of_it, dark=torch.zeros_like(offsets), effective=all_of_it)

@@ -38,13 +38,15 @@ class Matches:
 
 @dataclass(frozen=True)
 class MatchesWithCues(Matches):
-    """Matches, and what they say of the sides of contours.
+    """Matches, and what else there is to be said of them.
 
     Args:
         dark: 1 where an event says that the outer side of its contour is the darker one, -1 the inner one; 0 where that is not known.
+        effective: how far each counts beside those around it that have an error in common with it, 0 to 1.
     """
 
     dark: Float[Tensor, "b n"]
+    effective: Float[Tensor, "b n"]
 
 
 def both_coordinates(matches: MatchesWithCues) -> MatchesWithCues:

@@ -20,6 +20,7 @@ from torchtrack.tracking.association.polarity import octant
 from torchtrack.tracking.association.weights import (
     agreeing,
     dark_shift_px,
+    effective_weight,
     leading_side,
     match_weights,
 )
@@ -49,16 +50,17 @@ class ContourTable:
 
 
 @accelerable
-def contour_table(contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None) -> ContourTable:
+def contour_table(contours: Contours, index: ContourIndex, polarity: Float[Tensor, "b 8"] | None = None, *, of_texture: bool = True) -> ContourTable:
     """The table of contours and their index.
 
-    The normals of the mesh's own edges are oriented: they point outwards.
+    The normals of the mesh's own edges are oriented: they point outwards. Those of texture point to its darker side.
 
     Args:
         polarity: expected of the mesh's own edges, by the octant that they face (:func:`torchtrack.tracking.association.polarity.expected_polarity`).
+        of_texture: whether events on texture are expected to say which side of it is the darker one.
     """
     silhouette, crease, texture = (contours.kind == int(kind) for kind in (ContourKind.SMOOTH, ContourKind.CREASE, ContourKind.TEXTURE))
-    oriented, expected = silhouette | crease, torch.zeros_like(contours.pixels[..., 0])
+    oriented, expected = silhouette | crease, (texture & of_texture).to(contours.pixels.dtype)
     if polarity is not None:
         expected = torch.where(oriented, polarity.gather(1, octant(contours.normals)), expected)
     marks = torch.stack([silhouette.to(expected.dtype), oriented.to(expected.dtype), expected], -1)
@@ -103,7 +105,8 @@ def match_nearest(
     matched = near & (vecdot(difference, difference) < (gate.px * wider)[:, None].square())
     offsets = vecdot(difference, normals) / wider[:, None]
     as_expected, dark = agreeing(dark * expected), dark * oriented
-    weights = match_weights(offsets, targets, near, dark, as_expected, config.association)
-    matches = MatchesWithCues(contour, matched, weights, observations.age_s, points_obj, targets, normals, offsets, near, as_expected, dark)
+    weights, around = match_weights(offsets, targets, near, dark, as_expected, config.association)
+    cues = near, as_expected, dark, effective_weight(around, silhouette, config)
+    matches = MatchesWithCues(contour, matched, weights, observations.age_s, points_obj, targets, normals, offsets, *cues)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     return matches, torch.where(matched[..., None], carried - (pixels - indexed), place)

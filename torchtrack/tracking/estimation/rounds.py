@@ -16,6 +16,7 @@ from torchtrack.tracking.association.matches import MatchesWithCues, both_coordi
 from torchtrack.tracking.association.nearest import ContourTable, Gate, contour_table, match_nearest
 from torchtrack.tracking.association.observations import Observations
 from torchtrack.tracking.contours.index import INDEX_CELL_PX, ContourIndex, index_contours
+from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.implicit_gradient import with_gradient
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
@@ -139,7 +140,7 @@ def align(start: Start, observations: Observations, config: TrackerConfig) -> Fi
     Gradients are those of the last round's problem at its solution: what came before chose the matches, which do not bend.
     """
     objects = start.prediction.objects
-    table = contour_table(start.contours, start.index, objects.polarity)
+    table = _table(start.contours, start.index, objects, config)
     gates = Gates(_narrowing(start.gate_scale, len(config.association.gates_px)), _needs_subcell_lookup(start, table, config))
     solution, matches, contours = align_rounds(start, table, observations, gates, config)
     return Fit(solution, reproject(contours, solution.T_cam_obj, objects.intrinsics), matches)
@@ -161,7 +162,7 @@ def align_rounds(
         if number and config.contours.source == "splat":
             contours = objects.contours(begin.T_cam_obj, config.contours)
             index = index_for(contours, objects.image_size, config, start.gate_scale, start.index.radius_px)
-            table = contour_table(contours, index, objects.polarity)
+            table = _table(contours, index, objects, config)
             place = _first_place(begin, observations, config)
         moving = begin.moving(compensated=matching.motion_compensation)
         if matching.search == "along_flow":
@@ -174,6 +175,11 @@ def align_rounds(
         solution = solve_pose(problem, begin.T_cam_obj, config.solver, offset)
         begin, offset = prediction.at(solution.T_cam_obj, solution.from_prior), solution.from_prior
     return with_gradient(problem, solution, config.solver), matches, contours
+
+
+def _table(contours: Contours, index: ContourIndex, objects: ObjectBatch, config: TrackerConfig) -> ContourTable:
+    """What observations take from contours, with the polarity that is expected of them."""
+    return contour_table(contours, index, objects.polarity, of_texture=config.uses(Component.TEXTURE_POLARITY))
 
 
 def _needs_subcell_lookup(start: Start, table: ContourTable, config: TrackerConfig) -> Bool[Tensor, "b"]:
@@ -214,7 +220,7 @@ def _believed(matches: MatchesWithCues, observations: Observations, config: Trac
     if observations.trust is not None:
         weights = weights * observations.trust
     enough = weights.sum(-1, keepdim=True) >= config.validation.min_observations
-    return replace(matches, mask=matches.mask & enough, weights=weights * enough)
+    return replace(matches, mask=matches.mask & enough, weights=weights * enough * matches.effective)
 
 
 def _problem(

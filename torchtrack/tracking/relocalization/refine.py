@@ -27,7 +27,8 @@ def refined(hypotheses: Hypotheses, lost: LostObject) -> ScoredFit:
     events = lost.events.repeated(len(offsets))
     observations = select_events(events, index, begin.moving(compensated=True), config.association.max_events)
     fit = align(Start(rows, contours, index, tight, offsets), observations, config)
-    tried = score_fit(rows, fit, config, torch.zeros_like(tight), scored.reference_inlier_ratio[number].expand_as(tight))
+    references = (value[number].expand_as(tight) for value in (scored.reference_inlier_ratio, scored.required_spread))
+    tried = score_fit(rows, fit, config, torch.zeros_like(tight), *references)
     return replace(tried, is_relocalized=torch.ones_like(tried.is_relocalized))
 
 

@@ -21,6 +21,8 @@ class TrackHealth:
         reference_explained_ratio: of the moving contour, what events explain when the object is seen well.
         reference_inlier_ratio: of the events near its contours, how many are on them then.
         reference_matches: matched observations then.
+        reference_normal_spread: how far the normals of contours with events on them are spread then
+            (:func:`torchtrack.tracking.validation.measures.normal_spread`).
         drift_s: for how long, less the time it was not, the object has explained too little by smeared events (s).
         T_last_validated: pose of each object when it was last seen well (float64).
         time_since_validated_s: how long ago that was (s).
@@ -34,6 +36,7 @@ class TrackHealth:
     reference_explained_ratio: Float[Tensor, "b"]
     reference_inlier_ratio: Float[Tensor, "b"]
     reference_matches: Float[Tensor, "b"]
+    reference_normal_spread: Float[Tensor, "b"]
     drift_s: Float[Tensor, "b"]
     T_last_validated: Float[Tensor, "b 4 4"]
     time_since_validated_s: Float[Tensor, "b"]
@@ -60,6 +63,7 @@ class TrackHealth:
             reference_explained_ratio=zero,
             reference_inlier_ratio=zero,
             reference_matches=zero,
+            reference_normal_spread=zero,
             drift_s=zero,
             T_last_validated=T_cam_obj.clone(),
             time_since_validated_s=zero,

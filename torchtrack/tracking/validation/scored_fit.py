@@ -12,7 +12,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import once
 from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.validation.measures import fit_measures
+from torchtrack.tracking.validation.measures import constrained_2d, fit_measures
 
 # From this ratio of how far they do when an object is seen well, events gather in full.
 _GATHERED_FROM = 0.9
@@ -29,6 +29,8 @@ class ScoredFit:
         count: matched observations.
         inlier_ratio: of the events near the contour, how many are on it; not a number where it does not tell.
         reference_inlier_ratio: the same of when the object is seen well.
+        normal_spread: how far the normals of the contours are spread that events lie on.
+        required_spread: how far they have to be to count in full; zero for nothing required.
         is_relocalized: objects that a search took to another pose than the prediction led to.
     """
 
@@ -38,6 +40,8 @@ class ScoredFit:
     count: Int[Tensor, "b"]
     inlier_ratio: Float[Tensor, "b"]
     reference_inlier_ratio: Float[Tensor, "b"]
+    normal_spread: Float[Tensor, "b"]
+    required_spread: Float[Tensor, "b"]
     is_relocalized: Bool[Tensor, "b"]
 
     @once
@@ -58,16 +62,20 @@ def score_fit(
     config: TrackerConfig,
     ratio_at_rest: Float[Tensor, "b"],
     reference_inlier_ratio: Float[Tensor, "b"] | None = None,
+    required_spread: Float[Tensor, "b"] | None = None,
 ) -> ScoredFit:
     """A fit with its score, by the motion that was estimated with it; without enough observations it explains nothing.
 
     Args:
         reference_inlier_ratio: of when each object is seen well; zero, or none at all, where that is not known.
+        required_spread: how far normals have to be spread to count in full; zero, or none at all, for nothing required.
     """
     moving = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).moving(compensated=True)
-    measured, inliers = fit_measures(fit.contours, fit.matches, moving, prediction.objects.image_size, config)
+    measured, inliers, spread = fit_measures(fit.contours, fit.matches, moving, prediction.objects.image_size, config)
     # Of what does not move, events are noise.
     inliers = torch.where(measured.isnan(), torch.nan, inliers) if config.uses(Component.INLIER_RATIO) else torch.full_like(measured, torch.nan)
+    if required_spread is not None:
+        measured = measured * constrained_2d(spread, required_spread)
     nothing = torch.zeros_like(measured)
     return ScoredFit(
         fit=fit,
@@ -76,6 +84,8 @@ def score_fit(
         count=fit.matches.mask.sum(-1),
         inlier_ratio=inliers,
         reference_inlier_ratio=nothing if reference_inlier_ratio is None else reference_inlier_ratio,
+        normal_spread=spread,
+        required_spread=nothing if required_spread is None else required_spread,
         is_relocalized=nothing.bool(),
     )
 
