@@ -27,7 +27,7 @@ SEEN_WELL = {
     "is_due": False,
     "is_drift_due": False,
     "is_near_due": True,
-    "earlier": int(NONE),
+    "triggers": int(NONE),
 }
 
 

@@ -32,7 +32,7 @@ from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_object import Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.tentative import confirm_or_take_back
-from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, has, triggers
+from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, has, triggered
 from torchtrack.tracking.state import StepResult, TrackerState, each_tensor
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.measures import required_spread
@@ -94,14 +94,13 @@ class SteadyWindow:
     Args:
         expected, seen: of the window.
         scored: the fits.
-        evidence: for relocalization, and the ``triggers`` that it sets.
+        evidence: for relocalization, with the triggers of each object.
     """
 
     expected: Expected
     seen: Observed
     scored: ScoredFit
     evidence: TriggerEvidence
-    triggers: Int[Tensor, "b"]
 
     @property
     def located(self) -> Relocalized:
@@ -119,7 +118,7 @@ def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> t
     """
     window = steady_window(tracked, state, given)
     # A GPU is waited for: a pose that begins to slip is farther off a window later.
-    searches = given.reads.ask(has(window.triggers, SEARCHED), False).any()
+    searches = given.reads.ask(has(window.evidence.triggers, SEARCHED), False).any()
     return update(tracked, state, window, relocalized(tracked, state, window) if searches else window.located, given)
 
 
@@ -130,10 +129,11 @@ def steady_window(tracked: TrackedObjects, state: TrackerState, given: StepInput
     start = Start(expected.prediction, seen.contours, seen.index, seen.gate_scale, extra_terms=given.extra_terms)
     scored = validate(tracked, state, expected, seen, align(start, seen.observations, tracked.config))
     is_starting = torch.zeros_like(tracked.stream_index, dtype=torch.bool) if given.is_starting is None else given.is_starting
-    evidence = gather_evidence(state, expected.scheduled, scored, seen.sigma_px, is_starting)
-    reasons = triggers(evidence, tracked.config)
-    # A part of a window is taken for the objects that start: what the others come to in it is not kept.
-    return SteadyWindow(expected, seen, scored, evidence, reasons if given.is_starting is None else torch.where(is_starting, reasons, 0))
+    evidence = triggered(gather_evidence(state, expected.scheduled, scored, seen.sigma_px, is_starting), tracked.config)
+    if given.is_starting is not None:
+        # A part of a window is taken for the objects that start: what the others come to in it is not kept.
+        evidence = replace(evidence, triggers=torch.where(is_starting, evidence.triggers, 0))
+    return SteadyWindow(expected, seen, scored, evidence)
 
 
 def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, given: StepInput) -> Observed:
@@ -193,7 +193,7 @@ def validate(tracked: TrackedObjects, state: TrackerState, expected: Expected, s
 def relocalized(tracked: TrackedObjects, state: TrackerState, window: SteadyWindow) -> Relocalized:
     """Stage 5: other poses for objects that have a trigger, and for no others."""
     last_seen = LastSeen.from_state(state, tracked.objects, tracked.config)
-    return relocalize(window.located, window.triggers, window.evidence, window.seen.events, last_seen, tracked.config)
+    return relocalize(window.located, window.evidence, window.seen.events, last_seen, tracked.config)
 
 
 def update(
@@ -209,7 +209,7 @@ def update(
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
     limits, health = Limits.from_config(config), next_state.health.with_looks(located.looked)
     if located.looked is not None:
-        found_nothing = located.looked & has(window.triggers, Trigger.UNCONFIRMED)
+        found_nothing = located.looked & has(window.evidence.triggers, Trigger.UNCONFIRMED)
         health = replace(health, confirmations=looked_elsewhere(health.confirmations, found_nothing, limits))
     status = confirmed_status(result.status, health.confirmations, limits)
     maps = replace(next_state.maps, burst_age_us=seen.burst_age_us)
@@ -245,7 +245,7 @@ def steady_lane(
     reads.ask(of_unknown_motion(state, t_us, tracked.objects, tracked.config), False)
     given = StepInput(events, t_us, reads=reads, learns=learns)
     window = steady_window(tracked, state, given)
-    stated = torch.stack([reads.wrong(), has(window.triggers, SEARCHED).any(), reads.uncertain()])
+    stated = torch.stack([reads.wrong(), has(window.evidence.triggers, SEARCHED).any(), reads.uncertain()])
     return *update(tracked, state, window, window.located, given), stated, InPlace(window)
 
 

@@ -10,7 +10,7 @@ from tracked_boxes import in_motion
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization import acceptance
 from torchtrack.tracking.relocalization.acceptance import AcceptanceTest, is_likely, less_by_few_events, likeliest
-from torchtrack.tracking.relocalization.triggers import NONE, Trigger, triggers
+from torchtrack.tracking.relocalization.triggers import NONE, Trigger, triggered
 
 CONFIG = TrackerConfig()
 # Ten degrees and some millimetres: edges are several pixels off, farther than the tight gate reaches.
@@ -115,8 +115,8 @@ def test_what_explains_too_few_events_is_left():
 
 def asked_by(test, given, scored=None):
     """What a test asks for of a single object."""
-    flags, scored = triggers(given, CONFIG), scored or in_motion()[3]
-    return torch.stack(list(vars(test(given, flags, scored, CONFIG)).values()))[:, 0], scored
+    scored = scored or in_motion()[3]
+    return torch.stack(list(vars(test(triggered(given, CONFIG), scored, CONFIG)).values()))[:, 0], scored
 
 
 SLOWLY = {"is_drift_due": True, "time_since_validated_s": 0.2, "last_score": 0.5, "score": 0.5, "reference_explained_ratio": 0.8}
@@ -146,7 +146,7 @@ def test_what_is_held_gives_way_to_far_more_events_as_last_seen():
 
 def test_a_new_object_has_to_be_explained_nearly_all_with_events_that_gather_no_less():
     given = evidence(is_due=True, reference_explained_ratio=0.5, score=0.8, last_score=0.8, mean_score=0.8)
-    assert triggers(given, CONFIG).tolist() == [Trigger.NEW]
+    assert triggered(given, CONFIG).triggers.tolist() == [Trigger.NEW]
     asked, scored = asked_by(acceptance.near_prediction, given)
     torch.testing.assert_close(asked, torch.tensor([0.1, 0.9, float(scored.inlier_ratio) - 0.02, 0.0]))
 
@@ -164,12 +164,12 @@ def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
 
 @pytest.mark.parametrize("also", [NONE, Trigger.FAR_BELOW_REFERENCE])
 def test_what_changed_its_depth_gives_way_to_far_more_events(also):
-    asked, scored = asked_by(acceptance.around_last_seen, evidence(earlier=int(Trigger.DEPTH_CHANGED | also)))
+    asked, scored = asked_by(acceptance.around_last_seen, evidence(triggers=int(Trigger.DEPTH_CHANGED | also)))
     assert float(asked[0]) == -torch.inf and float(asked[2]) == 0
     assert float(asked[1]) == pytest.approx(0.75 * 0.9)
     assert float(asked[3]) == 2 * float(scored.count)
 
 
 def test_what_is_far_below_its_reference_gives_way_to_nearly_all_by_no_fewer_events():
-    asked, scored = asked_by(acceptance.around_last_seen, evidence(earlier=int(Trigger.FAR_BELOW_REFERENCE)))
+    asked, scored = asked_by(acceptance.around_last_seen, evidence(triggers=int(Trigger.FAR_BELOW_REFERENCE)))
     torch.testing.assert_close(asked, torch.tensor([0.15, 0.81, 0.0, float(scored.count)]))

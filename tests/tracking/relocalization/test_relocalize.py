@@ -19,7 +19,7 @@ from torchtrack.tracking.relocalization import refine
 from torchtrack.tracking.relocalization.hypotheses import around_prediction, around_prediction_released, sampled_around
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
-from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger, triggers
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger, triggered
 from torchtrack.tracking.validation.status import Status
 
 LOOP = "torchtrack.tracking.relocalization.relocalize"
@@ -62,7 +62,7 @@ def displaced_and_lost():
 
 
 def looped(lost, seen, given, sources=SOURCES):
-    return relocalize(lost.window, triggers(given, lost.config), given, seen, lost.last_seen, lost.config, sources)
+    return relocalize(lost.window, triggered(given, lost.config), seen, lost.last_seen, lost.config, sources)
 
 
 def test_a_further_source_needs_no_change_of_the_loop():
@@ -74,7 +74,7 @@ def test_a_further_source_needs_no_change_of_the_loop():
         return replace(sampled_around(seen_by_it, known, 1.0, seen_by_it.contours()), replaces_prediction=True)
 
     further = Source(Trigger.LOST, oracle, lambda *_: acceptance_test())
-    given = evidence(earlier=int(Trigger.LOST))
+    given = evidence(triggers=int(Trigger.LOST))
     untried = looped(lost, seen, given)
     assert untried.scored is lost.window.scored and untried.looked.tolist() == [False]
     after = looped(lost, seen, given, (*SOURCES, further))

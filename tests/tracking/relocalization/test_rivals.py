@@ -43,7 +43,7 @@ def chosen(rivals, from_prior_rad=0.1):
     tried = replace(tried, fit=replace(tried.fit, solution=replace(tried.fit.solution, from_prior=offsets)))
     covariance = turned(prediction, tracker.config).covariance[0]
     hypotheses = Hypotheses(prediction, offsets, covariance, (seen.pixels, seen.mask), is_wide=True)
-    choice = explains_far_more(evidence(), torch.zeros(1, dtype=torch.int64), own, tracker.config).row(0).choose(tried, hypotheses, lost)
+    choice = explains_far_more(evidence(), own, tracker.config).row(0).choose(tried, hypotheses, lost)
     return int(choice.row), bool(choice.is_accepted)
 
 
@@ -83,7 +83,7 @@ def test_of_a_pose_of_which_it_is_not_known_how_far_events_gather_nothing_is_bet
     lost = lost_object(tracker, prediction, seen, unknown, 1.0)
     hypotheses = turned_far(lost)
     tried = replace(scored, count=scored.count * 9)
-    choice = explains_far_more(evidence(), torch.zeros(1, dtype=torch.int64), unknown, tracker.config).choose(tried, hypotheses, lost)
+    choice = explains_far_more(evidence(), unknown, tracker.config).choose(tried, hypotheses, lost)
     assert choice.is_accepted.tolist() == [False]
 
 
@@ -106,7 +106,7 @@ def looked_at(displaced):
     tracker, prediction, seen, scored, T_true = in_motion(displaced=displaced)
     lost = lost_object(tracker, prediction, seen, scored, 1.0)
     flags = torch.tensor([int(Trigger.UNCONFIRMED)])
-    return scored, relocalize(lost.window, flags, evidence(earlier=flags), seen, lost.last_seen, tracker.config), T_true
+    return scored, relocalize(lost.window, evidence(triggers=flags), seen, lost.last_seen, tracker.config), T_true
 
 
 def test_a_pose_that_is_tens_of_degrees_off_gives_way_to_the_truth():

@@ -15,7 +15,7 @@ from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
-from torchtrack.tracking.relocalization.triggers import NONE, SEARCHED, Trigger, triggers
+from torchtrack.tracking.relocalization.triggers import NONE, SEARCHED, Trigger, triggered
 from torchtrack.tracking.validation import verdict
 from torchtrack.tracking.validation.scored_fit import reference_where_known
 from torchtrack.tracking.validation.status import Status
@@ -43,7 +43,7 @@ SLIPPED = torch.tensor([[0.35, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 def flags_of(given, *disabled, **settings):
     """The triggers of each object."""
     config = TrackerConfig(relocalization=RelocalizationConfig(**settings), disabled=disabled)
-    return [Trigger(number) for number in triggers(given, config).tolist()]
+    return [Trigger(number) for number in triggered(given, config).triggers.tolist()]
 
 
 def having(trigger, given, *disabled, **settings):
@@ -61,9 +61,9 @@ ALONE = {
     Trigger.SCORE_DROP: {"score": 0.62},
     Trigger.DRIFT: {"is_drift_due": True, "drift_s": 0.051, "sigma_px": 3.9, "matches": 10},
     Trigger.SLOW_DRIFT: {"is_drift_due": True, "time_since_validated_s": 0.051, "last_score": 0.7},
-    Trigger.LOST: {"earlier": int(Trigger.LOST)},
-    Trigger.DEPTH_CHANGED: {"earlier": int(Trigger.DEPTH_CHANGED)},
-    Trigger.FAR_BELOW_REFERENCE: {"earlier": int(Trigger.FAR_BELOW_REFERENCE)},
+    Trigger.LOST: {"triggers": int(Trigger.LOST)},
+    Trigger.DEPTH_CHANGED: {"triggers": int(Trigger.DEPTH_CHANGED)},
+    Trigger.FAR_BELOW_REFERENCE: {"triggers": int(Trigger.FAR_BELOW_REFERENCE)},
     Trigger.UNCONFIRMED: {"confirmations": 2.0},
 }
 

@@ -102,7 +102,7 @@ class AcceptanceTest:
 # ---- the tests
 
 
-def near_prediction(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
+def near_prediction(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses around the prediction.
 
     While a motion is not known nothing says how far events gather when all is well, and dense print explains as much of many poses:
@@ -111,41 +111,41 @@ def near_prediction(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: 
     search, starting, reference = config.relocalization, evidence.is_starting, evidence.reference_explained_ratio
     margin = torch.where(starting, _START_MARGIN, search.accept_margin)
     # What is far away has to explain about as much as usual; so has what is reached step by step, while a motion is lost, ever farther away.
-    min_score = torch.where(has(flags, DRIFTS) | starting, _DRIFT_MIN_RATIO * reference, 0)
+    min_score = torch.where(has(evidence.triggers, DRIFTS) | starting, _DRIFT_MIN_RATIO * reference, 0)
     # What is partly hidden explains less, too: nothing but the whole object, seen elsewhere by no fewer events, speaks against that.
     # A part of its edges does not.
-    slow = has(flags, Trigger.SLOW_DRIFT)
+    slow = has(evidence.triggers, Trigger.SLOW_DRIFT)
     margin = torch.where(slow, _ELSEWHERE_MARGIN, margin)
     min_score = torch.where(slow, search.accept_ratio * reference, min_score)
     # Of a new object, only what explains nearly all is surely better: edges of what hides it explain half.
-    new = has(flags, Trigger.NEW)
+    new = has(evidence.triggers, Trigger.NEW)
     min_score = torch.where(new, search.new_below, min_score)
     min_inlier_ratio = torch.where(starting | new, scored.inlier_ratio.nan_to_num(0.0) - AS_MUCH, 0)
     return AcceptanceTest(margin, min_score, min_inlier_ratio, torch.where(slow, _matches(scored), 0))
 
 
-def elsewhere(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
+def elsewhere(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses that are not around the prediction, or farther away than it allows."""
     reference = evidence.reference_explained_ratio
     nothing = torch.zeros_like(reference)
     return AcceptanceTest(nothing + _ELSEWHERE_MARGIN, config.relocalization.accept_ratio * reference, nothing, nothing)
 
 
-def as_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
+def as_last_seen(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses as the object was last validated: what is explained enough where it is gives way to far more events alone."""
-    test = elsewhere(evidence, flags, scored, config)
+    test = elsewhere(evidence, scored, config)
     matches = _matches(scored)
-    at_least = torch.where(has(flags, Trigger.SLOW_DRIFT), matches, 0)
-    min_matches = torch.where(has(flags, Trigger.HELD), _FAR_MORE * matches, at_least)
+    at_least = torch.where(has(evidence.triggers, Trigger.SLOW_DRIFT), matches, 0)
+    min_matches = torch.where(has(evidence.triggers, Trigger.HELD), _FAR_MORE * matches, at_least)
     return AcceptanceTest(test.margin, test.min_score, test.min_inlier_ratio, min_matches)
 
 
-def around_last_seen(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
+def around_last_seen(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses all around where the object was last validated.
 
     A small thing that is all explained says nothing against a pose of which far more events are explained. What is partly hidden does.
     """
-    changed, search = has(flags, Trigger.DEPTH_CHANGED), config.relocalization
+    changed, search = has(evidence.triggers, Trigger.DEPTH_CHANGED), config.relocalization
     margin = torch.where(changed, -torch.inf, _ELSEWHERE_MARGIN)
     min_score = torch.where(changed, VALIDATED_FROM, search.accept_ratio) * evidence.reference_explained_ratio
     min_matches = torch.where(changed, _FAR_MORE, 1) * _matches(scored)

@@ -44,7 +44,7 @@ class TriggerEvidence:
         confirmations: of each object's pose before the window.
         measured_ratio: what the fit explains of the moving contour; not a number where hardly anything moves.
         is_due, is_drift_due, is_near_due: as :class:`Schedule` has them.
-        earlier: triggers that are set already.
+        triggers: that are set: those of the schedule at first, all once the conditions are met.
     """
 
     sigma_px: Float[Tensor, "b"]
@@ -62,7 +62,7 @@ class TriggerEvidence:
     is_due: Bool[Tensor, "b"]
     is_drift_due: Bool[Tensor, "b"]
     is_near_due: Bool[Tensor, "b"]
-    earlier: Int[Tensor, "b"]
+    triggers: Int[Tensor, "b"]
 
     def stays_below(self, level: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
         """Whose score was below ``level`` in two windows in a row."""
@@ -93,5 +93,5 @@ def gather_evidence(
         is_due=window.is_due,
         is_drift_due=window.is_drift_due,
         is_near_due=window.is_near_due,
-        earlier=window.triggers,
+        triggers=window.triggers,
     )

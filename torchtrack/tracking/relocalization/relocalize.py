@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -24,7 +24,6 @@ from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, DRIFTS
 
 def relocalize(
     window: Relocalized,
-    triggers: Int[Tensor, "b"],
     evidence: TriggerEvidence,
     events: ObjectEvents,
     last_seen: LastSeen,
@@ -35,18 +34,21 @@ def relocalize(
 
     Args:
         window: what it gave so far.
+        evidence: with the triggers of each object.
         events: of all objects.
         last_seen: where objects were validated for the last time.
         sources: of hypotheses, in the order in which they are tried.
     """
-    tests = [source.test(evidence, triggers, window.scored, config) for source in sources]
+    triggers = evidence.triggers
+    tests = [source.test(evidence, window.scored, config) for source in sources]
     drifts = has(triggers, DRIFTS) & ~has(triggers, Trigger.HELD)
     drift_s = torch.where(has(triggers, Trigger.SLOW_DRIFT), evidence.time_since_validated_s, evidence.drift_s)
     widened = with_drift(window.prediction, drifts, drift_s)
     sigma_px = torch.where(drifts, widened.sigma_px(window.scored.fit.contours).detach(), evidence.sigma_px)
     # Without events no pose is better than another; what is looked for all around may have its own there.
     enough = events.counts() >= config.validation.min_observations
-    asking = _asking(window, torch.where(enough, triggers, triggers & int(AROUND_LAST_SEEN)), evidence, sources)
+    evidence = replace(evidence, triggers=torch.where(enough, triggers, triggers & int(AROUND_LAST_SEEN)))
+    asking = _asking(window, evidence, sources)
     looks = in_turn(asking, config.relocalization.objects)
     window = replace(window, looked=among([asks.number for asks in looks], drifts))
     sigmas_px = AsyncValue.to(sigma_px).numbers()
@@ -62,9 +64,9 @@ def relocalize(
     return window
 
 
-def _asking(window: Relocalized, triggers: Int[Tensor, "b"], evidence: TriggerEvidence, sources: Sequence[Source]) -> list[Asks]:
+def _asking(window: Relocalized, evidence: TriggerEvidence, sources: Sequence[Source]) -> list[Asks]:
     """The objects that a source is called for."""
-    whole = AsyncValue.to(torch.stack([window.prediction.objects.stream_index, triggers, evidence.looks, evidence.is_starting], 1))
+    whole = AsyncValue.to(torch.stack([window.prediction.objects.stream_index, evidence.triggers, evidence.looks, evidence.is_starting], 1))
     lost_s = AsyncValue.to(evidence.time_since_validated_s).numbers()
     asking = [
         Asks(number, stream, flags, looks, lost_s[number], is_starting=bool(starts))

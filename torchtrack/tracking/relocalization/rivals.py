@@ -8,8 +8,6 @@ there is one that explains more of the contour, by more events, which gather mor
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.motion.model import covariance_at_rest
@@ -54,7 +52,7 @@ def turned_far(lost: LostObject) -> Hypotheses:
     return replace(hypotheses, gate_scale=anywhere_scale(lost))
 
 
-def explains_far_more(evidence: TriggerEvidence, flags: Int[Tensor, "b"], scored: ScoredFit, config: TrackerConfig) -> "FarMore":
+def explains_far_more(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfig) -> "FarMore":
     """Of poses that are turned far: they are compared with what the object's own pose explains by then."""
     return FarMore()
 

@@ -3,9 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from jaxtyping import Int
-from torch import Tensor
-
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization import acceptance, hypotheses, rivals
 from torchtrack.tracking.relocalization.acceptance import Acceptance
@@ -30,7 +27,7 @@ class Source:
 
     triggers: Trigger
     propose: Callable[[LostObject], Hypotheses]
-    test: Callable[[TriggerEvidence, Int[Tensor, "b"], ScoredFit, TrackerConfig], Acceptance]
+    test: Callable[[TriggerEvidence, ScoredFit, TrackerConfig], Acceptance]
     unless: Trigger = NONE
     comes_last: bool = False
 

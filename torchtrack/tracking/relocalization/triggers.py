@@ -66,15 +66,15 @@ AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.NEW | Trigger.LOW_SCORE | DRIFTS
 SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP | Trigger.UNCONFIRMED
 
 
-def triggers(evidence: TriggerEvidence, config: TrackerConfig) -> Int[Tensor, "b"]:
-    """The :class:`Trigger` bits of each object; none where other poses are never tried."""
+def triggered(evidence: TriggerEvidence, config: TrackerConfig) -> TriggerEvidence:
+    """The evidence with the :class:`Trigger` bits of each object; with none where other poses are never tried."""
     if not config.searches:
-        return torch.zeros_like(evidence.earlier)
+        return replace(evidence, triggers=torch.zeros_like(evidence.triggers))
     for conditions in _CONDITIONS:
         flags = flags_of({bit: condition(evidence, config) for bit, condition in conditions.items()})
         if not none_of(flags):
-            evidence = replace(evidence, earlier=evidence.earlier | flags)
-    return evidence.earlier
+            evidence = replace(evidence, triggers=evidence.triggers | flags)
+    return evidence
 
 
 def has(flags: Int[Tensor, "b"], wanted: Trigger) -> Bool[Tensor, "b"]:
@@ -123,9 +123,9 @@ def is_held(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b
 
     Where something passes before an object, its edges smear the events around it, and what is laid along them explains more.
     """
-    if none_of(evidence.earlier):
+    if none_of(evidence.triggers):
         return torch.zeros_like(evidence.is_due)
-    drifts = has(evidence.earlier, Trigger.DRIFT)
+    drifts = has(evidence.triggers, Trigger.DRIFT)
     explains = evidence.score >= HELD_FROM * evidence.reference_explained_ratio
     return drifts & _is_sure(evidence) & explains & (evidence.matches >= Limits.from_config(config).many) & config.uses(Component.HELD)
 
@@ -158,7 +158,7 @@ def has_score_dropped(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[
     dropped = evidence.score < SCORE_DROP_BELOW * evidence.mean_score
     if none_of(dropped):
         return dropped
-    return _is_sure(evidence) & evidence.is_near_due & ~has(evidence.earlier, DRIFTS) & dropped & config.uses(Component.SCORE_DROP)
+    return _is_sure(evidence) & evidence.is_near_due & ~has(evidence.triggers, DRIFTS) & dropped & config.uses(Component.SCORE_DROP)
 
 
 def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
@@ -166,7 +166,7 @@ def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[T
     if none_of(evidence.is_drift_due):
         return evidence.is_drift_due
     long = (evidence.time_since_validated_s >= 1e-6 * LAST_SEEN_US) & config.uses(Component.LAST_SEEN)
-    return _looks_far(evidence, config) & long & (has(evidence.earlier, DRIFTS) | (evidence.sigma_px > config.relocalization.wide_sigma_px))
+    return _looks_far(evidence, config) & long & (has(evidence.triggers, DRIFTS) | (evidence.sigma_px > config.relocalization.wide_sigma_px))
 
 
 def is_unconfirmed(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
