@@ -156,5 +156,5 @@ def _what_to_try(of_object: ObjectSummary, output: Path) -> str:
         return f"It was out of view: check the initial pose, its time and the camera; {output / FIRST_STILL} shows the start."
     return (
         f"Look at {output / FIRST_STILL}: does the contour lie on the events? If not, `torchtrack pose` finds a pose (--points, --near, --search); "
-        "if it does, check the size of the model (`torchtrack model`) and the calibration."
+        "if it does, check the size of the model (`torchtrack model`) and the calibration; of a textured object, also the polarity (events.polarity)."
     )
