@@ -139,7 +139,7 @@ def test_stages(tiny, simulator, tmp_path):
 def test_graphs(tiny, simulator, tmp_path):
     assert bench("graphs", tmp_path) == ExitCode.DONE
     figures = {entry["name"]: entry["figures"][0] for entry in written(tmp_path, "graphs")["results"]}
-    assumed = ("never_found", "lost", "index_radius(gate_scale, config)", "has(window.triggers, SEARCHED)")
+    assumed = ("never_found", "lost", "index_radius(gate_scale, config)", "has(window.evidence.triggers, SEARCHED)")
     for count in ("1 objects", "2 objects"):
         shares = [figures[f"{count}: windows in which there is any {what}"] for what in assumed]
         assert shares[:2] == [0, 0] and all(0 <= share <= 100 for share in shares)

@@ -34,7 +34,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "reprojection": ("tracking.estimation.rounds:reproject", "tracking.update:reproject"),
     "alignment, rest": ("tracking.step:align",),
     "validation": ("tracking.step:score_fit",),
-    "relocalization": ("tracking.step:triggers", "tracking.step:relocalize"),
+    "relocalization": ("tracking.step:triggered", "tracking.step:relocalize"),
     "conclusion": ("tracking.step:conclude",),
     "adaptation": ("tracking.step:learned_after",),
     "rest": ("tracking.tracker:Tracker.step",),
