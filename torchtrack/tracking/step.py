@@ -208,7 +208,8 @@ def update(
         next_state, result = confirm_or_take_back(state, next_state, result, prediction, located.gate_scale, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, learns=given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
-    limits, health = Limits.from_config(config), without_contradicted(next_state.health.with_looks(located.looked), scored, config)
+    limits = Limits.from_config(config)
+    health = without_contradicted(next_state.health.with_looks(located.looked), scored, limits)
     if located.looked is not None:
         found_nothing = located.looked & has(window.evidence.triggers, Trigger.UNCONFIRMED)
         health = replace(health, confirmations=looked_elsewhere(health.confirmations, found_nothing, limits))

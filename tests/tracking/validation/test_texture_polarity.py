@@ -12,9 +12,10 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.validation.health import TrackHealth
 from torchtrack.tracking.validation.texture_polarity import AGREES_FROM, contradicts, without_contradicted
+from torchtrack.tracking.validation.verdict import Limits
 
-CONFIG = TrackerConfig()
-MANY = CONFIG.validation.min_observations
+LIMITS = Limits.from_config(TrackerConfig())
+MANY = LIMITS.min_observations
 
 
 def seen_on(agreement, *, count=MANY, kind=ContourKind.TEXTURE, offsets=0.0):
@@ -25,12 +26,12 @@ def seen_on(agreement, *, count=MANY, kind=ContourKind.TEXTURE, offsets=0.0):
 
 @pytest.mark.parametrize(("agreement", "expected"), [(1.0, False), (AGREES_FROM + 0.01, False), (AGREES_FROM - 0.01, True), (0.05, True)])
 def test_events_that_agree_too_little_speak_against_a_pose(agreement, expected):
-    assert contradicts(*seen_on(agreement), CONFIG).tolist() == [expected]
+    assert contradicts(*seen_on(agreement), LIMITS).tolist() == [expected]
 
 
 @pytest.mark.parametrize("other", [{"count": MANY - 1}, {"kind": ContourKind.CREASE}, {"kind": ContourKind.LEARNED}, {"offsets": 2.0}])
 def test_too_few_of_them_on_texture_say_nothing(other):
-    assert contradicts(*seen_on(0.1, **other), CONFIG).tolist() == [False]
+    assert contradicts(*seen_on(0.1, **other), LIMITS).tolist() == [False]
 
 
 def test_what_agrees_elsewhere_makes_up_for_nothing():
@@ -39,7 +40,7 @@ def test_what_agrees_elsewhere_makes_up_for_nothing():
     contours = replace(contours, kind=contours.kind.index_fill(1, torch.tensor([1]), int(ContourKind.CREASE)))
     half = (torch.arange(2 * MANY) % 2)[None]
     matches = replace(matches, contour=half, as_expected=torch.where(half == 1, 1.0, 0.5).double())
-    assert contradicts(contours, matches, CONFIG).tolist() == [True]
+    assert contradicts(contours, matches, LIMITS).tolist() == [True]
 
 
 def after(confirmations, agreement, *, is_relocalized=False):
@@ -48,7 +49,7 @@ def after(confirmations, agreement, *, is_relocalized=False):
     contours, matches = seen_on(agreement)
     scored = in_motion()[3]
     scored = replace(scored, fit=replace(scored.fit, contours=contours, matches=matches), is_relocalized=torch.tensor([is_relocalized]))
-    return without_contradicted(health, scored, CONFIG).confirmations.tolist()
+    return without_contradicted(health, scored, LIMITS).confirmations.tolist()
 
 
 @pytest.mark.parametrize("confirmations", [1.0, 3.0])
