@@ -142,8 +142,8 @@ def random_find(tracker, prediction, dtype):
     measured, inlier_ratio = uniform(OBJECTS, low=0.3, seed=23).to(dtype), uniform(OBJECTS, seed=24).to(dtype)
     measured[0], measured[1], measured[5], inlier_ratio[2] = 0.05, 0.3, torch.nan, torch.nan
     elsewhere = torch.arange(OBJECTS) % 3 == 0
-    reference_inlier_ratio, apart, required_spread = (uniform(OBJECTS, seed=seed).to(dtype) for seed in (26, 30, 31))
-    stated = measured, torch.ones_like(measured), count, inlier_ratio, reference_inlier_ratio, apart, required_spread
+    reference_inlier_ratio, apart, agreement, required_spread = (uniform(OBJECTS, seed=seed).to(dtype) for seed in (26, 30, 32, 31))
+    stated = measured, torch.ones_like(measured), count, inlier_ratio, reference_inlier_ratio, apart, agreement, required_spread
     return ScoredFit(Fit(solution, contours, matches), *stated, elsewhere)
 
 

@@ -253,7 +253,8 @@ class EventLineTracker(Tracker):
         rotated_rad, moved_m = step.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
         scale, yes, no = torch.ones_like(share), torch.ones_like(share, dtype=torch.bool), torch.zeros_like(share, dtype=torch.bool)
         measured = Measured(
-            *(share, share, scale, scale, in_view, scale, rotated_rad, moved_m / self.diameter_m, matches.mask.sum(-1)),
+            *(share, share, scale, scale, torch.full_like(share, torch.nan)),
+            *(in_view, scale, rotated_rad, moved_m / self.diameter_m, matches.mask.sum(-1)),
             is_moving=yes,
             is_usable=yes,
             is_relocalized=no,

@@ -37,7 +37,6 @@ from torchtrack.tracking.state import StepResult, TrackerState, each_tensor
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.measures import required_spread
 from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, reference_where_known, score_fit
-from torchtrack.tracking.validation.texture_polarity import without_contradicted
 from torchtrack.tracking.validation.verdict import Limits, confirmed_status, looked_elsewhere
 
 _READS = host_sync.HostReads()
@@ -209,7 +208,7 @@ def update(
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, learns=given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
     limits = Limits.from_config(config)
-    health = without_contradicted(next_state.health.with_looks(located.looked), scored, limits)
+    health = next_state.health.with_looks(located.looked)
     if located.looked is not None:
         found_nothing = located.looked & has(window.evidence.triggers, Trigger.UNCONFIRMED)
         health = replace(health, confirmations=looked_elsewhere(health.confirmations, found_nothing, limits))

@@ -82,6 +82,7 @@ def measured_of(located: Relocalized) -> Measured:
         score=scored.score,
         inlier_ratio=scored.inlier_ratio,
         reference_inlier_ratio=scored.reference_inlier_ratio,
+        texture_agreement=scored.texture_agreement,
         in_view=visible_ratio(scored.fit.contours, prediction.objects.image_size),
         gate_scale=located.gate_scale,
         rotated_rad=rotated_rad,

@@ -9,7 +9,7 @@ from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization import acceptance
-from torchtrack.tracking.relocalization.acceptance import AcceptanceTest, is_likely, less_by_few_events, likeliest
+from torchtrack.tracking.relocalization.acceptance import AcceptanceTest, is_contradicted, is_likely, less_by_few_events, likeliest
 from torchtrack.tracking.relocalization.triggers import NONE, Trigger, triggered
 
 CONFIG = TrackerConfig()
@@ -67,6 +67,13 @@ def test_what_a_prediction_does_not_allow_is_not_likely():
     assert is_likely(torch.cat([offsets[:1], wide]), 25.0 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True]
 
 
+def test_events_on_texture_contradict_poses_where_they_agree_at_the_objects_own():
+    tried = replace(scored_as([0.9] * 3, [torch.nan] * 3, [100] * 3), texture_agreement=torch.tensor([0.5, 0.9, torch.nan]))
+    assert is_contradicted(tried, torch.tensor(0.9)).tolist() == [True, False, False]
+    for own_agreement in (0.5, torch.nan):
+        assert not is_contradicted(tried, torch.tensor(own_agreement)).any()
+
+
 def test_small_poses_that_few_events_explain_are_worth_less():
     score, count = torch.tensor([0.9, 0.8, 0.0]), torch.tensor([100, 900, 2000])
     assert less_by_few_events(score, count).tolist() == pytest.approx([0.3, 0.8, 0.0])
@@ -99,6 +106,16 @@ def test_what_smears_events_more_than_it_may_is_left(inlier_ratio):
     better = searched(lost_object(tracker, prediction, seen, scored, 8.0), acceptance_test(min_inlier_ratio=inlier_ratio))
     assert better.is_relocalized.tolist() == [True]
     assert float(better.inlier_ratio) > 0.3
+
+
+@pytest.mark.parametrize(("own_agreement", "is_left"), [(0.9, True), (0.5, False)])
+def test_what_texture_contradicts_is_left(own_agreement, is_left, monkeypatch):
+    tracker, prediction, seen, scored, _ = in_motion(displaced=DISPLACED)
+    prediction = replace(prediction, covariance=1e2 * prediction.covariance)
+    scored = replace(scored, texture_agreement=torch.full_like(scored.texture_agreement, own_agreement))
+    low = lambda tried: replace(tried, texture_agreement=torch.full_like(tried.texture_agreement, 0.3))  # noqa: E731
+    monkeypatch.setattr(acceptance, "is_contradicted", lambda tried, own: is_contradicted(low(tried), own))
+    assert (searched(lost_object(tracker, prediction, seen, scored, 8.0)) is scored) == is_left
 
 
 def test_what_explains_too_few_events_is_left():

@@ -73,7 +73,8 @@ def test_a_search_leaves_what_it_was_given_as_it_was():
     prediction = replace(prediction, covariance=1e2 * prediction.covariance)
     before = [tensor.clone() for tensor in tensors_of(scored)]
     searched(lost_object(tracker, prediction, seen, scored, 8.0))
-    assert all(torch.equal(now, then) for now, then in zip(tensors_of(scored), before, strict=True))
+    for now, then in zip(tensors_of(scored), before, strict=True):
+        torch.testing.assert_close(now, then, rtol=0, atol=0, equal_nan=True)
 
 
 def test_what_slipped_goes_on_as_certain_as_if_it_had_been_predicted():

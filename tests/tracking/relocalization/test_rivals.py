@@ -19,6 +19,7 @@ from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.rivals import FarMore, explains_far_more, turned, turned_far
 from torchtrack.tracking.relocalization.triggers import Trigger
 from torchtrack.tracking.validation.status import Status
+from torchtrack.tracking.validation.verdict import AGREES_FROM
 
 LOOP = "torchtrack.tracking.relocalization.relocalize"
 UNCHECKED = TrackerConfig(disabled={Component.UNCONFIRMED})
@@ -29,16 +30,22 @@ TURNED = torch.tensor([[0.35, -0.25, 0.4, 0.0, 0.0, 0.0]], dtype=torch.float64)
 # ---- what is asked of them
 
 
-def chosen(rivals, from_prior_rad=0.1):
-    """Whether one of some rivals takes the place of a pose that explains 0.7 by 400 events, of which 0.6 gather, and which."""
+def chosen(rivals, from_prior_rad=0.1, agreements=(torch.nan, torch.nan)):
+    """Whether one of some rivals takes the place of a pose that explains 0.7 by 400 events, of which 0.6 gather, and which.
+
+    Args:
+        agreements: of events on the texture of that pose, and of the rivals.
+    """
     tracker, prediction, seen, scored, _ = in_motion()
     own = replace(scored, measured_ratio=torch.tensor([0.7]), count=torch.tensor([400]), inlier_ratio=torch.tensor([0.6]))
+    own = replace(own, texture_agreement=torch.tensor([agreements[0]]))
     lost = lost_object(tracker, prediction, seen, replace(own, reference_inlier_ratio=torch.zeros(1)), 1.0)
     share, count, inliers = (torch.tensor(values) for values in zip(*rivals, strict=True))
     rows = len(rivals)
     offsets = torch.zeros(rows, 12)
     offsets[:, 0] = from_prior_rad
-    values = {"measured_ratio": share, "count": count, "inlier_ratio": inliers}
+    agreement = torch.full_like(share, agreements[1])
+    values = {"measured_ratio": share, "count": count, "inlier_ratio": inliers, "texture_agreement": agreement}
     tried = replace(scored, **values, ratio_at_rest=torch.zeros(rows), reference_inlier_ratio=torch.zeros(rows))
     tried = replace(tried, fit=replace(tried.fit, solution=replace(tried.fit.solution, from_prior=offsets)))
     covariance = turned(prediction, tracker.config).covariance[0]
@@ -71,6 +78,26 @@ def test_a_rival_explains_more_by_more_events_that_gather_more(rival, accepted):
 
 def test_the_rival_that_explains_most_of_all_three_is_taken():
     assert chosen([(0.95, 500, 0.65), (0.9, 700, 0.8), (1.0, 300, 0.9)]) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("own", "rival", "accepted"),
+    [
+        (AGREES_FROM - 0.01, 0.95, True),
+        (AGREES_FROM - 0.01, torch.nan, True),
+        (AGREES_FROM - 0.01, AGREES_FROM - 0.01, False),
+        (AGREES_FROM + 0.01, 0.95, False),
+        (torch.nan, 0.95, False),
+    ],
+)
+def test_what_texture_contradicts_gives_way_to_what_is_as_good_and_is_not_contradicted(own, rival, accepted):
+    assert chosen([(0.69, 395, 0.59)], agreements=(own, rival))[1] is accepted
+    assert not chosen([(0.6, 395, 0.6)], agreements=(own, rival))[1]
+
+
+def test_a_rival_that_texture_contradicts_is_none_however_much_it_explains():
+    assert chosen([(0.95, 900, 0.9)], agreements=(0.95, 0.95))[1]
+    assert not chosen([(0.95, 900, 0.9)], agreements=(0.95, 0.5))[1]
 
 
 def test_a_rival_is_where_what_was_turned_wrong_may_be():

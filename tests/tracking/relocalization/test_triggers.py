@@ -25,13 +25,13 @@ from torchtrack.tracking.validation.status import Status
 # What slips turns on: with turns that die away it would be drawn back.
 UNREMEMBERED = frozenset({Component.POLARITY_PRIOR, Component.TURNS_FADE})
 SEARCHING = TrackerConfig(corners=CornerConfig(max_corners=32), disabled=UNREMEMBERED)
-NEVER_DRIFTING = SEARCHING.model_copy(update={"disabled": UNREMEMBERED | {Component.DRIFT, Component.SCORE_DROP}})
+NEVER_DRIFTING = SEARCHING.model_copy(update={"disabled": UNREMEMBERED | {Component.DRIFT, Component.SCORE_DROP, Component.UNCONFIRMED}})
 # Looks farther away are for what was not seen well for long, or for nothing.
 SLOWLY, NEVER_SLOWLY = (
     SEARCHING.model_copy(
         update={
             "relocalization": RelocalizationConfig(slow_drift_below=share, not_validated_below=0),
-            "disabled": UNREMEMBERED | {Component.SCORE_DROP},
+            "disabled": UNREMEMBERED | {Component.SCORE_DROP, Component.UNCONFIRMED},
         }
     )
     for share in (0.85, 0.0)
@@ -127,7 +127,7 @@ def test_where_looking_has_not_helped_for_long_it_waits_too_of_objects_whose_pla
     assert having(Trigger.UNCERTAIN, evidence(2, sigma_px=4.1, **near), trigger_sigma_px=4.0) == [True, False]
 
 
-def test_a_pose_is_compared_with_others_in_the_window_that_would_confirm_it():
+def test_a_pose_is_compared_with_others_in_the_window_that_would_confirm_it_and_once_in_a_while_before():
     given = evidence(
         6,
         confirmations=[1.0, 2.0, 3.0, 4.0, 3.0, 3.0],
@@ -135,6 +135,8 @@ def test_a_pose_is_compared_with_others_in_the_window_that_would_confirm_it():
     )
     assert having(Trigger.UNCONFIRMED, given) == [False, True, True, False, False, False]
     assert not any(having(Trigger.UNCONFIRMED, given, Component.UNCONFIRMED))
+    waits_long = evidence(4, confirmations=[0.0, 0.0, 4.0, 0.0], measured_ratio=[0.9, 0.9, 0.9, 0.59], is_drift_due=[True, False, True, True])
+    assert having(Trigger.UNCONFIRMED, waits_long) == [True, False, False, False]
     # Not in a part of a window, of which the motion is not known yet.
     assert not any(having(Trigger.UNCONFIRMED, evidence(confirmations=3.0, is_starting=True)))
 

@@ -10,7 +10,18 @@ from torchtrack.config.tracker import AssociationConfig, CornerConfig, TrackerCo
 from torchtrack.config.validation import ValidationConfig
 from torchtrack.tracking.validation import verdict as rules
 from torchtrack.tracking.validation.status import Status
-from torchtrack.tracking.validation.verdict import Limits, Measured, References, judge, needed_ratio, partly_hidden, smeared, trust
+from torchtrack.tracking.validation.verdict import (
+    AGREES_FROM,
+    STILL_AGREES_FROM,
+    Limits,
+    Measured,
+    References,
+    judge,
+    needed_ratio,
+    partly_hidden,
+    smeared,
+    trust,
+)
 
 NOTHING_HIDDEN = torch.zeros(1)
 
@@ -21,7 +32,7 @@ def limits(**settings):
 
 def measured(**values):
     """Of objects that are seen well, but for what is given."""
-    usual = Measured(1.0, 1.0, 0.8, 0.8, 1.0, 1.0, 0.0, 0.0, 100, True, True, False)
+    usual = Measured(1.0, 1.0, 0.8, 0.8, 1.0, 1.0, 1.0, 0.0, 0.0, 100, True, True, False)
     given = {name: torch.as_tensor(value).reshape(-1) for name, value in usual._replace(**values)._asdict().items()}
     longest = max(len(value) for value in given.values())
     return Measured(**{name: value.expand(longest) for name, value in given.items()})
@@ -222,6 +233,21 @@ def test_what_is_confirmed_stays_that_until_a_search_gives_another_pose():
 
 
 @pytest.mark.parametrize(
+    ("before", "agreement", "expected"),
+    [
+        (2.0, AGREES_FROM - 0.01, 0.0),
+        (2.0, AGREES_FROM + 0.01, 3.0),
+        (2.0, math.nan, 3.0),
+        (4.0, AGREES_FROM - 0.01, 4.0),
+        (4.0, STILL_AGREES_FROM - 0.01, 0.0),
+        (4.0, math.nan, 4.0),
+    ],
+)
+def test_a_pose_that_texture_contradicts_is_confirmed_anew_and_more_is_asked_to_contradict_a_confirmed_one(before, agreement, expected):
+    assert confirmed_after([{"explained_ratio": 0.7, "texture_agreement": agreement}], before) == expected
+
+
+@pytest.mark.parametrize(
     "settings",
     [
         {"disabled": ["unconfirmed"]},
@@ -262,14 +288,14 @@ def random_cases(count=300):
     generator = torch.Generator().manual_seed(3)
     draw = lambda most=1.0: most * torch.rand(count, generator=generator, dtype=torch.float64)  # noqa: E731
     seen = Measured(
-        *(draw() for _ in range(5)),
+        *(draw() for _ in range(6)),
         1 + draw(2),
         draw(0.7),
         draw(0.7),
         (200 * draw()).long(),
         *(draw() > threshold for threshold in (0.2, 0.1, 0.7)),
     )
-    for values in (seen.inlier_ratio, seen.rotated_rad):
+    for values in (seen.inlier_ratio, seen.texture_agreement, seen.rotated_rad):
         values[torch.rand(count, generator=generator) < 0.1] = torch.nan
     return seen, References(*(draw(most) for most in (1, 1, 1, 300, 0.1, 1, 6))), draw(0.02)
 

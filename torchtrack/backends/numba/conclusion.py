@@ -66,7 +66,7 @@ def conclude(
         T_before: poses before the window, ``[b, 4, 4]``.
         T_prior, usable, velocity, covariance: of the prediction.
         T_estimated, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 12]``, ``[b, 12, 12]``.
-        count, flags, measured: ``[b]``, ``[2, b]`` and ``[6, b]``: what is known of the fits, in the order of :class:`Measured`.
+        count, flags, measured: ``[b]``, ``[2, b]`` and ``[7, b]``: what is known of the fits, in the order of :class:`Measured`.
         remembered, T_last_validated: ``[7, b]``, in the order of :class:`References`, and ``[b, 4, 4]`` before the window; changed to those after it.
         T_cam_obj, new_velocity, posterior, left, status: after the window, ``left`` being the covariance of poses; filled.
     """
@@ -74,7 +74,7 @@ def conclude(
     for b in range(len(usable)):
         m, r = measured[:, b], remembered[:, b]
         rotated, moved = _length(offset[b, :3]), _length(offset[b, 3:6]) / diameter_m[b]
-        of_fit = Measured(m[0], m[1], m[2], m[3], m[4], m[5], rotated, moved, count[b], flags[0, b], usable[b], flags[1, b])
+        of_fit = Measured(m[0], m[1], m[2], m[3], m[4], m[5], m[6], rotated, moved, count[b], flags[0, b], usable[b], flags[1, b])
         known = References(r[0], r[1], r[2], r[3], r[4], r[5], r[6])
         judged = _verdict(of_fit, known, limits)
         status[b] = judged.status
@@ -171,7 +171,7 @@ def judged_objects_numba(state: TrackerState, located: Relocalized, dt_s: Float[
     prediction, scored = located.prediction, located.scored
     objects, solution, batch, health = prediction.objects, scored.fit.solution, len(dt_s), state.health
     in_view = visible_ratio(scored.fit.contours, objects.image_size)
-    ratios = scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, in_view
+    ratios = scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, scored.texture_agreement, in_view
     measured = torch.stack([*ratios, located.gate_scale])
     flags = torch.stack([~scored.measured_ratio.isnan(), scored.is_relocalized])
     remembered = torch.stack(health.references)

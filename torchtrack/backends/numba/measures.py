@@ -14,6 +14,7 @@ from torchtrack.backends.numba.parameters import QualitySettings
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerates
 from torchtrack.core.image_velocity import MovingObjects
+from torchtrack.object_model.contour_source import ContourKind
 from torchtrack.tracking.association import polarity, weights
 from torchtrack.tracking.association.matches import Matches
 from torchtrack.tracking.contours.points import Contours
@@ -27,6 +28,7 @@ def measure(
     pixels: Array,
     normals: Array,
     mask: Array,
+    kind: Array,
     velocity: Array,
     centre_cam: Array,
     intrinsics: Array,
@@ -35,24 +37,26 @@ def measure(
     offsets: Array,
     is_near: Array,
     as_expected: Array,
+    contour: Array,
     settings: QualitySettings,
     explained: Array,
     inliers: Array,
     spread: Array,
+    agreement: Array,
 ) -> None:
-    """Of the contour that should fire, the ratio with observations on it; of the observations near it, the ratio on it, and how normals spread.
+    """What events say of each pose, point by point.
 
     Args:
-        points_cam, pixels, normals, mask: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``, ``[b, m]``.
+        points_cam, pixels, normals, mask, kind: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``, ``[b, m]``, ``[b, m]``.
         velocity: ``[b, 6]``, about ``centre_cam [b, 3]``.
-        targets, directions, offsets, is_near, as_expected: of matches: ``[b, 2, n]`` and ``[b, n]``.
-        explained, inliers: ``[b]``, filled; not a number where too little is there to tell.
-        spread: ``[b]``, filled: :func:`torchtrack.tracking.validation.measures.normal_spread`.
+        targets, directions, offsets, is_near, as_expected, contour: of matches: ``[b, 2, n]`` and ``[b, n]``.
+        explained, inliers, spread, agreement: ``[b]``, filled: :class:`torchtrack.tracking.validation.measures.FitMeasures`.
     """
     counts = np.empty((settings.patches**2, 2))
     for b in range(len(mask)):
         inliers[b] = _count(targets[b], offsets[b], is_near[b], as_expected[b], settings, counts)
         spread[b] = _normal_spread(directions[b], offsets[b], is_near[b], settings.on_contour_px)
+        agreement[b] = _texture_agreement(kind[b], contour[b], offsets[b], is_near[b], as_expected[b], settings)
         motion, of_lens = drift(velocity[b], centre_cam[b]), lens(intrinsics[b])
         total, count = 0, 0
         for i in range(mask.shape[1]):
@@ -99,6 +103,17 @@ def _normal_spread(directions: Array, offsets: Array, is_near: Array, on_contour
             cosine += u * u - v * v
             sine += 2.0 * u * v
     return 0.5 * (count - np.sqrt(cosine * cosine + sine * sine)) / max(count, 1)
+
+
+@kernel()
+def _texture_agreement(kind: Array, contour: Array, offsets: Array, is_near: Array, as_expected: Array, settings: QualitySettings) -> float:
+    """Mean of what observations on texture say of its darker side."""
+    count, total = 0, 0.0
+    for i in range(len(offsets)):
+        if is_near[i] and abs(offsets[i]) < settings.on_contour_px and kind[contour[i]] == settings.texture:
+            count += 1
+            total += as_expected[i]
+    return total / count if count >= settings.min_observations else np.nan
 
 
 @kernel(fastmath=FAST)
@@ -200,17 +215,18 @@ def sigma_px_numba(prediction: Prediction, contours: Contours) -> Float[Tensor, 
 @accelerates(measures.fit_measures)
 def fit_measures_numba(
     contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: TrackerConfig
-) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
+) -> measures.FitMeasures:
     """Point by point."""
-    explained, inliers, spread = contours.pixels.new_empty(3, len(contours.mask))
-    shown = as_arrays(*(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask)
+    measured = measures.FitMeasures(*contours.pixels.new_empty(4, len(contours.mask)))
+    shown = *(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask, contours.kind
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
-    matched = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2), matches.offsets, matches.near, matches.as_expected)
+    sides = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2))
+    matched = *sides, *as_arrays(matches.offsets, matches.near, matches.as_expected, matches.contour)
     height, width = image_size
-    least = measures.min_on_contour(config)
-    settings = filled(QualitySettings, config.validation, measures, weights, height=height, width=width, min_on_contour=least)
-    measure(*shown, *moving, *matched, settings, explained.numpy(), inliers.numpy(), spread.numpy())
-    return explained, inliers, spread
+    more = {"height": height, "width": width, "min_on_contour": measures.min_on_contour(config), "texture": int(ContourKind.TEXTURE)}
+    settings = filled(QualitySettings, config.validation, measures, weights, **more)
+    measure(*as_arrays(*shown), *moving, *matched, settings, *(values.numpy() for values in measured))
+    return measured
 
 
 @accelerates(measures.visible_ratio)

@@ -229,6 +229,7 @@ class QualitySettings(NamedTuple):
     min_speed_px_s: float
     least_ratio: float
     min_moving_points: int
+    texture: int
     around_px: float
     on_contour_px: float
     smear_px: float

@@ -17,7 +17,7 @@ from torchtrack.tracking.relocalization.line_ends import running_on
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.triggers import DRIFTS, Trigger, has
 from torchtrack.tracking.validation.scored_fit import ScoredFit
-from torchtrack.tracking.validation.verdict import VALIDATED_FROM
+from torchtrack.tracking.validation.verdict import AGREES_FROM, VALIDATED_FROM
 
 # Ratios that differ by less are the same: which of them is larger is chance.
 AS_MUCH = 0.02
@@ -79,8 +79,11 @@ class AcceptanceTest:
     def choose(self, tried: ScoredFit, hypotheses: Hypotheses, lost: LostObject) -> Choice:
         """The hypothesis with the best score, and of those about as good the one that the prediction expects most."""
         config, prediction, offsets = lost.config, hypotheses.prediction, tried.fit.solution.from_prior
-        eligible = self.is_passed(tried, config) & is_likely(offsets, hypotheses.covariance)
-        score, asked = torch.where(eligible, tried.score, 0), self.asked_score(lost.window.scored, lost.number, config)
+        own = lost.window.scored
+        eligible = (
+            self.is_passed(tried, config) & is_likely(offsets, hypotheses.covariance) & ~is_contradicted(tried, own.texture_agreement[lost.number])
+        )
+        score, asked = torch.where(eligible, tried.score, 0), self.asked_score(own, lost.number, config)
         if config.uses(Component.LINE_ENDS) and hypotheses.is_wide:
             score = less_where_lines_run_on(score, score > asked, tried.fit.contours, hypotheses.places, prediction.objects.image_size)
         by_events = config.uses(Component.MATCH_COUNT) and hypotheses.is_wide
@@ -157,6 +160,11 @@ def _matches(scored: ScoredFit) -> Float[Tensor, "b"]:
 
 
 # ---- what they compare
+
+
+def is_contradicted(tried: ScoredFit, own_agreement: Float[Tensor, ""]) -> Bool[Tensor, "n"]:
+    """Which poses events on texture contradict, where they agree at the object's own pose; where motion is not known yet, they do at no pose."""
+    return (own_agreement >= AGREES_FROM) & (tried.texture_agreement < AGREES_FROM)
 
 
 def is_likely(from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Bool[Tensor, "n"]:

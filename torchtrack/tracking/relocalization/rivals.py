@@ -12,11 +12,12 @@ import torch
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.motion.model import covariance_at_rest
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.acceptance import Choice, is_likely
+from torchtrack.tracking.relocalization.acceptance import AS_MUCH, Choice, is_likely
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses, anywhere_scale, sampled_elsewhere
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.validation.scored_fit import ScoredFit
+from torchtrack.tracking.validation.verdict import AGREES_FROM
 
 # Standard deviations of what was put in its place but turned wrong: rotation (rad), across the image (diameters), and depth (as a share of it).
 # Of 33 poses that were more than 20 degrees off, a pose within 12 degrees of the truth was among the rivals of 19; with 0.7 rad, 0.15 diameters and
@@ -71,8 +72,10 @@ class FarMore:
         values = ((tried.score, own.score), (tried.count, own.count), (tried.inlier_ratio, own.inlier_ratio))
         # Of what does not tell how far it gathers nothing is better.
         times = torch.stack([theirs / mine[number].clamp(min=1e-6) for theirs, mine in values])
-        eligible = (times >= 1).all(0) & (tried.count >= lost.config.validation.min_observations)
-        eligible = eligible & is_likely(tried.fit.solution.from_prior, hypotheses.covariance)
+        # What texture contradicts gives way to what is about as good and is not contradicted.
+        is_wrong = own.texture_agreement[number] < AGREES_FROM
+        eligible = (times >= torch.where(is_wrong, 1 - AS_MUCH, 1)).all(0) & (tried.count >= lost.config.validation.min_observations)
+        eligible = eligible & is_likely(tried.fit.solution.from_prior, hypotheses.covariance) & ~(tried.texture_agreement < AGREES_FROM)
         more = torch.where(eligible, times.prod(0), 0)
         best = more.argmax()[None]
-        return Choice(best, more.index_select(0, best) > _FAR_MORE)
+        return Choice(best, more.index_select(0, best) > torch.where(is_wrong, 0, _FAR_MORE))

@@ -170,9 +170,13 @@ def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[T
 
 
 def is_unconfirmed(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """UNCONFIRMED: objects whose pose has windows enough that speak for it, this one among them: it is confirmed once no other explains far more."""
+    """UNCONFIRMED: objects whose pose has windows enough that speak for it, this one among them: it is confirmed once no other explains far more.
+
+    And, once in a while, those whose pose explains enough now, but did not in the windows before, or is contradicted by texture.
+    """
     limits = Limits.from_config(config)
-    waits = (evidence.confirmations >= limits.speaking_windows - 1) & (evidence.confirmations < limits.confirmed_by)
+    speaks = (evidence.confirmations >= limits.speaking_windows - 1) | evidence.is_drift_due
+    waits = (evidence.confirmations < limits.confirmed_by) & speaks
     if none_of(waits) or limits.confirmed_by == limits.speaking_windows:
         return torch.zeros_like(waits)
     # What hardly moves is not a number, and says nothing.
