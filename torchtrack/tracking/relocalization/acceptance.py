@@ -80,9 +80,8 @@ class AcceptanceTest:
         """The hypothesis with the best score, and of those about as good the one that the prediction expects most."""
         config, prediction, offsets = lost.config, hypotheses.prediction, tried.fit.solution.from_prior
         own = lost.window.scored
-        eligible = (
-            self.is_passed(tried, config) & is_likely(offsets, hypotheses.covariance) & ~is_contradicted(tried, own.texture_agreement[lost.number])
-        )
+        eligible = self.is_passed(tried, config) & is_likely(offsets, hypotheses.covariance)
+        eligible = eligible & ~is_contradicted(tried, own.texture_agreement[lost.number])
         score, asked = torch.where(eligible, tried.score, 0), self.asked_score(own, lost.number, config)
         if config.uses(Component.LINE_ENDS) and hypotheses.is_wide:
             score = less_where_lines_run_on(score, score > asked, tried.fit.contours, hypotheses.places, prediction.objects.image_size)

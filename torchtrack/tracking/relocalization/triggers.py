@@ -175,8 +175,8 @@ def is_unconfirmed(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Ten
     And, once in a while, those whose pose explains enough now, but did not in the windows before, or is contradicted by texture.
     """
     limits = Limits.from_config(config)
-    speaks = (evidence.confirmations >= limits.speaking_windows - 1) | evidence.is_drift_due
-    waits = (evidence.confirmations < limits.confirmed_by) & speaks
+    is_time = (evidence.confirmations >= limits.speaking_windows - 1) | evidence.is_drift_due
+    waits = (evidence.confirmations < limits.confirmed_by) & is_time
     if none_of(waits) or limits.confirmed_by == limits.speaking_windows:
         return torch.zeros_like(waits)
     # What hardly moves is not a number, and says nothing.

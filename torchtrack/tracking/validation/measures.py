@@ -1,4 +1,4 @@
-"""What events say of a pose: how much of the moving contour they explain, how they gather on it, how its normals are spread, and its texture agrees.
+"""What events say of a pose: how much of the moving contour they explain, how they gather on it, which ways it faces, and whether texture agrees.
 
 The residual does not tell: a slip onto a parallel edge has a small one.
 """

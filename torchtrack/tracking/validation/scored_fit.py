@@ -31,7 +31,7 @@ class ScoredFit:
         reference_inlier_ratio: the same of when the object is seen well.
         normal_spread: how far the normals of the contours are spread that events lie on.
         texture_agreement: how far events on texture agree on its darker side; not a number where it does not tell.
-        required_spread: how far they have to be to count in full; zero for nothing required.
+        required_spread: how far normals have to be spread to count in full; zero for nothing required.
         is_relocalized: objects that a search took to another pose than the prediction led to.
     """
 
