@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from helpers import SMALL_CAMERA, bevelled_model, pose, random_events
+from helpers import SMALL_CAMERA, bevelled_model, box_model, pose, random_events
 from states import changed
 from tracked_boxes import follow, moving_box, one_box_scene, scene_of_one_stream, scene_of_streams, tensors_of, tracker_of, windows
 
@@ -93,7 +93,22 @@ def long_window():
     follow(tracker, tracker.init(pose()[None], 0), [(events, 50_000)])
 
 
+class Trusting(torch.nn.Module):
+    """Believes every observation."""
+
+    def forward(self, inputs):
+        return torch.ones_like(inputs.observations.age_s)
+
+
+def own_network():
+    """A weighting network of one's own is shown all events."""
+    _, events = moving_box(pose(), 2)
+    tracker = Tracker([box_model()], SMALL_CAMERA, dtype=torch.float64, weighting_network=Trusting())
+    follow(tracker, tracker.init(pose()[None], 0), windows(events, 2))
+
+
 SCENES = (
+    own_network,
     lost_box,
     smooth_box,
     solved_again,

@@ -11,8 +11,7 @@ from solid_models import ball, l_prism
 
 from torchtrack import Tracker
 from torchtrack.config.tracker import ContourConfig, FlowConfig, TrackerConfig
-from torchtrack.core.camera import undistortion_table
-from torchtrack.core.events import EventBatch, concatenate, pad_streams
+from torchtrack.core.events import concatenate, pad_streams
 from torchtrack.core.image_velocity import MovingObjects
 from torchtrack.object_model import ObjectModel
 from torchtrack.object_model.contour_source import ContourKind, group_by_model
@@ -29,7 +28,6 @@ from torchtrack.tracking.frontend.arrival_flow import arrival_flow
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.sensor_view import SensorPoints, SensorView
-from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.frontend.time_surface import empty_last_event
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
@@ -235,19 +233,6 @@ def test_bursts_of_pixels_that_fire_again_and_again(elapsed_us, streams):
     assert torch.equal(ours, theirs)
 
 
-@pytest.mark.parametrize("objects", [1, 3])
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.6, 1.0])
-def test_events_near_objects(objects, share):
-    tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(2000, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
-    near = uniform(objects, len(tiles.middle)) < share
-    ours, theirs = both_ways(lambda: tiles.keep(events, near))
-    assert torch.equal(ours.events.t_us, theirs.events.t_us)
-    assert (ours.number is None) == (theirs.number is None)
-    assert (ours.of_each is None) == (theirs.of_each is None)
-    if ours.of_each is not None:
-        assert torch.equal(ours.of_each[0][ours.of_each[1]], theirs.of_each[0][theirs.of_each[1]])
-
-
 # ---- measures and matrices
 
 
@@ -314,11 +299,3 @@ def test_marks_of_poses(each, dtype):
     by_kernels, plain = both_ways(lambda: score_outlines(outlines, prediction.poses_at(offsets[:, :6]), camera, image))
     known = torch.arange(40) != 3
     torch.testing.assert_close(by_kernels[known], plain[known], rtol=1e-4, atol=1e-9 if dtype == torch.float64 else 0.03)
-
-
-@pytest.mark.parametrize("objects", [1, 3])
-def test_of_no_events_none_are_near(objects):
-    tiles = SensorTiles(undistortion_table(SMALL_CAMERA))
-    near = torch.ones(objects, len(tiles.middle), dtype=torch.bool)
-    for actual in both_ways(lambda: tiles.keep(EventBatch.empty(), near)):
-        assert len(actual.events) == 0 and actual.of_each is None

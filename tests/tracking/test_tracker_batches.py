@@ -19,6 +19,7 @@ from tracked_boxes import (
 
 from torchtrack import Tracker
 from torchtrack.core.events import concatenate
+from torchtrack.tracking import step
 from torchtrack.tracking.validation.status import Status
 
 
@@ -98,6 +99,32 @@ def test_streams_may_end_their_windows_at_different_times():
         single, expected = alone.step(single, second.of_stream(0), (k + 1) * 7000)
         assert result.t_us.tolist() == [(k + 1) * 5000, (k + 1) * 7000]
         torch.testing.assert_close(result.T_cam_obj[1:], expected.T_cam_obj, rtol=0, atol=1e-5)
+
+
+def test_an_object_is_looked_for_among_the_same_events_in_any_number_of_streams(monkeypatch):
+    """It starts turned by 35 degrees and adrift, and events lie all over the sensor: where it is looked for, far ones matter."""
+    counts, relocalize = [], step.relocalize
+
+    def counting(window, evidence, events, *args):
+        counts.append(events.counts())
+        return relocalize(window, evidence, events, *args)
+
+    monkeypatch.setattr(step, "relocalize", counting)
+    _, _, streams = streams_of_boxes(6, (WIDE_CAMERA,) * 2)
+    noise = [random_events(6000, width=WIDE_CAMERA.width, height=WIDE_CAMERA.height, duration_us=6 * WINDOW_US, seed=s, stream=s) for s in range(2)]
+    noisy = [merged(events, more) for events, more in zip(streams, noise, strict=True)]
+    turned, adrift = torch.stack([pose((0.5, 1.2, 0.1)), pose((0.4, -0.1, 0.3), (0.02, 0.01, 0.45))]), {"drift_s": torch.full((2,), 0.2)}
+    together = Tracker([box_model()] * 2, [WIDE_CAMERA] * 2, stream_index=[0, 1])
+    _, results = follow(together, changed(together.init(turned, 0), **adrift), joint_windows(noisy, 6))
+    of_both = torch.stack(counts)
+    assert len(of_both) > 1
+    for number in range(2):
+        counts.clear()
+        alone = Tracker([box_model()], WIDE_CAMERA)
+        start = changed(alone.init(turned[number : number + 1], 0), drift_s=adrift["drift_s"][:1])
+        _, single = follow(alone, start, windows(noisy[number].of_stream(0), 6))
+        torch.testing.assert_close(poses_of(results, number), poses_of(single), rtol=0, atol=1e-5)
+        assert torch.cat(counts).tolist() == of_both[:, number].tolist()
 
 
 def disturbed(kind, starts, state):

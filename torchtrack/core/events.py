@@ -209,7 +209,7 @@ class PaddedEvents:
     mask: Bool[Tensor, "s e"]
 
 
-def _check_streams_in_order(stream_index: Int[Tensor, "e"]) -> None:
+def check_streams_in_order(stream_index: Int[Tensor, "e"]) -> None:
     """Raise :class:`EventDataError` unless the streams come one after the other."""
     back = stream_index[1:] < stream_index[:-1]
     if bool(back.any()):
@@ -244,7 +244,7 @@ def pad_streams(events: EventBatch, streams: int, t_end_us: Int[Tensor, "s"]) ->
         mask = (events.stream_index < streams)[None]
         return PaddedEvents(events.x.long()[None], events.y.long()[None], t_end_us[:, None] - events.t_us, events.polarity[None], mask)
     if streams > 1 and host_sync.read_at_once(events.stream_index):
-        _check_streams_in_order(events.stream_index)
+        check_streams_in_order(events.stream_index)
     bounds = stream_bounds(events, streams)
     counts = torch.diff(bounds)
     column = torch.arange(max(_most_of_one(events, counts), 1), device=bounds.device)

@@ -18,8 +18,8 @@ from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.evidence import Schedule
 from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere
-from torchtrack.tracking.relocalization.schedule import schedule
-from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, Trigger, has
+from torchtrack.tracking.relocalization.schedule import may_look_far, schedule
+from torchtrack.tracking.relocalization.triggers import Trigger, has
 from torchtrack.tracking.state import TrackerState
 
 
@@ -67,23 +67,23 @@ def predicted_after(tracked: TrackedObjects, state: TrackerState, dt_s: Float[Te
     return forecast(state.motion, dt_s, objects, tracked.far_pose, config)
 
 
-def near_objects(tracked: TrackedObjects, expected: Expected, events: NearbyEvents) -> NearbyEvents:
-    """Those of the events that can have to do with the objects: any, for objects that are looked for anywhere.
+def near_objects(tracked: TrackedObjects, state: TrackerState, expected: Expected, events: NearbyEvents) -> NearbyEvents:
+    """Those of the events that can have to do with the objects: any, for objects that may be looked for anywhere.
 
     A weighting network of one's own is shown all.
     """
     if tracked.shows_all:
         return events
-    prediction, anew = expected.prediction.detached(), has(expected.scheduled.triggers, AROUND_LAST_SEEN)
-    if not host_sync.none_of(anew):
-        prediction = replace(prediction, covariance=anywhere(prediction.covariance, anew))
+    prediction, far = expected.prediction.detached(), may_look_far(state, expected.scheduled, tracked.config)
+    if not host_sync.none_of(far):
+        prediction = replace(prediction, covariance=anywhere(prediction.covariance, far))
     return tracked.sensors.near_objects(events, prediction, expected.dt_s, tracked.config)
 
 
-def near_tiles(tracked: TrackedObjects, state: TrackerState, t_us: Int[Tensor, "s"]) -> Bool[Tensor, "b t"] | None:
-    """Tiles of the one sensor with events of the window after ``state`` that can have to do with each object; none of several sensors."""
+def near_tiles(tracked: TrackedObjects, state: TrackerState, t_us: Int[Tensor, "s"]) -> Bool[Tensor, "b t"]:
+    """Tiles with events of the window after ``state`` that can have to do with each object where it is expected."""
     dt_s = _seconds_after(tracked, state, t_us)[tracked.stream_index]
-    return None if tracked.tiles is None else tracked.tiles.near(predicted_after(tracked, state, dt_s), dt_s, farthest_event_px(tracked.config))
+    return tracked.tiles.near(predicted_after(tracked, state, dt_s), dt_s, farthest_event_px(tracked.config))
 
 
 def _seconds_after(tracked: TrackedObjects, state: TrackerState, t_us: Int[Tensor, "s"]) -> Float[Tensor, "s"]:

@@ -71,7 +71,7 @@ class CompiledStep:
         self._lanes: dict[tuple[int | None, bool], _Lane] = {}
         # What the last window was like: whichever graph is tried first, the result is the same.
         self._expects_uncertain = False
-        self._near_tiles: Callable[[TrackerState, Tensor], Tensor | None] | None = None
+        self._near_tiles: Callable[[TrackerState, Tensor], Tensor] | None = None
 
     def __call__(self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult] | None:
         """State and result of a window, not counted yet; None where there is no graph, it is not steady, or there is hardly any event in it."""
@@ -137,18 +137,17 @@ class CompiledStep:
         self._taken(plain, NearbyEvents(events), t_us)
 
     def _near(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> NearbyEvents:
-        """The events that can have to do with the objects; all on a GPU, which would have to be waited for."""
-        tiles = self._tracker.tiles
-        if tiles is None or self._tracker.shows_all or t_us.device.type != "cpu":
+        """The events that can have to do with the objects; all of several streams, and on a GPU, which would have to be waited for."""
+        if len(t_us) > 1 or self._tracker.shows_all or t_us.device.type != "cpu":
             return NearbyEvents(events)
         if self._near_tiles is None:
             self._near_tiles = _compiled(self._tiles_near, t_us.device)
             near = _for_the_first_time(self._near_tiles, state, t_us)
         else:
             near = self._near_tiles(state, t_us)
-        return NearbyEvents(events) if near is None else tiles.keep(events, near)
+        return self._tracker.tiles.keep(events, near)
 
-    def _tiles_near(self, state: TrackerState, t_us: Tensor) -> Tensor | None:
+    def _tiles_near(self, state: TrackerState, t_us: Tensor) -> Tensor:
         return near_tiles(self._tracker, state, t_us)
 
     def _steady(self, state: TrackerState, events: NearbyEvents, t_us: Tensor) -> tuple[TrackerState, StepResult, Tensor]:

@@ -54,7 +54,7 @@ class TrackedObjects(nn.Module):
         self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
         for name, table in zip(("ideal_pixels", "sensor_pixels", "sensor_numbers"), sensor_tables(cameras), strict=True):
             self.register_buffer(name, table)
-        self.tiles = SensorTiles(self.ideal_pixels[0]) if len(cameras) == 1 else None
+        self.tiles = SensorTiles(self.ideal_pixels)
         self.register_buffer("centre_obj", torch.stack([model.centre for model in objects]))
         self.register_buffer("half_extent", torch.stack([model.half_extent for model in objects]))
         self.register_buffer("diameter_m", torch.tensor([model.diameter_m for model in objects]))

@@ -11,6 +11,7 @@ from tracked_boxes import WINDOW_US, follow, merged, moving_box, tracker_of, win
 from torchtrack import Tracker
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.camera import Camera, distort, undistortion_table
+from torchtrack.tracking import step
 from torchtrack.tracking.expectation import near_tiles, predicted_after
 from torchtrack.tracking.frontend.tiles import NearbyEvents, SensorTiles
 
@@ -26,12 +27,12 @@ def prediction_at(T_cam_obj):
 @pytest.mark.parametrize("camera", [SMALL_CAMERA, ODD])
 def test_every_pixel_lies_within_the_reach_of_its_tile(camera):
     ideal = undistortion_table(camera)
-    tiles = SensorTiles(ideal)
+    tiles = SensorTiles(ideal[None])
     v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-    tile = tiles._of(u.int(), v.int())
-    assert int(tile.max()) == len(tiles.middle) - 1
-    away = (ideal - tiles.middle[tile]).norm(dim=-1)
-    assert (away <= tiles.reach_px[tile] + 1e-4).all()
+    tile = tiles.tile_of(u.int(), v.int())
+    assert int(tile.max()) == tiles.middle.shape[1] - 1
+    away = (ideal - tiles.middle[0, tile]).norm(dim=-1)
+    assert (away <= tiles.reach_px[0, tile] + 1e-4).all()
     assert float(tiles.reach_px.max()) < 24
 
 
@@ -47,7 +48,7 @@ def test_what_can_be_seen_of_an_object_is_near(margin_px, shift_m):
     around = pixels[:, None] + margin_px * torch.stack([angle.cos(), angle.sin()], -1)
     u, v = torch.from_numpy(distort(around.flatten(0, 1).numpy(), SMALL_CAMERA)).round().int().unbind(-1)
     inside = (u >= 0) & (u < SMALL_CAMERA.width) & (v >= 0) & (v < SMALL_CAMERA.height)
-    assert near[0, tracker.tiles._of(u[inside], v[inside])].all()
+    assert near[0, tracker.tiles.tile_of(u[inside], v[inside])].all()
 
 
 def test_tiles_far_from_all_objects_are_not_near():
@@ -84,35 +85,24 @@ def test_an_object_that_is_not_known_where_to_be_is_near_everywhere():
 
 
 def test_kept_events_keep_their_order_and_tell_their_numbers():
-    tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
-    near = torch.rand((1, len(tiles.middle)), generator=generator(3)) < 0.4
+    tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)[None]), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
+    near = torch.rand((1, tiles.middle.shape[1]), generator=generator(3)) < 0.4
     actual = tiles.keep(events, near)
     kept = actual.events
     assert 0 < len(kept) < 400
     assert torch.equal(kept.t_us, events.t_us[actual.number])
-    assert near[0, tiles._of(kept.x, kept.y)].all()
-    assert int(near[0, tiles._of(events.x, events.y)].sum()) == len(kept)
-    assert actual.of_each is None
-
-
-@pytest.mark.parametrize("share", [0.2, 0.6])
-def test_of_several_objects_it_is_known_which_events_are_near_each(share):
-    tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
-    near = torch.rand((3, len(tiles.middle)), generator=generator(4)) < share
-    actual = tiles.keep(events, near)
-    assert torch.equal(actual.number, near.any(0)[tiles._of(events.x, events.y)].nonzero()[:, 0])
-    for chosen, exists, row in zip(*actual.of_each, near, strict=True):
-        assert torch.equal(chosen[exists], row[tiles._of(actual.events.x, actual.events.y)].nonzero()[:, 0])
+    assert near[0, tiles.tile_of(kept.x, kept.y)].all()
+    assert int(near[0, tiles.tile_of(events.x, events.y)].sum()) == len(kept)
 
 
 def test_where_all_events_are_near_all_are_kept():
-    tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
-    assert tiles.keep(events, torch.ones(1, len(tiles.middle), dtype=torch.bool)) == NearbyEvents(events)
-    none = tiles.keep(events, torch.zeros(2, len(tiles.middle), dtype=torch.bool))
-    assert (len(none.events), none.number, none.of_each) == (0, None, None)
+    tiles, events = SensorTiles(undistortion_table(SMALL_CAMERA)[None]), random_events(500, width=SMALL_CAMERA.width, height=SMALL_CAMERA.height)
+    assert tiles.keep(events, torch.ones(1, tiles.middle.shape[1], dtype=torch.bool)) == NearbyEvents(events)
+    none = tiles.keep(events, torch.zeros(2, tiles.middle.shape[1], dtype=torch.bool))
+    assert (len(none.events), none.number) == (0, None)
 
 
-def test_a_step_is_the_same_without_the_events_that_are_left_out():
+def test_a_step_is_the_same_without_the_events_that_are_left_out(monkeypatch):
     """But for the corners, which see the whole sensor."""
     _, events = moving_box(pose(), 6, camera=WIDE)
     tracker = Tracker([box_model()], WIDE, TrackerConfig(corners=CornerConfig(max_corners=0)))
@@ -122,6 +112,6 @@ def test_a_step_is_the_same_without_the_events_that_are_left_out():
     results = [tracker.step(state, noisy)[1]]
     near = near_tiles(tracker, state, torch.tensor([6 * WINDOW_US]))
     assert len(tracker.tiles.keep(noisy, near).events) < len(noisy) // 2
-    tracker.tiles = None
+    monkeypatch.setattr(step, "near_objects", lambda tracked, state, expected, events: events)
     results.append(tracker.step(state, noisy)[1])
     assert torch.equal(results[0].T_cam_obj, results[1].T_cam_obj)

@@ -9,7 +9,7 @@ from tracked_boxes import started
 from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.tracking.relocalization.schedule import is_time, schedule
+from torchtrack.tracking.relocalization.schedule import is_time, may_look_far, schedule
 from torchtrack.tracking.relocalization.triggers import Trigger, has
 
 CONFIG = TrackerConfig()
@@ -91,3 +91,21 @@ def test_an_object_that_explains_much_less_than_when_it_was_seen_well_is_looked_
     assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, changed(low, covariance=uncertain(low)), due)
     for never in ({"relocalization": {"not_validated_below": 0}}, {"disabled": ["around_last_seen"]}, {"relocalization": {"hypotheses": 0}}):
         assert not is_looked_for(Trigger.FAR_BELOW_REFERENCE, tracker, low, due, TrackerConfig.model_validate(never))
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"confirmations": 9.0}, False),
+        ({"confirmations": 9.0, "drift_s": 0.051}, True),
+        ({"confirmations": 9.0, "time_since_validated_s": 0.051}, True),
+        ({"confirmations": 0.0}, True),
+    ],
+)
+def test_what_drifts_or_waits_to_be_confirmed_may_be_looked_for_far_away_once_in_a_while(changes, expected):
+    tracker, state, *_ = started()
+    state = changed(state, **{name: torch.full_like(state.health.score, value) for name, value in changes.items()})
+    for end_us, is_due in ((100_000, True), (105_000, False)):
+        before = changed(state, t_us=state.t_us * 0 + end_us - 5000)
+        scheduled = schedule(before, tracker.objects, before.t_us + 5000, CONFIG)
+        assert bool(may_look_far(before, scheduled, CONFIG)) == (expected and is_due)

@@ -57,22 +57,23 @@ def claim(
 
 
 @kernel()
-def strike(pixels: Array, claimed: Array, concerned: Array, own: Array, count: Array) -> None:
+def strike(pixels: Array, claimed: Array, stream_index: Array, concerned: Array, own: Array, count: Array) -> None:
     """Strike events in claimed pixels from the lists of objects.
 
     Args:
         pixels: ``[e, 2]`` of all events.
+        claimed: ``[s, h, w]``.
         own, count: ``[b, e]`` and ``[b]``, the lists, and how many events each has; changed.
     """
-    height, width = claimed.shape
+    _, height, width = claimed.shape
     for b in range(len(own)):
         if not concerned[b]:
             continue
-        left = 0
+        of_stream, left = claimed[stream_index[b]], 0
         for i in range(count[b]):
             event = own[b, i]
             u, v = np.rint(pixels[event, 0]), np.rint(pixels[event, 1])
-            if not (0 <= u < width and 0 <= v < height and claimed[int(v), int(u)]):
+            if not (0 <= u < width and 0 <= v < height and of_stream[int(v), int(u)]):
                 own[b, left] = event
                 left += 1
         count[b] = left
@@ -91,9 +92,9 @@ def claimed_pixels_numba(
 
 @accelerates(claimed_events.without_claimed, supports=lambda events, *_: isinstance(events, SharedEvents))
 def without_claimed_numba(
-    events: SharedEvents, claimed: Bool[Tensor, "1 h w"], stream_index: Int[Tensor, "b"], concerned: Bool[Tensor, "b"]
+    events: SharedEvents, claimed: Bool[Tensor, "s h w"], stream_index: Int[Tensor, "b"], concerned: Bool[Tensor, "b"]
 ) -> SharedEvents:
-    """Event by event, of the one stream."""
+    """Event by event."""
     own, count = events.own.clone(), events.count.clone()
-    strike(*as_arrays(events.shared.pixels[0], claimed[0], concerned, own, count))
+    strike(*as_arrays(events.shared.pixels[0], claimed, stream_index, concerned, own, count))
     return replace(events, own=own, count=count)

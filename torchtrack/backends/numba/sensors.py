@@ -1,6 +1,7 @@
 """From a window's events to what each object sees of them: :class:`torchtrack.tracking.frontend.sensors.Sensors`, event by event."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -10,9 +11,9 @@ from torch import Tensor
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.bursts import age_all, fire
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.tiles import divide, numbers_near_numba
+from torchtrack.backends.numba.tiles import divide, numbers_near
 from torchtrack.core.dispatch import accelerates
-from torchtrack.core.events import PaddedEvents, of_streams
+from torchtrack.core.events import EventBatch, PaddedEvents, check_streams_in_order, of_streams, stream_bounds
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US, LONGEST_US
 from torchtrack.tracking.frontend.history import BORDER_PX
 from torchtrack.tracking.frontend.sensors import Sensors
@@ -52,6 +53,7 @@ def see(x: Array, y: Array, age_us: Array, polarity: Array, mask: Array, ideal_p
 @kernel(fastmath=FAST)
 def see_kept(
     kept: Array,
+    places: tuple[int, int, int],
     x: Array,
     y: Array,
     t_us: Array,
@@ -71,21 +73,23 @@ def see_kept(
     As :func:`torchtrack.backends.numba.bursts.update_bursts` and :func:`see` one after the other, without anything written in between.
 
     Args:
-        kept: numbers of the events, ``[n]``.
+        kept: numbers of the events of all streams, ``[n]``.
+        places: the first of the stream's own among them; where these end, and where the places for them do.
         ideal_pixels: ``[h, w, 2]``; ``before`` and ``ages [2, h, w]``.
-        seen, exists: ``[SEEN, n]`` and ``[n]``, filled; where there are more places, with zeros.
+        seen, exists: ``[SEEN, n]`` and ``[n]``, filled there; where there are more places, with zeros.
     """
     width, brighter = np.uint64(ideal_pixels.shape[1]), np.uint64(ideal_pixels.shape[0] * ideal_pixels.shape[1])
     aged, ideal = ages.ravel(), ideal_pixels.reshape(-1, 2)
     u, v, age_s, sign = seen[PIXELS], seen[PIXELS + 1], seen[AGE], seen[POLARITY]
     age_all(before.ravel(), np.int16(elapsed_us), np.int16(long_ago_us - elapsed_us), aged)
-    for j in range(len(kept)):
+    first, last, end = places
+    for j in range(first, last):
         i = np.uint64(kept[j])
         pixel, age = np.uint64(y[i]) * width + np.uint64(x[i]), end_us - t_us[i]
         fire(aged, pixel + np.uint64(polarity[i]) * brighter, min(age, long_ago_us), True, elapsed_us, longest_us)
         u[j], v[j], age_s[j] = ideal[pixel, 0], ideal[pixel, 1], age * 1e-6
         sign[j], exists[j] = 2.0 * polarity[i] - 1.0, True
-    for j in range(len(kept), len(exists)):
+    for j in range(last, end):
         exists[j] = False
         seen[:, j] = 0.0
 
@@ -121,7 +125,7 @@ def seen_numba(sensors: Sensors, window: PaddedEvents, number: Int[Tensor, "e"] 
 
 def _are_chosen(sensors: Sensors, nearby: NearbyEvents, burst_age_us: Tensor, t_us: Tensor, elapsed_us: Tensor) -> bool:
     """Whether the events that count are still to be chosen by their tiles, in a window short enough for ages of bursts to tell what began in it."""
-    return nearby.near_tiles is not None and int(elapsed_us) < LONG_AGO_US
+    return nearby.near_tiles is not None and max(elapsed_us.tolist()) < LONG_AGO_US
 
 
 @accelerates(Sensors.window_events, supports=_are_chosen)
@@ -133,26 +137,46 @@ def window_events_numba(
     elapsed_us: Int[Tensor, "s"],
 ) -> tuple[ObjectEvents, Int[Tensor, "s 2 h w"]]:
     """The events in tiles near each object, as it saw them, and the bursts' ages with them, event by event."""
-    near, tiles_of = nearby.near_tiles, sensors.tiles
-    if near is None or tiles_of is None:
+    near = nearby.near_tiles
+    if near is None:
         raise ValueError("a kernel chooses events by their tiles: there have to be some.")
-    events = of_streams(nearby.events, 1)
-    kept, batch = numbers_near_numba(tiles_of, events, near), len(near)
+    streams = len(t_us)
+    events = of_streams(nearby.events, streams)
+    kept, number, bounds = _kept(sensors, events, near)
     # One place at least: what selects from events needs one to point at.
-    numbers = kept if len(kept) else np.zeros(1, np.int64)
-    places = len(numbers)
+    places = max(len(kept), 1)
     seen, ages_us = sensors.ideal_pixels.new_empty(SEEN, 1, places), torch.empty(burst_age_us.shape, dtype=burst_age_us.dtype)
-    exists, of_bursts = torch.empty(1, places, dtype=torch.bool), (int(elapsed_us), LONGEST_US, LONG_AGO_US)
+    exists = torch.empty(1, places, dtype=torch.bool)
     of_events = as_arrays(events.x, events.y, events.t_us, events.polarity)
-    maps = as_arrays(sensors.ideal_pixels[0], burst_age_us[0], ages_us[0])
-    see_kept(kept, *of_events, int(t_us), *of_bursts, *maps, *as_arrays(seen[:, 0], exists[0]))
-    shared = replace(_of_rows(seen, exists), number=torch.from_numpy(numbers[None]))
-    if batch == 1:
+    maps, filled = as_arrays(sensors.ideal_pixels, burst_age_us, ages_us), as_arrays(seen[:, 0], exists[0])
+    for s, (end_us, elapsed) in enumerate(zip(t_us.tolist(), elapsed_us.tolist(), strict=True)):
+        last = int(bounds[s + 1])
+        of_stream = int(bounds[s]), last, places if s + 1 == streams else last
+        see_kept(kept, of_stream, *of_events, end_us, elapsed, LONGEST_US, LONG_AGO_US, *(table[s] for table in maps), *filled)
+    shared = replace(_of_rows(seen, exists), number=torch.from_numpy(number if len(kept) else np.zeros(1, np.int64))[None])
+    if len(near) == 1 == streams:
         return shared, ages_us
     # Only what is written of this is ever looked at.
-    own, counts = torch.empty(batch, places + 1, dtype=torch.int32), torch.empty(batch, dtype=torch.int64)
-    divide(kept, *of_events[:2], *as_arrays(near), TILE_BITS, tiles_of.columns, *as_arrays(own, counts))
+    own, counts = torch.empty(len(near), int(np.diff(bounds).max()) + 1, dtype=torch.int32), torch.empty(len(near), dtype=torch.int64)
+    divide(kept, bounds, *of_events[:2], *as_arrays(near, sensors.stream_index), TILE_BITS, sensors.tiles.columns, *as_arrays(own, counts))
     return SharedEvents(shared, own, counts), ages_us
+
+
+def _kept(sensors: Sensors, events: EventBatch, near: Bool[Tensor, "b t"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The events near any object of their stream: their numbers, those among their stream's, and where each stream begins among them."""
+    streams = len(sensors.ideal_pixels)
+    if streams == 1:
+        kept = numbers_near(sensors.tiles, events, near)
+        return kept, kept, np.array([0, len(kept)])
+    check_streams_in_order(events.stream_index)
+    own_numbers = [
+        numbers_near(sensors.tiles, events[first:last], near[sensors.stream_index == s])
+        for s, (first, last) in enumerate(pairwise(stream_bounds(events, streams).tolist()))
+    ]
+    bounds = np.concatenate([[0], np.cumsum([len(own) for own in own_numbers])])
+    before = np.repeat(stream_bounds(events, streams)[:-1].numpy(), np.diff(bounds))
+    number = np.concatenate(own_numbers)
+    return number + before, number, bounds
 
 
 def _of_rows(seen: Float[Tensor, "4 b e"], exists: Bool[Tensor, "b e"]) -> WindowEvents:

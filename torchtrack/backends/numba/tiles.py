@@ -32,13 +32,14 @@ def near_tiles(
     half_extent: Array,
     diameter_m: Array,
     intrinsics: Array,
+    stream_index: Array,
     tiles: TileSettings,
     near: Array,
 ) -> None:
     """Tiles that anything can be seen in that is near an object: :meth:`torchtrack.tracking.frontend.tiles.SensorTiles.near`.
 
     Args:
-        middle, reach_px: ``[t, 2]`` and ``[t]``.
+        middle, reach_px: ``[s, t, 2]`` and ``[s, t]``.
         velocity, variance: ``[b, 6]``, and of the pose, ``[b, 6]``.
         near: ``[b, t]``, filled.
     """
@@ -50,8 +51,9 @@ def near_tiles(
         within_m = (speed_m_s + rim_m * turning) * window_s[b] + tiles.sigmas * (moved + rim_m * turned)
         pose, of_lens = entries(T_cam_obj[b]), lens(intrinsics[b])
         left, top, right, bottom = _around(pose, centre_obj[b], half_extent[b], of_lens, within_m, tiles.least_depth_m)
-        for t in range(len(middle)):
-            u, v, away_px = middle[t, 0], middle[t, 1], reach_px[t] + tiles.margin_px
+        of_sensor, reach_of_sensor = middle[stream_index[b]], reach_px[stream_index[b]]
+        for t in range(len(of_sensor)):
+            u, v, away_px = of_sensor[t, 0], of_sensor[t, 1], reach_of_sensor[t] + tiles.margin_px
             near[b, t] = u + away_px >= left and u - away_px <= right and v + away_px >= top and v - away_px <= bottom
 
 
@@ -83,7 +85,7 @@ def _around(
 
 @kernel()
 def keep(x: Array, y: Array, is_near: Array, tile_bits: int, columns: int, width: int, height: int, kept: Array) -> np.int64:
-    """Numbers of the events in tiles near any object: how many; -1 where any event is outside the sensor.
+    """Numbers of the events of one stream in tiles near any object: how many; -1 where any event is outside the sensor.
 
     Args:
         kept: ``[e + 1]``, filled as far as there are any, and a zero after them.
@@ -114,11 +116,13 @@ def _tiles_of(x: Array, y: Array, tile_bits: int, columns: int, width: int, heig
 
 
 @kernel()
-def divide(kept: Array, x: Array, y: Array, near: Array, tile_bits: int, columns: int, own: Array, counts: Array) -> None:
+def divide(
+    kept: Array, bounds: Array, x: Array, y: Array, near: Array, stream_index: Array, tile_bits: int, columns: int, own: Array, counts: Array
+) -> None:
     """Which of the events that are kept are near each object.
 
     Args:
-        kept: numbers of the events, ``[n]``.
+        kept: numbers of the events, ``[n]``, stream by stream, as ``bounds [s + 1]`` says.
         near: ``[b, t]``, tiles near each object.
         own, counts: ``[b, n + 1]`` places among those that are kept, and how many of them there are: ``[b]``; filled.
     """
@@ -128,7 +132,7 @@ def divide(kept: Array, x: Array, y: Array, near: Array, tile_bits: int, columns
         tile[j] = _tile(x[i], y[i], tile_bits, columns)
     for b in range(len(near)):
         of_object, places, count = near[b], own[b], np.uint64(0)
-        for j in range(len(tile)):
+        for j in range(bounds[stream_index[b]], bounds[stream_index[b] + 1]):
             places[count] = j
             count += np.uint64(of_object[np.uint64(tile[j])])
         counts[b] = count
@@ -144,18 +148,21 @@ def _tile(x: int, y: int, tile_bits: int, columns: int) -> np.uint64:
 def near_numba(sensor: SensorTiles, prediction: Prediction, window_s: Float[Tensor, "b"], margin_px: float) -> Bool[Tensor, "b t"]:
     """Tile by tile."""
     objects = prediction.objects
-    near = torch.empty(len(window_s), len(sensor.middle), dtype=torch.bool)
+    near = torch.empty(len(window_s), sensor.middle.shape[1], dtype=torch.bool)
     variance = prediction.covariance.diagonal(dim1=-2, dim2=-1)[:, :6]
     moving = as_arrays(prediction.velocity, variance, prediction.T_cam_obj, window_s)
-    own = as_arrays(objects.centre_obj, objects.half_extent, objects.diameter_m, objects.intrinsics)
+    own = as_arrays(objects.centre_obj, objects.half_extent, objects.diameter_m, objects.intrinsics, objects.stream_index)
     settings = TileSettings(tiles.SIGMAS, margin_px + tiles.SLACK_PX, MIN_DEPTH_M)
     near_tiles(*as_arrays(sensor.middle, sensor.reach_px), *moving, *own, settings, near.numpy())
     return near
 
 
-@accelerates(tiles.SensorTiles.numbers_near)
-def numbers_near_numba(sensor: SensorTiles, events: EventBatch, near: Bool[Tensor, "b t"]) -> np.ndarray:
-    """Event by event."""
+def numbers_near(sensor: SensorTiles, events: EventBatch, near: Bool[Tensor, "b t"]) -> np.ndarray:
+    """The numbers of the events of one stream in tiles near any object.
+
+    Raises:
+        EventDataError: if an event is outside the sensor.
+    """
     kept = np.empty(len(events) + 1, np.int64)
     count = int(keep(*as_arrays(events.x, events.y, near.any(0)), TILE_BITS, sensor.columns, sensor.width, sensor.height, kept))
     if count < 0:

@@ -20,6 +20,7 @@ from torchtrack.tracking.frontend.bursts import update_bursts
 from torchtrack.tracking.frontend.flow import estimate_flow
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.sensors import Sensors, sensor_tables
+from torchtrack.tracking.frontend.tiles import SensorTiles
 from torchtrack.tracking.frontend.time_surface import update_last_event
 from torchtrack.tracking.state import StepResult, each_tensor
 from torchtrack.viz import OverlayWriter, draw_overlay, overlay_objects
@@ -38,7 +39,8 @@ class _Drawing:
         self._session, self._config, self._note = session, _with_corners(tracker), note(tracker)
         self._has_corners = tracker.corners.max_corners > 0
         first_stream = torch.zeros(len(session.models), dtype=torch.int64)
-        self._sensors = Sensors(*sensor_tables([session.camera]), stream_index=first_stream, tiles=None)
+        tables = sensor_tables([session.camera])
+        self._sensors = Sensors(*tables, stream_index=first_stream, tiles=SensorTiles(tables[0]))
         self._maps = SensorMaps.empty(1, self._sensors.image_size, torch.device("cpu"))
 
     def see(self, step: Step) -> None:

@@ -14,7 +14,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.camera import Camera, distortion_table, stack_tables, undistortion_table
 from torchtrack.core.dispatch import accelerable
-from torchtrack.core.events import PaddedEvents, check_on_sensor, pad_streams
+from torchtrack.core.events import PaddedEvents, check_on_sensor, of_streams, pad_streams
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.bursts import update_bursts
 from torchtrack.tracking.frontend.corners import Corners, detect_corners, no_corners
@@ -61,14 +61,14 @@ class Sensors:
         sensor_pixels: sensor pixel of every ideal pixel, with a border.
         sensor_numbers: numbers of these; all three from :func:`sensor_tables`.
         stream_index: the stream that each object is seen in.
-        tiles: of the sensor, where there is one stream alone.
+        tiles: of the sensors.
     """
 
     ideal_pixels: Float[Tensor, "s h w 2"]
     sensor_pixels: Float[Tensor, "s bh bw 2"]
     sensor_numbers: Int[Tensor, "s bh bw"]
     stream_index: Int[Tensor, "b"]
-    tiles: SensorTiles | None
+    tiles: SensorTiles
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -77,7 +77,7 @@ class Sensors:
 
     def near_objects(self, events: NearbyEvents, prediction: Prediction, window_s: Float[Tensor, "b"], config: TrackerConfig) -> NearbyEvents:
         """The events that can have to do with the objects. A GPU would have to be waited for: there, all are kept."""
-        if self.tiles is None or not host_sync.read_at_once(window_s):
+        if not host_sync.read_at_once(window_s):
             return events
         # They are chosen where they are seen.
         return replace(events, near_tiles=self.tiles.near(prediction, window_s, farthest_event_px(config)))
@@ -94,15 +94,20 @@ class Sensors:
             t_us: end of the window of each stream.
             elapsed_us: how long the window lasts.
         """
-        if self.tiles is not None and nearby.near_tiles is not None:
-            nearby = self.tiles.keep(nearby.events, nearby.near_tiles)
-        window = pad_streams(nearby.events, len(self.ideal_pixels), t_us)
+        near, streams = nearby.near_tiles, len(self.ideal_pixels)
+        if near is not None and streams == 1:
+            # What is near no object is left out before it is computed with.
+            nearby = self.tiles.keep(of_streams(nearby.events, 1), near)
+        window = pad_streams(nearby.events, streams, t_us)
         if host_sync.read_at_once(t_us):
             check_on_sensor(nearby.events, self.image_size[1], self.image_size[0])
         if not nearby.are_in_map:
             burst_age_us = update_bursts(burst_age_us, elapsed_us, window)
         seen = self.seen(window, nearby.number)
-        return seen if nearby.of_each is None else seen.only(*nearby.of_each), burst_age_us
+        if near is not None:
+            tile = self.tiles.tile_of(window.x, window.y)
+            seen = replace(seen, mask=seen.mask & near.gather(1, tile.expand(len(near), -1) if streams == 1 else tile[self.stream_index]))
+        return seen, burst_age_us
 
     @accelerable
     def seen(self, window: PaddedEvents, number: Int[Tensor, "e"] | None = None) -> WindowEvents:

@@ -1,6 +1,6 @@
 """Events near the objects: what lies elsewhere on the sensor is left out before anything is computed of it.
 
-The sensor is laid out in tiles of whole pixels. One look at each event's tile, in integers, tells whether any object can be there.
+Each sensor is laid out in tiles of whole pixels. One look at each event's tile, in integers, tells whether any object can be there.
 """
 
 from dataclasses import dataclass
@@ -34,38 +34,37 @@ class NearbyEvents:
 
     Args:
         events: the events.
-        number: of each among all of the window, where some were left out.
-        of_each: indices of those that can have to do with each object, padded, and which of these exist; all where not given.
+        number: of each among all of the window, where some were left out; of one stream alone.
         are_in_map: whether the map of bursts has been brought up with them already.
         near_tiles: tiles near each object, where the events in them are still to be chosen.
     """
 
     events: EventBatch
     number: Int[Tensor, "e"] | None = None
-    of_each: tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]] | None = None
     are_in_map: bool = False
     near_tiles: Bool[Tensor, "b t"] | None = None
 
 
 class SensorTiles(nn.Module):
-    """The tiles of one sensor: where their middles are in ideal pixels, and how far their pixels reach from there."""
+    """The tiles of each stream's sensor: where their middles are in ideal pixels, and how far their pixels reach from there."""
 
     middle: Tensor
     reach_px: Tensor
 
-    def __init__(self, ideal_pixels: Float[Tensor, "h w 2"]) -> None:
-        """Take the tiles from the undistortion table of the sensor."""
+    def __init__(self, ideal_pixels: Float[Tensor, "s h w 2"]) -> None:
+        """Take the tiles from the undistortion tables of the sensors."""
         super().__init__()
-        self.height, self.width = height, width = ideal_pixels.shape[:2]
+        self.height, self.width = height, width = ideal_pixels.shape[1:3]
         side = 1 << TILE_BITS
         self.columns = -(-width // side)
         rows, columns = (torch.arange(side // 2, side // 2 + extent, side).clamp(max=extent - 1) for extent in (height, width))
-        self.register_buffer("middle", ideal_pixels[rows[:, None], columns].flatten(0, 1))
-        tile = self._of(*torch.meshgrid(torch.arange(width), torch.arange(height), indexing="xy")).flatten()
-        from_middle = (ideal_pixels.flatten(0, 1) - self.middle[tile]).norm(dim=-1)
-        self.register_buffer("reach_px", torch.zeros(len(self.middle)).scatter_reduce(0, tile, from_middle, "amax"))
+        self.register_buffer("middle", ideal_pixels[:, rows[:, None], columns].flatten(1, 2))
+        tile = self.tile_of(*torch.meshgrid(torch.arange(width), torch.arange(height), indexing="xy")).flatten()
+        from_middle = (ideal_pixels.flatten(1, 2) - self.middle[:, tile]).norm(dim=-1)
+        nowhere = torch.zeros_like(self.middle[..., 0])
+        self.register_buffer("reach_px", nowhere.scatter_reduce(1, tile.expand_as(from_middle), from_middle, "amax"))
 
-    def _of(self, x: Int[Tensor, "*n"], y: Int[Tensor, "*n"]) -> Int[Tensor, "*n"]:
+    def tile_of(self, x: Int[Tensor, "*n"], y: Int[Tensor, "*n"]) -> Int[Tensor, "*n"]:
         """The tile of each pixel."""
         return torch.add(x >> TILE_BITS, y >> TILE_BITS, alpha=self.columns).long()
 
@@ -85,36 +84,20 @@ class SensorTiles(nn.Module):
         around_px = torch.where((nearest_m > MIN_DEPTH_M)[..., None], around_px, torch.inf) + (margin_px + SLACK_PX)
         at = project(corners, objects.intrinsics)
         low, high = (at - around_px).amin(1), (at + around_px).amax(1)
-        reach_px = self.reach_px[:, None]
-        return ((self.middle + reach_px >= low[:, None]) & (self.middle - reach_px <= high[:, None])).all(-1)
+        middle, reach_px = self.middle[objects.stream_index], self.reach_px[objects.stream_index, :, None]
+        return ((middle + reach_px >= low[:, None]) & (middle - reach_px <= high[:, None])).all(-1)
 
     def keep(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> NearbyEvents:
-        """The events in tiles near any object."""
-        kept = self.numbers_near(events, near)
-        if len(kept) == 0:
-            # Padding, which stands for no event at all, has no number and is near nothing.
-            return NearbyEvents(EventBatch.empty())
-        number = torch.from_numpy(kept) if len(kept) < len(events) else None
-        events = events if number is None else events[number]
-        # What is kept is near the one object; of several, it is told which.
-        of_each = _of_each(near.numpy(), self._of(events.x, events.y).numpy()) if len(near) > 1 else None
-        return NearbyEvents(events, number, of_each)
-
-    @accelerable
-    def numbers_near(self, events: EventBatch, near: Bool[Tensor, "b t"]) -> np.ndarray:
-        """The numbers of the events in tiles near any object.
+        """The events of one stream in tiles near any object.
 
         Raises:
             EventDataError: if an event is outside the sensor.
         """
         check_on_sensor(events, self.width, self.height)
         # NumPy finds them several times faster.
-        return np.flatnonzero(near.any(0).numpy()[self._of(events.x, events.y).numpy()])
-
-
-def _of_each(near: np.ndarray, tile: np.ndarray) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
-    """The events near each object, by the tiles near it and those of the events."""
-    own = [np.flatnonzero(row[tile]) for row in near]
-    count = torch.tensor([len(events) for events in own])
-    exists = torch.arange(max(int(count.max()), 1)) < count[:, None]
-    return torch.zeros_like(exists, dtype=torch.int64).masked_scatter_(exists, torch.from_numpy(np.concatenate(own))), exists
+        kept = np.flatnonzero(near.any(0).numpy()[self.tile_of(events.x, events.y).numpy()])
+        if len(kept) == 0:
+            # Padding, which stands for no event at all, has no number and is near nothing.
+            return NearbyEvents(EventBatch.empty())
+        number = torch.from_numpy(kept)
+        return NearbyEvents(events) if len(kept) == len(events) else NearbyEvents(events[number], number)

@@ -72,10 +72,10 @@ class WindowEvents:
 
 @dataclass(frozen=True)
 class SharedEvents:
-    """The events of a window that several objects' camera saw, and which of them can have to do with each: no copies of them.
+    """The events of a window as the objects' cameras saw them, and which of them can have to do with each object: no copies of them.
 
     Args:
-        shared: all of them, one row.
+        shared: all of them, one row, stream by stream.
         own: places in it of those of each object; as many as ``count`` says.
     """
 
@@ -115,6 +115,6 @@ def laid_out(events: ObjectEvents) -> tuple[WindowEvents, Int[Tensor, "b e"], In
     """
     if isinstance(events, SharedEvents):
         return events.shared, events.own, events.count
-    # Of what many have in common, one row is enough.
-    rows = events.of_object(0) if events.pixels.stride(0) == 0 else events
+    # Of what many have in common, one row is enough; but some may be left out for one of them alone.
+    rows = events.of_object(0) if events.pixels.stride(0) == events.mask.stride(0) == 0 else events
     return rows, torch.empty(0, 0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)

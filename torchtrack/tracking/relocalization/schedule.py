@@ -11,8 +11,9 @@ from torchtrack.core.host_sync import none_of
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.motion.model import MOST_UNCERTAIN
 from torchtrack.tracking.relocalization.evidence import Schedule
-from torchtrack.tracking.relocalization.triggers import DRIFT_US, Trigger, flags_of
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, DRIFT_US, Trigger, flags_of, has, waits_for_rivals
 from torchtrack.tracking.state import TrackerState
+from torchtrack.tracking.validation.verdict import Limits
 
 # A prediction that is so uncertain, as a ratio of the most that predictions become, tells nothing any more.
 _NOTHING_KNOWN = 0.8
@@ -31,6 +32,15 @@ def schedule(state: TrackerState, objects: ObjectBatch, t_us: Int[Tensor, "s"], 
     halved = (unseen_s[:, None] >= constant(_HALVED_FROM_S, unseen_s.dtype, unseen_s.device)).sum(1)
     usual, far = (_is_due(state.t_us, t_us, intervals_us, halved, objects.stream_index) for intervals_us in _intervals_us(interval_us))
     return Schedule(_not_validated_for_long(state, objects, far, config), usual, far, usual | (halved == 0))
+
+
+def may_look_far(state: TrackerState, scheduled: Schedule, config: TrackerConfig) -> Bool[Tensor, "b"]:
+    """Objects that may be looked for farther away than they are expected, by all that is known before the window is looked at."""
+    health, is_due = state.health, scheduled.is_drift_due
+    far = has(scheduled.triggers, AROUND_LAST_SEEN) | waits_for_rivals(health.confirmations, is_due, Limits.from_config(config))
+    if none_of(is_due):
+        return far
+    return far | (is_due & (torch.maximum(health.drift_s, health.time_since_validated_s) >= 1e-6 * DRIFT_US))
 
 
 def _intervals_us(interval_us: int) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from enum import IntFlag, auto
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.components import Component
@@ -175,12 +175,17 @@ def is_unconfirmed(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Ten
     And, once in a while, those whose pose explains enough now, but did not in the windows before, or is contradicted by texture.
     """
     limits = Limits.from_config(config)
-    is_time = (evidence.confirmations >= limits.speaking_windows - 1) | evidence.is_drift_due
-    waits = (evidence.confirmations < limits.confirmed_by) & is_time
-    if none_of(waits) or limits.confirmed_by == limits.speaking_windows:
-        return torch.zeros_like(waits)
+    waits = waits_for_rivals(evidence.confirmations, evidence.is_drift_due, limits)
+    if none_of(waits):
+        return waits
     # What hardly moves is not a number, and says nothing.
     return waits & ~evidence.is_starting & (evidence.measured_ratio >= limits.confirmed_from)
+
+
+def waits_for_rivals(confirmations: Float[Tensor, "b"], is_drift_due: Bool[Tensor, "b"], limits: Limits) -> Bool[Tensor, "b"]:
+    """Objects whose pose waits to be confirmed, where it is time to compare it with others."""
+    is_time = (confirmations >= limits.speaking_windows - 1) | is_drift_due
+    return is_time & (confirmations < limits.confirmed_by) & (limits.confirmed_by != limits.speaking_windows)
 
 
 # First those that others hang on.
