@@ -159,7 +159,7 @@ def test_the_others_stay_as_they_are(lost):
     own = replace(state, motion=replace(state.motion, T_cam_obj=2 * state.T_cam_obj))
     row = take_part(own, slice(1, 2), slice(0, 1))
     changed = with_object(state, 1, row)
-    for part in ("motion", "health", "tentative"):
+    for part in ("motion", "health"):
         for name, value in vars(getattr(state, part)).items():
             assert torch.equal(getattr(getattr(changed, part), name)[0], value[0])
     assert torch.equal(changed.T_cam_obj[1], own.T_cam_obj[1]) and float(changed.health.time_since_validated_s[1]) == 0

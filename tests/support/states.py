@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchtrack.tracking.state import TrackerState
 
-_PARTS = ("motion", "health", "tentative", "appearance", "maps")
+_PARTS = ("motion", "health", "appearance", "maps")
 
 
 def changed(state: TrackerState, **values: Tensor | None) -> TrackerState:

@@ -38,4 +38,3 @@ class Component(StrEnum):
     INLIER_RATIO = "inlier_ratio"
     LINE_ENDS = "line_ends"
     ALL_DIRECTIONS = "all_directions"
-    TENTATIVE = "tentative"

@@ -91,7 +91,6 @@ SWITCHES: dict[str, dict[str, Component]] = {
         "not_validated_us": Component.AROUND_LAST_SEEN,
         "by_matches": Component.MATCH_COUNT,
         "line_ends": Component.LINE_ENDS,
-        "tentative": Component.TENTATIVE,
         "by_inlier_ratio": Component.INLIER_RATIO,
         "drift_us": Component.DRIFT,
         "held_from": Component.HELD,

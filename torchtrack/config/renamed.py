@@ -19,7 +19,6 @@ KEYS = {
         "by_events": "by_matches",
         "slip_sigma_px": "score_drop_sigma_px",
         "new_share": "new_below",
-        "probation": "tentative",
         "by_gathering": "by_inlier_ratio",
         "doubted_below": "drift_below",
         "doubt_us": "drift_us",
@@ -78,6 +77,8 @@ REMOVED: dict[str, dict[str, str]] = {
         "mirrored_below": "no poses mirrored in depth are tried",
         "realignments": "every pose is aligned once",
         "at_start": "what starts is searched for as any other object",
+        "tentative": "what a search gives is UNCERTAIN until windows enough confirm it",
+        "probation": "what a search gives is UNCERTAIN until windows enough confirm it",
     },
     "validation": {
         "holds_on": "a pose that goes on from the one before is asked for as much as any other",

@@ -224,5 +224,4 @@ def with_object(state: TrackerState, number: int, own: TrackerState) -> TrackerS
             T_last_validated=put(health.T_last_validated, own.T_cam_obj),
             time_since_validated_s=put(health.time_since_validated_s, zero),
         ),
-        tentative=replace(state.tentative, is_tentative=put(state.tentative.is_tentative, zero.bool()), evidence=put(state.tentative.evidence, zero)),
     )

@@ -153,7 +153,6 @@ def _turned_back(state: TrackerState, number: int, alone: Tracker) -> TrackerSta
             time_since_validated_s=fresh.health.time_since_validated_s,
         ),
         maps=fresh.maps,
-        tentative=fresh.tentative,
     )
 
 

@@ -25,7 +25,7 @@ from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.model import MotionState, initial_covariance
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.state import TrackerState
-from torchtrack.tracking.validation.health import TentativeTrack, TrackHealth
+from torchtrack.tracking.validation.health import TrackHealth
 
 
 def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us: Int[Tensor, "s"]) -> TrackerState:
@@ -39,7 +39,6 @@ def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us
         t_us=t_us,
         motion=MotionState(T_cam_obj.clone(), velocity=at_rest, covariance=covariance),
         health=TrackHealth.unknown(T_cam_obj, at_rest.dtype),
-        tentative=TentativeTrack.none(T_cam_obj, covariance),
         appearance=Appearance(nothing_remembered(at_rest), learned),
         maps=SensorMaps.empty(tracked.streams, tracked.image_size, T_cam_obj.device),
     )

@@ -13,7 +13,7 @@ from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.motion.model import MotionState
-from torchtrack.tracking.validation.health import TentativeTrack, TrackHealth
+from torchtrack.tracking.validation.health import TrackHealth
 from torchtrack.tracking.validation.status import Status
 
 # Of more objects than this, the others are counted.
@@ -28,7 +28,6 @@ class TrackerState:
         t_us: end of the last window of each stream (µs).
         motion: pose and motion of each object at that time.
         health: how well each object is seen.
-        tentative: which poses that objects were found in are not confirmed yet.
         appearance: what was learned of how objects look.
         maps: what is remembered of every pixel of the sensors.
     """
@@ -36,7 +35,6 @@ class TrackerState:
     t_us: Int[Tensor, "s"]
     motion: MotionState
     health: TrackHealth
-    tentative: TentativeTrack
     appearance: Appearance
     maps: SensorMaps
 

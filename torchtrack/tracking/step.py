@@ -31,7 +31,6 @@ from torchtrack.tracking.relocalization.evidence import TriggerEvidence, gather_
 from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_object import Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
-from torchtrack.tracking.relocalization.tentative import confirm_or_take_back
 from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, has, triggered
 from torchtrack.tracking.state import StepResult, TrackerState, each_tensor
 from torchtrack.tracking.update import conclude
@@ -203,8 +202,6 @@ def update(
     config, expected, seen = tracked.config, window.expected, window.seen
     scored, prediction = located.scored, located.prediction.detached()
     next_state, result = conclude(state, located, seen.corners, expected.dt_s, config)
-    if config.uses(Component.TENTATIVE):
-        next_state, result = confirm_or_take_back(state, next_state, result, prediction, located.gate_scale, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, learns=given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
     limits = Limits.from_config(config)

@@ -176,13 +176,12 @@ def test_one_look_is_made_for_a_start(monkeypatch):
     assert looks.count(Trigger.UNCONFIRMED) == 1
 
 
-def test_what_takes_its_place_is_tentative_and_has_to_be_confirmed_itself(monkeypatch):
+def test_what_takes_its_place_has_to_be_confirmed_itself(monkeypatch):
     tracker, state, _, window, _ = started()
     monkeypatch.setattr(FarMore, "choose", lambda *_: Choice(torch.tensor([0]), torch.tensor([True])))
     state = replace(state, health=replace(state.health, confirmations=torch.tensor([2.0])))
     after, result = tracker.step(state, *window)
     assert int(result.status) == Status.UNCERTAIN and float(after.health.confirmations) == 0
-    assert after.tentative.is_tentative.tolist() == [True]
 
 
 def test_where_many_start_at_once_each_waits_for_its_look():

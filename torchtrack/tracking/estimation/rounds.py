@@ -61,11 +61,6 @@ def _widest_scale(config: TrackerConfig) -> float:
     return max(MAX_GATE_PX / config.association.gates_px[0], 1.0) if config.uses(Component.WIDE_GATES) else 1.0
 
 
-def may_be_anywhere(gate_scale: Float[Tensor, "b"]) -> Bool[Tensor, "b"]:
-    """Objects of whose place hardly anything was known, by the scale of their first gates."""
-    return gate_scale >= ANYWHERE
-
-
 def index_radius(gate_scale: Float[Tensor, "b"], config: TrackerConfig) -> Int[Tensor, "b"]:
     """How far contours are to be found for each object's first gate (px)."""
     return (gate_scale * max(config.association.gates_px)).long() + _INDEX_MARGIN_PX

@@ -49,7 +49,7 @@ def turned_far(lost: LostObject) -> Hypotheses:
     search = search.model_copy(update={"rotations": max(int(_ROTATIONS_RATIO * search.rotations), 1)})
     lost = replace(lost, config=lost.config.model_copy(update={"relocalization": search}))
     hypotheses = sampled_elsewhere(lost, prediction, 2 * search.wide_sigma_px)
-    # One that is accepted is no jump, and stays tentative.
+    # One that is accepted is no jump.
     return replace(hypotheses, gate_scale=anywhere_scale(lost))
 
 

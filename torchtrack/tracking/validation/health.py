@@ -1,4 +1,4 @@
-"""How well each object was seen so far, and what is not confirmed yet."""
+"""How well each object was seen so far."""
 
 from dataclasses import dataclass, replace
 
@@ -70,24 +70,3 @@ class TrackHealth:
             looks=torch.zeros_like(zero, dtype=torch.int64),
             confirmations=zero,
         )
-
-
-@dataclass(frozen=True)
-class TentativeTrack:
-    """Where to look for objects again, should the pose that a search gave them turn out to be wrong.
-
-    Args:
-        is_tentative: objects whose new pose is not confirmed yet.
-        evidence: for it, in windows.
-        T_cam_obj, covariance: of the object before that.
-    """
-
-    is_tentative: Bool[Tensor, "b"]
-    evidence: Float[Tensor, "b"]
-    T_cam_obj: Float[Tensor, "b 4 4"]
-    covariance: Float[Tensor, "b 12 12"]
-
-    @classmethod
-    def none(cls, T_cam_obj: Float[Tensor, "b 4 4"], covariance: Float[Tensor, "b 12 12"]) -> "TentativeTrack":
-        """All confirmed."""
-        return cls(torch.zeros_like(T_cam_obj[:, 0, 0], dtype=torch.bool), torch.zeros_like(T_cam_obj[:, 0, 0]), T_cam_obj, covariance)
