@@ -30,7 +30,6 @@ class Component(StrEnum):
     SCORE_DROP = "score_drop"
     DRIFT = "drift"
     HELD = "held"
-    LAST_SEEN = "last_seen"
     AROUND_LAST_SEEN = "around_last_seen"
     UNCONFIRMED = "unconfirmed"
     # how they are compared

@@ -87,7 +87,6 @@ SWITCHES: dict[str, dict[str, Component]] = {
     "relocalization": {
         "low_score_below": Component.LOW_SCORE,
         "score_drop_below": Component.SCORE_DROP,
-        "last_seen_us": Component.LAST_SEEN,
         "not_validated_us": Component.AROUND_LAST_SEEN,
         "by_matches": Component.MATCH_COUNT,
         "line_ends": Component.LINE_ENDS,

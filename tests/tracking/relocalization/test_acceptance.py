@@ -141,9 +141,8 @@ SLOWLY = {"is_drift_due": True, "time_since_validated_s": 0.2, "last_score": 0.5
 
 def test_what_drifts_slowly_has_to_explain_nearly_all_elsewhere_and_by_no_fewer_events():
     given = evidence(**SLOWLY)
-    for test in (acceptance.near_prediction, acceptance.as_last_seen):
-        asked, scored = asked_by(test, given)
-        torch.testing.assert_close(asked, torch.tensor([0.15, 0.72, 0.0, float(scored.count)]))
+    asked, scored = asked_by(acceptance.near_prediction, given)
+    torch.testing.assert_close(asked, torch.tensor([0.15, 0.72, 0.0, float(scored.count)]))
     torch.testing.assert_close(asked_by(acceptance.elsewhere, given)[0], torch.tensor([0.15, 0.72, 0.0, 0.0]))
 
 
@@ -154,11 +153,6 @@ def test_what_is_where_it_is_predicted_gives_way_to_what_is_better_by_the_margin
 def test_what_drifts_has_to_explain_about_as_much_as_usual_far_away():
     given = evidence(is_drift_due=True, drift_s=0.2, matches=10)
     torch.testing.assert_close(asked_by(acceptance.near_prediction, given)[0], torch.tensor([0.1, 0.65 * 0.9, 0.0, 0.0]))
-
-
-def test_what_is_held_gives_way_to_far_more_events_as_last_seen():
-    asked, scored = asked_by(acceptance.as_last_seen, evidence(is_drift_due=True, drift_s=0.2, reference_explained_ratio=0.8))
-    torch.testing.assert_close(asked, torch.tensor([0.15, 0.72, 0.0, 2.0 * float(scored.count)]))
 
 
 def test_a_new_object_has_to_be_explained_nearly_all_with_events_that_gather_no_less():

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import SMALL_CAMERA, box_model, pose, pose_errors, random_pose
-from lost_objects import drifting_soon
+from helpers import SMALL_CAMERA, box_model, pose
 from lost_states import moved_away, uncertain, unseen
 from states import changed
 from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, started, windows
@@ -13,10 +12,10 @@ from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, started, win
 from torchtrack import Tracker
 from torchtrack.config.components import Component
 from torchtrack.config.relocalization import RelocalizationConfig
-from torchtrack.config.tracker import CornerConfig, TrackerConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization import last_seen
-from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere, less_certain, where_last_seen, with_drift
+from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere, less_certain, with_drift
 from torchtrack.tracking.state import joined
 from torchtrack.tracking.validation import verdict
 from torchtrack.tracking.validation.status import Status
@@ -162,7 +161,7 @@ def test_an_object_that_ran_off_is_found_again_where_it_was_seen_well(name):
 def test_an_object_that_holds_on_to_other_edges_is_found_again_where_it_was_seen_well(monkeypatch):
     """Sure of a pose forty degrees off, as near as it was: nowhere else is it looked for so far away."""
     monkeypatch.setattr(verdict, "DRIFT_BELOW", 0)
-    disabled = {Component.LAST_SEEN, Component.SCORE_DROP, Component.LOW_SCORE}
+    disabled = {Component.SCORE_DROP, Component.LOW_SCORE}
     trajectory, events = moving_box(pose(), 30)
 
     @torch.no_grad()
@@ -177,52 +176,6 @@ def test_an_object_that_holds_on_to_other_edges_is_found_again_where_it_was_seen
 
     assert after(0.75) < 0.02
     assert after(0.0) > 0.2
-
-
-@torch.no_grad()
-def test_as_last_seen_it_is_turned_and_as_far_away_as_then_in_the_place_of_now():
-    _, prediction, *_ = in_motion(dtype=torch.float64)
-    prediction, then = replace(prediction, T_cam_obj=random_pose(1, seed=1)), random_pose(seed=2)
-    other = where_last_seen(prediction, then)
-    torch.testing.assert_close(other.T_cam_obj[0, :3, :3], then[:3, :3])
-    centre_then = then[:3, :3] @ prediction.objects.centre_obj[0] + then[:3, 3]
-    assert float(other.centre_cam[0, 2]) == pytest.approx(float(centre_then[2]))
-    torch.testing.assert_close(*(p.centre_cam[0, :2] / p.centre_cam[0, 2] for p in (other, prediction)))
-    assert torch.equal(other.covariance, prediction.covariance) and torch.equal(other.velocity, prediction.velocity)
-
-
-@torch.no_grad()
-def runs_on(config, change, count=8):
-    """Results of a box in full motion whose state was changed, and its true poses; windows end when it is time to look far away."""
-    tracker = Tracker([box_model()], SMALL_CAMERA, config)
-    trajectory, events = moving_box(pose(), count + 5)
-    state, _ = follow(tracker, tracker.init(pose()[None], 0), windows(events, 5))
-    state = change(tracker, changed(state, reference_explained_ratio=state.health.mean_score))
-    _, results = follow(tracker, state, windows(events, count, 5 * WINDOW_US))
-    return results, trajectory
-
-
-@pytest.mark.parametrize("as_last_seen", [False, True])
-def test_a_box_that_ran_off_far_is_found_as_it_was_last_seen(monkeypatch, as_last_seen):
-    """Turned off by nearly a right angle and far away: much farther than it is looked for from there."""
-    drifting_soon(monkeypatch)
-
-    def run_off(tracker, state):
-        away = torch.tensor([[1.3, 0.0, 0.0, 0.0, 0.0, 0.15]], dtype=torch.float64)
-        T_cam_obj = retract_about(state.T_cam_obj, away, tracker.centre_obj.double())
-        return changed(
-            state,
-            T_cam_obj=T_cam_obj,
-            drift_s=torch.full((1,), 0.1),
-            time_since_validated_s=torch.full((1,), 0.2),
-            velocity=torch.zeros_like(state.velocity),
-        )
-
-    disabled = {Component.AROUND_LAST_SEEN} if as_last_seen else {Component.AROUND_LAST_SEEN, Component.LAST_SEEN}
-    config = TrackerConfig(corners=CornerConfig(max_corners=32), disabled=disabled)
-    results, trajectory = runs_on(config, run_off)
-    degrees, _ = pose_errors(results[-1].T_cam_obj, trajectory.at(results[-1].t_us))
-    assert (float(degrees) < 1) == as_last_seen
 
 
 @torch.no_grad()

@@ -77,11 +77,10 @@ def test_each_condition_alone_sets_its_bit_and_its_neighbour_has_none(trigger):
 def test_what_hangs_on_other_triggers_is_set_beside_them():
     drifts = {"is_drift_due": True, "drift_s": 0.051}
     assert flags_of(evidence(**drifts)) == [Trigger.DRIFT | Trigger.HELD]
-    assert flags_of(evidence(**drifts, matches=10, time_since_validated_s=0.21)) == [Trigger.DRIFT | Trigger.NOT_VALIDATED]
 
 
 def test_every_trigger_but_those_that_hang_on_others_is_set_alone_here():
-    assert set(Trigger) - set(ALONE) == {Trigger.HELD, Trigger.NOT_VALIDATED}
+    assert set(Trigger) - set(ALONE) == {Trigger.HELD}
 
 
 def test_what_is_seen_well_has_no_trigger_whatever_it_is_time_for():
@@ -160,16 +159,6 @@ def test_new_objects_that_leave_much_unexplained_are_searched_for_when_it_is_tim
     # One window that is a little worse is no reason.
     assert not any(having(Trigger.NEW, replace(given, last_score=torch.full((3,), 0.95))))
     assert not any(having(Trigger.NEW, given, new_below=0))
-
-
-def test_what_drifts_or_is_very_uncertain_is_looked_for_as_it_was_last_seen_when_it_is_time():
-    changes = {"sigma_px": [1.0, 1.0, 11.0, 11.0], "drift_s": [0.1, 0.0, 0.0, 0.0], "is_drift_due": [True, True, True, False]}
-    given = evidence(4, time_since_validated_s=0.21, **changes)
-    assert having(Trigger.NOT_VALIDATED, given, wide_sigma_px=10.0) == [True, False, True, False]
-    later = replace(given, time_since_validated_s=torch.tensor([0.21, 0.21, 0.19, 0.21]))
-    assert having(Trigger.NOT_VALIDATED, later) == [True, False, False, False]
-    for never in (Component.LAST_SEEN, Component.DRIFT):
-        assert not any(having(Trigger.NOT_VALIDATED, given, never))
 
 
 def test_an_object_drifts_once_it_explained_too_little_for_long_and_it_is_time():

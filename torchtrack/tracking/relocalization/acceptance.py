@@ -133,15 +133,6 @@ def elsewhere(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfi
     return AcceptanceTest(nothing + _ELSEWHERE_MARGIN, config.relocalization.accept_ratio * reference, nothing, nothing)
 
 
-def as_last_seen(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
-    """Of poses as the object was last validated: what is explained enough where it is gives way to far more events alone."""
-    test = elsewhere(evidence, scored, config)
-    matches = _matches(scored)
-    at_least = torch.where(has(evidence.triggers, Trigger.SLOW_DRIFT), matches, 0)
-    min_matches = torch.where(has(evidence.triggers, Trigger.HELD), _FAR_MORE * matches, at_least)
-    return AcceptanceTest(test.margin, test.min_score, test.min_inlier_ratio, min_matches)
-
-
 def around_last_seen(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
     """Of poses all around where the object was last validated.
 

@@ -15,7 +15,7 @@ from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.rounds import gate_scale_of
 from torchtrack.tracking.frontend.sensors import LEAST_SIGMA_PX
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.last_seen import less_certain, where_last_seen
+from torchtrack.tracking.relocalization.last_seen import less_certain
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.sampling import sample
 from torchtrack.tracking.relocalization.triggers import SCORE_DROP_SIGMA_PX
@@ -61,12 +61,6 @@ def around_prediction_released(lost: LostObject) -> Hypotheses:
     hypotheses = sampled_around(lost, less_certain(lost.predicted(), sigma_px, slip_px), slip_px, lost.contours())
     released = config.solver.observation_px**2 * (1 - (sigma_px / slip_px) ** 2) * lost.widened.information[lost.number]
     return replace(hypotheses, released=released)
-
-
-def as_last_seen(lost: LostObject) -> Hypotheses:
-    """Rotated and as far away as when it was last validated, in the place of the image where it is predicted."""
-    T_last_seen = lost.last_seen.T_cam_obj[lost.number]
-    return sampled_elsewhere(lost, where_last_seen(lost.predicted(), T_last_seen), lost.sigma_px)
 
 
 def around_last_seen(lost: LostObject) -> Hypotheses:

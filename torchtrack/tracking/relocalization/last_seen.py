@@ -91,15 +91,3 @@ def anywhere(covariance: Float[Tensor, "b 12 12"], chosen: Bool[Tensor, "b"]) ->
     """Covariances of poses and velocities, of the ``chosen`` objects so large that they may be anywhere in the image."""
     unknown = torch.eye(12, dtype=covariance.dtype, device=covariance.device)
     return torch.where(chosen[:, None, None], unknown, covariance)
-
-
-def where_last_seen(prediction: Prediction, T_last_seen: Float[Tensor, "4 4"]) -> Prediction:
-    """The prediction, of an object alone, rotated and as far away as when it was last seen well, in the place of the image where it is predicted.
-
-    What slips runs off in depth and rotates on; in the image it is held by what it slipped onto.
-    """
-    centre_obj, then = prediction.objects.centre_obj[0], T_last_seen.to(prediction.T_cam_obj.dtype)
-    now_cam, then_cam = prediction.centre_cam[0], then[:3, :3] @ centre_obj + then[:3, 3]
-    T_cam_obj = then.clone()
-    T_cam_obj[:3, 3] += now_cam * (then_cam[2] / now_cam[2]) - then_cam
-    return replace(prediction, T_cam_obj=T_cam_obj[None])

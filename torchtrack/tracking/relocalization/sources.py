@@ -40,8 +40,6 @@ SOURCES = (
     Source(Trigger.HELD, hypotheses.around_prediction_released, acceptance.near_prediction),
     Source(AROUND_PREDICTION, hypotheses.around_prediction, acceptance.near_prediction, unless=Trigger.HELD),
     Source(Trigger.SCORE_DROP, hypotheses.around_prediction_released, acceptance.elsewhere),
-    # What is lost is predicted there already.
-    Source(Trigger.NOT_VALIDATED, hypotheses.as_last_seen, acceptance.as_last_seen, unless=Trigger.LOST),
     Source(AROUND_LAST_SEEN, hypotheses.around_last_seen, acceptance.around_last_seen, comes_last=True),
     Source(Trigger.UNCONFIRMED, rivals.turned_far, rivals.explains_far_more, comes_last=True),
 )

@@ -31,8 +31,6 @@ SCORE_DROP_SIGMA_PX = 6.0
 # What drifts but explains this share of what it does when seen well is looked for near its place alone. With that, and line ends, 12.8 instead of
 # 22.7 % of the windows of 14 scenes with a bar were lost, which were simulated after both were chosen.
 HELD_FROM = 0.25
-# What was not seen well for so long is also looked for as it was then (µs).
-LAST_SEEN_US = 200_000
 # An object is new while what it explains when seen well, which rises with every window, is below this ratio of what it explains.
 _NEW = 0.9
 
@@ -47,7 +45,6 @@ class Trigger(IntFlag):
     DRIFT = auto()
     SLOW_DRIFT = auto()
     HELD = auto()
-    NOT_VALIDATED = auto()
     DEPTH_CHANGED = auto()
     FAR_BELOW_REFERENCE = auto()
     LOST = auto()
@@ -161,14 +158,6 @@ def has_score_dropped(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[
     return _is_sure(evidence) & evidence.is_near_due & ~has(evidence.triggers, DRIFTS) & dropped & config.uses(Component.SCORE_DROP)
 
 
-def is_not_validated(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """NOT_VALIDATED: objects that drift or are very uncertain, and were not seen well for long: they are also looked for as they were then."""
-    if none_of(evidence.is_drift_due):
-        return evidence.is_drift_due
-    long = (evidence.time_since_validated_s >= 1e-6 * LAST_SEEN_US) & config.uses(Component.LAST_SEEN)
-    return _looks_far(evidence, config) & long & (has(evidence.triggers, DRIFTS) | (evidence.sigma_px > config.relocalization.wide_sigma_px))
-
-
 def is_unconfirmed(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """UNCONFIRMED: objects whose pose has windows enough that speak for it, this one among them: it is confirmed once no other explains far more.
 
@@ -197,7 +186,6 @@ _CONDITIONS: tuple[dict[int, Condition], ...] = (
         int(Trigger.LOW_SCORE): is_scored_low,
         int(Trigger.SCORE_DROP): has_score_dropped,
         int(Trigger.HELD): is_held,
-        int(Trigger.NOT_VALIDATED): is_not_validated,
         int(Trigger.UNCONFIRMED): is_unconfirmed,
     },
 )
@@ -209,7 +197,3 @@ def _is_sure(evidence: TriggerEvidence) -> Bool[Tensor, "b"]:
 
 def _is_near_or_due(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     return torch.where(evidence.sigma_px <= config.relocalization.wide_sigma_px, evidence.is_near_due, evidence.is_due)
-
-
-def _looks_far(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    return evidence.is_drift_due & config.uses(Component.DRIFT)
