@@ -46,7 +46,6 @@ def boxes(config=None, dtype=torch.float64):
         name: uniform(OBJECTS, seed=number).to(dtype)
         for number, name in enumerate(("mean_score", "reference_explained_ratio", "reference_inlier_ratio", "score"))
     }
-    shares["reference_matches"] = 80 * uniform(OBJECTS, seed=7).to(dtype)
     times = {name: 0.2 * uniform(OBJECTS, seed=5 + number).to(dtype) for number, name in enumerate(("drift_s", "time_since_validated_s"))}
     darker = uniform(OBJECTS, 8, low=-1, seed=9).to(dtype)
     motion = {"velocity": velocity, "covariance": 1e-4 * random_covariances(OBJECTS)}
@@ -163,7 +162,6 @@ CONCLUDED = {
     "nothing asked": {"validation": {"lost_below": 0.0, "uncertain_below": 0.0, "min_observations": 6, "max_rotation_rad": 9.0}},
     "much asked": {"validation": {"min_observations": 450, "max_translation": 0.3}},
     "no sides": {"disabled": ["polarity_prior"]},
-    "by ratios alone": {"disabled": ["match_count"]},
 }
 
 

@@ -33,7 +33,6 @@ class Component(StrEnum):
     AROUND_LAST_SEEN = "around_last_seen"
     UNCONFIRMED = "unconfirmed"
     # how they are compared
-    MATCH_COUNT = "match_count"
     INLIER_RATIO = "inlier_ratio"
     LINE_ENDS = "line_ends"
     ALL_DIRECTIONS = "all_directions"

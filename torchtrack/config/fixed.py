@@ -88,7 +88,6 @@ SWITCHES: dict[str, dict[str, Component]] = {
         "low_score_below": Component.LOW_SCORE,
         "score_drop_below": Component.SCORE_DROP,
         "not_validated_us": Component.AROUND_LAST_SEEN,
-        "by_matches": Component.MATCH_COUNT,
         "line_ends": Component.LINE_ENDS,
         "by_inlier_ratio": Component.INLIER_RATIO,
         "drift_us": Component.DRIFT,

@@ -9,7 +9,7 @@ from tracked_boxes import in_motion
 
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization import acceptance
-from torchtrack.tracking.relocalization.acceptance import AcceptanceTest, is_contradicted, is_likely, less_by_few_events, likeliest
+from torchtrack.tracking.relocalization.acceptance import AcceptanceTest, is_contradicted, is_likely, likeliest
 from torchtrack.tracking.relocalization.triggers import NONE, Trigger, triggered
 
 CONFIG = TrackerConfig()
@@ -72,12 +72,6 @@ def test_events_on_texture_contradict_poses_where_they_agree_at_the_objects_own(
     assert is_contradicted(tried, torch.tensor(0.9)).tolist() == [True, False, False]
     for own_agreement in (0.5, torch.nan):
         assert not is_contradicted(tried, torch.tensor(own_agreement)).any()
-
-
-def test_small_poses_that_few_events_explain_are_worth_less():
-    score, count = torch.tensor([0.9, 0.8, 0.0]), torch.tensor([100, 900, 2000])
-    assert less_by_few_events(score, count).tolist() == pytest.approx([0.3, 0.8, 0.0])
-    assert less_by_few_events(torch.zeros(3), count).tolist() == [0.0, 0.0, 0.0]
 
 
 # ---- what it leaves

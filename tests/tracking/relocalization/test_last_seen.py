@@ -112,24 +112,6 @@ def test_of_what_slipped_all_is_less_certain_alike():
     torch.testing.assert_close(wider, 25 * prediction.covariance)
 
 
-# ---- what is remembered
-
-
-def test_an_object_seen_by_few_events_is_not_remembered_as_seen_well(way):
-    """Far more were explained when it was seen well than now, though they explain all of it."""
-    tracker, state, _, (events, end_us), _ = started()
-    much = changed(state, reference_matches=10 * state.health.reference_matches)
-    assert float(state.health.reference_matches) > 0
-    with torch.no_grad():
-        after, result = tracker.step(much, events, end_us)
-        usual, _ = tracker.step(state, events, end_us)
-    assert int(result.status) == Status.TRACKING
-    assert torch.equal(after.health.T_last_validated, much.health.T_last_validated) and float(after.health.time_since_validated_s) > 0
-    assert not torch.equal(usual.health.T_last_validated, state.health.T_last_validated) and float(usual.health.time_since_validated_s) == 0
-    by_share = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(disabled={Component.MATCH_COUNT}))
-    assert float(by_share.step(much, events, end_us)[0].health.time_since_validated_s) == 0
-
-
 # ---- all together
 
 

@@ -67,7 +67,7 @@ def conclude(
         T_prior, usable, velocity, covariance: of the prediction.
         T_estimated, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 12]``, ``[b, 12, 12]``.
         count, flags, measured: ``[b]``, ``[2, b]`` and ``[7, b]``: what is known of the fits, in the order of :class:`Measured`.
-        remembered, T_last_validated: ``[7, b]``, in the order of :class:`References`, and ``[b, 4, 4]`` before the window; changed to those after it.
+        remembered, T_last_validated: ``[6, b]``, in the order of :class:`References`, and ``[b, 4, 4]`` before the window; changed to those after it.
         T_cam_obj, new_velocity, posterior, left, status: after the window, ``left`` being the covariance of poses; filled.
     """
     inverses, centre = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(3)
@@ -75,7 +75,7 @@ def conclude(
         m, r = measured[:, b], remembered[:, b]
         rotated, moved = _length(offset[b, :3]), _length(offset[b, 3:6]) / diameter_m[b]
         of_fit = Measured(m[0], m[1], m[2], m[3], m[4], m[5], m[6], rotated, moved, count[b], flags[0, b], usable[b], flags[1, b])
-        known = References(r[0], r[1], r[2], r[3], r[4], r[5], r[6])
+        known = References(r[0], r[1], r[2], r[3], r[4], r[5])
         judged = _verdict(of_fit, known, limits)
         status[b] = judged.status
         _orthonormalise(T_prior[b] if judged.failed else T_estimated[b], T_cam_obj[b])
@@ -85,7 +85,7 @@ def conclude(
         _update(judged.trusted, judged.failed, dt_s[b], velocity[b], covariance[b], offset[b], inverses, settings, new_velocity[b], posterior[b])
         centre_of(T_cam_obj[b], centre_obj[b], centre)
         _to_left(posterior[b], centre, left[b])
-        r[0], r[1], r[2], r[3], r[4], r[5], r[6] = _remembered(known, of_fit, judged, dt_s[b], limits)
+        r[0], r[1], r[2], r[3], r[4], r[5] = _remembered(known, of_fit, judged, dt_s[b], limits)
         if judged.is_certain:
             T_last_validated[b] = T_cam_obj[b]
 

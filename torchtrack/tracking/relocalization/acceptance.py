@@ -85,8 +85,7 @@ class AcceptanceTest:
         score, asked = torch.where(eligible, tried.score, 0), self.asked_score(own, lost.number, config)
         if config.uses(Component.LINE_ENDS) and hypotheses.is_wide:
             score = less_where_lines_run_on(score, score > asked, tried.fit.contours, hypotheses.places, prediction.objects.image_size)
-        by_events = config.uses(Component.MATCH_COUNT) and hypotheses.is_wide
-        best = likeliest(less_by_few_events(score, tried.count) if by_events else score, offsets, prediction.covariance[0])
+        best = likeliest(score, offsets, prediction.covariance[0])
         return Choice(best, score.index_select(0, best) > asked)
 
     def is_passed(self, tried: ScoredFit, config: TrackerConfig) -> Bool[Tensor, "n"]:
@@ -180,12 +179,6 @@ def less_where_lines_run_on(
         return score
     rows = concerned.nonzero()[:, 0] if host_sync.read_at_once(concerned) else torch.arange(len(score), device=score.device)
     return score.index_copy(0, rows, score[rows] * (1 - running_on(contours.rows(rows), places, image_size)))
-
-
-def less_by_few_events(score: Float[Tensor, "n"], count: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Scores of poses, less where fewer events are explained than by others: of small ones, far away, chance explains all."""
-    matched = torch.where(score > 0, count, 0).to(score.dtype)
-    return score * (matched / matched.max().clamp(min=1)).sqrt()
 
 
 def likeliest(score: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Int[Tensor, "1"]:

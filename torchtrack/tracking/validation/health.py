@@ -20,7 +20,6 @@ class TrackHealth:
         mean_score: its running mean; zero of an object that was never seen.
         reference_explained_ratio: of the moving contour, what events explain when the object is seen well.
         reference_inlier_ratio: of the events near its contours, how many are on them then.
-        reference_matches: matched observations then.
         reference_normal_spread: how far the normals of contours with events on them are spread then
             (:func:`torchtrack.tracking.validation.measures.normal_spread`).
         drift_s: for how long, less the time it was not, the object has explained too little by smeared events (s).
@@ -35,7 +34,6 @@ class TrackHealth:
     mean_score: Float[Tensor, "b"]
     reference_explained_ratio: Float[Tensor, "b"]
     reference_inlier_ratio: Float[Tensor, "b"]
-    reference_matches: Float[Tensor, "b"]
     reference_normal_spread: Float[Tensor, "b"]
     drift_s: Float[Tensor, "b"]
     T_last_validated: Float[Tensor, "b 4 4"]
@@ -62,7 +60,6 @@ class TrackHealth:
             mean_score=zero,
             reference_explained_ratio=zero,
             reference_inlier_ratio=zero,
-            reference_matches=zero,
             reference_normal_spread=zero,
             drift_s=zero,
             T_last_validated=T_cam_obj.clone(),

@@ -29,9 +29,8 @@ DRIFT_BELOW = 0.6
 SMEARED = 0.8
 # Weight of a new window in the mean score, and in references; and in these where it is less: what is hidden for a while is not seen well.
 USUAL_GAIN, FALL_GAIN = 0.1, 0.005
-# A pose that explains this ratio of what it does when seen well, by this ratio of the observations, is remembered as one: most that
-# slipped explain less, or are far away, where few explain all.
-CERTAIN, CERTAIN_COUNT = 0.9, 0.5
+# A pose that explains this ratio of what it does when seen well is remembered as one: most that slipped explain less.
+CERTAIN = 0.9
 # A pose is confirmed by so many windows, less those that explain clearly less, in which events explain this share of the moving contour.
 # Of 27 starts that were 40 degrees off, 0.5 lets 142 of 1,620 windows be TRACKING while wrong, 0.55 13, 0.6 and 0.65 one; 31 starts that were
 # right were confirmed by the third window in the median.
@@ -50,7 +49,6 @@ class Limits(NamedTuple):
         refound_above: as :data:`REFOUND_ABOVE`, no less than ``lost_below``.
         many: observations that tell of an object of which little is explained.
         partly_hidden: whether these are told apart.
-        certain_count: as :data:`CERTAIN_COUNT`, or zero where numbers of observations are not compared.
         drift_below: as :data:`DRIFT_BELOW`.
         confirmed_from: as :data:`CONFIRMED_FROM`, no less than ``uncertain_below``.
         speaking_windows: as :data:`CONFIRMED_BY`; none where corners alone are observed, which lie on little of a contour.
@@ -66,7 +64,6 @@ class Limits(NamedTuple):
     max_rotation_rad: float
     max_translation: float
     partly_hidden: bool
-    certain_count: float
     drift_below: float
     confirmed_from: float
     speaking_windows: float
@@ -88,7 +85,6 @@ class Limits(NamedTuple):
             max_rotation_rad=validation.max_rotation_rad,
             max_translation=validation.max_translation,
             partly_hidden=config.uses(Component.PARTLY_HIDDEN),
-            certain_count=CERTAIN_COUNT if config.uses(Component.MATCH_COUNT) else 0.0,
             drift_below=DRIFT_BELOW,
             confirmed_from=max(CONFIRMED_FROM, validation.uncertain_below),
             speaking_windows=speaking_windows,
@@ -132,7 +128,6 @@ class References(NamedTuple):
     mean_score: Float[Tensor, "b"]
     reference_explained_ratio: Float[Tensor, "b"]
     reference_inlier_ratio: Float[Tensor, "b"]
-    reference_matches: Float[Tensor, "b"]
     drift_s: Float[Tensor, "b"]
     time_since_validated_s: Float[Tensor, "b"]
     confirmations: Float[Tensor, "b"]
@@ -221,13 +216,12 @@ def verdict(measured: Measured, known: References, limits: Limits) -> Verdict:
     is_smeared = logical_not(failed) & smeared(measured, reference, limits)
     status = where(is_smeared & (status < _UNCERTAIN), _UNCERTAIN, status)
     is_certain = (measured.explained_ratio >= CERTAIN * reference) & (status == _TRACKING)
-    is_certain = is_certain & (measured.matched >= limits.certain_count * known.reference_matches)
     # Until a pose is confirmed, what explains much may be others' edges: where the object was before is not to be forgotten for them.
     is_certain = is_certain & (known.confirmations >= limits.confirmed_by)
     return Verdict(status, failed, trusted, is_smeared, is_certain)
 
 
-def seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"] | Int[Tensor, "b"]) -> Float[Tensor, "b"]:
+def seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     """A running mean of when objects are seen well: it rises fast, and falls slowly."""
     change = now - before
     return before + where(change > 0, USUAL_GAIN * change, FALL_GAIN * change)
@@ -267,7 +261,6 @@ def remembered(known: References, measured: Measured, judged: Verdict, dt_s: Flo
         mean_score=where(failed, known.mean_score, known.mean_score + USUAL_GAIN * (measured.score - known.mean_score)),
         reference_explained_ratio=where(failed, explained, seen_well(explained, measured.explained_ratio)),
         reference_inlier_ratio=where(failed | isnan(measured.inlier_ratio), inliers, seen_well(inliers, measured.inlier_ratio)),
-        reference_matches=where(failed, known.reference_matches, seen_well(known.reference_matches, measured.matched)),
         drift_s=where(drift_s > 0.0, drift_s, 0.0),
         time_since_validated_s=where(judged.is_certain, 0.0, known.time_since_validated_s + dt_s),
         confirmations=confirmations(known.confirmations, measured, judged, limits),
