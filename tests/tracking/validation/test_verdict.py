@@ -280,6 +280,12 @@ def test_what_is_not_confirmed_is_not_remembered_as_seen_well():
     assert after.time_since_validated_s.tolist() == pytest.approx([0.405, 0.0])
 
 
+def test_what_a_search_gave_just_now_is_not_remembered_as_seen_well_by_what_spoke_for_the_pose_before():
+    known = References(*torch.tensor([0.9, 0.9, 0.8, 0.0, 0.4, 4.0])[:, None].expand(6, 2))
+    seen = measured(matched=torch.tensor([100, 100]), is_relocalized=torch.tensor([False, True]))
+    assert rules.verdict(seen, known, limits()).is_certain.tolist() == [True, False]
+
+
 # ---- the whole, for tensors and for numbers
 
 

@@ -217,7 +217,8 @@ def verdict(measured: Measured, known: References, limits: Limits) -> Verdict:
     status = where(is_smeared & (status < _UNCERTAIN), _UNCERTAIN, status)
     is_certain = (measured.explained_ratio >= CERTAIN * reference) & (status == _TRACKING)
     # Until a pose is confirmed, what explains much may be others' edges: where the object was before is not to be forgotten for them.
-    is_certain = is_certain & (known.confirmations >= limits.confirmed_by)
+    # So may what a search gave just now: windows before it speak for the pose before.
+    is_certain = is_certain & (known.confirmations >= limits.confirmed_by) & logical_not(measured.is_relocalized)
     return Verdict(status, failed, trusted, is_smeared, is_certain)
 
 
