@@ -105,6 +105,19 @@ def test_a_method_that_ran_once_is_not_judged():
     assert table["all"]["δR (°)"] == "1.000 ± 0.100"
 
 
+@pytest.mark.parametrize(
+    ("without", "expected"),
+    [([[1.0, 2.0], [3.0, math.nan]], "0"), ([[1.0, 2.0 + 1e-12]], "1"), ([[1.0, 2.0, 2.0]], "1"), ([[1.0, 2.0], [3.0, 4.0]], "1")],
+)
+def test_it_is_told_on_how_many_tracks_anything_differs_from_the_same_start(without, expected):
+    others = [*runs("all", [1.0, 2.0], [3.0, math.nan], sequence="dim_cube"), *runs("less", [1.0, 2.0], [3.0, math.nan], sequence="dim_cube")]
+    results = [*runs("all", [1.0, 2.0], [3.0, math.nan]), *runs("less", *without), *others]
+    # A run that is not complete is left out, and so are those of its number.
+    results = [entry for entry in results if entry.method == "all" or entry.run <= len(without)]
+    table = rows(report(results, ("all", "less"), ("far_cube", "dim_cube")).grids[0])
+    assert (table["all"]["differ"], table["less"]["differ"]) == ("", expected)
+
+
 def test_runs_that_are_not_complete_and_sequences_that_failed_are_left_out():
     results = [*runs("all", [1.0], [1.0]), *runs("less", [2.0], [2.0]), *runs("all", [1.0], sequence="dim_cube")]
     both = ("far_cube", "dim_cube")

@@ -13,6 +13,8 @@ either has lost, so that losing the difficult ones is no gain. A change counts i
 - twice its standard error over tracks: one track of many that is lost by one method and not by another is chance, even if it is so
   in all runs, as a run that differs by roundings alone may go wrong in the same way;
 - 1 % of an error, or 0.1 % of the windows.
+
+How many tracks differ at all, in runs from the same start, tells where a part never does anything: there, no change is chance.
 """
 
 import math
@@ -36,7 +38,7 @@ _SIGMAS = 2.0
 _LEAST_RELATIVE, _LEAST_LOST = 0.01, 0.001
 _NOTE = (
     "±: standard deviation between runs. δR, δT: over windows that are not lost; their changes: over windows that no run of either has lost. "
-    "Changes: to the first row, larger than 0 where leaving out is worse."
+    "Changes: to the first row, larger than 0 where leaving out is worse. Differ: tracks with another digit, of runs from the same start."
 )
 
 Track = tuple[str, str]
@@ -66,12 +68,14 @@ class Comparison:
         own: what was measured in each run.
         with_all, without: of each run of the first method and of this one, on the windows that both have.
         over_tracks: standard errors of the change over tracks.
+        differing: tracks of which any error has another digit, in runs of the same number.
     """
 
     own: Sequence[Figures]
     with_all: Sequence[Figures]
     without: Sequence[Figures]
     over_tracks: Figures = _NO_FIGURES
+    differing: int = 0
 
     @property
     def change(self) -> Figures:
@@ -119,7 +123,19 @@ def compared(first: Sequence[Arm], other: Sequence[Arm], limits: Limits) -> Comp
     held = {track: reduce(np.intersect1d, [_held_us(arm[track].errors, limits) for arm in (*first, *other)]) for track in tracks}
     own = [_figures(arm, {track: _held_us(result.errors, limits) for track, result in arm.items()}, limits) for arm in other]
     with_all, without = ([_figures(arm, held, limits) for arm in arms] for arms in (first, other))
-    return Comparison(own, with_all, without, _standard_errors(first, other, held, limits))
+    differing = sum(_differs(track, first, other) for track in tracks)
+    return Comparison(own, with_all, without, _standard_errors(first, other, held, limits), differing)
+
+
+def _differs(track: Track, first: Sequence[Arm], other: Sequence[Arm]) -> bool:
+    """Whether runs of the same number, which have the same start, differ in any digit of a track's errors."""
+    of_run = {arm[track].run: arm[track].errors for arm in first}
+    pairs = [(of_run[arm[track].run], arm[track].errors) for arm in other if arm[track].run in of_run]
+    return not all(np.array_equal(ours, theirs, equal_nan=True) for pair in pairs for ours, theirs in zip(*map(_numbers, pair), strict=True))
+
+
+def _numbers(errors: PoseErrors) -> tuple[ndarray, ndarray, ndarray]:
+    return errors.t_us.numpy(), errors.rotation_deg.numpy(), errors.translation_cm.numpy()
 
 
 def _standard_errors(first: Sequence[Arm], other: Sequence[Arm], held_us: Mapping[Track, Int[ndarray, "h"]], limits: Limits) -> Figures:
@@ -183,7 +199,7 @@ def _variance(values: Sequence[float]) -> float:
 
 
 def _grid(comparisons: Mapping[str, Comparison], spread: Figures | None, methods: int, failed: set[str]) -> Grid:
-    names = ("left out", "runs", "δR (°)", "δT (mm)", "lost (%)", "change δR", "change δT", "change lost", "verdict")
+    names = ("left out", "runs", "δR (°)", "δT (mm)", "lost (%)", "change δR", "change δT", "change lost", "differ", "verdict")
     rows = tuple(_row(method, entry, spread, first=number == 0) for number, (method, entry) in enumerate(comparisons.items()))
     notes = [_NOTE]
     if spread is not None:
@@ -202,10 +218,10 @@ def _row(method: str, entry: Comparison, spread: Figures | None, *, first: bool)
         *(_with_spread(rotation, 3), _with_spread(translation, 2), _with_spread([100 * share for share in lost], 2)),
     ]
     if first:
-        return tuple(map(Cell, [*texts, "", "", "", ""]))
+        return tuple(map(Cell, [*texts, "", "", "", "", ""]))
     change = entry.change
     worth = verdict(entry, spread)
-    texts += [f"{change.rotation_deg:+.3f}", f"{change.translation_mm:+.2f}", f"{100 * change.lost:+.2f}", worth]
+    texts += [f"{change.rotation_deg:+.3f}", f"{change.translation_mm:+.2f}", f"{100 * change.lost:+.2f}", str(entry.differing), worth]
     return tuple(Cell(text, bold=text == worth == "gains") for text in texts)
 
 
