@@ -169,14 +169,13 @@ def _kept(sensors: Sensors, events: EventBatch, near: Bool[Tensor, "b t"]) -> tu
         kept = numbers_near(sensors.tiles, events, near)
         return kept, kept, np.array([0, len(kept)])
     check_streams_in_order(events.stream_index)
+    firsts = stream_bounds(events, streams)
     own_numbers = [
-        numbers_near(sensors.tiles, events[first:last], near[sensors.stream_index == s])
-        for s, (first, last) in enumerate(pairwise(stream_bounds(events, streams).tolist()))
+        numbers_near(sensors.tiles, events[first:last], near[sensors.stream_index == s]) for s, (first, last) in enumerate(pairwise(firsts.tolist()))
     ]
     bounds = np.concatenate([[0], np.cumsum([len(own) for own in own_numbers])])
-    before = np.repeat(stream_bounds(events, streams)[:-1].numpy(), np.diff(bounds))
     number = np.concatenate(own_numbers)
-    return number + before, number, bounds
+    return number + np.repeat(firsts[:-1].numpy(), np.diff(bounds)), number, bounds
 
 
 def _of_rows(seen: Float[Tensor, "4 b e"], exists: Bool[Tensor, "b e"]) -> WindowEvents:

@@ -33,8 +33,6 @@ GATE_SIGMAS = 3.0
 # of larger ones of which more is seen than plain faces. By cells for all, errors are 0.31° / 0.72 mm instead of 0.30° / 0.71 mm (docs/results.md),
 # and were a fifth larger on print when that was measured alone.
 FINE_BELOW_PX = 120.0
-# What has to be looked for with a gate this many times wider may be anywhere.
-ANYWHERE = 2.0
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,7 @@ DRIFTS = Trigger.DRIFT | Trigger.SLOW_DRIFT
 AROUND_LAST_SEEN = Trigger.DEPTH_CHANGED | Trigger.FAR_BELOW_REFERENCE
 # An object that is looked for around its prediction.
 AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.NEW | Trigger.LOW_SCORE | DRIFTS
-# What calls for a search. An object that is lost is expected where it was last validated, and uncertain there; an object that was not
-# validated for long is uncertain or drifts.
+# What calls for a search. An object that is lost is expected where it was last validated, and uncertain there.
 SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP | Trigger.UNCONFIRMED
 
 

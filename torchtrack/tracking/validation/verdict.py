@@ -12,9 +12,10 @@ from torch import Tensor, clamp, isnan, logical_not, where
 
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.tracking.estimation.rounds import ANYWHERE
 from torchtrack.tracking.validation.status import Status
 
+# What has to be looked for with a gate this many times wider may be anywhere.
+_ANYWHERE = 2.0
 # What gathers no more than this ratio of how far it does when an object is seen well says nothing for a pose; from the other one on, all.
 HIDDEN_FROM, HIDDEN_FULLY = 0.8, 0.95
 # It says nothing of objects on which less gathers even then, nor by fewer observations than so many times the least.
@@ -188,7 +189,7 @@ def judge(measured: Measured, hidden: Float[Tensor, "b"], limits: Limits) -> Int
     """The status of each object, the gravest reason last; ``hidden``: how far no more is asked of it for having been looked for in many places."""
     explained, gate_scale = measured.explained_ratio, measured.gate_scale
     # A new pose of what may be anywhere is no jump, however far away it is; what is not a number stays that.
-    counts = where(measured.is_relocalized & (gate_scale >= ANYWHERE), 0.0, 1.0) / gate_scale
+    counts = where(measured.is_relocalized & (gate_scale >= _ANYWHERE), 0.0, 1.0) / gate_scale
     is_near = (counts * measured.rotated_rad < limits.max_rotation_rad) & (counts * measured.moved_diameters < limits.max_translation)
     status = where(explained < limits.uncertain_below, _UNCERTAIN, _TRACKING)
     status = where(explained < needed_ratio(gate_scale, hidden, limits), _LOST, status)
