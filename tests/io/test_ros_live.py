@@ -119,7 +119,9 @@ def test_a_run_publishes_poses_while_it_goes_on(ros, tmp_path):
     trajectory = read_tum(tmp_path / "out" / "trajectory_box.tum")
     poses = [message for topic, message in ros.published if topic == "/torchtrack/box/pose"]
     transforms = [message.transforms[0] for topic, message in ros.published if topic == "/tf"]
-    assert len(poses) == len(transforms) == len(trajectory) >= 3
+    assert len(poses) == len(transforms) == len(trajectory) == summary.windows >= 1
+    # On a slow machine some are joined.
+    assert summary.windows + summary.joined_windows + summary.dropped_windows >= 3
     stamps_us = [message.header.stamp.sec * 10**6 + message.header.stamp.nanosec // 1000 for message in poses]
     assert stamps_us == [t_us + AHEAD_US for t_us in trajectory.t_us.tolist()]
     positions = torch.tensor([[message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.position.z] for message in poses])
