@@ -163,8 +163,8 @@ def stated(name, value, args):
     """What counts of a result: of padding, nothing does."""
     operation = name.rpartition(".")[2]
     if operation == "mesh_points":
-        points, tangents, kind, mask = value
-        return [points[mask], tangents[mask], kind[mask]]
+        points, tangents, kind, mask, resolved = value
+        return [points[mask], tangents[mask], kind[mask], resolved[mask]]
     if operation in ("hidden_by_self", "hidden_in_buffer"):
         return [value[args[1].mask]]
     if operation == "contour_table":

@@ -49,19 +49,21 @@ def random_contours(batch=3, count=400, seed=0, dtype=torch.float64):
     angle = uniform(batch, count, high=6.28, seed=seed + 1, dtype=dtype)
     kind = torch.randint(len(ContourKind), (batch, count), generator=generator(seed + 2))
     mask = uniform(batch, count, seed=seed + 3) < 0.8
-    return replace(contours_at(pixels, torch.stack([angle.cos(), angle.sin()], -1), mask=mask, dtype=dtype), kind=kind)
+    contours = contours_at(pixels, torch.stack([angle.cos(), angle.sin()], -1), mask=mask, dtype=dtype)
+    return replace(contours, kind=kind, resolved=uniform(batch, count, low=-0.5, seed=seed + 4, dtype=dtype).clamp(min=0))
 
 
 # ---- contours, hidden or not
 
 
 def textured_plate():
-    """A plate with points of texture on one side."""
+    """A plate with lines of texture on one side, now brighter above, now below."""
     plate = ObjectModel.from_mesh(trimesh.creation.box((0.12, 0.10, 0.01)))
     grid = torch.stack(torch.meshgrid(torch.linspace(-0.05, 0.05, 21), torch.linspace(-0.04, 0.04, 17), indexing="ij"), -1).flatten(0, 1)
     points = torch.cat([grid, torch.full_like(grid[:, :1], -0.005)], 1)
-    tangents, normals = torch.tensor([1.0, 0.0, 0.0]).expand_as(points), torch.tensor([0.0, 0.0, -1.0]).expand_as(points)
-    return replace(plate, texture_points=points, texture_tangents=tangents.clone(), texture_normals=normals.clone())
+    tangents, normals = torch.tensor([1.0, 0.0, 0.0]).repeat(len(points), 1), torch.tensor([0.0, 0.0, -1.0]).repeat(len(points), 1)
+    tangents.view(21, 17, 3)[:, 1::2] *= -1
+    return replace(plate, texture_points=points, texture_tangents=tangents, texture_normals=normals)
 
 
 def all_kinds():
@@ -236,7 +238,7 @@ def test_bursts_of_pixels_that_fire_again_and_again(elapsed_us, streams):
 # ---- measures and matrices
 
 
-def random_matches(batch=3, count=1800):
+def random_matches(batch=3, count=6000):
     """Matches with numbers all over."""
     offsets, near = uniform(batch, count, low=-6, high=6, seed=1), uniform(batch, count, seed=2) < 0.7
     zeros, points = torch.zeros_like(offsets), torch.zeros(batch, count, 3).double()

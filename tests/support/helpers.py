@@ -172,7 +172,9 @@ def contours_at(pixels, normals=None, kind=ContourKind.CREASE, mask=None, dtype=
     normals = torch.tensor([1.0, 0.0], dtype=dtype).expand_as(pixels) if normals is None else torch.as_tensor(normals, dtype=dtype)
     points = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1)
     mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
-    return Contours(points, torch.zeros_like(points), torch.full(mask.shape, int(kind)), mask, points, pixels, normals)
+    return Contours(
+        points, torch.zeros_like(points), torch.full(mask.shape, int(kind)), mask, points, pixels, normals, torch.ones_like(points[..., 0])
+    )
 
 
 def moving_objects(velocity_px_s, batch=1, dtype=torch.float64):

@@ -159,7 +159,9 @@ def box_result(T_cam_obj: torch.Tensor) -> StepResult:
     points = torch.tensor([[0.05, 0.05, -0.05], [0.0, 0.0, 0.0]]).expand(count, 2, 3)
     pixels = torch.tensor([[70.0, 80.0], [1.0, 1.0]]).expand(count, 2, 2)
     mask = torch.tensor([True, False]).expand(count, 2)
-    contours = Contours(points, torch.zeros(count, 2, 3), torch.zeros(count, 2, dtype=torch.int64), mask, points, pixels, pixels)
+    contours = Contours(
+        points, torch.zeros(count, 2, 3), torch.zeros(count, 2, dtype=torch.int64), mask, points, pixels, pixels, torch.ones(count, 2)
+    )
     flow, has_flow = torch.full((count, 2, 2), 7.0), torch.zeros(count, 2, dtype=torch.bool)
     corners = Corners(pixels.long(), pixels, torch.zeros(count, 2), mask, flow, has_flow, polarity=mask.float())
     status = torch.tensor([int(Status.TRACKING), int(Status.OUT_OF_VIEW)])[:count]

@@ -20,6 +20,9 @@ _SHARP_COSINE = 0.5
 _VIEWS, _MORE_FACING = 512, 1.1
 # Points of texture edges of a model, at most: as many as a model is sampled with unless it is asked for more. It bounds time; not measured.
 MAX_TEXTURE_POINTS = 4000
+# Edges of texture are opposite whose directions to the brighter side have a cosine below minus this, of faces that look the same way; beside each
+# other, where they lie within so many spacings along the edge. So many points are compared with all others at once.
+_OPPOSITE_COSINE, _BESIDE, _GAPS_AT_ONCE = 0.5, 2.0, 256
 # Models of up to this many faces hide their own contours exactly, face by face: of more, one depth buffer takes less time. Not measured closely.
 EXACT_FACES = 512
 
@@ -47,6 +50,7 @@ class ContourModel(nn.Module):
     texture_points: Tensor
     texture_tangents: Tensor
     texture_normals: Tensor
+    texture_gaps_m: Tensor
     surface_points: Tensor
     triangles: Tensor
     triangle_normals: Tensor
@@ -71,6 +75,7 @@ class ContourModel(nn.Module):
         spread = torch.linspace(0, max(len(model.texture_points) - 1, 0), texture_count).long()
         for name in ("texture_points", "texture_tangents", "texture_normals"):
             self.register_buffer(name, getattr(model, name)[spread].clone())
+        self.register_buffer("texture_gaps_m", _gaps(self.texture_points, self.texture_tangents, self.texture_normals))
         self.texture_spacing_m = _spacing(self.texture_points)
         self.most_texture_facing = _most_facing(self.texture_normals)
         self.register_buffer("edges", _edge_table(points, normals, is_segment))
@@ -129,6 +134,19 @@ def _spacing(points: Float[Tensor, "n 3"]) -> float:
         return 0.0
     distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=2)
     return float(np.median(distances[:, 1]))
+
+
+def _gaps(points: Float[Tensor, "n 3"], tangents: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Distance across each edge of texture to the nearest one whose darker side is the opposite one (m); infinite where there is none."""
+    if len(points) == 0:
+        return points.new_zeros(0)
+    to_brighter, beside_m, parts = torch.linalg.cross(normals, tangents, dim=-1), _BESIDE * _spacing(points), []
+    for part in torch.arange(len(points)).split(_GAPS_AT_ONCE):
+        difference = points - points[part, None]
+        across, along = ((difference * way[part, None]).sum(-1).abs() for way in (to_brighter, tangents))
+        is_opposite = (to_brighter[part] @ to_brighter.T < -_OPPOSITE_COSINE) & (normals[part] @ normals.T > _OPPOSITE_COSINE)
+        parts.append(torch.where(is_opposite & (along <= beside_m), across, torch.inf).amin(1))
+    return torch.cat(parts)
 
 
 def group_by_model(models: Sequence[ObjectModel], config: ContourConfig) -> list[ContourModel]:

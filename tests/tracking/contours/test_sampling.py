@@ -16,7 +16,7 @@ from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.object_model import ObjectModel, contour_source
 from torchtrack.object_model.contour_source import ContourKind, ContourModel, group_by_model
 from torchtrack.tracking.contours.points import image_normals, reproject
-from torchtrack.tracking.contours.sampling import SPACING_PX, mesh_contours
+from torchtrack.tracking.contours.sampling import RESOLVED_PX, SPACING_PX, mesh_contours, px_per_m_across
 
 CONFIG = ContourConfig(remove_hidden=False)
 INTRINSICS = SMALL_CAMERA.intrinsics(torch.float64)
@@ -255,6 +255,50 @@ def test_texture_can_be_switched_off_and_is_thinned(monkeypatch):
     monkeypatch.setattr(contour_source, "MAX_TEXTURE_POINTS", 50)
     thinned = contours_of(model, pose()[None], ContourConfig(max_edge_points=100))
     assert 100 < int(thinned.mask.sum()) < 150
+
+
+def striped_plate(gap_m, *, is_opposite=True):
+    """Lines on a plane, along x and so far apart, of which every second one has its brighter side above; or all of them."""
+    x, y = torch.meshgrid(torch.linspace(-0.02, 0.02, 21), gap_m * torch.arange(-3, 4), indexing="ij")
+    points = torch.stack([x, y, torch.zeros_like(x)], -1).flatten(0, 1)
+    tangents, normals = torch.zeros_like(points), torch.zeros_like(points)
+    tangents[:, 0], normals[:, 2] = 1.0, -1.0
+    tangents.view(21, 7, 3)[:, 1::2] *= -1 if is_opposite else 1
+    return replace(box_model(), texture_points=points, texture_tangents=tangents, texture_normals=normals)
+
+
+# The lines are 1.8 px apart at the first depth, seen from the front. Turned about their own direction they come nearer, about the other they do not.
+@pytest.mark.parametrize(
+    ("rotation", "depth_m", "gap_px"),
+    [
+        ((0.0, 0.0, 0.0), 0.5, 1.8),
+        ((0.0, 0.0, 0.0), 0.9, 1.0),
+        ((math.pi / 3, 0.0, 0.0), 0.5, 0.9),
+        ((0.0, math.pi / 3, 0.0), 0.5, 1.8),
+        ((0.0, 0.0, math.pi / 3), 0.5, 1.8),
+    ],
+)
+def test_texture_is_resolved_as_far_as_the_image_shows_opposite_edges_apart(rotation, depth_m, gap_px, dtype):
+    plate, T = striped_plate(1.8 * 0.5 / SMALL_CAMERA.fx), pose(rotation, (0.0, 0.0, depth_m))[None]
+    for model, resolved in ((plate, min(gap_px / RESOLVED_PX, 1.0)), (striped_plate(1e-4, is_opposite=False), 1.0)):
+        contours = contours_of(model, T, dtype=dtype)
+        is_print = contours.kind == int(ContourKind.TEXTURE)
+        # A little more where the plate is nearer.
+        torch.testing.assert_close(contours.resolved[is_print & contours.mask].mean(), torch.tensor(resolved, dtype=dtype), rtol=0.03, atol=0)
+        assert (contours.resolved[~is_print & contours.mask] == 1).all()
+
+
+def test_how_far_apart_lines_of_texture_are_is_what_their_pixels_say(dtype):
+    """Far from the image's middle, too, and seen from the side."""
+    T, gap_m = pose((0.5, 0.3, 0.2), (0.12, -0.08, 0.5)).to(dtype), torch.tensor(1e-4, dtype=dtype)
+    point, tangent, brighter, normal = (torch.tensor([[way]], dtype=dtype) for way in ([0.01, 0.0, 0.0], [1.0, 0, 0], [0.0, 1, 0], [0.0, 0, 1]))
+    intrinsics = INTRINSICS.to(dtype)[None]
+    ends = torch.cat([point, point + gap_m * brighter, point + gap_m * tangent], 1)
+    here, across, along = project(transform_points(T[None], ends), intrinsics)[0].double()
+    along = (along - here) / (along - here).norm()
+    expected = ((across - here)[0] * along[1] - (across - here)[1] * along[0]).abs() / gap_m
+    actual = px_per_m_across(point, tangent, normal, T[None], intrinsics)[0, 0]
+    torch.testing.assert_close(actual.double(), expected, rtol=1e-3 if dtype == torch.float64 else 0.2, atol=0)
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.2, 3.0])

@@ -27,7 +27,7 @@ def contours_of(*lines, device="cpu", dtype=torch.float32):
     normals = torch.cat([normal.expand(len(points), 2) for points, normal in lines]).to(device, dtype)[None]
     shape, points = pixels.shape[:2], torch.zeros(*pixels.shape[:2], 3, device=device, dtype=dtype)
     kind, mask = torch.zeros(shape, dtype=torch.int64, device=device), torch.ones(shape, dtype=torch.bool, device=device)
-    return Contours(points, points, kind, mask, points, pixels, normals)
+    return Contours(points, points, kind, mask, points, pixels, normals, torch.ones_like(points[..., 0]))
 
 
 def places_of(*lines, device="cpu", dtype=torch.float32):

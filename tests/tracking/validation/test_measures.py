@@ -21,7 +21,16 @@ def contours_at(pixels, normals=(1.0, 0.0), mask=None):
     points = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1)
     mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
     normals = torch.tensor(normals, dtype=torch.float64).expand_as(pixels)
-    return Contours(points, torch.zeros_like(points), torch.full(mask.shape, int(ContourKind.CREASE)), mask, points, pixels, normals)
+    return Contours(
+        points,
+        torch.zeros_like(points),
+        torch.full(mask.shape, int(ContourKind.CREASE)),
+        mask,
+        points,
+        pixels,
+        normals,
+        torch.ones_like(points[..., 0]),
+    )
 
 
 def upright_line(u=80.0, count=80, first=20.0):

@@ -25,9 +25,30 @@ def test_it_is_the_mean_over_observations_on_texture():
     assert texture_agreement(*seen_on(0.7), SETTINGS).tolist() == pytest.approx([0.7])
 
 
-@pytest.mark.parametrize("other", [{"count": MANY - 1}, {"kind": ContourKind.CREASE}, {"kind": ContourKind.LEARNED}, {"offsets": 2.0}])
+@pytest.mark.parametrize("other", [{"count": MANY - 1}, {"offsets": 2.0}])
 def test_too_few_of_them_say_nothing(other):
     assert texture_agreement(*seen_on(0.1, **other), SETTINGS).isnan().all()
+
+
+@pytest.mark.parametrize("kind", sorted(set(ContourKind) - {ContourKind.TEXTURE}))
+def test_those_on_other_contours_say_nothing(kind):
+    assert texture_agreement(*seen_on(0.1, kind=kind), SETTINGS).isnan().all()
+
+
+@pytest.mark.parametrize("resolved", [1.0, 0.5, 0.2])
+def test_the_less_an_edge_is_resolved_the_less_is_asked_of_its_events(resolved):
+    """Where half of what they say is chance, three quarters that agree are as good as all where nothing is."""
+    contours, matches = seen_on(0.5 + 0.5 * resolved, count=int(MANY / resolved**2) + 1)
+    fine = replace(contours, resolved=torch.full_like(contours.resolved, resolved))
+    assert texture_agreement(fine, matches, SETTINGS).tolist() == pytest.approx([1.0])
+    # So they tell less.
+    few = seen_on(0.5 + 0.5 * resolved, count=int(MANY / resolved**2) - 1)[1]
+    assert texture_agreement(fine, few, SETTINGS).isnan().all()
+
+
+def test_what_is_not_resolved_at_all_says_nothing():
+    contours, matches = seen_on(0.1, count=100 * MANY)
+    assert texture_agreement(replace(contours, resolved=torch.zeros_like(contours.resolved)), matches, SETTINGS).isnan().all()
 
 
 def test_what_agrees_elsewhere_makes_up_for_nothing():

@@ -29,6 +29,7 @@ def measure(
     normals: Array,
     mask: Array,
     kind: Array,
+    resolved: Array,
     velocity: Array,
     centre_cam: Array,
     intrinsics: Array,
@@ -47,7 +48,7 @@ def measure(
     """What events say of each pose, point by point.
 
     Args:
-        points_cam, pixels, normals, mask, kind: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``, ``[b, m]``, ``[b, m]``.
+        points_cam, pixels, normals, mask, kind, resolved: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``, and ``[b, m]``.
         velocity: ``[b, 6]``, about ``centre_cam [b, 3]``.
         targets, directions, offsets, is_near, as_expected, contour: of matches: ``[b, 2, n]`` and ``[b, n]``.
         explained, inliers, spread, agreement: ``[b]``, filled: :class:`torchtrack.tracking.validation.measures.FitMeasures`.
@@ -56,7 +57,7 @@ def measure(
     for b in range(len(mask)):
         inliers[b] = _count(targets[b], offsets[b], is_near[b], as_expected[b], settings, counts)
         spread[b] = _normal_spread(directions[b], offsets[b], is_near[b], settings.on_contour_px)
-        agreement[b] = _texture_agreement(kind[b], contour[b], offsets[b], is_near[b], as_expected[b], settings)
+        agreement[b] = _texture_agreement(kind[b], resolved[b], contour[b], offsets[b], is_near[b], as_expected[b], settings)
         motion, of_lens = drift(velocity[b], centre_cam[b]), lens(intrinsics[b])
         total, count = 0, 0
         for i in range(mask.shape[1]):
@@ -106,14 +107,17 @@ def _normal_spread(directions: Array, offsets: Array, is_near: Array, on_contour
 
 
 @kernel()
-def _texture_agreement(kind: Array, contour: Array, offsets: Array, is_near: Array, as_expected: Array, settings: QualitySettings) -> float:
-    """Mean of what observations on texture say of its darker side."""
-    count, total = 0, 0.0
+def _texture_agreement(
+    kind: Array, resolved: Array, contour: Array, offsets: Array, is_near: Array, as_expected: Array, settings: QualitySettings
+) -> float:
+    """What observations on texture say of its darker side."""
+    evidence, total = 0.0, 0.0
     for i in range(len(offsets)):
-        if is_near[i] and abs(offsets[i]) < settings.on_contour_px and kind[contour[i]] == settings.texture:
-            count += 1
-            total += as_expected[i]
-    return total / count if count >= settings.min_observations else np.nan
+        weight = resolved[contour[i]]
+        if is_near[i] and abs(offsets[i]) < settings.on_contour_px and kind[contour[i]] == settings.texture and weight > 0.0:
+            evidence += weight * weight
+            total += weight * (as_expected[i] - 0.5)
+    return 0.5 + total / max(evidence, 1e-6) if evidence >= settings.min_observations else np.nan
 
 
 @kernel(fastmath=FAST)
@@ -218,7 +222,8 @@ def fit_measures_numba(
 ) -> measures.FitMeasures:
     """Point by point."""
     measured = measures.FitMeasures(*contours.pixels.new_empty(4, len(contours.mask)))
-    shown = *(values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals)), contours.mask, contours.kind
+    places = (values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals))
+    shown = *places, contours.mask, contours.kind, contours.resolved
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
     sides = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2))
     matched = *sides, *as_arrays(matches.offsets, matches.near, matches.as_expected, matches.contour)

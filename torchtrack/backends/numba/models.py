@@ -40,6 +40,6 @@ def arrays_of(model: ContourModel) -> ModelArrays:
 
 def _made(model: ContourModel) -> ModelArrays:
     of_edges = model.edge_ends, model.face_normals.movedim(0, -1), model.face_offsets.T, model.is_crease, model.is_segment, model.edges
-    sampled = as_arrays(*of_edges, model.texture_points, model.texture_tangents, model.texture_normals)
+    sampled = as_arrays(*of_edges, model.texture_points, model.texture_tangents, model.texture_normals, model.texture_gaps_m)
     members, triangles, normals, surface = as_arrays(model.members, model.triangles, model.triangle_normals, model.surface_points.T)
     return ModelArrays(members, tuple(sampled), (triangles, normals), surface)

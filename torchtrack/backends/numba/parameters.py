@@ -181,6 +181,7 @@ class SamplingSettings(NamedTuple):
         max_edge_points: points on edges, at most.
         spacing_px: points are no closer than this in the image.
         texture: number of that kind.
+        resolved_px: edges of it so far from opposite ones are resolved in full.
         least_cosine: texture seen at a smaller one is left out.
         least_depth_m: what is nearer is not seen.
     """
@@ -189,6 +190,7 @@ class SamplingSettings(NamedTuple):
     max_edge_points: int
     spacing_px: float
     texture: int
+    resolved_px: float
     least_cosine: float
     least_depth_m: float
 

@@ -100,4 +100,5 @@ def assemble_numba(
     rows, tangents = points_obj.transpose(1, 2), tangents_obj.transpose(1, 2)
     points_cam, pixels, normals, is_shown = rows.new_empty(rows.shape), *rows.new_empty(2, len(mask), 2, mask.shape[1]), torch.empty_like(mask)
     show(*as_arrays(rows, tangents, mask, T_cam_obj, intrinsics), SHOWING, *as_arrays(points_cam, pixels, normals, is_shown))
-    return Contours(points_obj, tangents_obj, kind, is_shown, *(value.transpose(1, 2) for value in (points_cam, pixels, normals)))
+    points_cam, pixels, normals = (value.transpose(1, 2) for value in (points_cam, pixels, normals))
+    return Contours(points_obj, tangents_obj, kind, is_shown, points_cam, pixels, normals, torch.ones_like(mask, dtype=points_obj.dtype))

@@ -15,12 +15,12 @@ from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.dispatch import accelerates
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
-from torchtrack.tracking.contours.sampling import MAX_ACTIVE_EDGES, MIN_TEXTURE_COSINE, SPACING_PX, mesh_points
+from torchtrack.tracking.contours.sampling import MAX_ACTIVE_EDGES, MIN_TEXTURE_COSINE, RESOLVED_PX, SPACING_PX, mesh_points
 
 # Rows of a model's table of edges, and of the points sampled on them.
 _START, _VECTOR, _DIRECTION, _TURNING, _KIND = 0, 3, 6, 9, 12
-_POINT, _TANGENT = 0, 3
-_SAMPLED = 6
+_POINT, _TANGENT, _RESOLVED = 0, 3, 6
+_SAMPLED = 7
 
 
 @kernel(fastmath=FAST)
@@ -35,6 +35,7 @@ def sample(
     texture_points: Array,
     texture_tangents: Array,
     texture_normals: Array,
+    texture_gaps_m: Array,
     texture_spacing_m: float,
     T_cam_obj: Array,
     intrinsics: Array,
@@ -61,7 +62,7 @@ def sample(
         total = _measure(active, used, edge_ends, pose, of_lens, settings, length, depths)
         count = _sample_edges(active, used, edges, camera_obj, length, depths, total, settings, sampled[b], kind[b])
         counts[b] = count + _sample_texture(
-            count, texture_points, texture_tangents, texture_normals, texture_spacing_m, pose, of_lens, settings, sampled[b], kind[b]
+            count, texture_points, texture_tangents, texture_normals, texture_gaps_m, texture_spacing_m, pose, of_lens, settings, sampled[b], kind[b]
         )
 
 
@@ -155,6 +156,7 @@ def _sample_edges(
         sign = 1.0 if side > 0 else -1.0
         for k in range(3):
             sampled[_TANGENT + k, i] = sign * edges[_DIRECTION + k, e]
+        sampled[_RESOLVED, i] = 1.0
         kind[i] = int(edges[_KIND, e])
     return count
 
@@ -165,6 +167,7 @@ def _sample_texture(
     points: Array,
     tangents: Array,
     normals: Array,
+    gaps_m: Array,
     spacing_m: float,
     pose: Numbers,
     intrinsics: Numbers,
@@ -184,21 +187,33 @@ def _sample_texture(
     for i in range(0, len(points), every):
         x, y, z = placed(pose, points[i, 0], points[i, 1], points[i, 2])
         nx, ny, nz = turned(pose, normals[i, 0], normals[i, 1], normals[i, 2])
-        if nx * x + ny * y + nz * z < -settings.least_cosine * np.sqrt(x * x + y * y + z * z):
+        towards = -(nx * x + ny * y + nz * z)
+        if towards > settings.least_cosine * np.sqrt(x * x + y * y + z * z):
             for k in range(3):
                 sampled[_POINT + k, at], sampled[_TANGENT + k, at] = points[i, k], tangents[i, k]
-            kind[at] = settings.texture
+            tangent, place = turned(pose, tangents[i, 0], tangents[i, 1], tangents[i, 2]), (x, y, z)
+            gap_px = gaps_m[i] * _px_per_m_across(place, tangent, towards, intrinsics)
+            kind[at], sampled[_RESOLVED, at] = settings.texture, min(gap_px / settings.resolved_px, 1.0)
             at += 1
     return at - first
 
 
 @kernel(fastmath=FAST)
-def gather(sampled: Array, kind: Array, counts: Array, points_obj: Array, tangents_obj: Array, kinds: Array, mask: Array) -> None:
+def _px_per_m_across(place: Numbers, tangent: Numbers, towards: float, intrinsics: Numbers) -> float:
+    """:func:`torchtrack.tracking.contours.sampling.px_per_m_across`, of a point whose normal times its place is ``-towards``."""
+    per_depth, fx, fy = inverse_depth(place[2]), intrinsics[0], intrinsics[1]
+    u, v = fx * (tangent[0] - place[0] * per_depth * tangent[2]), fy * (tangent[1] - place[1] * per_depth * tangent[2])
+    return fx * fy * towards * per_depth * per_depth / np.sqrt(max(u * u + v * v, 1e-18))
+
+
+@kernel(fastmath=FAST)
+def gather(sampled: Array, kind: Array, counts: Array, points_obj: Array, tangents_obj: Array, kinds: Array, mask: Array, resolved: Array) -> None:
     """Lay out what was sampled in as many places as needed: ``[b, 3, m]`` and ``[b, m]``; zero where there is nothing."""
     for b in range(len(counts)):
         for i in range(mask.shape[1]):
             exists = i < counts[b]
             mask[b, i], kinds[b, i] = exists, kind[b, i] if exists else 0
+            resolved[b, i] = sampled[b, _RESOLVED, i] if exists else 0.0
             for k in range(3):
                 points_obj[b, k, i] = sampled[b, _POINT + k, i] if exists else 0.0
                 tangents_obj[b, k, i] = sampled[b, _TANGENT + k, i] if exists else 0.0
@@ -211,6 +226,7 @@ def sampling_settings(config: ContourConfig) -> SamplingSettings:
         max_edge_points=config.max_edge_points,
         spacing_px=SPACING_PX,
         texture=int(ContourKind.TEXTURE),
+        resolved_px=RESOLVED_PX,
         least_cosine=MIN_TEXTURE_COSINE,
         least_depth_m=MIN_DEPTH_M,
     )
@@ -231,5 +247,6 @@ def mesh_points_numba(models: Sequence[ContourModel], T_cam_obj: Tensor, intrins
     width = max(int(counts.max()), 1)
     points_obj, tangents_obj = T_cam_obj.new_empty(2, batch, 3, width)
     kinds, mask = torch.empty(batch, width, dtype=torch.int64), torch.empty(batch, width, dtype=torch.bool)
-    gather(sampled, kind, counts, *as_arrays(points_obj, tangents_obj, kinds, mask))
-    return points_obj.transpose(1, 2), tangents_obj.transpose(1, 2), kinds, mask
+    resolved = T_cam_obj.new_empty(batch, width)
+    gather(sampled, kind, counts, *as_arrays(points_obj, tangents_obj, kinds, mask, resolved))
+    return points_obj.transpose(1, 2), tangents_obj.transpose(1, 2), kinds, mask, resolved

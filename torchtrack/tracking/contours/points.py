@@ -29,6 +29,7 @@ class Contours:
         points_cam: the points in the camera's frame (m).
         pixels: ideal pixels.
         normals: unit normals of the projected contour.
+        resolved: how far an event there tells which side is the darker one, 0 to 1: less where an edge of the opposite contrast is close.
     """
 
     points_obj: Float[Tensor, "b m 3"]
@@ -38,6 +39,7 @@ class Contours:
     points_cam: Float[Tensor, "b m 3"]
     pixels: Float[Tensor, "b m 2"]
     normals: Float[Tensor, "b m 2"]
+    resolved: Float[Tensor, "b m"]
 
     def of_object(self, number: int) -> "Contours":
         """Those of one object."""
@@ -100,9 +102,10 @@ def assemble(
     T_cam_obj: Float[Tensor, "b 4 4"],
     intrinsics: Float[Tensor, "b 4"],
 ) -> Contours:
-    """Contours from points in the object's frame; those behind the camera or without a normal are masked."""
+    """Contours from points in the object's frame, apart from one another; those behind the camera or without a normal are masked."""
     points_cam = transform_points(T_cam_obj, points_obj)
     tangents_cam = affine(T_cam_obj[:, :3, :3], tangents_obj.transpose(1, 2)).transpose(1, 2)
     normals, has_normal = image_normals(points_cam, tangents_cam, intrinsics)
     mask = mask & has_normal & (points_cam[..., 2] > MIN_DEPTH_M)
-    return Contours(points_obj, tangents_obj, kind, mask, points_cam, project(points_cam, intrinsics), normals)
+    resolved = torch.ones_like(points_obj[..., 0])
+    return Contours(points_obj, tangents_obj, kind, mask, points_cam, project(points_cam, intrinsics), normals, resolved)

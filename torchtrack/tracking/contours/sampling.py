@@ -5,6 +5,7 @@ image. Objects that share a model are handled as one batch.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,7 +15,7 @@ from torchtrack.config.tracker import ContourConfig
 from torchtrack.core import host_sync
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.dispatch import accelerable
-from torchtrack.core.lie import transform_points
+from torchtrack.core.lie import affine, transform_points
 from torchtrack.core.padded import select_ranked
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.tracking.contours.points import Contours, assemble, widened
@@ -31,9 +32,13 @@ MAX_ACTIVE_EDGES = 8192
 
 # Texture seen at a grazing angle (cosine below this) is foreshortened beyond use. What fires and is left out draws what is beside it.
 MIN_TEXTURE_COSINE = 0.02
+# Edges of texture are resolved in full where the next one of the opposite contrast is so far away in the image (px). Of 38,000 events on the print of
+# a book at right poses, 57 % agreed on its darker side where that was less than 0.4 px away, 64 % up to 0.6, 68 % up to 0.8, 80 % up to 1, 91 % up
+# to 1.2, and 95 % beyond.
+RESOLVED_PX = 1.2
 
 
-# Points and tangents (object frame), kinds and mask.
+# Points and tangents (object frame), kinds, mask, and how far they are resolved.
 _Points = tuple[Tensor, ...]
 
 
@@ -44,8 +49,8 @@ def mesh_contours(
     config: ContourConfig,
 ) -> Contours:
     """Contours of each object at its pose, hidden parts included."""
-    points, tangents, kind, mask = mesh_points(models, T_cam_obj, intrinsics, config)
-    return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics)
+    points, tangents, kind, mask, resolved = mesh_points(models, T_cam_obj, intrinsics, config)
+    return replace(assemble(points, tangents, kind, mask, T_cam_obj, intrinsics), resolved=resolved)
 
 
 @accelerable
@@ -54,7 +59,7 @@ def mesh_points(models: Sequence[ContourModel], T_cam_obj: Tensor, intrinsics: T
     if len(models) == 1:
         return _model_contours(models[0], T_cam_obj, intrinsics, config)
     parts = [_model_contours(model, T_cam_obj[model.members], intrinsics[model.members], config) for model in models]
-    width = max(mask.shape[1] for _, _, _, mask in parts)
+    width = max(mask.shape[1] for _, _, _, mask, _ in parts)
     order = torch.cat([model.members for model in models]).argsort()
     return tuple(torch.cat([widened(value, width) for value in column])[order] for column in zip(*parts, strict=True))
 
@@ -87,7 +92,7 @@ def _edge_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, con
     # The normal in the image is to point out of the object: tangents turn with it on their right.
     side = (turning * (points - camera_obj)).sum(1, keepdim=True)
     tangents = torch.where(side > 0, direction, -direction)
-    return points.transpose(1, 2), tangents.transpose(1, 2), kind[:, 0].long(), number < counts
+    return points.transpose(1, 2), tangents.transpose(1, 2), kind[:, 0].long(), number < counts, torch.ones_like(along)
 
 
 def _places_for(active: Bool[Tensor, "b e"]) -> int:
@@ -124,8 +129,20 @@ def _texture_points(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor) 
     # On a GPU, which would have to be waited for to know how many there are, there are places for as many as there can be.
     count = int(facing.sum(1).amax()) if host_sync.read_at_once(facing) else model.most_texture_facing
     chosen, mask = select_ranked(facing, count)
-    points, tangents = (values.T[:, chosen].permute(1, 2, 0) for values in (model.texture_points, model.texture_tangents))
-    return points, tangents, torch.full_like(chosen, int(ContourKind.TEXTURE)), mask
+    of_model = model.texture_points, model.texture_tangents, model.texture_normals
+    points, tangents, normals = (values.T[:, chosen].permute(1, 2, 0) for values in of_model)
+    gap_px = model.texture_gaps_m[chosen] * px_per_m_across(points, tangents, normals, T_cam_obj, intrinsics).detach()
+    return points, tangents, torch.full_like(chosen, int(ContourKind.TEXTURE)), mask, (gap_px / RESOLVED_PX).clamp(max=1)
+
+
+def px_per_m_across(points: Tensor, tangents: Tensor, normals: Tensor, T_cam_obj: Tensor, intrinsics: Tensor) -> Float[Tensor, "b m"]:
+    """Distance in the image across an edge, of lines beside it on the surface, over their distance there: the area shown over the length shown."""
+    x, y, z = transform_points(T_cam_obj, points).unbind(-1)
+    (tx, ty, tz), (nx, ny, nz) = (affine(T_cam_obj[:, :3, :3], way.transpose(1, 2)).unbind(1) for way in (tangents, normals))
+    (fx, fy), inverse_z = intrinsics[:, :2, None].unbind(1), 1 / z.clamp(min=MIN_DEPTH_M)
+    area = fx * fy * (nx * x + ny * y + nz * z).abs() * inverse_z.square()
+    u, v = fx * (tx - x * inverse_z * tz), fy * (ty - y * inverse_z * tz)
+    return area / (u * u + v * v).clamp(min=1e-18).sqrt()
 
 
 def _model_contours(model: ContourModel, T_cam_obj: Tensor, intrinsics: Tensor, config: ContourConfig) -> _Points:
@@ -144,4 +161,4 @@ def _no_points(T_cam_obj: Tensor) -> _Points:
     """One place of contours, and nothing there: what selects from contours needs a place to point at."""
     nowhere = T_cam_obj.new_zeros(len(T_cam_obj), 1, 3)
     nothing = torch.zeros(len(T_cam_obj), 1, dtype=torch.int64, device=T_cam_obj.device)
-    return nowhere, nowhere, nothing, nothing.bool()
+    return nowhere, nowhere, nothing, nothing.bool(), nowhere[..., 0]

@@ -56,11 +56,11 @@ def nearest_view(T_cam_obj: Float[Tensor, "n 4 4"], centre_obj: Float[Tensor, "#
 def thinned(contours: Contours) -> Contours:
     """Of each object's contour points as many as an outline has."""
     chosen, exists = select_ranked(contours.mask, _POINTS)
-    kind = contours.kind.gather(1, chosen)
+    kind, resolved = contours.kind.gather(1, chosen), contours.resolved.gather(1, chosen)
     points_obj, tangents_obj, points_cam, pixels, normals = (
         take_points(values, chosen) for values in (contours.points_obj, contours.tangents_obj, contours.points_cam, contours.pixels, contours.normals)
     )
-    return Contours(points_obj, tangents_obj, kind, exists, points_cam, pixels, normals)
+    return Contours(points_obj, tangents_obj, kind, exists, points_cam, pixels, normals, resolved)
 
 
 def outlines_at(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], config: TrackerConfig) -> Contours:

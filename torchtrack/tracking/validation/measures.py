@@ -106,10 +106,14 @@ def texture_agreement(contours: Contours, matches: Matches, config: ValidationCo
     """How far the observations on an object's texture agree on which side of it is the darker one; not a number where they are too few to tell.
 
     On the right pose nearly all do, on another as many say this as that. Dense print explains much of the events at many poses, and no measure of
-    how much tells these apart.
+    how much tells these apart. Where edges are hardly resolved, half of the events agree on the right pose, too: so it is what observations say above
+    a half, by least squares over how far their edges are resolved.
     """
-    on_texture = (contours.kind == int(ContourKind.TEXTURE)).gather(1, matches.contour)
-    return _mean_where(on_texture & matches.near & (matches.offsets.abs() < ON_CONTOUR_PX), matches.as_expected, config)
+    on_texture = ((contours.kind == int(ContourKind.TEXTURE)) * contours.resolved).gather(1, matches.contour)
+    weights = torch.where(matches.near & (matches.offsets.abs() < ON_CONTOUR_PX), on_texture, 0)
+    evidence = weights.square().sum(-1)
+    agreement = 0.5 + torch.where(weights > 0, weights * (matches.as_expected - 0.5), 0).sum(-1) / evidence.clamp(min=1e-6)
+    return torch.where(evidence < config.min_observations, torch.nan, agreement)
 
 
 def _mean_where(counts: Bool[Tensor, "b n"], values: Float[Tensor, "b n"], config: ValidationConfig) -> Float[Tensor, "b"]:
