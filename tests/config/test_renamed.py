@@ -6,9 +6,9 @@ import pytest
 
 from torchtrack.config.components import Component
 from torchtrack.config.explain import dotted_keys
-from torchtrack.config.fixed import FIXED, SWITCHES, fixed
+from torchtrack.config.fixed import FIXED, SWITCHES
 from torchtrack.config.load import load
-from torchtrack.config.renamed import KEYS, REMOVED, SECTIONS
+from torchtrack.config.renamed import KEYS, REMOVED, SECTIONS, no_setting
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.errors import ConfigError
 
@@ -20,6 +20,7 @@ from torchtrack.errors import ConfigError
         ("search.hypotheses", "search.*: renamed to 'relocalization'$"),
         ("relocalization.margin", "relocalization.margin .*: renamed to 'relocalization.accept_margin'$"),
         ("relocalization.doubt_us", "renamed to 'relocalization.drift_us', which is a component now: 'disabled: .drift.' switches it off"),
+        ("relocalization.stands_from", "renamed to 'relocalization.held_from', which is removed, leave it out: what drifts is looked for farther"),
         ("quality.certain_at", "quality.*: renamed to 'validation', 'certain_at' is fixed at 0.75 now"),
         ("matching.min_observations", "matching.*: renamed to 'association'$"),
     ],
@@ -33,7 +34,7 @@ def test_all_the_names_that_settings_have_now_are_settings():
     known = set(dotted_keys(TrackerConfig))
     for section, keys in KEYS.items():
         now = {(SECTIONS.get(section, section), key) for key in keys.values()}
-        assert {".".join(place) for place in now if fixed(place) is None} <= known
+        assert {".".join(place) for place in now if no_setting(place) is None} <= known
         assert not known & {f"{section}.{key}" for key in keys}
 
 

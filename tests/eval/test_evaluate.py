@@ -349,9 +349,9 @@ def test_methods_are_joined_in_the_order_of_their_names():
 
 def test_methods_that_are_joined_leave_out_what_each_of_them_does():
     each = {name: {"preset": "causal", "tracker": {"disabled": [name]}} for name in ("line_ends", "drift")}
-    both = {"joins": [*each], "tracker": {"disabled": ["held"]}}
+    both = {"joins": [*each], "tracker": {"disabled": ["around_last_seen"]}}
     methods = EvaluateConfig.model_validate({"methods": {"both": both, **each}}).methods
-    assert methods["both"].tracker.disabled == {"line_ends", "drift", "held"}
+    assert methods["both"].tracker.disabled == {"line_ends", "drift", "around_last_seen"}
     assert methods["drift"].tracker.disabled == {"drift"}
 
 

@@ -16,7 +16,6 @@ SEEN_WELL = {
     "score": 0.9,
     "last_score": 0.9,
     "mean_score": 0.9,
-    "matches": 200,
     "reference_explained_ratio": 0.9,
     "drift_s": 0.0,
     "time_since_validated_s": 0.0,

@@ -29,7 +29,6 @@ class Component(StrEnum):
     LOW_SCORE = "low_score"
     SCORE_DROP = "score_drop"
     DRIFT = "drift"
-    HELD = "held"
     AROUND_LAST_SEEN = "around_last_seen"
     UNCONFIRMED = "unconfirmed"
     # how they are compared

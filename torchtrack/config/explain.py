@@ -7,8 +7,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from torchtrack.config.fixed import fixed
-from torchtrack.config.renamed import removed, renamed
+from torchtrack.config.renamed import no_setting, renamed
 
 Location = tuple[int | str, ...]
 # What was got may be a whole file in the wrong place.
@@ -34,10 +33,8 @@ def _reason(details: ErrorDetails, settings: type[BaseModel]) -> str:
     if details["type"] == "extra_forbidden":
         if now := renamed(details["loc"], details["input"]):
             return f"renamed to {now}"
-        if what := fixed(details["loc"]):
+        if what := no_setting(details["loc"]):
             return what
-        if why := removed(details["loc"]):
-            return f"removed, leave it out: {why}"
         return f"unknown setting{_suggestion(details['loc'], settings)}"
     if details["type"] == "missing":
         return f"missing: {_description(details['loc'], settings)}"

@@ -91,7 +91,6 @@ SWITCHES: dict[str, dict[str, Component]] = {
         "line_ends": Component.LINE_ENDS,
         "by_inlier_ratio": Component.INLIER_RATIO,
         "drift_us": Component.DRIFT,
-        "held_from": Component.HELD,
     },
 }
 

@@ -22,6 +22,9 @@ KEYS = {
         "doubt_us": "drift_us",
         "strayed_to": "slow_drift_below",
         "stands_from": "held_from",
+        "by_events": "by_matches",
+        "unseen_us": "last_seen_us",
+        "probation": "tentative",
         "adrift_share": "drift_min_ratio",
         "slip_margin": "elsewhere_margin",
         "slip_share": "accept_ratio",
@@ -76,11 +79,9 @@ REMOVED: dict[str, dict[str, str]] = {
         "realignments": "every pose is aligned once",
         "at_start": "what starts is searched for as any other object",
         "by_matches": "poses are compared by what they explain, however many events that are",
-        "by_events": "poses are compared by what they explain, however many events that are",
         "last_seen_us": "what was not seen well for long is looked for all around where it was then",
-        "unseen_us": "what was not seen well for long is looked for all around where it was then",
+        "held_from": "what drifts is looked for farther away, however much it explains where it is",
         "tentative": "what a search gives is UNCERTAIN until windows enough confirm it",
-        "probation": "what a search gives is UNCERTAIN until windows enough confirm it",
     },
     "validation": {
         "holds_on": "a pose that goes on from the one before is asked for as much as any other",
@@ -88,14 +89,11 @@ REMOVED: dict[str, dict[str, str]] = {
 }
 
 
-def removed(location: tuple[int | str, ...]) -> str | None:
-    """Why a setting at a place that is not known was removed; None where there never was one.
-
-    Args:
-        location: its keys, from the outermost.
-    """
+def _removed(location: tuple[int | str, ...]) -> str | None:
+    """That a setting at a place that is not known was removed, and why; None where there never was one."""
     *before, name = location
-    return REMOVED.get(str(before[-1]), {}).get(str(name)) if before else None
+    why = REMOVED.get(str(before[-1]), {}).get(str(name)) if before else None
+    return why and f"removed, leave it out: {why}"
 
 
 def renamed(location: tuple[int | str, ...], value: Any) -> str | None:
@@ -109,12 +107,21 @@ def renamed(location: tuple[int | str, ...], value: Any) -> str | None:
     if name in SECTIONS:
         place, inner = (*before, SECTIONS[str(name)]), KEYS[str(name)]
         keys = list(map(str, value)) if isinstance(value, Mapping) else []
-        now = {key: fixed((*place, inner.get(key, key))) or (f"now '{inner[key]}'" if key in inner else None) for key in keys}
+        now = {key: no_setting((*place, inner.get(key, key))) or (f"now '{inner[key]}'" if key in inner else None) for key in keys}
         return ", ".join([f"'{'.'.join(map(str, place))}'", *(f"'{key}' is {what}" for key, what in now.items() if what)])
     section = str(before[-1]) if before else ""
     for old, new in (*SECTIONS.items(), *((section, section) for section in KEYS if section not in SECTIONS)):
         if section == new and name in KEYS[old]:
             place = (*before, KEYS[old][str(name)])
-            what = fixed(place)
+            what = no_setting(place)
             return f"'{'.'.join(map(str, place))}'" + (f", which is {what}" if what else "")
     return None
+
+
+def no_setting(location: tuple[int | str, ...]) -> str | None:
+    """What became of a setting that is none now; None where there never was one, or it has another name.
+
+    Args:
+        location: its keys, from the outermost.
+    """
+    return fixed(location) or _removed(location)

@@ -145,7 +145,7 @@ def test_what_is_where_it_is_predicted_gives_way_to_what_is_better_by_the_margin
 
 
 def test_what_drifts_has_to_explain_about_as_much_as_usual_far_away():
-    given = evidence(is_drift_due=True, drift_s=0.2, matches=10)
+    given = evidence(is_drift_due=True, drift_s=0.2)
     torch.testing.assert_close(asked_by(acceptance.near_prediction, given)[0], torch.tensor([0.1, 0.65 * 0.9, 0.0, 0.0]))
 
 

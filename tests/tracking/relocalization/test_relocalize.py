@@ -16,7 +16,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
 from torchtrack.tracking.relocalization import refine
-from torchtrack.tracking.relocalization.hypotheses import around_prediction, around_prediction_released, sampled_around
+from torchtrack.tracking.relocalization.hypotheses import around_prediction, sampled_around
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
 from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger, triggered
@@ -40,12 +40,6 @@ def test_every_trigger_but_lost_calls_for_a_source(trigger):
 
 def test_without_triggers_or_lost_alone_nothing_is_called_for():
     assert not any(source.is_called_for(flags) for source in SOURCES for flags in (NONE, Trigger.LOST))
-
-
-def test_what_is_held_is_looked_for_as_if_its_score_had_dropped_and_not_far_away():
-    proposed = [source.propose for source in SOURCES if source.is_called_for(Trigger.DRIFT | Trigger.HELD)]
-    assert proposed == [around_prediction_released]
-    assert [source.propose for source in SOURCES if source.is_called_for(Trigger.DRIFT)] == [around_prediction]
 
 
 def test_what_is_called_for_around_the_last_place_comes_last():
@@ -101,7 +95,7 @@ def test_sources_are_tried_in_order_and_each_on_what_those_before_gave():
 
 def test_what_had_drifted_and_is_relocalized_is_as_uncertain_as_that_made_it():
     lost, seen, _ = displaced_and_lost()
-    drifts = evidence(is_drift_due=True, drift_s=0.2, sigma_px=8.0, matches=10, reference_explained_ratio=0.5)
+    drifts = evidence(is_drift_due=True, drift_s=0.2, sigma_px=8.0, reference_explained_ratio=0.5)
     after = looped(lost, seen, drifts)
     assert after.scored.is_relocalized.tolist() == [True]
     assert float(after.prediction.covariance[0, 3, 3]) > float(lost.window.prediction.covariance[0, 3, 3])

@@ -59,7 +59,7 @@ ALONE = {
     Trigger.NEW: {"is_due": True, "reference_explained_ratio": 0.5, "score": 0.8, "last_score": 0.8, "mean_score": 0.8},
     Trigger.LOW_SCORE: {"score": 0.71, "last_score": 0.71},
     Trigger.SCORE_DROP: {"score": 0.62},
-    Trigger.DRIFT: {"is_drift_due": True, "drift_s": 0.051, "sigma_px": 3.9, "matches": 10},
+    Trigger.DRIFT: {"is_drift_due": True, "drift_s": 0.051},
     Trigger.SLOW_DRIFT: {"is_drift_due": True, "time_since_validated_s": 0.051, "last_score": 0.7},
     Trigger.LOST: {"triggers": int(Trigger.LOST)},
     Trigger.DEPTH_CHANGED: {"triggers": int(Trigger.DEPTH_CHANGED)},
@@ -72,15 +72,6 @@ ALONE = {
 def test_each_condition_alone_sets_its_bit_and_its_neighbour_has_none(trigger):
     changes = {name: [value, SEEN_WELL[name]] for name, value in ALONE[trigger].items()}
     assert flags_of(evidence(2, **changes)) == [trigger, NONE]
-
-
-def test_what_hangs_on_other_triggers_is_set_beside_them():
-    drifts = {"is_drift_due": True, "drift_s": 0.051}
-    assert flags_of(evidence(**drifts)) == [Trigger.DRIFT | Trigger.HELD]
-
-
-def test_every_trigger_but_those_that_hang_on_others_is_set_alone_here():
-    assert set(Trigger) - set(ALONE) == {Trigger.HELD}
 
 
 def test_what_is_seen_well_has_no_trigger_whatever_it_is_time_for():
@@ -183,17 +174,6 @@ def test_what_is_sure_of_its_place_and_was_not_seen_well_for_long_may_drift_slow
     # What drifts at once does not drift slowly, nor does what only starts.
     for other in ({"drift_s": torch.full((6,), 0.1)}, {"is_starting": torch.ones(6, dtype=torch.bool)}):
         assert not any(having(Trigger.SLOW_DRIFT, replace(given, **other), **settings))
-
-
-def test_what_drifts_but_explains_enough_by_many_events_is_held():
-    drifts = {"is_drift_due": True, "drift_s": 0.2, "last_score": 0.3, "reference_explained_ratio": 0.8}
-    # Of 0.8 that it explains when seen well, a quarter; four times the least number of events.
-    given = evidence(5, score=[0.21, 0.19, 0.21, 0.21, 0.21], matches=[120, 120, 119, 120, 120], sigma_px=[1.0] * 3 + [6.5, 1.0], **drifts)
-    given = replace(given, is_starting=torch.tensor([False] * 4 + [True]))
-    assert having(Trigger.HELD, given) == [True] + [False] * 4
-    assert not any(having(Trigger.HELD, given, Component.HELD))
-    slowly = evidence(is_drift_due=True, time_since_validated_s=0.2, last_score=0.3)
-    assert having(Trigger.SLOW_DRIFT, slowly) == [True] and having(Trigger.HELD, slowly) == [False]
 
 
 def test_of_those_whose_place_is_not_known_events_need_not_gather():

@@ -35,7 +35,6 @@ class TriggerEvidence:
         sigma_px: standard deviation of each object's prediction in the image (px).
         score: of the fit; ``last_score`` is that of the window before: a single window that is a little worse is no reason.
         mean_score: as a rule.
-        matches: matched observations of the fit.
         reference_explained_ratio: what the object explains when it is seen well.
         drift_s: for how long it has explained too little by smeared events (s).
         time_since_validated_s: how long ago it was last seen well (s).
@@ -51,7 +50,6 @@ class TriggerEvidence:
     score: Float[Tensor, "b"]
     last_score: Float[Tensor, "b"]
     mean_score: Float[Tensor, "b"]
-    matches: Int[Tensor, "b"]
     reference_explained_ratio: Float[Tensor, "b"]
     drift_s: Float[Tensor, "b"]
     time_since_validated_s: Float[Tensor, "b"]
@@ -82,7 +80,6 @@ def gather_evidence(
         score=scored.score,
         last_score=state.health.score,
         mean_score=state.health.mean_score,
-        matches=scored.count,
         reference_explained_ratio=state.health.reference_explained_ratio,
         drift_s=state.health.drift_s,
         time_since_validated_s=state.health.time_since_validated_s,

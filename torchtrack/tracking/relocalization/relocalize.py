@@ -41,7 +41,7 @@ def relocalize(
     """
     triggers = evidence.triggers
     tests = [source.test(evidence, window.scored, config) for source in sources]
-    drifts = has(triggers, DRIFTS) & ~has(triggers, Trigger.HELD)
+    drifts = has(triggers, DRIFTS)
     drift_s = torch.where(has(triggers, Trigger.SLOW_DRIFT), evidence.time_since_validated_s, evidence.drift_s)
     widened = with_drift(window.prediction, drifts, drift_s)
     sigma_px = torch.where(drifts, widened.sigma_px(window.scored.fit.contours).detach(), evidence.sigma_px)

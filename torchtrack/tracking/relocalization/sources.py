@@ -9,7 +9,7 @@ from torchtrack.tracking.relocalization.acceptance import Acceptance
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.lost_object import LostObject
-from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, Trigger
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 
 
@@ -21,24 +21,21 @@ class Source:
         triggers: any of which calls for them.
         propose: the hypotheses of an object.
         test: what is asked of them, of each object, before any are tried.
-        unless: a trigger that calls for others in their place.
         comes_last: whether they are tried once all others were, and what these gave is settled.
     """
 
     triggers: Trigger
     propose: Callable[[LostObject], Hypotheses]
     test: Callable[[TriggerEvidence, ScoredFit, TrackerConfig], Acceptance]
-    unless: Trigger = NONE
     comes_last: bool = False
 
     def is_called_for(self, flags: int) -> bool:
         """Whether an object with these triggers is to be tried there."""
-        return bool(flags & self.triggers) and not flags & self.unless
+        return bool(flags & self.triggers)
 
 
 SOURCES = (
-    Source(Trigger.HELD, hypotheses.around_prediction_released, acceptance.near_prediction),
-    Source(AROUND_PREDICTION, hypotheses.around_prediction, acceptance.near_prediction, unless=Trigger.HELD),
+    Source(AROUND_PREDICTION, hypotheses.around_prediction, acceptance.near_prediction),
     Source(Trigger.SCORE_DROP, hypotheses.around_prediction_released, acceptance.elsewhere),
     Source(AROUND_LAST_SEEN, hypotheses.around_last_seen, acceptance.around_last_seen, comes_last=True),
     Source(Trigger.UNCONFIRMED, rivals.turned_far, rivals.explains_far_more, comes_last=True),

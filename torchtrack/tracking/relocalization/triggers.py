@@ -28,9 +28,6 @@ LOW_SCORE_BELOW, SCORE_DROP_BELOW = 0.8, 0.7
 # An object whose prediction has a smaller standard deviation in the image is sure of its place; after a drop of its score, others are drawn with
 # this one (px).
 SCORE_DROP_SIGMA_PX = 6.0
-# What drifts but explains this share of what it does when seen well is looked for near its place alone. With that, and line ends, 12.8 instead of
-# 22.7 % of the windows of 14 scenes with a bar were lost, which were simulated after both were chosen.
-HELD_FROM = 0.25
 # An object is new while what it explains when seen well, which rises with every window, is below this ratio of what it explains.
 _NEW = 0.9
 
@@ -44,7 +41,6 @@ class Trigger(IntFlag):
     SCORE_DROP = auto()
     DRIFT = auto()
     SLOW_DRIFT = auto()
-    HELD = auto()
     DEPTH_CHANGED = auto()
     FAR_BELOW_REFERENCE = auto()
     LOST = auto()
@@ -114,18 +110,6 @@ def is_drifting_slowly(evidence: TriggerEvidence, config: TrackerConfig) -> Bool
     return ~other & (due & low & long & (evidence.sigma_px < SCORE_DROP_SIGMA_PX))
 
 
-def is_held(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """HELD: objects that drift, and yet are sure of their place and explain enough there: they are looked for near it alone.
-
-    Where something passes before an object, its edges smear the events around it, and what is laid along them explains more.
-    """
-    if none_of(evidence.triggers):
-        return torch.zeros_like(evidence.is_due)
-    drifts = has(evidence.triggers, Trigger.DRIFT)
-    explains = evidence.score >= HELD_FROM * evidence.reference_explained_ratio
-    return drifts & _is_sure(evidence) & explains & (evidence.matches >= Limits.from_config(config).many) & config.uses(Component.HELD)
-
-
 def is_uncertain(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """UNCERTAIN: objects whose prediction is not certain; of those where it is very uncertain, when it is time."""
     return _is_near_or_due(evidence, config) & (evidence.sigma_px > config.relocalization.trigger_sigma_px)
@@ -184,7 +168,6 @@ _CONDITIONS: tuple[dict[int, Condition], ...] = (
         int(Trigger.NEW): is_new,
         int(Trigger.LOW_SCORE): is_scored_low,
         int(Trigger.SCORE_DROP): has_score_dropped,
-        int(Trigger.HELD): is_held,
         int(Trigger.UNCONFIRMED): is_unconfirmed,
     },
 )
