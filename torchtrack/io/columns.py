@@ -1,7 +1,8 @@
 """Events as plain numpy arrays: what decoders give, before it is checked and becomes an :class:`EventBatch`."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -72,3 +73,19 @@ def join(parts: Iterable[Columns]) -> Columns:
     if len(parts) == 1:
         return parts[0]
     return Columns(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("t_us", "x", "y", "polarity")))
+
+
+def parted(pieces: list[Columns], t_us: int) -> tuple[list[Columns], list[Columns]]:
+    """Sorted pieces before ``t_us``, and from then on."""
+    number = next((number for number, piece in enumerate(pieces) if piece.t_us[-1] >= t_us), len(pieces))
+    if number == len(pieces):
+        return pieces, []
+    cut = int(np.searchsorted(pieces[number].t_us, t_us))
+    before = [*pieces[:number], pieces[number][:cut]] if cut else pieces[:number]
+    return before, [pieces[number][cut:], *pieces[number + 1 :]]
+
+
+def batches_of(pieces: Iterable[Columns], max_events: int) -> Iterator[EventBatch]:
+    """Events of all pieces, as batches of up to ``max_events``."""
+    starts = chain.from_iterable(((piece, start) for start in range(0, len(piece), max_events)) for piece in pieces)
+    return (piece[start : start + max_events].batch() for piece, start in starts)

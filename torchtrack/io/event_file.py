@@ -11,10 +11,10 @@ from torchtrack.config.events import ReadingConfig
 from torchtrack.core.events import EventBatch
 from torchtrack.core.files import check_is_file, naming
 from torchtrack.errors import EventDataError
-from torchtrack.io.columns import Columns
+from torchtrack.io.columns import Columns, batches_of
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
 from torchtrack.io.event_stream import EventStream
-from torchtrack.io.mending import Mender, all_of
+from torchtrack.io.mending import Mender
 from torchtrack.io.polarity_code import PolarityCode
 from torchtrack.io.problems import Problem, Problems
 from torchtrack.io.reading import Reading
@@ -114,8 +114,8 @@ class EventFile(EventStream):
                 events = inside(part, self.width, self.height, self.problems, count)
                 count += len(part)
                 self.reading.advance(len(part))
-                yield from all_of(self._noted(mender.add(events)), max_events)
-            yield from all_of(self._noted(mender.rest()), max_events)
+                yield from batches_of(self._noted(mender.add(events)), max_events)
+            yield from batches_of(self._noted(mender.rest()), max_events)
         self.reading.end()
         self.problems.warn()
 

@@ -5,10 +5,10 @@ from abc import abstractmethod
 from collections.abc import Iterator
 
 from torchtrack.core.events import EventBatch
-from torchtrack.io.columns import Columns
+from torchtrack.io.columns import Columns, batches_of
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, check_max_events, check_sensor_size
 from torchtrack.io.event_stream import EventStream
-from torchtrack.io.mending import Mender, all_of
+from torchtrack.io.mending import Mender
 from torchtrack.io.problems import Problems
 from torchtrack.io.soundness import inside
 
@@ -44,7 +44,7 @@ class LiveSource(EventStream):
                     return
                 received = self._receive()
                 self._ended = received is None
-                self._waiting = list(all_of(self._mended(received), max_events))
+                self._waiting = list(batches_of(self._mended(received), max_events))
                 continue
             # It stays in line until the next one is asked for: who looks at the first events only does not lose them.
             yield self._waiting[0]

@@ -12,13 +12,12 @@ A few events far ahead of all others are wild, and are left out. A leap forward 
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import chain
 
 import numpy as np
 
 from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError
-from torchtrack.io.columns import Columns, join, shifted
+from torchtrack.io.columns import Columns, join, parted, shifted
 from torchtrack.io.lateness import Arrivals, Recent, merged
 from torchtrack.io.problems import ClockChange, Problem, Problems
 from torchtrack.io.soundness import in_order, inside
@@ -147,7 +146,7 @@ class Mender:
         arrivals = Arrivals(events.t_us, self._newest_us if self._newest_us is not None else int(events.t_us[0]))
         before, after = arrivals.first_step_back
         detail = f"time goes back from {before} to {after} µs at event {self._at + arrivals.first_late}. Sort the events by time."
-        whole, overlapping = _parted(self._held, int(events.t_us.min()))
+        whole, overlapping = parted(self._held, int(events.t_us.min()))
         events, repeated, too_late, late = merged(overlapping, events, arrivals, self._recent)
         self._problems.record(Problem.REPEATED, repeated, f"{detail} These were there already: a packet was sent twice.")
         self._problems.record(Problem.BACK, too_late, detail)
@@ -281,16 +280,6 @@ class Mender:
         self._held = [piece for piece in (tail[:left], tail[left:]) if len(piece)]
 
 
-def _parted(pieces: list[Columns], t_us: int) -> tuple[list[Columns], list[Columns]]:
-    """Sorted pieces before ``t_us``, and from then on."""
-    number = next((number for number, piece in enumerate(pieces) if piece.t_us[-1] >= t_us), len(pieces))
-    if number == len(pieces):
-        return pieces, []
-    cut = int(np.searchsorted(pieces[number].t_us, t_us))
-    before = [*pieces[:number], pieces[number][:cut]] if cut else pieces[:number]
-    return before, [pieces[number][cut:], *pieces[number + 1 :]]
-
-
 def _return(t_us: np.ndarray, newest_us: int) -> tuple[int, bool]:
     """How many of the times stay in the past of ``newest_us``, and whether the stream then leaps back to where it was."""
     if len(t_us) > _BLOCK:
@@ -318,9 +307,3 @@ def mended_batches(batches: Iterable[EventBatch], width: int, height: int, probl
         yield from (piece.batch() for piece in mender.add(events))
     yield from (piece.batch() for piece in mender.rest())
     problems.warn()
-
-
-def all_of(pieces: Iterable[Columns], max_events: int) -> Iterator[EventBatch]:
-    """Pieces as batches of up to ``max_events``."""
-    starts = chain.from_iterable(((piece, start) for start in range(0, len(piece), max_events)) for piece in pieces)
-    return (piece[start : start + max_events].batch() for piece, start in starts)
