@@ -142,8 +142,8 @@ def _gaps(points: Float[Tensor, "n 3"], tangents: Float[Tensor, "n 3"], normals:
         return points.new_zeros(0)
     to_brighter, beside_m, parts = torch.linalg.cross(normals, tangents, dim=-1), _BESIDE * _spacing(points), []
     for part in torch.arange(len(points)).split(_GAPS_AT_ONCE):
-        difference = points - points[part, None]
-        across, along = ((difference * way[part, None]).sum(-1).abs() for way in (to_brighter, tangents))
+        ways = (way[part] for way in (to_brighter, tangents))
+        across, along = ((way @ points.T - (way * points[part]).sum(-1, keepdim=True)).abs_() for way in ways)
         is_opposite = (to_brighter[part] @ to_brighter.T < -_OPPOSITE_COSINE) & (normals[part] @ normals.T > _OPPOSITE_COSINE)
         parts.append(torch.where(is_opposite & (along <= beside_m), across, torch.inf).amin(1))
     return torch.cat(parts)
