@@ -288,6 +288,23 @@ def test_texture_is_resolved_as_far_as_the_image_shows_opposite_edges_apart(rota
         assert (contours.resolved[~is_print & contours.mask] == 1).all()
 
 
+def gaps_of(model):
+    return ContourModel(model, [0], CONFIG).texture_gaps_m
+
+
+def test_the_next_opposite_edge_is_looked_for_beside_each_point_on_faces_that_look_the_same_way():
+    plate, same = striped_plate(0.003), striped_plate(0.003, is_opposite=False)
+    torch.testing.assert_close(gaps_of(plate), torch.full((147,), 0.003))
+    assert gaps_of(same).isinf().all()
+    # On the other side of a thin plate, and beyond the lines' ends, opposite edges do not count.
+    behind = replace(same, texture_points=same.texture_points - 1e-4, texture_tangents=-same.texture_tangents, texture_normals=-same.texture_normals)
+    beyond = replace(same, texture_points=same.texture_points + torch.tensor([0.1, 1e-4, 0.0]), texture_tangents=-same.texture_tangents)
+    names = ("texture_points", "texture_tangents", "texture_normals")
+    for other in (behind, beyond):
+        assert gaps_of(replace(same, **{name: torch.cat([getattr(same, name), getattr(other, name)]) for name in names})).isinf().all()
+    assert len(gaps_of(box_model())) == 0
+
+
 def test_how_far_apart_lines_of_texture_are_is_what_their_pixels_say(dtype):
     """Far from the image's middle, too, and seen from the side."""
     T, gap_m = pose((0.5, 0.3, 0.2), (0.12, -0.08, 0.5)).to(dtype), torch.tensor(1e-4, dtype=dtype)

@@ -102,7 +102,7 @@ def assemble(
     T_cam_obj: Float[Tensor, "b 4 4"],
     intrinsics: Float[Tensor, "b 4"],
 ) -> Contours:
-    """Contours from points in the object's frame, apart from one another; those behind the camera or without a normal are masked."""
+    """Contours from points in the object's frame, all resolved in full; those behind the camera or without a normal are masked."""
     points_cam = transform_points(T_cam_obj, points_obj)
     tangents_cam = affine(T_cam_obj[:, :3, :3], tangents_obj.transpose(1, 2)).transpose(1, 2)
     normals, has_normal = image_normals(points_cam, tangents_cam, intrinsics)
