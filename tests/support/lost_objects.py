@@ -8,7 +8,6 @@ from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
 from torchtrack.tracking.relocalization.refine import exchanged, refined
-from torchtrack.tracking.relocalization.triggers import NONE
 
 # Of an object that is seen well, in a window in which it is time for nothing.
 SEEN_WELL = {
@@ -26,7 +25,7 @@ SEEN_WELL = {
     "is_due": False,
     "is_drift_due": False,
     "is_near_due": True,
-    "triggers": int(NONE),
+    "triggers": 0,
 }
 
 

@@ -75,8 +75,9 @@ class ContourModel(nn.Module):
         spread = torch.linspace(0, max(len(model.texture_points) - 1, 0), texture_count).long()
         for name in ("texture_points", "texture_tangents", "texture_normals"):
             self.register_buffer(name, getattr(model, name)[spread].clone())
-        self.register_buffer("texture_gaps_m", _gaps(self.texture_points, self.texture_tangents, self.texture_normals))
         self.texture_spacing_m = _spacing(self.texture_points)
+        of_texture = self.texture_points, self.texture_tangents, self.texture_normals
+        self.register_buffer("texture_gaps_m", _gaps(*of_texture, _BESIDE * self.texture_spacing_m))
         self.most_texture_facing = _most_facing(self.texture_normals)
         self.register_buffer("edges", _edge_table(points, normals, is_segment))
         # Edges that may be the silhouette of what is smooth in reality.
@@ -136,11 +137,11 @@ def _spacing(points: Float[Tensor, "n 3"]) -> float:
     return float(np.median(distances[:, 1]))
 
 
-def _gaps(points: Float[Tensor, "n 3"], tangents: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Distance across each edge of texture to the nearest one whose darker side is the opposite one (m); infinite where there is none."""
+def _gaps(points: Float[Tensor, "n 3"], tangents: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], beside_m: float) -> Float[Tensor, "n"]:
+    """Distance across each edge of texture to the nearest opposite one (m), no more than ``beside_m`` along it; infinite where there is none."""
     if len(points) == 0:
         return points.new_zeros(0)
-    to_brighter, beside_m, parts = torch.linalg.cross(normals, tangents, dim=-1), _BESIDE * _spacing(points), []
+    to_brighter, parts = torch.linalg.cross(normals, tangents, dim=-1), []
     for part in torch.arange(len(points)).split(_GAPS_AT_ONCE):
         ways = (way[part] for way in (to_brighter, tangents))
         across, along = ((way @ points.T - (way * points[part]).sum(-1, keepdim=True)).abs_() for way in ways)

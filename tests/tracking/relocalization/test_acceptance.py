@@ -10,7 +10,7 @@ from tracked_boxes import in_motion
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.tracking.relocalization import acceptance
 from torchtrack.tracking.relocalization.acceptance import AcceptanceTest, is_contradicted, is_likely, likeliest
-from torchtrack.tracking.relocalization.triggers import NONE, Trigger, triggered
+from torchtrack.tracking.relocalization.triggers import Trigger, triggered
 
 CONFIG = TrackerConfig()
 # Ten degrees and some millimetres: edges are several pixels off, farther than the tight gate reaches.
@@ -167,7 +167,7 @@ def test_while_a_motion_is_not_known_other_poses_must_not_smear_events_more():
     assert float(asked_by(acceptance.near_prediction, starting, unknown)[0][2]) <= 0
 
 
-@pytest.mark.parametrize("also", [NONE, Trigger.FAR_BELOW_REFERENCE])
+@pytest.mark.parametrize("also", [Trigger(0), Trigger.FAR_BELOW_REFERENCE])
 def test_what_changed_its_depth_gives_way_to_far_more_events(also):
     asked, scored = asked_by(acceptance.around_last_seen, evidence(triggers=int(Trigger.DEPTH_CHANGED | also)))
     assert float(asked[0]) == -torch.inf and float(asked[2]) == 0

@@ -19,7 +19,7 @@ from torchtrack.tracking.relocalization import refine
 from torchtrack.tracking.relocalization.hypotheses import around_prediction, sampled_around
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
-from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, NONE, Trigger, triggered
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, Trigger, triggered
 from torchtrack.tracking.validation.status import Status
 
 LOOP = "torchtrack.tracking.relocalization.relocalize"
@@ -39,7 +39,7 @@ def test_every_trigger_but_lost_calls_for_a_source(trigger):
 
 
 def test_without_triggers_or_lost_alone_nothing_is_called_for():
-    assert not any(source.is_called_for(flags) for source in SOURCES for flags in (NONE, Trigger.LOST))
+    assert not any(source.is_called_for(flags) for source in SOURCES for flags in (Trigger(0), Trigger.LOST))
 
 
 def test_what_is_called_for_around_the_last_place_comes_last():

@@ -15,7 +15,7 @@ from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
-from torchtrack.tracking.relocalization.triggers import NONE, SEARCHED, Trigger, triggered
+from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, triggered
 from torchtrack.tracking.validation import verdict
 from torchtrack.tracking.validation.scored_fit import reference_where_known
 from torchtrack.tracking.validation.status import Status
@@ -71,16 +71,20 @@ ALONE = {
 @pytest.mark.parametrize("trigger", ALONE, ids=lambda trigger: trigger.name)
 def test_each_condition_alone_sets_its_bit_and_its_neighbour_has_none(trigger):
     changes = {name: [value, SEEN_WELL[name]] for name, value in ALONE[trigger].items()}
-    assert flags_of(evidence(2, **changes)) == [trigger, NONE]
+    assert flags_of(evidence(2, **changes)) == [trigger, Trigger(0)]
+
+
+def test_every_trigger_is_set_alone_here():
+    assert set(Trigger) == set(ALONE)
 
 
 def test_what_is_seen_well_has_no_trigger_whatever_it_is_time_for():
-    assert flags_of(evidence(is_due=True, is_drift_due=True)) == [NONE]
+    assert flags_of(evidence(is_due=True, is_drift_due=True)) == [Trigger(0)]
 
 
 @pytest.mark.parametrize("trigger", ALONE, ids=lambda trigger: trigger.name)
 def test_without_searches_there_are_no_triggers(trigger):
-    assert flags_of(evidence(**ALONE[trigger]), hypotheses=0) == [NONE]
+    assert flags_of(evidence(**ALONE[trigger]), hypotheses=0) == [Trigger(0)]
 
 
 # ---- when

@@ -2,35 +2,17 @@
 
 import pytest
 import torch
+from helpers import contours_at
 from measured_matches import matches_at
 
 from torchtrack.config.tracker import AssociationConfig, CornerConfig, TrackerConfig
 from torchtrack.config.validation import ValidationConfig
-from torchtrack.object_model.contour_source import ContourKind
-from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.validation.measures import explained_ratio, inlier_ratio, visible_ratio
 
 IMAGE_SIZE = (150, 200)
 CONFIG, TRACKER = ValidationConfig(), TrackerConfig()
 
 CORNERS_ALONE = TrackerConfig(corners=CornerConfig(max_corners=32), association=AssociationConfig(max_events=0))
-
-
-def contours_at(pixels, normals=(1.0, 0.0), mask=None):
-    pixels = torch.as_tensor(pixels, dtype=torch.float64)
-    points = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1)
-    mask = torch.ones(pixels.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
-    normals = torch.tensor(normals, dtype=torch.float64).expand_as(pixels)
-    return Contours(
-        points,
-        torch.zeros_like(points),
-        torch.full(mask.shape, int(ContourKind.CREASE)),
-        mask,
-        points,
-        pixels,
-        normals,
-        torch.ones_like(points[..., 0]),
-    )
 
 
 def upright_line(u=80.0, count=80, first=20.0):

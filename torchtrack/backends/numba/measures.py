@@ -117,7 +117,7 @@ def _texture_agreement(
         if is_near[i] and abs(offsets[i]) < settings.on_contour_px and kind[contour[i]] == settings.texture and weight > 0.0:
             evidence += weight * weight
             total += weight * (as_expected[i] - 0.5)
-    return 0.5 + total / max(evidence, 1e-6) if evidence >= settings.min_observations else np.nan
+    return 0.5 + total / evidence if evidence >= settings.min_observations else np.nan
 
 
 @kernel(fastmath=FAST)

@@ -47,7 +47,6 @@ class Trigger(IntFlag):
     UNCONFIRMED = auto()
 
 
-NONE = Trigger(0)
 # An object that may have drifted off, at once or slowly.
 DRIFTS = Trigger.DRIFT | Trigger.SLOW_DRIFT
 # An object that is looked for all around where it was last validated.
@@ -138,7 +137,8 @@ def has_score_dropped(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[
     dropped = evidence.score < SCORE_DROP_BELOW * evidence.mean_score
     if none_of(dropped):
         return dropped
-    return _is_sure(evidence) & evidence.is_near_due & ~has(evidence.triggers, DRIFTS) & dropped & config.uses(Component.SCORE_DROP)
+    is_sure = ~evidence.is_starting & (evidence.sigma_px < SCORE_DROP_SIGMA_PX)
+    return is_sure & evidence.is_near_due & ~has(evidence.triggers, DRIFTS) & dropped & config.uses(Component.SCORE_DROP)
 
 
 def is_unconfirmed(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
@@ -171,10 +171,6 @@ _CONDITIONS: tuple[dict[int, Condition], ...] = (
         int(Trigger.UNCONFIRMED): is_unconfirmed,
     },
 )
-
-
-def _is_sure(evidence: TriggerEvidence) -> Bool[Tensor, "b"]:
-    return ~evidence.is_starting & (evidence.sigma_px < SCORE_DROP_SIGMA_PX)
 
 
 def _is_near_or_due(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:

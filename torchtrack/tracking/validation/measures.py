@@ -6,7 +6,7 @@ The residual does not tell: a slip onto a parallel edge has a small one.
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.config.components import Component
@@ -99,7 +99,9 @@ def inlier_ratio(matches: Matches, config: ValidationConfig) -> Float[Tensor, "b
     """
     offsets = matches.offsets.abs()
     near = matches.near & (offsets < AROUND_PX)
-    return _mean_where(near, (offsets < ON_CONTOUR_PX).to(offsets.dtype), config)
+    count = near.sum(-1)
+    ratio = (near & (offsets < ON_CONTOUR_PX)).to(offsets.dtype).sum(-1) / count.clamp(min=1)
+    return torch.where(count < config.min_observations, torch.nan, ratio)
 
 
 def texture_agreement(contours: Contours, matches: Matches, config: ValidationConfig) -> Float[Tensor, "b"]:
@@ -114,13 +116,6 @@ def texture_agreement(contours: Contours, matches: Matches, config: ValidationCo
     evidence = weights.square().sum(-1)
     agreement = 0.5 + torch.where(weights > 0, weights * (matches.as_expected - 0.5), 0).sum(-1) / evidence.clamp(min=1e-6)
     return torch.where(evidence < config.min_observations, torch.nan, agreement)
-
-
-def _mean_where(counts: Bool[Tensor, "b n"], values: Float[Tensor, "b n"], config: ValidationConfig) -> Float[Tensor, "b"]:
-    """Mean over those that count; not a number where they are too few."""
-    count = counts.sum(-1)
-    mean = torch.where(counts, values, 0).sum(-1) / count.clamp(min=1)
-    return torch.where(count < config.min_observations, torch.nan, mean)
 
 
 def normal_spread(matches: Matches) -> Float[Tensor, "b"]:
