@@ -9,6 +9,10 @@ import torch
 from first_calls import check_again
 from places import REPOSITORY
 
+if not torch.cuda.is_available():
+    # Must come before the first import of Triton: without a GPU, its kernels are interpreted.
+    os.environ.setdefault("TRITON_INTERPRET", "1")
+
 # Must come before the first import of torchtrack: it wraps the package's functions as they are loaded.
 jaxtyping.install_import_hook("torchtrack", "first_calls.checked")
 

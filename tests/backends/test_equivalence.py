@@ -26,7 +26,7 @@ from torchtrack.backends.numba import operations  # noqa: F401 - it registers al
 CALLS = 2
 # A solver's steps multiply roundings.
 TOLERANCE = 1e-6
-NAMES = sorted(name for name, operation in dispatch.OPERATIONS.items() if operation.accelerated is not None)
+NAMES = sorted(name for name, operation in dispatch.OPERATIONS.items() if "cpu" in operation.bodies)
 
 
 def lost_box():
@@ -139,8 +139,8 @@ def samples():
             calls = {name: [] for name in NAMES}
             with patch.context() as own:
                 for name in NAMES:
-                    operation = dispatch.OPERATIONS[name]
-                    own.setattr(operation, "accelerated", recorded(name, operation.accelerated, calls[name]))
+                    body = dispatch.OPERATIONS[name].bodies["cpu"]
+                    own.setattr(body, "accelerated", recorded(name, body.accelerated, calls[name]))
                 scene()
             for name in NAMES:
                 actual[name] += calls[name]
@@ -153,7 +153,7 @@ def test_what_is_accelerated_gives_what_its_reference_gives(name, samples):
     operation = dispatch.OPERATIONS[name]
     for args, kwargs in samples[name]:
         with torch.inference_mode():
-            ours = operation.accelerated(*args, **kwargs)
+            ours = operation.bodies["cpu"].accelerated(*args, **kwargs)
             with dispatch.backend(wanted=False):
                 theirs = operation.reference(*args, **kwargs)
         assert_alike(stated(name, ours, args), stated(name, theirs, args))

@@ -21,7 +21,7 @@ from torchtrack.tracking import graphs
 from torchtrack.tracking.frontend.tiles import NearbyEvents
 
 pytest.importorskip("numba", reason="needs numba: pip install 'torchtrack[fast]'")
-from torchtrack.backends.numba.rounds import knows
+from torchtrack.backends.alignment import knows
 
 SETTINGS = {
     "default": {},
@@ -130,7 +130,7 @@ def test_without_numba_all_is_done_by_pytorch(monkeypatch):
         tracker.kernels = False
         _, expected = tracker.step(state, events, end_us)
         tracker.kernels = True
-        monkeypatch.setattr(dispatch, "backend_is_installed", lambda: False)
+        monkeypatch.setattr(dispatch, "backend_is_installed", lambda device: False)
         _, actual = tracker.step(state, events, end_us)
     assert_same(actual, expected)
 
@@ -161,9 +161,9 @@ def test_a_neighbour_that_fails_changes_nothing():
 
 def test_a_stream_is_tracked_by_kernels(monkeypatch):
     """The loop over windows records no gradients."""
-    taken, operation = [], dispatch.OPERATIONS["tracking.estimation.rounds.align_rounds"]
-    accelerated = operation.accelerated
-    monkeypatch.setattr(operation, "accelerated", lambda *args: taken.append(args) or accelerated(*args))
+    taken, body = [], dispatch.OPERATIONS["tracking.estimation.rounds.align_rounds"].bodies["cpu"]
+    accelerated = body.accelerated
+    monkeypatch.setattr(body, "accelerated", lambda *args: taken.append(args) or accelerated(*args))
     trajectory, events = moving_box(pose(), 2)
     tracker = Tracker([box_model()], SMALL_CAMERA)
     assert len(list(track([events], tracker, tracker.init(trajectory.T_cam_obj[:1], 0)))) == 2
@@ -174,7 +174,7 @@ def test_a_stream_is_tracked_by_kernels(monkeypatch):
 @pytest.mark.parametrize("name", ["default", "paper", "line"])
 def test_what_is_compiled_is_compiled_before_the_first_window(name, streams, monkeypatch):
     asked = []
-    monkeypatch.setattr(dispatch, "backend_is_installed", lambda: not asked.append(name))
+    monkeypatch.setattr(dispatch, "backend_is_installed", lambda device: not asked.append(name))
     tracker = tracker_class(name)([box_model()] * len(streams), [SMALL_CAMERA] * (max(streams) + 1), preset(name), streams)
     state = tracker.init(torch.stack([pose()] * len(streams)), 0)
     before = [tensor.clone() for tensor in tensors_of(state)]

@@ -80,7 +80,8 @@ def test_no_kernels_means_none(name, monkeypatch):
         # The first step loads the kernels.
         trackers[0].step(state, events, WINDOW_US)
         for operation in dispatch.OPERATIONS.values():
-            monkeypatch.setattr(operation, "supports", lambda *_, **__: taken.append(1))
+            for body in operation.bodies.values():
+                monkeypatch.setattr(body, "supports", lambda *_, **__: taken.append(1))
         trackers[1].step(state, events, WINDOW_US)
         assert not taken
         trackers[0].step(state, events, WINDOW_US)

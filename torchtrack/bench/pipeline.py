@@ -74,14 +74,14 @@ def _of_scenes(setup: Setup) -> Iterator[_Part]:
         for compiled in setup.ways:
             yield _latency(setup, _Case(f"1 object ({shape})", simulated((shape,)), *ONE_OBJECT_MS[kind], compiled=compiled))
     for count, columns, streams, target_ms in MANY[kind]:
-        name = f"{count * streams} objects" + (f" in {streams} streams" if streams > 1 else "")
+        name = _many(count, streams)
         # On a CPU, graphs gain little where kernels work on many objects.
         for compiled in setup.ways if kind == "cuda" else (False,):
             yield _latency(setup, _Case(name, simulated(shapes_of(count), columns), target_ms, streams=streams, compiled=compiled))
-    if kind == "cpu" and backend_is_installed():
+    if backend_is_installed(kind):
         yield _latency(setup, _Case(f"1 object ({SHAPES[0]})", simulated(SHAPES[:1]), kernels=False))
-        count, columns, _, _ = MANY[kind][0]
-        yield _latency(setup, _Case(f"{count} objects", simulated(shapes_of(count), columns), kernels=False))
+        count, columns, streams, _ = MANY[kind][0]
+        yield _latency(setup, _Case(_many(count, streams), simulated(shapes_of(count), columns), streams=streams, kernels=False))
     yield _outside(setup)
     for compiled in setup.ways:
         yield _real_time(setup, compiled)
@@ -97,6 +97,11 @@ def _latency(setup: Setup, case: _Case) -> _Part:
     median, p95 = ([float(value) for value in np.quantile(repeats, share, axis=1)] for share in (0.5, 0.95))
     results = [time_result(f"{name}, median", median, case.median_ms), time_result(f"{name}, 95 %", p95, case.p95_ms)]
     return results, f"{name}: {case.scene.mev_per_s:.1f} Mev/s, {quality}"
+
+
+def _many(count: int, streams: int) -> str:
+    """The name of so many objects in each of some streams."""
+    return f"{count * streams} objects" + (f" in {streams} streams" if streams > 1 else "")
 
 
 def _named(name: str, compiled: bool) -> str:

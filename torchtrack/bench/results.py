@@ -15,7 +15,7 @@ import torch
 
 from torchtrack.bench.plots import Plot, draw
 from torchtrack.core.atomic import atomic_path
-from torchtrack.core.dispatch import backend_is_installed
+from torchtrack.core.dispatch import LIBRARIES, backend_is_installed
 from torchtrack.core.machine import processor
 from torchtrack.errors import ConfigError, MissingFileError
 
@@ -106,8 +106,14 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
         "python": platform.python_version(),
         "numpy": np.__version__,
         "torch": torch.__version__,
-        "kernels": f"numba {version('numba')}" if backend_is_installed() else "none, as Numba is not installed",
+        "kernels": _kernels(),
     }
+
+
+def _kernels() -> str:
+    """The libraries that kernels are written with, where they are installed."""
+    libraries = [f"{library} {version(library)}" for device, library in LIBRARIES.items() if backend_is_installed(device)]
+    return ", ".join(libraries) or "none, as Numba is not installed"
 
 
 def plain(value: float) -> str:

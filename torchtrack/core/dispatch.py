@@ -1,8 +1,9 @@
 """The one seam between the reference and what runs in its place.
 
 A pipeline file holds the reference: complete, differentiable, for any device. A backend registers a second body of the same
-function, with the same signature. Which of the two runs is decided here and nowhere else: the backend's on the CPU, where no
-gradients are recorded and nothing is compiled, where it is wanted and installed, and where it supports the arguments.
+function, with the same signature: Numba's for the CPU, Triton's for a GPU. Which of them runs is decided here and nowhere else: the
+backend's, where no gradients are recorded and nothing is compiled, where it is wanted and installed, and where it supports the
+arguments.
 
     # tracking/estimation/rounds.py
     @accelerable
@@ -13,11 +14,14 @@ gradients are recorded and nothing is compiled, where it is wanted and installed
     def align_rounds_numba(...): ...
 """
 
+import importlib.metadata
 import importlib.util
+import os
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, wraps
 from importlib import import_module
 from typing import Any, ParamSpec, TypeVar
@@ -25,12 +29,26 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from torchtrack.core import host_sync
-
 P, R = ParamSpec("P"), TypeVar("R")
-_BACKEND = "torchtrack.backends.numba.operations"
-# Whether a backend computes; where it is not known, the arguments tell.
-_USED: ContextVar[bool | None] = ContextVar("a backend is used", default=None)
+# By kind of device: the library that its kernels are written with, which is also the name of the backend's folder.
+LIBRARIES = {"cpu": "numba", "cuda": "triton"}
+# Versions before it fail to compile the kernels.
+_OLDEST_TRITON = (3, 5)
+# The kind of device whose backend computes, empty for none; where it is not known, the arguments tell.
+_USED: ContextVar[str | None] = ContextVar("a backend is used", default=None)
+
+
+@dataclass
+class Body:
+    """A backend's body of one function.
+
+    Args:
+        accelerated: the body.
+        supports: whether it can do what the arguments ask for.
+    """
+
+    accelerated: Callable[..., Any]
+    supports: Callable[..., bool] | None = None
 
 
 @dataclass
@@ -40,26 +58,25 @@ class Operation:
     Args:
         name: of its reference, ``room.module.function``.
         reference: the body in PyTorch.
-        accelerated: the backend's body, once it is loaded.
-        supports: whether that one can do what the arguments ask for.
+        bodies: those of backends, once they are loaded, by kind of device.
     """
 
     name: str
     reference: Callable[..., Any]
-    accelerated: Callable[..., Any] | None = None
-    supports: Callable[..., bool] | None = None
+    bodies: dict[str, Body] = field(default_factory=dict)
 
     def body(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[..., Any]:
         """What takes a call with these arguments."""
         used = _USED.get()
         if used is None:
-            used = host_sync.read_at_once(_a_tensor_of(args)) and backend_is_installed()
+            used = _backend_for(_a_tensor_of(args))
         if not used or torch.is_grad_enabled():
             return self.reference
-        _load()
-        if self.accelerated is None or (self.supports is not None and not self.supports(*args, **kwargs)):
+        _load(used)
+        body = self.bodies.get(used)
+        if body is None or (body.supports is not None and not body.supports(*args, **kwargs)):
             return self.reference
-        return self.accelerated
+        return body.accelerated
 
 
 # Every function of the seam, by name: filled as modules are imported.
@@ -83,25 +100,25 @@ def accelerable(reference: Callable[P, R]) -> Callable[P, R]:
     return chosen
 
 
-def accelerates(chosen: Callable[P, R], supports: Callable[P, bool] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator: this is the backend's body of an :func:`accelerable` function.
+def accelerates(chosen: Callable[P, R], supports: Callable[P, bool] | None = None, device: str = "cpu") -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorator: this is a backend's body of an :func:`accelerable` function.
 
     Args:
         chosen: that function.
         supports: whether this body can do what the arguments ask for; all of it when not given.
+        device: the kind of device that it computes on.
     """
 
     def registered(accelerated: Callable[P, R]) -> Callable[P, R]:
-        operation = OPERATIONS[chosen.operation]
-        operation.accelerated, operation.supports = accelerated, supports
+        OPERATIONS[chosen.operation].bodies[device] = Body(accelerated, supports)
         return accelerated
 
     return registered
 
 
 def may_accelerate(values: Tensor) -> bool:
-    """Whether a backend may compute with tensors like this one: on the CPU, where no gradients are recorded, and one is installed and wanted."""
-    return host_sync.read_at_once(values) and not torch.is_grad_enabled() and _USED.get() is not False and backend_is_installed()
+    """Whether a backend may compute with tensors like this one: where no gradients are recorded, and one for its device is installed and wanted."""
+    return not torch.is_grad_enabled() and _USED.get() != "" and bool(_backend_for(values))
 
 
 @contextmanager
@@ -111,8 +128,8 @@ def backend(*, wanted: bool, values: Tensor | None = None) -> Iterator[None]:
     Args:
         values: a tensor on the device of all that is computed within: then no call looks for one among its arguments.
     """
-    used = _USED.get() if values is None else host_sync.read_at_once(values)
-    token = _USED.set(used if wanted and _USED.get() is not False and backend_is_installed() else False)
+    used = _USED.get() if values is None else _backend_for(values)
+    token = _USED.set(used if wanted and _USED.get() != "" else "")
     try:
         yield
     finally:
@@ -120,15 +137,29 @@ def backend(*, wanted: bool, values: Tensor | None = None) -> Iterator[None]:
 
 
 @cache
-def backend_is_installed() -> bool:
-    """Whether there is anything to compile kernels with."""
-    return importlib.util.find_spec("numba") is not None
+def backend_is_installed(device: str = "cpu") -> bool:
+    """Whether there is anything to compile kernels with, for a kind of device."""
+    if device not in LIBRARIES or importlib.util.find_spec(LIBRARIES[device]) is None:
+        return False
+    # Triton has what starts its kernels built by the system's compiler.
+    return device == "cpu" or (_triton_is_new_enough() and any(map(shutil.which, [os.environ.get("CC", "cc"), "gcc", "clang"])))
+
+
+def _triton_is_new_enough() -> bool:
+    major, minor = importlib.metadata.version("triton").split(".")[:2]
+    return (int(major), int(minor)) >= _OLDEST_TRITON
+
+
+def _backend_for(values: Tensor) -> str:
+    """The kind of device whose backend may compute with tensors like this one; empty where there is none."""
+    device = values.device.type
+    return device if not torch.compiler.is_compiling() and backend_is_installed(device) else ""
 
 
 @cache
-def _load() -> None:
-    """Have the backend register what it accelerates."""
-    import_module(_BACKEND)
+def _load(device: str) -> None:
+    """Have a backend register what it accelerates."""
+    import_module(f"torchtrack.backends.{LIBRARIES[device]}.operations")
 
 
 def _a_tensor_of(args: tuple[Any, ...]) -> Tensor:

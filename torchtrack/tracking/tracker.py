@@ -46,7 +46,7 @@ class Tracker(TrackedObjects):
             comes with the package, for what ``association.weighting_network`` says. Other poses that a search tries are aligned
             without it.
         compiled: whether steady windows are taken by compiled graphs, see :mod:`torchtrack.tracking.graphs`.
-        kernels: whether Numba's kernels are used where they apply, see :mod:`torchtrack.backends.numba`.
+        kernels: whether kernels of Numba, and on a GPU of Triton, are used where they apply: :mod:`torchtrack.core.dispatch`.
 
     Raises:
         ConfigError: if graphs are asked for, and this version of PyTorch cannot make them.
@@ -176,7 +176,7 @@ class Tracker(TrackedObjects):
         """
         self.graphs.prepare(state)
         with torch.inference_mode(), dispatch.backend(wanted=self.kernels):
-            if dispatch.may_accelerate(self.intrinsics):
+            if host_sync.read_at_once(self.intrinsics) and dispatch.may_accelerate(self.intrinsics):
                 # Kernels are compiled, or read from the disk, when they are first called: for a window without events.
                 self._advance(state, EventBatch.empty(), state.t_us + 1)
                 if self.config.searches:

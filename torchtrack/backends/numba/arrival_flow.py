@@ -5,9 +5,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchtrack.backends.filling import filled
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.filling import filled
 from torchtrack.backends.numba.parameters import ArrivalSettings
 from torchtrack.config.tracker import FlowConfig
 from torchtrack.core.constants import disc

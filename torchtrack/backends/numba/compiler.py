@@ -11,6 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from torchtrack.backends import alignment
 from torchtrack.tracking.validation import verdict
 
 Array = np.ndarray
@@ -47,9 +48,9 @@ def for_numbers(*rules: Callable[..., Any]) -> dict[str, Any]:
 
 @cache
 def _digest(folder: Path) -> str:
-    """What all code comes to that kernels are made of: that of a folder, and rules."""
+    """What all code comes to that kernels are made of: that of a folder, numbers of rows, and rules."""
     digest = hashlib.sha256()
-    for file in [*sorted(folder.glob("*.py")), Path(verdict.__file__)]:
+    for file in [*sorted(folder.glob("*.py")), Path(alignment.__file__), Path(verdict.__file__)]:
         digest.update(file.read_bytes())
     return digest.hexdigest()
 

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.filling import filled
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, for_numbers, kernel
-from torchtrack.backends.numba.filling import filled
 from torchtrack.backends.numba.filtering import inverse
 from torchtrack.backends.numba.geometry import centre_of, is_finite
 from torchtrack.backends.numba.parameters import CorrectionSettings

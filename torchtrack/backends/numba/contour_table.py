@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.alignment import COLUMNS, EXPECTED, INDEXED_U, INDEXED_V, NORMAL_U, NORMAL_V, ORIENTED, SMOOTH, X, Y, Z
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
-from torchtrack.backends.numba.matching import COLUMNS, EXPECTED, INDEXED_U, INDEXED_V, NORMAL_U, NORMAL_V, ORIENTED, SMOOTH, X, Y, Z
 from torchtrack.backends.numba.measures import octant
 from torchtrack.backends.numba.parameters import TableSettings
 from torchtrack.core.dispatch import accelerates

@@ -5,10 +5,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.filling import filled
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.backends.numba.corner_response import corner_responses
-from torchtrack.backends.numba.filling import filled
 from torchtrack.backends.numba.parameters import CornerSettings
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig

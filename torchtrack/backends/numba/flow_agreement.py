@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.filling import filled
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.filling import filled
 from torchtrack.backends.numba.geometry import Numbers, across, at_depth, drift, inverse_depth, lens
 from torchtrack.backends.numba.index import cells_of
 from torchtrack.backends.numba.look_up import nearest

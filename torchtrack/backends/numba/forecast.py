@@ -5,9 +5,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.filling import filled
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
-from torchtrack.backends.numba.filling import filled
 from torchtrack.backends.numba.geometry import depth_of, is_finite, turn
 from torchtrack.backends.numba.parameters import ForecastSettings
 from torchtrack.config.components import Component

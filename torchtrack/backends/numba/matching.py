@@ -2,20 +2,41 @@
 
 import numpy as np
 
+from torchtrack.backends.alignment import (
+    AS_EXPECTED,
+    COLUMNS,
+    DARK,
+    DIRECTION_U,
+    DIRECTION_V,
+    EFFECTIVE,
+    EXPECTED,
+    INDEXED_U,
+    INDEXED_V,
+    MATCH_AGE,
+    NORMAL_U,
+    NORMAL_V,
+    OFFSET,
+    ORIENTED,
+    POINT_X,
+    POINT_Y,
+    POINT_Z,
+    ROWS,
+    SMOOTH,
+    TARGET_U,
+    TARGET_V,
+    TRUST,
+    WEIGHT,
+    MatchingSettings,
+    U,
+    X,
+    Y,
+    Z,
+)
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, across, inverse_depth, placed
 from torchtrack.backends.numba.look_up import nearest, nearest_of_four
-from torchtrack.backends.numba.parameters import Cells, MatchingSettings
+from torchtrack.backends.numba.parameters import Cells
 
-# Rows of what was observed.
-U, V, AGE, POLARITY, TRUST = range(5)
-# Columns of a contour point: its place on the object, its normal, where it was indexed, and marks.
-X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, SMOOTH, ORIENTED, EXPECTED = range(10)
-COLUMNS = 10
-# Rows of a match.
-WEIGHT, MATCH_AGE, POINT_X, POINT_Y, POINT_Z, TARGET_U, TARGET_V, DIRECTION_U, DIRECTION_V = range(9)
-OFFSET, DARK, AS_EXPECTED, EFFECTIVE = range(9, 13)
-ROWS = 13
 # Patches of the image: votes of the observations in each.
 _ON, _NEAR, _VOTES = range(3)
 # Observations that are matched together. What is known of them lies in rows of this length, in one piece of memory: so a compiler sees that no row

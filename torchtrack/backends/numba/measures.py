@@ -5,9 +5,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.filling import filled
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.filling import filled
 from torchtrack.backends.numba.geometry import across, drift, inverse_depth, lens
 from torchtrack.backends.numba.matching import patch
 from torchtrack.backends.numba.parameters import QualitySettings

@@ -18,27 +18,6 @@ class Cells(NamedTuple):
     aside_px: float
 
 
-class MatchingSettings(NamedTuple):
-    """What :mod:`torchtrack.backends.numba.matching` goes by: settings, and constants of :mod:`torchtrack.tracking.association.weights`."""
-
-    dark_shift_px: float
-    silhouette_dark_shift_px: float
-    polarity_gain: float
-    least_agreement: float
-    smeared_share: float
-    gathered_share: float
-    least_trust: float
-    concentration: bool
-    polarity: bool
-    slow_px_s: float
-    on_contour_px: float
-    smear_px: float
-    patch_bits: int
-    patches: int
-    min_observations: int
-    common_variance: float
-
-
 class ArrivalSettings(NamedTuple):
     """What :mod:`torchtrack.backends.numba.arrival_flow` goes by: constants of :mod:`torchtrack.tracking.frontend.arrival_flow`, and settings."""
 
@@ -84,19 +63,6 @@ class RoundSettings(NamedTuple):
 
     compensated: bool
     velocity_in_window: bool
-
-
-class DampingSettings(NamedTuple):
-    """How a Hessian is damped along its diagonal, as :mod:`torchtrack.tracking.estimation.levenberg_marquardt` does.
-
-    Args:
-        damping: share of each entry, at first.
-        least_diagonal, least_share: what is added beside it: so much, and this share of the pose's largest entry.
-    """
-
-    damping: float
-    least_diagonal: float
-    least_share: float
 
 
 class SolvingSettings(NamedTuple):

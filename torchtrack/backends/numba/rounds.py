@@ -5,39 +5,40 @@ One Gauss-Newton step a round, as :func:`tracking.estimation.levenberg_marquardt
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.filling import filled
-from torchtrack.backends.numba.geometry import Numbers, at_depth, centre_of, drift, entries, lens
-from torchtrack.backends.numba.index import cells_of
-from torchtrack.backends.numba.matching import (
+from torchtrack.backends.alignment import (
     AGE,
-    BLOCK,
     NORMAL_U,
     NORMAL_V,
     ROWS,
     TARGET_U,
     TARGET_V,
+    UNKNOWNS,
     WEIGHT,
+    DampingSettings,
+    MatchingSettings,
     U,
     V,
     X,
     Y,
     Z,
-    believe,
-    match,
-    room_for,
+    damping_settings,
+    knows,
+    matches_of,
+    matching_settings,
+    observed_rows,
 )
-from torchtrack.backends.numba.parameters import Cells, DampingSettings, MatchingSettings, RoundSettings
-from torchtrack.backends.numba.solving import damped_step, damping_settings, move, normal_equations, row_of
+from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.compiler import FAST, Array, kernel
+from torchtrack.backends.numba.geometry import Numbers, at_depth, centre_of, drift, entries, lens
+from torchtrack.backends.numba.index import cells_of
+from torchtrack.backends.numba.matching import BLOCK, believe, match, room_for
+from torchtrack.backends.numba.parameters import Cells, RoundSettings
+from torchtrack.backends.numba.solving import damped_step, move, normal_equations, row_of
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerates
-from torchtrack.tracking.association import weights
 from torchtrack.tracking.association.matches import MatchesWithCues
 from torchtrack.tracking.association.nearest import ContourTable
 from torchtrack.tracking.association.observations import Observations
@@ -46,8 +47,8 @@ from torchtrack.tracking.estimation import rounds
 from torchtrack.tracking.estimation.rounds import Gates, Start
 from torchtrack.tracking.estimation.terms import Linearisation
 
-# Pose and velocity; and in the rows that are derived, after their Jacobian, residual and weight.
-UNKNOWNS, _RESIDUAL, _WEIGHT = 12, 12, 13
+# In the rows that are derived, after their Jacobian: residual and weight.
+_RESIDUAL, _WEIGHT = 12, 13
 # What these are derived from, in rows: contour point, normal, target, age, and how far a match is believed.
 _X, _Y, _Z, _NU, _NV, _TO_U, _TO_V, _AGE, _BELIEVED = range(9)
 _GIVEN = 9
@@ -177,13 +178,6 @@ def _linearise(
         derived[_RESIDUAL * BLOCK + i], derived[_WEIGHT * BLOCK + i] = residual, given[_BELIEVED * BLOCK + i] * robust * robust
 
 
-def knows(config: TrackerConfig) -> bool:
-    """Whether the kernel does all that is set: the settings of the preset ``default``, and most beside them."""
-    matching, solver = config.association, config.solver
-    usual = solver.prior and solver.iterations == 1 and solver.loss == "tukey" and config.contours.source == "mesh"
-    return usual and matching.search != "along_flow" and matching.residual == "normal"
-
-
 @accelerates(rounds.align_rounds, supports=lambda start, table, observations, gates, config: knows(config) and not start.extra_terms)
 def align_rounds_numba(
     start: Start, table: ContourTable, observations: Observations, gates: Gates, config: TrackerConfig
@@ -198,35 +192,13 @@ def align_rounds_numba(
     is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool)
     matches = torch.empty(batch, ROWS, count, dtype=offset.dtype)
     align(
-        *as_arrays(_seen(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
+        *as_arrays(observed_rows(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
         cells_of(table.index),
         *as_arrays(prediction.velocity, information, objects.intrinsics, objects.centre_obj),
         *as_arrays(constant(config.association.gates_px, offset.dtype, offset.device), gates.wider, gates.subcell_lookup),
-        _matching_settings(config),
+        matching_settings(config),
         RoundSettings(config.association.motion_compensation, config.uses(Component.VELOCITY_IN_WINDOW)),
         damping_settings(config.solver, information),
         *as_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
     )
-    return Linearisation(T_cam_obj, gradient, hessian, offset), _matches(contour, is_near, is_matched, matches), start.contours
-
-
-def _matching_settings(config: TrackerConfig) -> MatchingSettings:
-    """What matching goes by."""
-    step_px, silhouette_px = weights.dark_shifts_px(config)
-    derived = {"dark_shift_px": step_px, "silhouette_dark_shift_px": silhouette_px, "common_variance": weights.common_variance(config)}
-    return filled(MatchingSettings, config.association, config.validation, weights, **derived)
-
-
-def _seen(observations: Observations) -> Float[Tensor, "b 5 n"]:
-    """Rows of what was observed."""
-    trust = torch.ones_like(observations.age_s) if observations.trust is None else observations.trust
-    return torch.stack([*observations.pixels.unbind(-1), observations.age_s, observations.polarity, trust], 1)
-
-
-def _matches(contour: Tensor, is_near: Tensor, is_matched: Tensor, rows: Float[Tensor, "b 13 n"]) -> MatchesWithCues:
-    """The matches as the pipeline knows them."""
-    weights, age_s, points, targets, directions, *rest = rows.split((1, 1, 3, 2, 2, 1, 1, 1, 1), 1)
-    offsets, dark, as_expected, effective = (value[:, 0] for value in rest)
-    points_obj, targets, directions = (value.transpose(1, 2) for value in (points, targets, directions))
-    geometry = weights[:, 0], age_s[:, 0], points_obj, targets, directions, offsets
-    return MatchesWithCues(contour, is_matched, *geometry, is_near, as_expected, dark, effective)
+    return Linearisation(T_cam_obj, gradient, hessian, offset), matches_of(contour, is_near, is_matched, matches), start.contours

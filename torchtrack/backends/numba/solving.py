@@ -5,11 +5,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchtrack.backends.alignment import DampingSettings, damping_settings
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.cholesky import factorise, solve
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, centre_of, entries, inverse_depth, is_finite, lens, turn, turned
-from torchtrack.backends.numba.parameters import DampingSettings, SolvingSettings
+from torchtrack.backends.numba.parameters import SolvingSettings
 from torchtrack.config.tracker import SolverConfig
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.estimation import levenberg_marquardt as lm
@@ -210,11 +211,6 @@ def move(T_cam_obj: Array, centre_obj: Array, offset: Array, step: Array) -> Non
             T_cam_obj[j, k] = into[j, k]
     for k in range(len(step)):
         offset[k] += step[k]
-
-
-def damping_settings(config: SolverConfig, hessian: Float[Tensor, "b k k"]) -> DampingSettings:
-    """What a kernel goes by that damps Hessians like this one."""
-    return DampingSettings(config.damping, lm.LEAST_DIAGONAL, lm.least_share(hessian))
 
 
 @accelerates(lm.solve_pose, supports=lambda problem, T_start, config, from_prior=None: not problem.extra_terms)

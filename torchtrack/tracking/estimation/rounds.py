@@ -150,13 +150,13 @@ def align_rounds(
     """
     prediction, begin, contours = start.prediction, start.begin, start.contours
     objects, matching, information = prediction.objects, config.association, prior_information(prediction, config)
-    offset, place = start.from_prior(information), _first_place(begin, observations, config)
+    offset, place = start.from_prior(information), first_place(begin, observations, config)
     for number, (gate_px, wider) in enumerate(zip(matching.gates_px, gates.wider, strict=True)):
         if number and config.contours.source == "splat":
             contours = objects.contours(begin.T_cam_obj, config.contours)
             index = index_for(contours, objects.image_size, config, start.gate_scale, start.index.radius_px)
             table = _table(contours, index, objects, config)
-            place = _first_place(begin, observations, config)
+            place = first_place(begin, observations, config)
         moving = begin.moving(compensated=matching.motion_compensation)
         if matching.search == "along_flow":
             contours = reproject(contours, begin.T_cam_obj, objects.intrinsics)
@@ -193,7 +193,7 @@ def _narrowing(gate_scale: Float[Tensor, "b"], rounds: int) -> Float[Tensor, "r 
     return gate_scale ** constant(left, gate_scale.dtype, gate_scale.device)
 
 
-def _first_place(begin: Prediction, observations: Observations, config: TrackerConfig) -> Float[Tensor, "b n 2"]:
+def first_place(begin: Prediction, observations: Observations, config: TrackerConfig) -> Float[Tensor, "b n 2"]:
     """Where the first round looks for each observation: carried to the window's end with the object's plane."""
     if not config.association.motion_compensation:
         return observations.pixels
