@@ -169,8 +169,8 @@ def stated(name, value, args):
         return [value[args[1].mask]]
     if operation == "contour_table":
         return [value.rows.transpose(1, 2)[args[0].mask], value.not_plain]
-    if operation == "peaks":
-        # Which of several equal cells is named is chance.
+    if operation == "highest":
+        # Which of several equal shifts is named is chance.
         return [value[0]]
     if operation == "strongest_along_normals":
         # So it is which of several places with as many events.

@@ -3,12 +3,12 @@
 import pytest
 import torch
 from both_ways import both_ways
-from helpers import generator
+from helpers import contours_at, generator
 from tracked_boxes import in_motion
 
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.tracking.relocalization.correlation import peaks, shifted
+from torchtrack.tracking.relocalization.correlation import NONE, SIDE, Square, highest, peaks, shifted
 from torchtrack.tracking.relocalization.view_sphere import outlines_at
 
 CONFIG = TrackerConfig(relocalization=RelocalizationConfig(rotations=24))
@@ -90,11 +90,32 @@ def test_events_that_are_nowhere_count_for_nothing():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 1.0])
-def test_peaks_are_higher_than_all_around_them(share, dtype):
-    fit = torch.randn((20, 96, 96), generator=generator(), dtype=torch.float64).to(dtype)
-    allowed = torch.rand((96, 96), generator=generator(1)) < share
-    (best, place), (others, other_place) = both_ways(lambda: peaks(fit, allowed))
-    assert torch.equal(best, others)
-    there = best > -9
-    assert torch.equal(place[there], other_place[there])
+def test_shifts_that_are_added_up_are_those_of_spectra(share, dtype):
+    """Wherever points of outlines are, and whichever shifts are allowed."""
+    count = 40
+    square = Square(torch.tensor([60.0, 50.0], dtype=dtype), torch.tensor(1.3, dtype=dtype))
+    pixels = 130 * torch.rand((count, 60, 2), generator=generator(), dtype=torch.float64).to(dtype)
+    pixels[0, 0], pixels[1] = torch.nan, torch.inf
+    mask = torch.rand((count, 60), generator=generator(1)) < 0.9
+    outlines = contours_at(pixels, torch.ones_like(pixels), mask=mask, dtype=dtype)
+    denser = torch.randn((SIDE, SIDE), generator=generator(2), dtype=torch.float64).to(dtype)
+    allowed = torch.rand((SIDE, SIDE), generator=generator(3)) < share
+    (best, place), (others, other_place) = both_ways(lambda: highest(denser, outlines, square, allowed))
+    torch.testing.assert_close(best, others, rtol=0, atol=10 * torch.finfo(dtype).eps)
+    there = best > NONE
+    # What is nowhere fits nowhere, and everywhere alike.
+    there[1] = False
     assert bool(there.any()) == (share > 0)
+    if dtype == torch.float64:
+        assert torch.equal(place[there], other_place[there])
+
+
+def test_peaks_are_higher_than_all_around_them(dtype):
+    fit, allowed = torch.zeros((1, 96, 96), dtype=dtype), torch.ones((96, 96), dtype=torch.bool)
+    for row, column, height in ((10, 10, 5.0), (10, 12, 4.0), (10, 15, 3.0), (80, 95, 2.0), (40, 40, 9.0)):
+        fit[0, row, column] = height
+    allowed[40, 40] = False
+    best, place = peaks(fit, allowed)
+    # One next to a higher one is none, nor is one that is not allowed.
+    assert best[0].tolist() == [5.0, 3.0, 2.0]
+    assert place[0].tolist() == [10 * 96 + 10, 10 * 96 + 15, 80 * 96 + 95]

@@ -1,11 +1,7 @@
-"""Where contour points have most events along their normals, and peaks of correlations, point by point and cell by cell.
-
-References are :mod:`torchtrack.tracking.relocalization.edge_search` and :mod:`torchtrack.tracking.relocalization.correlation`.
-"""
+"""Where contour points have most events along their normals: :func:`torchtrack.tracking.relocalization.edge_search.strongest_along_normals`."""
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
@@ -13,7 +9,7 @@ from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.outlines import at
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.relocalization import correlation, edge_search
+from torchtrack.tracking.relocalization import edge_search
 from torchtrack.tracking.relocalization.event_image import BORDER_PX
 
 
@@ -42,48 +38,6 @@ def look_along_normals(
                     place = j if there > most else place
                     most = max(there, most)
             targets[k, i, 0], targets[k, i, 1], weights[k, i] = u + step_px[place] * nu, v + step_px[place] * nv, most
-
-
-@kernel()
-def peaks(fit: Array, allowed: Array, apart: int, best: Array, place: Array) -> None:
-    """The highest peaks of each map, the highest first; a peak is a cell than which none of those around it is higher.
-
-    Args:
-        fit: ``[n, h, w]``.
-        allowed: ``[h, w]``, cells that count.
-        apart: how far around a peak cells are lower (cells).
-        best, place: ``[n, k]`` of the peaks, and which cells they are; filled. ``best`` holds what is no peak at all when given.
-    """
-    most = best.shape[1] - 1
-    for n in range(len(fit)):
-        place[n] = 0
-        for i in range(fit.shape[1]):
-            for j in range(fit.shape[2]):
-                # Hardly any cell is as high as the peaks that are known already.
-                if fit[n, i, j] > best[n, most] and allowed[i, j] and _is_peak(fit[n], allowed, i, j, apart):
-                    rank = most
-                    while rank > 0 and fit[n, i, j] > best[n, rank - 1]:
-                        best[n, rank], place[n, rank] = best[n, rank - 1], place[n, rank - 1]
-                        rank -= 1
-                    best[n, rank], place[n, rank] = fit[n, i, j], i * fit.shape[2] + j
-
-
-@kernel()
-def _is_peak(fit: Array, allowed: Array, row: int, column: int, apart: int) -> bool:
-    """Whether no cell that counts and is so close by is higher."""
-    for i in range(max(row - apart, 0), min(row + apart + 1, fit.shape[0])):
-        for j in range(max(column - apart, 0), min(column + apart + 1, fit.shape[1])):
-            if fit[i, j] > fit[row, column] and allowed[i, j]:
-                return False
-    return np.isfinite(fit[row, column])
-
-
-@accelerates(correlation.peaks)
-def peaks_numba(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
-    """Cell by cell."""
-    best, place = fit.new_full((len(fit), correlation.SHIFTS), correlation.NONE), torch.empty(len(fit), correlation.SHIFTS, dtype=torch.int64)
-    peaks(*as_arrays(fit, allowed), correlation.APART, *as_arrays(best, place))
-    return best, place
 
 
 @accelerates(edge_search.strongest_along_normals)

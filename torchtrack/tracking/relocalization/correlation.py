@@ -21,7 +21,7 @@ from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.view_sphere import outlines_by_view
 
 # Cells a side of the square in which events and outlines are compared.
-_SIDE = 96
+SIDE = 96
 # Shifts are looked for within this many standard deviations, around an object that takes this many diameters.
 _SIGMAS, _DIAMETERS = 2.5, 1.3
 # Cells to each side that events are blurred over, and that their surroundings are taken from.
@@ -37,7 +37,7 @@ _KEPT_RATIO = 0.512
 
 
 @dataclass(frozen=True)
-class _Square:
+class Square:
     """A part of the image, in cells.
 
     Args:
@@ -50,11 +50,11 @@ class _Square:
 
     def counts(self, pixels: Float[Tensor, "k n 2"], mask: Bool[Tensor, "k n"]) -> Float[Tensor, "k h w"]:
         """How many of the pixels of each row are in each cell."""
-        place = ((pixels - self.middle) / self.cell_px + _SIDE // 2).round().nan_to_num(-1.0)
-        inside = mask & (place >= 0).all(-1) & (place < _SIDE).all(-1)
+        place = ((pixels - self.middle) / self.cell_px + SIDE // 2).round().nan_to_num(-1.0)
+        inside = mask & (place >= 0).all(-1) & (place < SIDE).all(-1)
         u, v = torch.where(inside[..., None], place, 0).long().unbind(-1)
-        cells = pixels.new_zeros(len(pixels), _SIDE**2)
-        return cells.scatter_add(1, v * _SIDE + u, inside.to(pixels.dtype)).unflatten(1, (_SIDE, _SIDE))
+        cells = pixels.new_zeros(len(pixels), SIDE**2)
+        return cells.scatter_add(1, v * SIDE + u, inside.to(pixels.dtype)).unflatten(1, (SIDE, SIDE))
 
 
 def kept_rotations(config: TrackerConfig) -> int:
@@ -76,8 +76,8 @@ def shifted(
     objects, centre = prediction.objects, prediction.centre_cam[0]
     focal = objects.intrinsics[0, :2]
     ray, sigma_px = centre / centre[2], sigma_m * focal[0] / centre[2]
-    cell_px = (_DIAMETERS * objects.size_px(prediction.T_cam_obj)[0] + 2 * _SIGMAS * sigma_px) / _SIDE
-    square = _Square(ray[:2] * focal + objects.intrinsics[0, 2:], cell_px)
+    cell_px = (_DIAMETERS * objects.size_px(prediction.T_cam_obj)[0] + 2 * _SIGMAS * sigma_px) / SIDE
+    square = Square(ray[:2] * focal + objects.intrinsics[0, 2:], cell_px)
     steps = torch.cat([steps[:, :3], steps[:, 5:] * ray], 1)
     outlines = outlines_by_view(prediction, prediction.poses_at(steps), config)
     number, shift = _best(square, places, outlines, sigma_px / cell_px, kept_rotations(config))
@@ -86,36 +86,21 @@ def shifted(
 
 
 def _best(
-    square: _Square, places: tuple[Tensor, Tensor], outlines: Contours, sigma_cells: Float[Tensor, ""], count: int
+    square: Square, places: tuple[Tensor, Tensor], outlines: Contours, sigma_cells: Float[Tensor, ""], count: int
 ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k 2"]]:
     """Numbers of the outlines that fit best, and their shifts (cells)."""
-    step = torch.arange(_SIDE, dtype=sigma_cells.dtype, device=sigma_cells.device) - _SIDE // 2
+    step = torch.arange(SIDE, dtype=sigma_cells.dtype, device=sigma_cells.device) - SIDE // 2
     allowed = step[:, None].square() + step.square() <= (_SIGMAS * sigma_cells).square()
-    spectrum = _spectrum(square.counts(*places)[0] / square.cell_px)
-    split = zip(outlines.pixels.split(_TOGETHER), outlines.mask.split(_TOGETHER), strict=True)
-    highest = (peaks(_correlation(spectrum, square.counts(*some)), allowed) for some in split)
-    best, place = (torch.cat(values).flatten() for values in zip(*highest, strict=True))
+    best, place = (values.flatten() for values in highest(_denser(square.counts(*places)[0] / square.cell_px), outlines, square, allowed))
     chosen = best.topk(min(count, best.numel())).indices
     place = place[chosen]
-    return chosen // SHIFTS, torch.stack([step[place % _SIDE], step[place // _SIDE]], -1)
+    return chosen // SHIFTS, torch.stack([step[place % SIDE], step[place // SIDE]], -1)
 
 
-def _spectrum(events: Float[Tensor, "h w"]) -> Tensor:
-    """The spectrum of how much denser events are than around them, of which one for each pixel of a contour through the cell is enough."""
+def _denser(events: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """How much denser events are than around them, of which one for each pixel of a contour through the cell is enough."""
     enough = events.clamp(max=1)
-    denser = _blurred(enough, _BLUR) - _blurred(enough, _AROUND)
-    return rfft2(denser.roll((_SIDE // 2, _SIDE // 2), (0, 1)))
-
-
-def _correlation(spectrum: Tensor, outlines: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
-    """How much more events there are on each outline than around it, for every shift; none at all is in the middle.
-
-    Args:
-        spectrum: of the events.
-        outlines: the number of contour points.
-    """
-    fit = irfft2(rfft2(outlines).conj() * spectrum, s=(_SIDE, _SIDE))
-    return fit.div_(outlines.sum((1, 2), keepdim=True).clamp(min=1))
+    return _blurred(enough, _BLUR) - _blurred(enough, _AROUND)
 
 
 def _blurred(cells: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
@@ -125,6 +110,38 @@ def _blurred(cells: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
 
 
 @accelerable
+def highest(
+    denser: Float[Tensor, "h w"], outlines: Contours, square: Square, allowed: Bool[Tensor, "h w"]
+) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
+    """Of each outline, the shifts with most events on it, more than around it, and how many more for each of its points; no two of them are close.
+
+    By spectra; where few shifts are allowed, kernels take less time to add up each of them.
+
+    Args:
+        denser: how much denser events are in each cell than around it.
+        square: of the cells.
+        allowed: which shifts count; none at all is in the middle.
+
+    Returns:
+        The fit, :data:`NONE` where there are not so many shifts, and the cell that each shift is in.
+    """
+    spectrum = rfft2(denser.roll((SIDE // 2, SIDE // 2), (0, 1)))
+    split = zip(outlines.pixels.split(_TOGETHER), outlines.mask.split(_TOGETHER), strict=True)
+    best, place = zip(*(peaks(_correlation(spectrum, square.counts(*some)), allowed) for some in split), strict=True)
+    return torch.cat(best), torch.cat(place)
+
+
+def _correlation(spectrum: Tensor, outlines: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
+    """How much more events there are on each outline than around it, for every shift; none at all is in the middle.
+
+    Args:
+        spectrum: of the events.
+        outlines: the number of contour points.
+    """
+    fit = irfft2(rfft2(outlines).conj() * spectrum, s=(SIDE, SIDE))
+    return fit.div_(outlines.sum((1, 2), keepdim=True).clamp(min=1))
+
+
 def peaks(fit: Float[Tensor, "n h w"], allowed: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
     """The highest cells of each map, none of which is close to a higher one, and which they are; of cells that are allowed alone."""
     fit = torch.where(allowed, fit, NONE)
