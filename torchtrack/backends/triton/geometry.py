@@ -46,3 +46,14 @@ def velocity_at(T_cam_obj, centre_obj, velocity, x, y, z):
         turn_z * arm_x - turn_x * arm_z + tl.load(velocity + 4),
         turn_x * arm_y - turn_y * arm_x + tl.load(velocity + 5),
     )
+
+
+@kernel
+def show(T_cam_obj, centre_obj, velocity, intrinsics, x, y, z):
+    """Pixels of points of the object, and their velocities (px/s); ``intrinsics`` points to ``[fx, fy, cx, cy]``."""
+    along_x, along_y, along_z = placed(T_cam_obj, x, y, z)
+    inverse, focal_u, focal_v = inverse_depth(along_z), tl.load(intrinsics), tl.load(intrinsics + 1)
+    ray_u, ray_v = along_x * inverse, along_y * inverse
+    moving_x, moving_y, moving_z = velocity_at(T_cam_obj, centre_obj, velocity, along_x, along_y, along_z)
+    speed_u, speed_v = (moving_x - ray_u * moving_z) * inverse * focal_u, (moving_y - ray_v * moving_z) * inverse * focal_v
+    return tl.load(intrinsics + 2) + ray_u * focal_u, tl.load(intrinsics + 3) + ray_v * focal_v, speed_u, speed_v

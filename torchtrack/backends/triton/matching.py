@@ -4,7 +4,7 @@ import triton.language as tl
 
 from torchtrack.backends import alignment as rows
 from torchtrack.backends.triton.compiler import kernel
-from torchtrack.backends.triton.geometry import inverse_depth, placed, velocity_at
+from torchtrack.backends.triton.geometry import show
 
 # Patches of the image: votes of the observations in each.
 _ON, _NEAR, _VOTES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
@@ -35,61 +35,48 @@ def match(
     b = tl.program_id(0).to(tl.int64)
     i = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     inside = i < count
-    seen += b * 5 * count + i
-    place += b * 2 * count + i
+    seen, place, table, matches = (
+        seen + b * 5 * count + i,
+        place + b * 2 * count + i,
+        table + b * rows.COLUMNS * points,
+        matches + b * rows.ROWS * count + i,
+    )
     place_u, place_v = tl.load(place, inside, 0.0), tl.load(place + count, inside, 0.0)
-    table += b * rows.COLUMNS * points
-    nearest_of_cell, first = nearest_of_cell + b * cell_rows * cell_columns, first + b * 2
+    index = nearest_of_cell + b * cell_rows * cell_columns, first + b * 2, cell_rows, cell_columns, side_px, aside_px
     if tl.load(subcell_lookup + b):
-        indexed = table + rows.INDEXED_U * points
-        nearest_index = _nearest_of_four(nearest_of_cell, first, indexed, points, place_u, place_v, cell_rows, cell_columns, side_px, aside_px)
+        nearest_index = _nearest_of_four(index, table + rows.INDEXED_U * points, points, place_u, place_v)
     else:
-        nearest_index = _nearest(nearest_of_cell, first, place_u, place_v, cell_rows, cell_columns, side_px, aside_px)
+        nearest_index = _nearest(index, place_u, place_v)
     near = inside & tl.load(exists + b * count + i, inside, 0).to(tl.int1) & (nearest_index >= 0)
     point = tl.where(near, nearest_index, 0)
     table += point
     normal_u, normal_v = tl.load(table + rows.NORMAL_U * points), tl.load(table + rows.NORMAL_V * points)
     point_x, point_y, point_z = tl.load(table + rows.X * points), tl.load(table + rows.Y * points), tl.load(table + rows.Z * points)
-    smooth = tl.load(table + rows.SMOOTH * points)
-    # Where the contour is, and how it moves across the image.
-    x, y, z = placed(T_cam_obj + b * 16, point_x, point_y, point_z)
-    inverse = inverse_depth(z)
-    focal_u, focal_v = tl.load(intrinsics + b * 4), tl.load(intrinsics + b * 4 + 1)
-    ray_u, ray_v = x * inverse, y * inverse
-    u, v = tl.load(intrinsics + b * 4 + 2) + ray_u * focal_u, tl.load(intrinsics + b * 4 + 3) + ray_v * focal_v
-    moving_x, moving_y, moving_z = velocity_at(T_cam_obj + b * 16, centre_obj + b * 3, velocity + b * 6, x, y, z)
-    speed_u, speed_v = (moving_x - ray_u * moving_z) * inverse * focal_u, (moving_y - ray_v * moving_z) * inverse * focal_v
+    u, v, speed_u, speed_v = show(T_cam_obj + b * 16, centre_obj + b * 3, velocity + b * 6, intrinsics + b * 4, point_x, point_y, point_z)
     # Where the observation would be at the window's end, on its edge.
-    crossing = normal_u * speed_u + normal_v * speed_v
+    crossing, smooth = normal_u * speed_u + normal_v * speed_v, tl.load(table + rows.SMOOTH * points)
     dark = tl.load(seen + rows.POLARITY * count, inside, 0.0) * crossing / (tl.abs(crossing) + settings.slow_px_s)
     age_s = tl.load(seen + rows.AGE * count, inside, 0.0)
     carried_u, carried_v = tl.load(seen, inside, 0.0) + age_s * speed_u, tl.load(seen + count, inside, 0.0) + age_s * speed_v
     shift = dark * (settings.dark_shift_px + smooth * (settings.silhouette_dark_shift_px - settings.dark_shift_px))
     target_u, target_v = carried_u - normal_u * shift, carried_v - normal_v * shift
-    away_u, away_v = u - target_u, v - target_v
-    scale = tl.load(wider + b)
+    # How far its contour is from there.
+    away_u, away_v, scale = u - target_u, v - target_v, tl.load(wider + b)
     matched = near & (away_u * away_u + away_v * away_v < gate_px * scale * gate_px * scale)
     offset = (away_u * normal_u + away_v * normal_v) / scale
     as_expected = tl.where(near, _agreeing(dark * tl.load(table + rows.EXPECTED * points), settings), 0.0)
     dark *= tl.load(table + rows.ORIENTED * points)
+    cell = b * settings.patches * settings.patches + _patch(target_u, target_v, settings)
+    _vote(votes + cell * 3, near, offset, as_expected, dark, settings)
     # Without the dark shift: between edges that lie close, it would make a choice confirm itself.
     next_u = carried_u - (u - tl.load(table + rows.INDEXED_U * points))
     next_v = carried_v - (v - tl.load(table + rows.INDEXED_V * points))
     tl.store(place, tl.where(matched, next_u, place_u), inside)
     tl.store(place + count, tl.where(matched, next_v, place_v), inside)
-    on = tl.where(tl.abs(offset) < settings.on_contour_px, as_expected, 0.0)
-    votes += (b * settings.patches * settings.patches + _patch(target_u, target_v, settings)) * 3
-    tl.atomic_add(votes + _NEAR, tl.where(tl.abs(offset) < settings.smear_px, as_expected, 0.0), near)
-    tl.atomic_add(votes + _ON, on, near)
-    tl.atomic_add(votes + _VOTES, on * dark, near)
     tl.store(contour + b * count + i, point, inside)
     tl.store(is_near + b * count + i, near, inside)
     tl.store(is_matched + b * count + i, matched, inside)
-    matches += b * rows.ROWS * count + i
-    tl.store(matches + rows.MATCH_AGE * count, age_s, inside)
-    tl.store(matches + rows.POINT_X * count, point_x, inside)
-    tl.store(matches + rows.POINT_Y * count, point_y, inside)
-    tl.store(matches + rows.POINT_Z * count, point_z, inside)
+    _write_point(matches, count, inside, point_x, point_y, point_z, age_s)
     tl.store(matches + rows.TARGET_U * count, target_u, inside)
     tl.store(matches + rows.TARGET_V * count, target_v, inside)
     tl.store(matches + rows.DIRECTION_U * count, normal_u, inside)
@@ -99,6 +86,24 @@ def match(
     tl.store(matches + rows.AS_EXPECTED * count, as_expected, inside)
     # Until it is known how many lie around it: whether it has an error in common with them.
     tl.store(matches + rows.EFFECTIVE * count, smooth, inside)
+
+
+@kernel
+def _vote(votes, near, offset, as_expected, dark, settings: tl.constexpr):
+    """Count observations in their patches: those on a contour, those near one, and which side they say is the darker one."""
+    on = tl.where(tl.abs(offset) < settings.on_contour_px, as_expected, 0.0)
+    tl.atomic_add(votes + _ON, on, near)
+    tl.atomic_add(votes + _NEAR, tl.where(tl.abs(offset) < settings.smear_px, as_expected, 0.0), near)
+    tl.atomic_add(votes + _VOTES, on * dark, near)
+
+
+@kernel
+def _write_point(matches, count, inside, x, y, z, age_s):
+    """Write the contour points of matches, and how long ago they were seen."""
+    tl.store(matches + rows.MATCH_AGE * count, age_s, inside)
+    tl.store(matches + rows.POINT_X * count, x, inside)
+    tl.store(matches + rows.POINT_Y * count, y, inside)
+    tl.store(matches + rows.POINT_Z * count, z, inside)
 
 
 @kernel
@@ -140,8 +145,9 @@ def believe(seen, votes, is_matched, matches, count, settings: tl.constexpr, BLO
 
 
 @kernel
-def _nearest(nearest_of_cell, first, u, v, cell_rows, cell_columns, side_px, aside_px):
+def _nearest(index, u, v):
     """The contour point that the cell around each place knows, -1 for none: :meth:`tracking.contours.index.ContourIndex.look_up`."""
+    nearest_of_cell, first, cell_rows, cell_columns, side_px, aside_px = index
     half = 0.5 * side_px + aside_px
     column, row = tl.floor((u + half) / side_px) - tl.load(first), tl.floor((v + half) / side_px) - tl.load(first + 1)
     # The region's border is empty: what lies outside finds nothing there, nor does what is not a number.
@@ -151,12 +157,13 @@ def _nearest(nearest_of_cell, first, u, v, cell_rows, cell_columns, side_px, asi
 
 
 @kernel
-def _nearest_of_four(nearest_of_cell, first, indexed, points, u, v, cell_rows, cell_columns, side_px, aside_px):
+def _nearest_of_four(index, indexed, points, u, v):
     """Of the contour points that the four cells around each place know, the one nearest to it; -1 for none.
 
     Args:
         indexed: rows of the places of contour points when they were indexed.
     """
+    nearest_of_cell, first, cell_rows, cell_columns, side_px, aside_px = index
     column, row = tl.floor((u + aside_px) / side_px) - tl.load(first), tl.floor((v + aside_px) / side_px) - tl.load(first + 1)
     inside = (column >= 0) & (row >= 0) & (column < cell_columns - 1) & (row < cell_rows - 1)
     begin = tl.where(inside, row, 0.0).to(tl.int32) * cell_columns + tl.where(inside, column, 0.0).to(tl.int32)
