@@ -183,6 +183,14 @@ def test_an_old_triton_is_none(version, is_new_enough, monkeypatch):
     assert dispatch.backend_is_installed.__wrapped__("cuda") == is_new_enough
 
 
+def test_a_triton_under_another_name_is_none(monkeypatch):
+    def unknown(library):
+        raise dispatch.importlib.metadata.PackageNotFoundError(library)
+
+    monkeypatch.setattr(dispatch.importlib.metadata, "version", unknown)
+    assert not dispatch.backend_is_installed.__wrapped__("cuda")
+
+
 COMPILED = """
 import triton
 from triton.backends.compiler import GPUTarget

@@ -146,7 +146,11 @@ def backend_is_installed(device: str = "cpu") -> bool:
 
 
 def _triton_is_new_enough() -> bool:
-    major, minor = importlib.metadata.version("triton").split(".")[:2]
+    """Whether the kernels are known to compile; of a build under another name, as for AMD's GPUs, that is not known."""
+    try:
+        major, minor = importlib.metadata.version("triton").split(".")[:2]
+    except importlib.metadata.PackageNotFoundError:
+        return False
     return (int(major), int(minor)) >= _OLDEST_TRITON
 
 

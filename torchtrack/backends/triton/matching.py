@@ -35,12 +35,8 @@ def match(
     b = tl.program_id(0).to(tl.int64)
     i = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     inside = i < count
-    seen, place, table, matches = (
-        seen + b * 5 * count + i,
-        place + b * 2 * count + i,
-        table + b * rows.COLUMNS * points,
-        matches + b * rows.ROWS * count + i,
-    )
+    seen, place, matches = seen + b * 5 * count + i, place + b * 2 * count + i, matches + b * rows.ROWS * count + i
+    table += b * rows.COLUMNS * points
     place_u, place_v = tl.load(place, inside, 0.0), tl.load(place + count, inside, 0.0)
     index = nearest_of_cell + b * cell_rows * cell_columns, first + b * 2, cell_rows, cell_columns, side_px, aside_px
     if tl.load(subcell_lookup + b):
