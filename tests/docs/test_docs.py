@@ -184,7 +184,7 @@ def test_example_of_a_config_is_one(text, tmp_path):
 def test_example_of_an_evaluation_is_one(text, tmp_path):
     path = tmp_path / "trial.yaml"
     path.write_text(text)
-    assert load(EvaluateConfig, path).methods["drift_and_drop"].tracker.disabled == {Component.DRIFT, Component.SCORE_DROP}
+    assert load(EvaluateConfig, path).methods["drift_and_lines"].tracker.disabled == {Component.DRIFT, Component.LINE_ENDS}
 
 
 @pytest.mark.parametrize("text", blocks("yaml simulate"))

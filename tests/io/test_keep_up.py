@@ -139,7 +139,7 @@ def test_in_haste_no_other_poses_are_tried_and_few_to_find_what_is_lost():
     assert none.relocalization.hypotheses == 0
     assert 0 < few.relocalization.hypotheses < usual.relocalization.hypotheses
     assert few.relocalization.rotations < usual.relocalization.rotations
-    assert not few.uses(Component.SCORE_DROP)
+    assert not few.uses(Component.LOW_SCORE)
     assert few.relocalization.slow_drift_below == few.relocalization.new_below == 0
     assert not none.uses(Component.WINDOW_PARTS) and not few.uses(Component.WINDOW_PARTS)
     assert none.association == few.association == usual.association

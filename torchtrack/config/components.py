@@ -27,7 +27,6 @@ class Component(StrEnum):
     PARTLY_HIDDEN = "partly_hidden"
     # why other poses are tried
     LOW_SCORE = "low_score"
-    SCORE_DROP = "score_drop"
     DRIFT = "drift"
     AROUND_LAST_SEEN = "around_last_seen"
     UNCONFIRMED = "unconfirmed"

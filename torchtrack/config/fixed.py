@@ -60,7 +60,6 @@ FIXED: dict[str, dict[str, str]] = {
         "kept_rotations": "0.512 of relocalization.rotations",
         "pulled": "an eighth of the rotations that are kept",
         "least_sigma_px": "3",
-        "score_drop_sigma_px": "6",
         "drift_below": "0.6",
         "drift_px_s": "200",
         "drift_diameters_s": "1.5",
@@ -86,7 +85,6 @@ SWITCHES: dict[str, dict[str, Component]] = {
     "validation": {"partly_hidden": Component.PARTLY_HIDDEN, "all_directions": Component.ALL_DIRECTIONS},
     "relocalization": {
         "low_score_below": Component.LOW_SCORE,
-        "score_drop_below": Component.SCORE_DROP,
         "not_validated_us": Component.AROUND_LAST_SEEN,
         "line_ends": Component.LINE_ENDS,
         "by_inlier_ratio": Component.INLIER_RATIO,

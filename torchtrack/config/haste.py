@@ -7,7 +7,7 @@ from torchtrack.config.tracker import TrackerConfig
 # A search that takes about as long as ten windows, where one takes as long as a hundred.
 _HYPOTHESES, _ROTATIONS = 8, 60
 # What is not searched for at all, and what takes a window several times over.
-_LEFT_OUT = frozenset({Component.LOW_SCORE, Component.SCORE_DROP, Component.UNCONFIRMED, Component.WINDOW_PARTS})
+_LEFT_OUT = frozenset({Component.LOW_SCORE, Component.UNCONFIRMED, Component.WINDOW_PARTS})
 
 
 def in_haste(config: TrackerConfig, *, searches: bool) -> TrackerConfig:

@@ -81,6 +81,8 @@ REMOVED: dict[str, dict[str, str]] = {
         "by_matches": "poses are compared by what they explain, however many events that are",
         "last_seen_us": "what was not seen well for long is looked for all around where it was then",
         "held_from": "what drifts is looked for farther away, however much it explains where it is",
+        "score_drop_below": "a score that drops is acted on where it stays low",
+        "score_drop_sigma_px": "a score that drops is acted on where it stays low",
         "tentative": "what a search gives is UNCERTAIN until windows enough confirm it",
     },
     "validation": {

@@ -143,7 +143,7 @@ def test_an_object_that_ran_off_is_found_again_where_it_was_seen_well(name):
 def test_an_object_that_holds_on_to_other_edges_is_found_again_where_it_was_seen_well(monkeypatch):
     """Sure of a pose forty degrees off, as near as it was: nowhere else is it looked for so far away."""
     monkeypatch.setattr(verdict, "DRIFT_BELOW", 0)
-    disabled = {Component.SCORE_DROP, Component.LOW_SCORE}
+    disabled = {Component.LOW_SCORE}
     trajectory, events = moving_box(pose(), 30)
 
     @torch.no_grad()

@@ -25,13 +25,13 @@ from torchtrack.tracking.validation.status import Status
 # What slips turns on: with turns that die away it would be drawn back.
 UNREMEMBERED = frozenset({Component.POLARITY_PRIOR, Component.TURNS_FADE})
 SEARCHING = TrackerConfig(corners=CornerConfig(max_corners=32), disabled=UNREMEMBERED)
-NEVER_DRIFTING = SEARCHING.model_copy(update={"disabled": UNREMEMBERED | {Component.DRIFT, Component.SCORE_DROP, Component.UNCONFIRMED}})
+NEVER_DRIFTING = SEARCHING.model_copy(update={"disabled": UNREMEMBERED | {Component.DRIFT, Component.UNCONFIRMED}})
 # Looks farther away are for what was not seen well for long, or for nothing.
 SLOWLY, NEVER_SLOWLY = (
     SEARCHING.model_copy(
         update={
             "relocalization": RelocalizationConfig(slow_drift_below=share, not_validated_below=0),
-            "disabled": UNREMEMBERED | {Component.SCORE_DROP, Component.UNCONFIRMED},
+            "disabled": UNREMEMBERED | {Component.UNCONFIRMED},
         }
     )
     for share in (0.85, 0.0)
@@ -58,7 +58,6 @@ ALONE = {
     Trigger.UNCERTAIN: {"sigma_px": 4.1},
     Trigger.NEW: {"is_due": True, "reference_explained_ratio": 0.5, "score": 0.8, "last_score": 0.8, "mean_score": 0.8},
     Trigger.LOW_SCORE: {"score": 0.71, "last_score": 0.71},
-    Trigger.SCORE_DROP: {"score": 0.62},
     Trigger.DRIFT: {"is_drift_due": True, "drift_s": 0.051},
     Trigger.SLOW_DRIFT: {"is_drift_due": True, "time_since_validated_s": 0.051, "last_score": 0.7},
     Trigger.LOST: {"triggers": int(Trigger.LOST)},
@@ -100,24 +99,10 @@ def test_uncertain_objects_and_those_explained_worse_than_usual_are_searched_for
     assert not any(having(Trigger.LOW_SCORE, evidence(score=0.65)))
 
 
-def test_what_is_sure_of_its_place_and_explains_far_less_at_once_has_dropped():
-    given = evidence(
-        5,
-        score=[0.62, 0.64, 0.62, 0.62, 0.62],
-        sigma_px=[1.0, 1.0, 6.1, 1.0, 1.0],
-        is_starting=[False] * 3 + [True, False],
-        drift_s=[0.0] * 4 + [0.1],
-        is_drift_due=True,
-    )
-    assert having(Trigger.SCORE_DROP, given) == [True, False, False, False, False]
-    assert not any(having(Trigger.SCORE_DROP, given, Component.SCORE_DROP))
-
-
 def test_where_looking_has_not_helped_for_long_it_waits_too_of_objects_whose_place_is_known():
     near = {"is_near_due": [True, False]}
     low = evidence(2, score=0.5, last_score=0.5, **near)
-    for trigger in (Trigger.LOW_SCORE, Trigger.SCORE_DROP):
-        assert having(trigger, low) == [True, False]
+    assert having(Trigger.LOW_SCORE, low) == [True, False]
     assert having(Trigger.UNCERTAIN, evidence(2, sigma_px=4.1, **near), trigger_sigma_px=4.0) == [True, False]
 
 

@@ -21,8 +21,8 @@ from torchtrack.tracking.validation.verdict import AGREES_FROM, VALIDATED_FROM
 
 # Ratios that differ by less are the same: which of them is larger is chance.
 AS_MUCH = 0.02
-# By how much the score of another pose must be better while a motion is not known; and where the score dropped, or the pose is not near the
-# prediction. Not measured alone.
+# By how much the score of another pose must be better while a motion is not known; and where the pose is not near the prediction. Not measured
+# alone.
 _START_MARGIN, _ELSEWHERE_MARGIN = 0.02, 0.15
 # Share of what an object explains when seen well that is asked of a pose farther away. Not measured alone.
 _DRIFT_MIN_RATIO = 0.65
@@ -123,13 +123,6 @@ def near_prediction(evidence: TriggerEvidence, scored: ScoredFit, config: Tracke
     min_score = torch.where(new, search.new_below, min_score)
     min_inlier_ratio = torch.where(starting | new, scored.inlier_ratio.nan_to_num(0.0) - AS_MUCH, 0)
     return AcceptanceTest(margin, min_score, min_inlier_ratio, torch.where(slow, _matches(scored), 0))
-
-
-def elsewhere(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:
-    """Of poses that are not around the prediction, or farther away than it allows."""
-    reference = evidence.reference_explained_ratio
-    nothing = torch.zeros_like(reference)
-    return AcceptanceTest(nothing + _ELSEWHERE_MARGIN, config.relocalization.accept_ratio * reference, nothing, nothing)
 
 
 def around_last_seen(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfig) -> AcceptanceTest:

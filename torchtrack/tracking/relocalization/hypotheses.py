@@ -18,7 +18,6 @@ from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.last_seen import less_certain
 from torchtrack.tracking.relocalization.lost_object import LostObject
 from torchtrack.tracking.relocalization.sampling import sample
-from torchtrack.tracking.relocalization.triggers import SCORE_DROP_SIGMA_PX
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,6 @@ class Hypotheses:
         places: pixels of the object's events at the window's end, and which of them exist.
         is_wide: whether hardly anything was known of where the object is.
         replaces_prediction: whether the prediction takes the place of the object's own where one of them is accepted.
-        released: information that then no longer holds the pose; none for nothing.
         gate_scale: the scale of the first gate then; none for as it is.
     """
 
@@ -42,25 +40,12 @@ class Hypotheses:
     places: tuple[Float[Tensor, "1 e 2"], Bool[Tensor, "1 e"]]
     is_wide: bool
     replaces_prediction: bool = False
-    released: Float[Tensor, "12 12"] | None = None
     gate_scale: Float[Tensor, "1"] | None = None
 
 
 def around_prediction(lost: LostObject) -> Hypotheses:
     """Sampled from its prediction: near it, or, where hardly anything is known, in all places of the image."""
     return sampled_around(lost, lost.predicted(), lost.sigma_px, lost.contours())
-
-
-def around_prediction_released(lost: LostObject) -> Hypotheses:
-    """Sampled near the prediction of an object that is sure of where it is, and may be farther off than that.
-
-    Held by its prediction, no pose some pixels away is reached, however much it explains. What is accepted goes on as certain as
-    if it had been predicted: an object that is not held at all wanders off from a hypothesis to the next.
-    """
-    config, sigma_px, slip_px = lost.config, lost.sigma_px, SCORE_DROP_SIGMA_PX
-    hypotheses = sampled_around(lost, less_certain(lost.predicted(), sigma_px, slip_px), slip_px, lost.contours())
-    released = config.solver.observation_px**2 * (1 - (sigma_px / slip_px) ** 2) * lost.widened.information[lost.number]
-    return replace(hypotheses, released=released)
 
 
 def around_last_seen(lost: LostObject) -> Hypotheses:

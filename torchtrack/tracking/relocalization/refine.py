@@ -38,10 +38,6 @@ def exchanged(lost: LostObject, hypotheses: Hypotheses, tried: ScoredFit, choice
     if host_sync.none_of(accepted):
         return window
     scored, prediction, gate_scale = replaced(window.scored, number, tried, choice), window.prediction, window.gate_scale
-    if hypotheses.released is not None:
-        hessian = scored.fit.solution.hessian.clone()
-        hessian[number] += (hypotheses.released * accepted).to(hessian.dtype)
-        scored = replace(scored, fit=replace(scored.fit, solution=replace(scored.fit.solution, hessian=hessian)))
     if hypotheses.replaces_prediction:
         prediction = prediction.exchanged(number, hypotheses.prediction, accepted[0])
     if hypotheses.gate_scale is not None:

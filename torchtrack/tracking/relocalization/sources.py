@@ -36,7 +36,6 @@ class Source:
 
 SOURCES = (
     Source(AROUND_PREDICTION, hypotheses.around_prediction, acceptance.near_prediction),
-    Source(Trigger.SCORE_DROP, hypotheses.around_prediction_released, acceptance.elsewhere),
     Source(AROUND_LAST_SEEN, hypotheses.around_last_seen, acceptance.around_last_seen, comes_last=True),
     Source(Trigger.UNCONFIRMED, rivals.turned_far, rivals.explains_far_more, comes_last=True),
 )

@@ -23,11 +23,10 @@ from torchtrack.tracking.validation.verdict import Limits
 
 # What drifts for so long is looked for farther away, once in this time (µs).
 DRIFT_US = 50_000
-# Below this share of the usual score others are tried, two windows in a row; and at once below the other one.
-LOW_SCORE_BELOW, SCORE_DROP_BELOW = 0.8, 0.7
-# An object whose prediction has a smaller standard deviation in the image is sure of its place; after a drop of its score, others are drawn with
-# this one (px).
-SCORE_DROP_SIGMA_PX = 6.0
+# Below this share of the usual score others are tried, two windows in a row.
+LOW_SCORE_BELOW = 0.8
+# An object whose prediction has a smaller standard deviation in the image is sure of its place (px).
+_SURE_SIGMA_PX = 6.0
 # An object is new while what it explains when seen well, which rises with every window, is below this ratio of what it explains.
 _NEW = 0.9
 
@@ -38,7 +37,6 @@ class Trigger(IntFlag):
     UNCERTAIN = auto()
     NEW = auto()
     LOW_SCORE = auto()
-    SCORE_DROP = auto()
     DRIFT = auto()
     SLOW_DRIFT = auto()
     DEPTH_CHANGED = auto()
@@ -54,7 +52,7 @@ AROUND_LAST_SEEN = Trigger.DEPTH_CHANGED | Trigger.FAR_BELOW_REFERENCE
 # An object that is looked for around its prediction.
 AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.NEW | Trigger.LOW_SCORE | DRIFTS
 # What calls for a search. An object that is lost is expected where it was last validated, and uncertain there.
-SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.SCORE_DROP | Trigger.UNCONFIRMED
+SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.UNCONFIRMED
 
 
 def triggered(evidence: TriggerEvidence, config: TrackerConfig) -> TriggerEvidence:
@@ -106,7 +104,7 @@ def is_drifting_slowly(evidence: TriggerEvidence, config: TrackerConfig) -> Bool
     low = evidence.last_score < search.slow_drift_below * evidence.reference_explained_ratio
     long = evidence.time_since_validated_s >= 1e-6 * DRIFT_US
     other = is_drifting(evidence, config) | evidence.is_starting
-    return ~other & (due & low & long & (evidence.sigma_px < SCORE_DROP_SIGMA_PX))
+    return ~other & (due & low & long & (evidence.sigma_px < _SURE_SIGMA_PX))
 
 
 def is_uncertain(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
@@ -130,15 +128,6 @@ def is_new(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"
     best = torch.maximum(evidence.score, evidence.last_score)
     new = ~evidence.is_starting & evidence.is_due & (evidence.reference_explained_ratio < _NEW * best)
     return new & (best < config.relocalization.new_below)
-
-
-def has_score_dropped(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
-    """SCORE_DROP: objects that are sure of their place, and explain far less all at once."""
-    dropped = evidence.score < SCORE_DROP_BELOW * evidence.mean_score
-    if none_of(dropped):
-        return dropped
-    is_sure = ~evidence.is_starting & (evidence.sigma_px < SCORE_DROP_SIGMA_PX)
-    return is_sure & evidence.is_near_due & ~has(evidence.triggers, DRIFTS) & dropped & config.uses(Component.SCORE_DROP)
 
 
 def is_unconfirmed(evidence: TriggerEvidence, config: TrackerConfig) -> Bool[Tensor, "b"]:
@@ -167,7 +156,6 @@ _CONDITIONS: tuple[dict[int, Condition], ...] = (
         int(Trigger.UNCERTAIN): is_uncertain,
         int(Trigger.NEW): is_new,
         int(Trigger.LOW_SCORE): is_scored_low,
-        int(Trigger.SCORE_DROP): has_score_dropped,
         int(Trigger.UNCONFIRMED): is_unconfirmed,
     },
 )
