@@ -10,7 +10,7 @@ Numbers = Mapping[str, torch.Tensor]
 # Fields of results that have another name here than in the tree at BASE: ``{"name there": "name here"}``. A dotted name stands for all
 # that is under it; None is for what is no longer there. For ADDED there is nothing to compare. To be emptied when BASE moves on.
 RENAMED: dict[str, str | None] = {}
-ADDED: frozenset[str] = frozenset({"contours.resolved"})
+ADDED: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
