@@ -124,7 +124,9 @@ def test_an_object_is_looked_for_among_the_same_events_in_any_number_of_streams(
         start = changed(alone.init(turned[number : number + 1], 0), drift_s=adrift["drift_s"][:1])
         _, single = follow(alone, start, windows(noisy[number].of_stream(0), 6))
         torch.testing.assert_close(poses_of(results, number), poses_of(single), rtol=0, atol=1e-5)
-        assert torch.cat(counts).tolist() == of_both[:, number].tolist()
+        # Together, it is also asked for in windows in which the other one alone is looked for.
+        counted = iter(of_both[:, number].tolist())
+        assert counts and all(count in counted for count in torch.cat(counts).tolist())
 
 
 def disturbed(kind, starts, state):

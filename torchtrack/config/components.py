@@ -19,6 +19,7 @@ class Component(StrEnum):
     WIDE_GATES = "wide_gates"
     SUBCELL_LOOKUP = "subcell_lookup"
     # motion
+    SPEED_FROM_EVENTS = "speed_from_events"
     WINDOW_PARTS = "window_parts"
     TURNS_FADE = "turns_fade"
     # estimation and validation

@@ -81,7 +81,7 @@ SWITCHES: dict[str, dict[str, Component]] = {
         "silhouette_dark_shift_px": Component.SILHOUETTE_DARK_SHIFT,
     },
     "solver": {"velocity_in_window": Component.VELOCITY_IN_WINDOW, "common_px": Component.COMMON_ERROR},
-    "motion": {"turn_s": Component.TURNS_FADE},
+    "motion": {"speed_from_events": Component.SPEED_FROM_EVENTS, "turn_s": Component.TURNS_FADE},
     "validation": {"partly_hidden": Component.PARTLY_HIDDEN, "all_directions": Component.ALL_DIRECTIONS},
     "relocalization": {
         "low_score_below": Component.LOW_SCORE,

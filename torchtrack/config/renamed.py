@@ -71,7 +71,6 @@ REMOVED: dict[str, dict[str, str]] = {
     "motion": {
         "acceleration_px": "no acceleration is estimated",
         "acceleration_s": "no acceleration is estimated",
-        "speed_from_events": "how few events a new object fires says nothing of its speed later",
         "spin_fades": "a spin that no event shows goes on",
     },
     "relocalization": {

@@ -29,6 +29,8 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
+from torchtrack.core import host_sync
+
 P, R = ParamSpec("P"), TypeVar("R")
 # By kind of device: the library that its kernels are written with, which is also the name of the backend's folder.
 LIBRARIES = {"cpu": "numba", "cuda": "triton"}
@@ -156,7 +158,7 @@ def _triton_is_new_enough() -> bool:
 
 def _backend_for(values: Tensor) -> str:
     """The kind of device whose backend may compute with tensors like this one; empty where there is none."""
-    device = values.device.type
+    device = "cpu" if host_sync.read_at_once(values) else "cuda" if host_sync.on_gpu(values) else ""
     return device if not torch.compiler.is_compiling() and backend_is_installed(device) else ""
 
 

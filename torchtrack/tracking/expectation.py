@@ -5,11 +5,14 @@ from dataclasses import dataclass, replace
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.config.components import Component
 from torchtrack.core import host_sync
+from torchtrack.core.events import EventBatch, pad_streams
 from torchtrack.tracking.adapt import objects_as_known
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensors import farthest_event_px
 from torchtrack.tracking.frontend.tiles import NearbyEvents
+from torchtrack.tracking.initialization import held_back
 from torchtrack.tracking.motion.predict import forecast
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.objects import TrackedObjects
@@ -37,17 +40,21 @@ class Expected:
     scheduled: Schedule
 
 
-def expect(tracked: TrackedObjects, state: TrackerState, t_us: Int[Tensor, "s"], reads: host_sync.HostReads) -> Expected:
+def expect(tracked: TrackedObjects, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], reads: host_sync.HostReads) -> Expected:
     """Where objects are expected at a window's end: objects that are lost for long, where they were last seen well.
 
     Args:
-        t_us: its end.
+        events: of the window that ends at ``t_us``.
         reads: asks for what has to be decided.
     """
     window_s = _seconds_after(tracked, state, t_us)
     dt_s, objects = window_s[tracked.stream_index], tracked.objects
     scheduled = schedule(state, objects, t_us, tracked.config)
     lost = has(scheduled.triggers, Trigger.LOST)
+    # Most windows are of objects that were found long ago: their events need not be counted, where that is known at once.
+    never_found = ~(state.health.mean_score > 0)
+    if tracked.config.uses(Component.SPEED_FROM_EVENTS) and not reads.none_of(never_found):
+        state = held_back(state, never_found, objects, tracked.sensors.seen(pad_streams(events, tracked.streams, t_us)), dt_s)
     if not reads.none_of(lost):
         state = LastSeen.from_state(state, objects, tracked.config).in_place_of(state, lost)
     return Expected(predicted_after(tracked, state, dt_s, objects), window_s, dt_s, scheduled)

@@ -1,6 +1,7 @@
 """The state of a tracker before its first window: poses, and nothing learned yet."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,9 +10,10 @@ from torch import Tensor
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import lie
-from torchtrack.core.camera import MIN_DEPTH_M
+from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.events import EventBatch, stream_bounds
+from torchtrack.core.lie import transform_points
 from torchtrack.core.pose_checks import check_pose
 from torchtrack.errors import PoseError
 from torchtrack.tracking.adaptation.appearance import Appearance
@@ -19,6 +21,7 @@ from torchtrack.tracking.adaptation.learned_contours import LearnedContours
 from torchtrack.tracking.association.polarity import nothing_remembered
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
+from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.model import MotionState, initial_covariance
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.state import TrackerState
@@ -41,10 +44,51 @@ def first_state(tracked: TrackedObjects, T_cam_obj: Float[Tensor, "b 4 4"], t_us
     )
 
 
+# A shorter way need not show at all: a pixel fires only once an edge has passed far enough over it (px).
+_LEAST_WAY_PX = 0.6
+
+
 def unknown_speed(covariance: Float[Tensor, "b 12 12"], diameter_m: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
     """Standard deviation of the speed of an object's rim along one axis (m/s)."""
     turning, moving = covariance.diagonal(dim1=-2, dim2=-1)[:, 6:].unflatten(-1, (2, 3)).mean(-1).unbind(-1)
     return (moving + turning * (0.5 * diameter_m).square()).sqrt()
+
+
+def limit_speed(
+    covariance: Float[Tensor, "b 12 12"], limit_m_s: Float[Tensor, "b"], diameter_m: Float[Tensor, "b"], depth_m: Float[Tensor, "b"]
+) -> Float[Tensor, "b 12 12"]:
+    """Covariance where the speed of an object's rim across the image is known to be no larger than a limit (float64).
+
+    A motion along the line of sight moves the rim in the image by so much less as the object is farther away than wide.
+    """
+    scale = limit_m_s.double() / unknown_speed(covariance, diameter_m)
+    along = scale * 2 * depth_m / diameter_m
+    both = torch.stack([torch.ones_like(scale)] * 6 + [scale] * 5 + [along], -1).clamp(max=1)
+    return covariance * both[:, :, None] * both[:, None]
+
+
+def largest_speed(objects: ObjectBatch, T_cam_obj: Float[Tensor, "b 4 4"], events: WindowEvents, window_s: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
+    """Speed of an object's rim (m/s) for which a window's events before it would just do.
+
+    An outline that moves fires in every pixel it passes, and it is at least twice as long as the object is wide.
+    """
+    centre_cam = transform_points(T_cam_obj, objects.centre_obj[:, None])
+    diameter_px = objects.size_px(T_cam_obj)
+    x, y = (events.pixels - project(centre_cam, objects.intrinsics)).unbind(-1)
+    before_it = events.mask & (x * x + y * y < (0.5 * diameter_px[:, None]).square())
+    way_px = (before_it.sum(-1) / (2 * diameter_px)).clamp(min=_LEAST_WAY_PX)
+    return way_px / diameter_px * objects.diameter_m / window_s
+
+
+@torch.no_grad()
+def held_back(
+    state: TrackerState, unfound: Bool[Tensor, "b"], objects: ObjectBatch, events: WindowEvents, window_s: Float[Tensor, "b"]
+) -> TrackerState:
+    """The state, with the speed of objects that are ``unfound`` yet limited by a window's events before them."""
+    T_cam_obj = state.T_cam_obj.detach().to(objects.intrinsics.dtype)
+    limit_m_s = torch.where(unfound, largest_speed(objects, T_cam_obj, events, window_s), torch.inf)
+    covariance = limit_speed(state.motion.covariance, limit_m_s, objects.diameter_m, objects.depth_m(T_cam_obj))
+    return replace(state, motion=replace(state.motion, covariance=covariance))
 
 
 # While an object's motion is not known, a window is taken in so many parts, where more than this of the motion in it is not known (px); fewer events

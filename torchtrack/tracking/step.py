@@ -123,7 +123,7 @@ def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> t
 
 def steady_window(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> SteadyWindow:
     """Stages 1 to 4, of all objects alike, and which of them have triggers."""
-    expected = expect(tracked, state, given.t_us, given.reads)
+    expected = expect(tracked, state, given.events.events, given.t_us, given.reads)
     seen = observe(tracked, state, expected, given)
     start = Start(expected.prediction, seen.contours, seen.index, seen.gate_scale, extra_terms=given.extra_terms)
     scored = validate(tracked, state, expected, seen, align(start, seen.observations, tracked.config))
