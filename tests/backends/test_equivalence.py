@@ -170,8 +170,8 @@ def stated(name, value, args):
     if operation == "contour_table":
         return [value.rows.transpose(1, 2)[args[0].mask], value.not_plain]
     if operation == "highest":
-        # Which of several equal shifts is named is chance.
-        return [value[0]]
+        # Which of several equal shifts is named is chance, and so is whether one beside an equal one is another.
+        return [value[0][:, :1]]
     if operation == "strongest_along_normals":
         # So it is which of several places with as many events.
         return [value[1]]
