@@ -15,6 +15,7 @@ from torchtrack.tracking.estimation import levenberg_marquardt as lm
 
 # Rows of what was observed.
 U, V, AGE, POLARITY, TRUST = range(5)
+OBSERVED = 5
 # Columns of a contour point: its place on the object, its normal, where it was indexed, and marks.
 X, Y, Z, NORMAL_U, NORMAL_V, INDEXED_U, INDEXED_V, SMOOTH, ORIENTED, EXPECTED = range(10)
 COLUMNS = 10

@@ -35,7 +35,7 @@ def match(
     b = tl.program_id(0).to(tl.int64)
     i = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     inside = i < count
-    seen, place, matches = seen + b * 5 * count + i, place + b * 2 * count + i, matches + b * rows.ROWS * count + i
+    seen, place, matches = seen + b * rows.OBSERVED * count + i, place + b * 2 * count + i, matches + b * rows.ROWS * count + i
     table += b * rows.COLUMNS * points
     place_u, place_v = tl.load(place, inside, 0.0), tl.load(place + count, inside, 0.0)
     index = nearest_of_cell + b * cell_rows * cell_columns, first + b * 2, cell_rows, cell_columns, side_px, aside_px
@@ -72,7 +72,10 @@ def match(
     tl.store(contour + b * count + i, point, inside)
     tl.store(is_near + b * count + i, near, inside)
     tl.store(is_matched + b * count + i, matched, inside)
-    _write_point(matches, count, inside, point_x, point_y, point_z, age_s)
+    tl.store(matches + rows.MATCH_AGE * count, age_s, inside)
+    tl.store(matches + rows.POINT_X * count, point_x, inside)
+    tl.store(matches + rows.POINT_Y * count, point_y, inside)
+    tl.store(matches + rows.POINT_Z * count, point_z, inside)
     tl.store(matches + rows.TARGET_U * count, target_u, inside)
     tl.store(matches + rows.TARGET_V * count, target_v, inside)
     tl.store(matches + rows.DIRECTION_U * count, normal_u, inside)
@@ -94,15 +97,6 @@ def _vote(votes, near, offset, as_expected, dark, settings: tl.constexpr):
 
 
 @kernel
-def _write_point(matches, count, inside, x, y, z, age_s):
-    """Write the contour points of matches, and how long ago they were seen."""
-    tl.store(matches + rows.MATCH_AGE * count, age_s, inside)
-    tl.store(matches + rows.POINT_X * count, x, inside)
-    tl.store(matches + rows.POINT_Y * count, y, inside)
-    tl.store(matches + rows.POINT_Z * count, z, inside)
-
-
-@kernel
 def believe(seen, votes, is_matched, matches, count, settings: tl.constexpr, BLOCK: tl.constexpr):
     """Weigh one object's matches by those around them; none counts without a match, or where the object has too few of them.
 
@@ -111,7 +105,7 @@ def believe(seen, votes, is_matched, matches, count, settings: tl.constexpr, BLO
     """
     b = tl.program_id(0).to(tl.int64)
     matches, is_matched = matches + b * rows.ROWS * count, is_matched + b * count
-    trust, votes = seen + (b * 5 + rows.TRUST) * count, votes + b * settings.patches * settings.patches * 3
+    trust, votes = seen + (b * rows.OBSERVED + rows.TRUST) * count, votes + b * settings.patches * settings.patches * 3
     total = tl.zeros([BLOCK], matches.dtype.element_ty)
     for begin in range(0, count, BLOCK):
         i = begin + tl.arange(0, BLOCK)
