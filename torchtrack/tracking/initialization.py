@@ -22,7 +22,7 @@ from torchtrack.tracking.association.polarity import nothing_remembered
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.window_events import WindowEvents
-from torchtrack.tracking.motion.model import MotionState, initial_covariance
+from torchtrack.tracking.motion.model import MotionState, initial_covariance, rim_and_centre
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.state import TrackerState
 from torchtrack.tracking.validation.health import TrackHealth
@@ -60,11 +60,13 @@ def limit_speed(
     """Covariance where the speed of an object's rim across the image is known to be no larger than a limit (float64).
 
     A motion along the line of sight moves the rim in the image by so much less as the object is farther away than wide.
+    Each direction is limited by itself: what is within the limit stays as it is, however often it is said.
     """
-    scale = limit_m_s.double() / unknown_speed(covariance, diameter_m)
-    along = scale * 2 * depth_m / diameter_m
-    both = torch.stack([torch.ones_like(scale)] * 6 + [scale] * 5 + [along], -1).clamp(max=1)
-    return covariance * both[:, :, None] * both[:, None]
+    # As much by turning as by moving.
+    most = rim_and_centre(limit_m_s.double()[:, None] / 2**0.5, diameter_m.double()[:, None])
+    most[:, 5] *= 2 * depth_m / diameter_m
+    scale = torch.nn.functional.pad(most / covariance.diagonal(dim1=-2, dim2=-1)[:, 6:].sqrt(), (6, 0), value=1.0).clamp(max=1)
+    return covariance * scale[:, :, None] * scale[:, None]
 
 
 def largest_speed(objects: ObjectBatch, T_cam_obj: Float[Tensor, "b 4 4"], events: WindowEvents, window_s: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
