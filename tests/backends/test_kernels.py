@@ -238,6 +238,10 @@ def test_bursts_of_pixels_that_fire_again_and_again(elapsed_us, streams):
 # ---- measures and matrices
 
 
+# Each object in an image of its own size.
+IMAGE_SIZES = torch.tensor([IMAGE_SIZE, (90, 200), (150, 110)])
+
+
 def random_matches(batch=3, count=6000):
     """Matches with numbers all over."""
     offsets, near = uniform(batch, count, low=-6, high=6, seed=1), uniform(batch, count, seed=2) < 0.7
@@ -253,7 +257,7 @@ def random_matches(batch=3, count=6000):
 def test_what_events_explain(speed, settings):
     config = TrackerConfig.model_validate(settings)
     contours, objects = random_contours(), moving_objects((speed, 0.5 * speed), 3)
-    by_kernels, plain = both_ways(lambda: fit_measures(contours, random_matches(), objects, IMAGE_SIZE, config))
+    by_kernels, plain = both_ways(lambda: fit_measures(contours, random_matches(), objects, IMAGE_SIZES, config))
     assert_as_close(by_kernels, plain, tolerance=1e-6)
     assert by_kernels.texture_agreement.isnan().all() == ("validation" in settings)
 
@@ -275,7 +279,7 @@ def test_what_is_not_a_number_stays_with_its_object(what):
     (spoilt.points_cam if what == "points" else spoilt.pixels)[1] = torch.nan
     objects = MovingObjects(torch.eye(4).double().expand(3, 4, 4), random_twist(3), torch.ones(3, 3).double(), torch.ones(3, 4).double())
     with torch.inference_mode():
-        alone, neighbours = (fit_measures(owner, random_matches(), objects, IMAGE_SIZE, TrackerConfig()) for owner in (contours, spoilt))
+        alone, neighbours = (fit_measures(owner, random_matches(), objects, IMAGE_SIZES, TrackerConfig()) for owner in (contours, spoilt))
         index, other = (index_contours(owner, IMAGE_SIZE, 7, 2) for owner in (contours, spoilt))
     for first, second in zip(alone, neighbours, strict=True):
         torch.testing.assert_close(first[[0, 2]], second[[0, 2]], rtol=0, atol=0, equal_nan=True)
@@ -289,7 +293,7 @@ def test_what_is_not_a_number_stays_with_its_object(what):
 def test_marks_of_poses(each, dtype):
     camera = torch.tensor([[1.0, 1.0, 0.0, 0.0]], dtype=dtype)
     group = group_by_model([box_model()], ContourConfig())[0].to(dtype)
-    own = torch.zeros(1, 3, dtype=dtype), torch.ones(1, 3, dtype=dtype), torch.ones(1, dtype=dtype), torch.zeros(1).long()
+    own = torch.zeros(1, 3, dtype=dtype), torch.ones(1, 3, dtype=dtype), torch.ones(1, dtype=dtype), torch.zeros(1).long(), torch.tensor([IMAGE_SIZE])
     objects = ObjectBatch([group], camera, *own, (1, *IMAGE_SIZE), False)
     T_cam_obj = torch.eye(4, dtype=dtype)[None]
     prediction = Prediction(objects, T_cam_obj, torch.ones(1).bool(), torch.zeros(1, 6, dtype=dtype), torch.eye(12).double()[None])

@@ -24,6 +24,7 @@ def boxes(poses, covariance=None, velocity=None, dtype=torch.float64):
         half_extent=torch.full((count, 3), 0.05, dtype=dtype),
         diameter_m=torch.full((count,), 0.17, dtype=dtype),
         stream_index=torch.arange(count),
+        image_sizes=torch.tensor([[SMALL_CAMERA.height, SMALL_CAMERA.width]]).expand(count, 2),
         image_shape=(count, SMALL_CAMERA.height, SMALL_CAMERA.width),
         shared=False,
     )

@@ -247,9 +247,9 @@ class EventLineTracker(Tracker):
     def _judge(self, window: Window, fit: LineFit) -> Judged:
         """What each object's pose is worth."""
         contours, matches = fit.contours, fit.matches
-        share = explained_ratio(contours, matches, self._contour_velocity(window, contours), self.image_size, self.config)
+        share = explained_ratio(contours, matches, self._contour_velocity(window, contours), self.image_sizes, self.config)
         step = lie.small_difference_about(window.T_start, fit.solution.T_cam_obj, self.centre_obj)
-        in_view = visible_ratio(contours, self.image_size)
+        in_view = visible_ratio(contours, self.image_sizes)
         rotated_rad, moved_m = step.unflatten(1, (2, 3)).norm(dim=-1).unbind(1)
         scale, yes, no = torch.ones_like(share), torch.ones_like(share, dtype=torch.bool), torch.zeros_like(share, dtype=torch.bool)
         measured = Measured(

@@ -25,6 +25,7 @@ class TrackedObjects(nn.Module):
     sensor_pixels: Tensor
     sensor_numbers: Tensor
     stream_index: Tensor
+    image_sizes: Tensor
     centre_obj: Tensor
     half_extent: Tensor
     diameter_m: Tensor
@@ -51,6 +52,7 @@ class TrackedObjects(nn.Module):
         self.image_size = (max(c.height for c in cameras), max(c.width for c in cameras))
         self.groups = nn.ModuleList(group_by_model(objects, self.config.contours))
         self.register_buffer("stream_index", torch.tensor(streams))
+        self.register_buffer("image_sizes", torch.tensor([(cameras[s].height, cameras[s].width) for s in streams]).reshape(-1, 2))
         self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
         for name, table in zip(("ideal_pixels", "sensor_pixels", "sensor_numbers"), sensor_tables(cameras), strict=True):
             self.register_buffer(name, table)
@@ -77,7 +79,7 @@ class TrackedObjects(nn.Module):
     def objects(self) -> ObjectBatch:
         """The objects as one batch."""
         shape = (self.streams, *self.image_size)
-        own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m, self.stream_index
+        own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m, self.stream_index, self.image_sizes
         return ObjectBatch(self.models, *own, shape, self._shared)
 
     @property

@@ -83,7 +83,7 @@ def measured_of(located: Relocalized) -> Measured:
         inlier_ratio=scored.inlier_ratio,
         reference_inlier_ratio=scored.reference_inlier_ratio,
         texture_agreement=scored.texture_agreement,
-        in_view=visible_ratio(scored.fit.contours, prediction.objects.image_size),
+        in_view=visible_ratio(scored.fit.contours, prediction.objects.image_sizes),
         gate_scale=located.gate_scale,
         rotated_rad=rotated_rad,
         moved_diameters=moved_m / prediction.objects.diameter_m,

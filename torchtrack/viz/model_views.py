@@ -73,6 +73,7 @@ def view_contours(model: ObjectModel, T_cam_obj: Float[Tensor, "v 4 4"]) -> Cont
         model.half_extent.expand(count, 3),
         torch.full((count,), model.diameter_m),
         torch.arange(count),
+        torch.full((count, 2), _SIDE_PX),
         (count, _SIDE_PX, _SIDE_PX),
         False,
     )

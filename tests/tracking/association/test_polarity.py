@@ -155,7 +155,7 @@ def test_contours_are_not_explained_by_events_that_are_not_as_expected():
     for dark in ([1.0] * 60, [-1.0] * 60):
         contours, matches = matched(dark)
         moving = torch.tensor([500.0, 0.0], dtype=torch.float64).expand_as(contours.pixels)
-        shares.append(float(explained_ratio(contours, matches, moving, IMAGE_SIZE, TrackerConfig())))
+        shares.append(float(explained_ratio(contours, matches, moving, torch.tensor([IMAGE_SIZE]), TrackerConfig())))
     assert shares[0] > 0.1
     assert shares[1] == 0
 

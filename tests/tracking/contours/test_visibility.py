@@ -197,8 +197,8 @@ def test_contours_outside_the_image_are_not_said_to_be_hidden(x_m):
     """Else an object that leaves the image seems to be in view until it is gone."""
     model = ObjectModel.from_mesh(ball(0.1, subdivisions=4), name="ball")
     before, after = extracted([model], pose((0.0, 0.0, 0.0), (x_m, 0.0, 0.6))[None], camera=LARGE_CAMERA)
-    size = (LARGE_CAMERA.height, LARGE_CAMERA.width)
-    assert float(visible_ratio(after, size)) == pytest.approx(float(visible_ratio(before, size)), abs=0.1)
+    sizes = torch.tensor([[LARGE_CAMERA.height, LARGE_CAMERA.width]])
+    assert float(visible_ratio(after, sizes)) == pytest.approx(float(visible_ratio(before, sizes)), abs=0.1)
 
 
 def test_a_bad_pose_harms_no_neighbour(dtype):

@@ -22,7 +22,7 @@ def upright_line(u=80.0, count=80, first=20.0):
 
 def ratio(contours, matches, velocity=(100.0, 0.0), config=TRACKER):
     moving = torch.tensor(velocity, dtype=torch.float64).expand_as(contours.pixels)
-    return explained_ratio(contours, matches, moving, IMAGE_SIZE, config)
+    return explained_ratio(contours, matches, moving, torch.tensor([IMAGE_SIZE]).expand(len(moving), 2), config)
 
 
 # ---- the explained ratio
@@ -68,9 +68,9 @@ def test_what_does_not_move_need_not_be_explained():
     moving[:, 80:, 0] = 100.0
     moving[:, :80, 0] = 29.0
     matches = matches_at(upright_line(80.0))
-    assert float(explained_ratio(contours, matches, moving, IMAGE_SIZE, TRACKER)) == 1
+    assert float(explained_ratio(contours, matches, moving, torch.tensor([IMAGE_SIZE]), TRACKER)) == 1
     moving[:, :80, 0] = 31.0
-    assert float(explained_ratio(contours, matches, moving, IMAGE_SIZE, TRACKER)) == 0.5
+    assert float(explained_ratio(contours, matches, moving, torch.tensor([IMAGE_SIZE]), TRACKER)) == 0.5
 
 
 def test_only_motion_across_the_contour_counts():
@@ -127,10 +127,10 @@ def test_few_events_do_not_tell_how_far_they_gather():
 
 def test_the_visible_ratio_counts_points_in_the_image():
     pixels = [[[0.0, 0.0], [199.5, 149.5], [200.0, 20.0], [-0.1, 20.0], [20.0, -0.1], [20.0, 150.0], [50.0, 50.0]]]
-    assert float(visible_ratio(contours_at(pixels), IMAGE_SIZE)) == pytest.approx(3 / 7)
+    assert float(visible_ratio(contours_at(pixels), torch.tensor([IMAGE_SIZE]))) == pytest.approx(3 / 7)
     mask = [[True, True, False, False, False, False, True]]
-    assert float(visible_ratio(contours_at(pixels, mask=mask), IMAGE_SIZE)) == 1
+    assert float(visible_ratio(contours_at(pixels, mask=mask), torch.tensor([IMAGE_SIZE]))) == 1
 
 
 def test_without_contours_nothing_is_in_view():
-    assert float(visible_ratio(contours_at([[[50.0, 50.0]]], mask=[[False]]), IMAGE_SIZE)) == 0
+    assert float(visible_ratio(contours_at([[[50.0, 50.0]]], mask=[[False]]), torch.tensor([IMAGE_SIZE]))) == 0

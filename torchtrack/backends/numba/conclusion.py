@@ -170,7 +170,7 @@ def judged_objects_numba(state: TrackerState, located: Relocalized, dt_s: Float[
     """Object by object."""
     prediction, scored = located.prediction, located.scored
     objects, solution, batch, health = prediction.objects, scored.fit.solution, len(dt_s), state.health
-    in_view = visible_ratio(scored.fit.contours, objects.image_size)
+    in_view = visible_ratio(scored.fit.contours, objects.image_sizes)
     ratios = scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, scored.texture_agreement, in_view
     measured = torch.stack([*ratios, located.gate_scale])
     flags = torch.stack([~scored.measured_ratio.isnan(), scored.is_relocalized])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.backends.filling import filled
@@ -30,6 +30,7 @@ def measure(
     mask: Array,
     kind: Array,
     resolved: Array,
+    image_sizes: Array,
     velocity: Array,
     centre_cam: Array,
     intrinsics: Array,
@@ -49,6 +50,7 @@ def measure(
 
     Args:
         points_cam, pixels, normals, mask, kind, resolved: of contours: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``, and ``[b, m]``.
+        image_sizes: ``[b, 2]``, height and width.
         velocity: ``[b, 6]``, about ``centre_cam [b, 3]``.
         targets, directions, offsets, is_near, as_expected, contour: of matches: ``[b, 2, n]`` and ``[b, n]``.
         explained, inliers, spread, agreement: ``[b]``, filled: :class:`torchtrack.tracking.validation.measures.FitMeasures`.
@@ -62,7 +64,7 @@ def measure(
         total, count = 0, 0
         for i in range(mask.shape[1]):
             u, v = pixels[b, 0, i], pixels[b, 1, i]
-            if not mask[b, i] or not (u >= 0 and v >= 0 and u < settings.width and v < settings.height):
+            if not mask[b, i] or not (u >= 0 and v >= 0 and u < image_sizes[b, 1] and v < image_sizes[b, 0]):
                 continue
             x, y, z = points_cam[b, 0, i], points_cam[b, 1, i], points_cam[b, 2, i]
             speed_u, speed_v = across(motion, x, y, z, inverse_depth(z), of_lens)
@@ -121,14 +123,14 @@ def _texture_agreement(
 
 
 @kernel(fastmath=FAST)
-def visible(pixels: Array, mask: Array, height: int, width: int, ratio: Array) -> None:
+def visible(pixels: Array, mask: Array, image_sizes: Array, ratio: Array) -> None:
     """Ratio of contour points in the image: :func:`tracking.validation.measures.visible_ratio`, of ``pixels [b, 2, m]`` and ``mask [b, m]``."""
     for b in range(len(mask)):
         total = seen = 0
         for i in range(mask.shape[1]):
             u, v = pixels[b, 0, i], pixels[b, 1, i]
             total += mask[b, i]
-            seen += mask[b, i] and u >= 0 and v >= 0 and u < width and v < height
+            seen += mask[b, i] and u >= 0 and v >= 0 and u < image_sizes[b, 1] and v < image_sizes[b, 0]
         ratio[b] = seen / max(total, 1)
 
 
@@ -218,27 +220,26 @@ def sigma_px_numba(prediction: Prediction, contours: Contours) -> Float[Tensor, 
 
 @accelerates(measures.fit_measures)
 def fit_measures_numba(
-    contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: TrackerConfig
+    contours: Contours, matches: Matches, objects: MovingObjects, image_sizes: Int[Tensor, "b 2"], config: TrackerConfig
 ) -> measures.FitMeasures:
     """Point by point."""
     measured = measures.FitMeasures(*contours.pixels.new_empty(4, len(contours.mask)))
     places = (values.transpose(1, 2) for values in (contours.points_cam, contours.pixels, contours.normals))
-    shown = *places, contours.mask, contours.kind, contours.resolved
+    shown = *places, contours.mask, contours.kind, contours.resolved, image_sizes
     moving = as_arrays(objects.velocity, objects.centre_cam, objects.intrinsics)
     sides = as_arrays(matches.targets.transpose(1, 2), matches.directions.transpose(1, 2))
     matched = *sides, *as_arrays(matches.offsets, matches.near, matches.as_expected, matches.contour)
-    height, width = image_size
-    more = {"height": height, "width": width, "min_on_contour": measures.min_on_contour(config), "texture": int(ContourKind.TEXTURE)}
+    more = {"min_on_contour": measures.min_on_contour(config), "texture": int(ContourKind.TEXTURE)}
     settings = filled(QualitySettings, config.validation, measures, weights, **more)
     measure(*as_arrays(*shown), *moving, *matched, settings, *(values.numpy() for values in measured))
     return measured
 
 
 @accelerates(measures.visible_ratio)
-def visible_ratio_numba(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
+def visible_ratio_numba(contours: Contours, image_sizes: Int[Tensor, "b 2"]) -> Float[Tensor, "b"]:
     """Point by point."""
     ratio = contours.pixels.new_empty(len(contours.mask))
-    visible(*as_arrays(contours.pixels.transpose(1, 2), contours.mask), *image_size, ratio.numpy())
+    visible(*as_arrays(contours.pixels.transpose(1, 2), contours.mask, image_sizes), ratio.numpy())
     return ratio
 
 

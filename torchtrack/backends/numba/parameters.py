@@ -188,10 +188,8 @@ class TileSettings(NamedTuple):
 
 
 class QualitySettings(NamedTuple):
-    """What :mod:`torchtrack.backends.numba.measures` goes by: settings, the image, and constants of :mod:`validation.measures` and ``matching``."""
+    """What :mod:`torchtrack.backends.numba.measures` goes by: settings, and constants of :mod:`validation.measures` and ``matching``."""
 
-    height: int
-    width: int
     min_observations: int
     min_on_contour: int
     min_speed_px_s: float

@@ -108,7 +108,7 @@ def judge_model(
     learned: LearnedContours,
     scored: ScoredFit,
     velocity: Callable[[Contours], Tensor],
-    image_size: tuple[int, int],
+    image_sizes: Int[Tensor, "b 2"],
     config: TrackerConfig,
     *,
     any_count: bool,
@@ -123,7 +123,7 @@ def judge_model(
         any_count: whether any learned contours were among those of the fit.
     """
     contours = scored.fit.contours
-    share = _share_of_own(scored, velocity(contours), image_size, config) if any_count else scored.measured_ratio
+    share = _share_of_own(scored, velocity(contours), image_sizes, config) if any_count else scored.measured_ratio
     known = torch.isfinite(share) & (scored.count > 0)
     share = torch.where(known, torch.lerp(learned.model_share, share, _SHARE_GAIN), learned.model_share)
     enough = share > _BELOW_RATIO + _MORE_SHARE
@@ -132,12 +132,12 @@ def judge_model(
     return replace(learned, model_share=share, needed=(learned.needed & ~enough) | (share < _BELOW_RATIO))
 
 
-def _share_of_own(scored: ScoredFit, velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: TrackerConfig) -> Float[Tensor, "b"]:
+def _share_of_own(scored: ScoredFit, velocity: Float[Tensor, "b m 2"], image_sizes: Int[Tensor, "b 2"], config: TrackerConfig) -> Float[Tensor, "b"]:
     """Share of the moving contours of the model itself that events explain; not a number where hardly any move."""
     contours, matches = scored.fit.contours, scored.fit.matches
     own = contours.kind != int(ContourKind.LEARNED)
     matches = replace(matches, near=matches.near & own.gather(1, matches.contour))
-    return measured_ratio(replace(contours, mask=contours.mask & own), matches, velocity, image_size, config)
+    return measured_ratio(replace(contours, mask=contours.mask & own), matches, velocity, image_sizes, config)
 
 
 def _in_motion(contours: Contours, velocity: Float[Tensor, "b m 2"]) -> Bool[Tensor, "b"]:

@@ -117,8 +117,8 @@ def learn_after(
     Args:
         wanted: objects to learn of, from the state before the window; none where the window is not due.
     """
-    velocity, image_size, any_count = around.contour_velocity, around.objects.image_size, around.objects.learned is not None
-    learned = judge_model(learned, scored, velocity, image_size, config, any_count=any_count)
+    velocity, image_sizes, any_count = around.contour_velocity, around.objects.image_sizes, around.objects.learned is not None
+    learned = judge_model(learned, scored, velocity, image_sizes, config, any_count=any_count)
     if wanted is None or host_sync.none_of(wanted):
         return learned
     if not host_sync.read_at_once(wanted):

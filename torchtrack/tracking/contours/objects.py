@@ -48,7 +48,8 @@ class ObjectBatch:
         half_extent: from there to the sides of each object's bounding box, along the axes of its frame (m).
         diameter_m: diameter of each object.
         stream_index: the stream that each object is seen in.
-        image_shape: streams, height and width of the image.
+        image_sizes: height and width of the image that each object is seen in (px).
+        image_shape: streams, height and width of the largest image.
         shared: whether any stream has more than one object.
         learned: contour points beside those of the models; none when not given.
         polarity: the darker side expected of contours, by the octant that they face (:mod:`tracking.association.polarity`); nothing when not given.
@@ -60,6 +61,7 @@ class ObjectBatch:
     half_extent: Float[Tensor, "b 3"]
     diameter_m: Float[Tensor, "b"]
     stream_index: Int[Tensor, "b"]
+    image_sizes: Int[Tensor, "b 2"]
     image_shape: tuple[int, int, int]
     shared: bool
     learned: LearnedPoints | None = None
@@ -67,7 +69,7 @@ class ObjectBatch:
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Height and width of the image."""
+        """Height and width of the largest image (px)."""
         return self.image_shape[1:]
 
     def depth_m(self, T_cam_obj: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b"]:
@@ -106,12 +108,12 @@ class ObjectBatch:
         """Some of the objects; where they are read on the CPU."""
         places = [(model, torch.isin(chosen, model.members).nonzero()[:, 0]) for model in self.models]
         models = [model.with_members(of_model, of_model.tolist()) for model, of_model in places if len(of_model)]
-        own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m, self.stream_index
-        intrinsics, centre_obj, half_extent, diameter_m, stream_index = (value[chosen] for value in own)
+        own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m, self.stream_index, self.image_sizes
+        intrinsics, centre_obj, half_extent, diameter_m, stream_index, sizes = (value[chosen] for value in own)
         learned = None if self.learned is None else LearnedPoints(*(value[chosen] for value in vars(self.learned).values()))
         polarity = None if self.polarity is None else self.polarity[chosen]
         shape, shared = self.image_shape, self.shared
-        return ObjectBatch(models, intrinsics, centre_obj, half_extent, diameter_m, stream_index, shape, shared, learned, polarity)
+        return ObjectBatch(models, intrinsics, centre_obj, half_extent, diameter_m, stream_index, sizes, shape, shared, learned, polarity)
 
     def copies(self, number: int, count: int) -> "ObjectBatch":
         """One object many times, each in a stream of its own: copies do not hide one another."""
@@ -121,8 +123,8 @@ class ObjectBatch:
         intrinsics, centre_obj, half_extent, diameter_m = (repeat_row(value, number, count) for value in own)
         learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))
         polarity = None if self.polarity is None else repeat_row(self.polarity, number, count)
-        size = (count, *self.image_size)
-        return ObjectBatch([model], intrinsics, centre_obj, half_extent, diameter_m, streams, size, False, learned, polarity)
+        sizes, shape = repeat_row(self.image_sizes, number, count), (count, *self.image_size)
+        return ObjectBatch([model], intrinsics, centre_obj, half_extent, diameter_m, streams, sizes, shape, False, learned, polarity)
 
 
 def repeat_row(values: Tensor, number: int, count: int) -> Tensor:

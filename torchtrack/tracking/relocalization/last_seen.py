@@ -69,8 +69,8 @@ class LastSeen:
         """Poses as they were, as uncertain as each object's next look asks for."""
         T_cam_obj = state.health.T_last_validated.to(objects.intrinsics.dtype)
         fraction = (state.health.looks % _LOOKS + 1).double() / _LOOKS
-        height, width = objects.image_size
-        across_px = (_SPEED_PX_S * state.health.time_since_validated_s.double()).clamp(max=_DIAGONALS * (height**2 + width**2) ** 0.5)
+        diagonal_px = objects.image_sizes.double().norm(dim=-1)
+        across_px = (_SPEED_PX_S * state.health.time_since_validated_s.double()).clamp(max=_DIAGONALS * diagonal_px)
         across_m, depth_m = across_px / objects.px_per_m(T_cam_obj).double(), _DEPTH_SHARE * objects.depth_m(T_cam_obj).double()
         rotation_rad = torch.full_like(depth_m, _ROTATION_RAD)
         pose = fraction[:, None] * torch.stack([rotation_rad, rotation_rad, rotation_rad, across_m, across_m, depth_m], 1)

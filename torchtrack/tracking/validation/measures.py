@@ -6,7 +6,7 @@ The residual does not tell: a slip onto a parallel edge has a small one.
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.components import Component
@@ -46,14 +46,14 @@ AROUND_PX = 5.0
 
 
 def explained_ratio(
-    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: TrackerConfig
+    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_sizes: Int[Tensor, "b 2"], config: TrackerConfig
 ) -> Float[Tensor, "b"]:
     """:func:`measured_ratio`; where hardly anything moves, nothing speaks against the pose: all is explained."""
-    return measured_ratio(contours, matches, contour_velocity, image_size, config).nan_to_num(1.0)
+    return measured_ratio(contours, matches, contour_velocity, image_sizes, config).nan_to_num(1.0)
 
 
 def measured_ratio(
-    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_size: tuple[int, int], config: TrackerConfig
+    contours: Contours, matches: Matches, contour_velocity: Float[Tensor, "b m 2"], image_sizes: Int[Tensor, "b 2"], config: TrackerConfig
 ) -> Float[Tensor, "b"]:
     """Of the visible contour that should fire given its motion, the ratio with observations on it; not a number where hardly any moves.
 
@@ -64,7 +64,7 @@ def measured_ratio(
     on, near = counts.gather(2, patch(contours.pixels)[:, None].expand(-1, 2, -1)).unbind(1)
     explained = (on >= min_on_contour(config)) & (on + 1 > LEAST_RATIO * (near + 2))
     speed = (contours.normals * contour_velocity).sum(-1).abs()
-    moving = contours.mask & inside(contours.pixels, image_size) & (speed > MIN_SPEED_PX_S)
+    moving = contours.mask & inside(contours.pixels, image_sizes) & (speed > MIN_SPEED_PX_S)
     total = moving.sum(-1)
     ratio = (moving & explained).sum(-1).to(contours.pixels.dtype) / total.clamp(min=1)
     return torch.where(total < MIN_MOVING_POINTS, torch.nan, ratio)
@@ -85,10 +85,10 @@ class FitMeasures(NamedTuple):
 
 
 @accelerable
-def fit_measures(contours: Contours, matches: Matches, objects: MovingObjects, image_size: tuple[int, int], config: TrackerConfig) -> FitMeasures:
+def fit_measures(contours: Contours, matches: Matches, objects: MovingObjects, image_sizes: Int[Tensor, "b 2"], config: TrackerConfig) -> FitMeasures:
     """What events say of poses whose contours move with their objects."""
     velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
-    measured, inliers = measured_ratio(contours, matches, velocity, image_size, config), inlier_ratio(matches, config.validation)
+    measured, inliers = measured_ratio(contours, matches, velocity, image_sizes, config), inlier_ratio(matches, config.validation)
     return FitMeasures(measured, inliers, normal_spread(matches), texture_agreement(contours, matches, config.validation))
 
 
@@ -157,14 +157,13 @@ def constrained_2d(spread: Float[Tensor, "b"], required: Float[Tensor, "b"]) -> 
     return torch.where(required > 0, ratio.clamp(0, 1), 1)
 
 
-def inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """Which pixels lie in the image (height, width)."""
-    u, v = pixels.unbind(-1)
-    return (u >= 0) & (u < image_size[1]) & (v >= 0) & (v < image_size[0])
+def inside(pixels: Float[Tensor, "b m 2"], image_sizes: Int[Tensor, "b 2"]) -> Bool[Tensor, "b m"]:
+    """Which pixels lie in the image of their object (height, width)."""
+    return ((pixels >= 0) & (pixels < image_sizes.flip(-1)[:, None])).all(-1)
 
 
 @accelerable
-def visible_ratio(contours: Contours, image_size: tuple[int, int]) -> Float[Tensor, "b"]:
+def visible_ratio(contours: Contours, image_sizes: Int[Tensor, "b 2"]) -> Float[Tensor, "b"]:
     """Ratio of an object's contour points that lie in the image; zero without any."""
-    seen = contours.mask & inside(contours.pixels, image_size)
+    seen = contours.mask & inside(contours.pixels, image_sizes)
     return seen.sum(-1) / contours.mask.sum(-1).clamp(min=1)

@@ -73,7 +73,7 @@ def score_fit(
         required_spread: how far normals have to be spread to count in full; zero, or none at all, for nothing required.
     """
     moving = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).moving(compensated=True)
-    measured, inliers, spread, agreement = fit_measures(fit.contours, fit.matches, moving, prediction.objects.image_size, config)
+    measured, inliers, spread, agreement = fit_measures(fit.contours, fit.matches, moving, prediction.objects.image_sizes, config)
     # Of what does not move, events are noise.
     inliers = torch.where(measured.isnan(), torch.nan, inliers) if config.uses(Component.INLIER_RATIO) else torch.full_like(measured, torch.nan)
     if required_spread is not None:
