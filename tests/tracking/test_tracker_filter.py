@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors
 from states import changed
-from tracked_boxes import WINDOW_US, follow, moving_box, started, tracker_of, windows
+from tracked_boxes import PREDICT, WINDOW_US, follow, moving_box, started, tracker_of, windows
 
 from torchtrack import Tracker
 from torchtrack.config.components import Component
@@ -156,7 +156,7 @@ def test_a_box_that_turned_away_during_an_outage_is_found_again(dtype):
 
 def test_a_share_that_is_too_small_for_so_wide_a_search_is_no_find():
     """Where an object is looked for all over, a few edges that fit are not it: the pose stays as predicted."""
-    tracker, state, _, (events, end_us), _ = started()
+    tracker, state, _, (events, end_us), _ = started(config=PREDICT)
     uncertain = changed(state, covariance=1e3 * state.motion.covariance)
     away = retract_about(state.T_cam_obj, torch.tensor([[0.0, 0.0, 0.0, 0.06, 0.05, 0.0]]).double(), tracker.centre_obj.double())
     _, result = tracker.step(changed(uncertain, T_cam_obj=away), events[torch.arange(0, len(events), 8)], end_us)

@@ -254,7 +254,7 @@ class EventLineTracker(Tracker):
         scale, yes, no = torch.ones_like(share), torch.ones_like(share, dtype=torch.bool), torch.zeros_like(share, dtype=torch.bool)
         measured = Measured(
             *(share, share, scale, scale, torch.full_like(share, torch.nan)),
-            *(in_view, scale, rotated_rad, moved_m / self.diameter_m, matches.mask.sum(-1)),
+            *(in_view, scale, rotated_rad, moved_m / self.diameter_m, matches.mask.sum(-1), matches.near.sum(-1)),
             is_moving=yes,
             is_usable=yes,
             is_relocalized=no,

@@ -89,7 +89,9 @@ class MotionConfig(Settings):
     initial_speed_m_s: float = Field(0.6, gt=0, description="Standard deviation of the initial speed (m/s).")
     acceleration_rate_hz: float = Field(20.0, ge=0, description="Acceleration to be expected, as a multiple of the speed (1/s).")
     acceleration_floor_m_s2: float = Field(2.0, gt=0, description="Acceleration to be expected of an object at rest (m/s²).")
-    without_events: Literal["predict", "hold"] = Field("predict", description="What the pose does in a window with too few events.")
+    without_events: Literal["rest", "predict", "hold"] = Field(
+        "rest", description="Poses that are not found go on as predicted, but rest where hardly anything fires; or they go on, or rest, in any case."
+    )
 
 
 class AdaptationConfig(Settings):

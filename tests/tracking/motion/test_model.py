@@ -181,17 +181,12 @@ def test_what_is_unknown_stays_unknown_and_harms_no_neighbour():
 def test_velocities_die_away_where_nothing_confirms_them(dtype):
     velocity = torch.ones(3, 6, dtype=dtype)
     failed, dt_s = torch.tensor([True, False, True]), torch.tensor([0.1, 0.1, 0.3], dtype=dtype)
-    actual = fade(velocity, dt_s, failed, MotionConfig())
+    actual = fade(velocity, dt_s, failed)
     assert actual[:, 0].tolist() == pytest.approx([0.60653, 1.0, 0.22313], rel=1e-4)
     assert actual.dtype == dtype
     # Two windows are as good as one that is as long as both.
-    twice = fade(fade(velocity, dt_s / 2, failed, MotionConfig()), dt_s / 2, failed, MotionConfig())
+    twice = fade(fade(velocity, dt_s / 2, failed), dt_s / 2, failed)
     torch.testing.assert_close(twice, actual)
-
-
-def test_objects_that_are_held_stand_still():
-    actual = fade(torch.ones(2, 6), torch.full((2,), 0.1), torch.tensor([True, False]), MotionConfig(without_events="hold"))
-    assert actual[:, 0].tolist() == [0, 1]
 
 
 def test_a_velocity_that_is_set_aside_is_uncertain_by_as_much():

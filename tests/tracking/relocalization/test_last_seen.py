@@ -7,7 +7,7 @@ import torch
 from helpers import SMALL_CAMERA, box_model, pose
 from lost_states import moved_away, uncertain, unseen
 from states import changed
-from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, started, windows
+from tracked_boxes import PREDICT, WINDOW_US, follow, in_motion, moving_box, started, windows
 
 from torchtrack import Tracker
 from torchtrack.config.components import Component
@@ -162,7 +162,7 @@ def test_an_object_that_holds_on_to_other_edges_is_found_again_where_it_was_seen
 
 @torch.no_grad()
 def test_where_an_object_was_last_seen_well_is_remembered_and_not_where_it_was_not():
-    tracker, trajectory, events = Tracker([box_model()], SMALL_CAMERA), *moving_box(pose(), 8)
+    tracker, trajectory, events = Tracker([box_model()], SMALL_CAMERA, PREDICT), *moving_box(pose(), 8)
     state = tracker.init(pose()[None], 0)
     assert torch.equal(state.health.T_last_validated, state.T_cam_obj)
     state, results = follow(tracker, state, windows(events, 8))

@@ -32,7 +32,7 @@ def limits(**settings):
 
 def measured(**values):
     """Of objects that are seen well, but for what is given."""
-    usual = Measured(1.0, 1.0, 0.8, 0.8, 1.0, 1.0, 1.0, 0.0, 0.0, 100, True, True, False)
+    usual = Measured(1.0, 1.0, 0.8, 0.8, 1.0, 1.0, 1.0, 0.0, 0.0, 100, 120, True, True, False)
     given = {name: torch.as_tensor(value).reshape(-1) for name, value in usual._replace(**values)._asdict().items()}
     longest = max(len(value) for value in given.values())
     return Measured(**{name: value.expand(longest) for name, value in given.items()})
@@ -289,6 +289,19 @@ def test_what_a_search_gave_just_now_is_not_remembered_as_seen_well_by_what_spok
 # ---- the whole, for tensors and for numbers
 
 
+@pytest.mark.parametrize(("matched", "near", "rests"), [(29, 29, True), (29, 30, False), (30, 30, False), (0, 0, True), (0, 400, False)])
+def test_what_hardly_fires_rests_and_what_fires_elsewhere_does_not(matched, near, rests):
+    known = References(*torch.tensor([0.8, 0.8, 0.8, 0.0, 0.0, 4.0])[:, None])
+    judged = rules.verdict(measured(matched=matched, near=near), known, limits())
+    assert bool(judged.rests) == rests
+    assert bool(judged.failed) == (matched < 30)
+
+
+def test_what_is_out_of_view_does_not_rest():
+    known = References(*torch.tensor([0.8, 0.8, 0.8, 0.0, 0.0, 4.0])[:, None])
+    assert not rules.verdict(measured(matched=0, near=0, in_view=0.1), known, limits()).rests
+
+
 def random_cases(count=300):
     """Objects near and beyond every limit, and some of which something is not a number."""
     generator = torch.Generator().manual_seed(3)
@@ -298,7 +311,7 @@ def random_cases(count=300):
         1 + draw(2),
         draw(0.7),
         draw(0.7),
-        (200 * draw()).long(),
+        *((200 * draw()).long() for _ in range(2)),
         *(draw() > threshold for threshold in (0.2, 0.1, 0.7)),
     )
     for values in (seen.inlier_ratio, seen.texture_agreement, seen.rotated_rad):

@@ -44,7 +44,7 @@ def conclude(
     T_estimated: Array,
     offset: Array,
     hessian: Array,
-    count: Array,
+    counts: Array,
     flags: Array,
     measured: Array,
     dt_s: Array,
@@ -66,7 +66,7 @@ def conclude(
         T_before: poses before the window, ``[b, 4, 4]``.
         T_prior, usable, velocity, covariance: of the prediction.
         T_estimated, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 12]``, ``[b, 12, 12]``.
-        count, flags, measured: ``[b]``, ``[2, b]`` and ``[7, b]``: what is known of the fits, in the order of :class:`Measured`.
+        counts, flags, measured: ``[2, b]``, ``[2, b]`` and ``[7, b]``: what is known of the fits, in the order of :class:`Measured`.
         remembered, T_last_validated: ``[6, b]``, in the order of :class:`References`, and ``[b, 4, 4]`` before the window; changed to those after it.
         T_cam_obj, new_velocity, posterior, left, status: after the window, ``left`` being the covariance of poses; filled.
     """
@@ -74,15 +74,17 @@ def conclude(
     for b in range(len(usable)):
         m, r = measured[:, b], remembered[:, b]
         rotated, moved = _length(offset[b, :3]), _length(offset[b, 3:6]) / diameter_m[b]
-        of_fit = Measured(m[0], m[1], m[2], m[3], m[4], m[5], m[6], rotated, moved, count[b], flags[0, b], usable[b], flags[1, b])
+        of_fit = Measured(m[0], m[1], m[2], m[3], m[4], m[5], m[6], rotated, moved, counts[0, b], counts[1, b], flags[0, b], usable[b], flags[1, b])
         known = References(r[0], r[1], r[2], r[3], r[4], r[5])
         judged = _verdict(of_fit, known, limits)
         status[b] = judged.status
         _orthonormalise(T_prior[b] if judged.failed else T_estimated[b], T_cam_obj[b])
-        if judged.failed and (settings.holds or not usable[b]):
+        held = (judged.failed and settings.holds) or (judged.rests and settings.rests)
+        if held or (judged.failed and not usable[b]):
             T_cam_obj[b] = T_before[b]
         inverse(hessian[b], inverses)
-        _update(judged.trusted, judged.failed, dt_s[b], velocity[b], covariance[b], offset[b], inverses, settings, new_velocity[b], posterior[b])
+        of_prediction = velocity[b], covariance[b]
+        _update(judged.trusted, judged.failed, held, dt_s[b], of_prediction, offset[b], inverses, settings, new_velocity[b], posterior[b])
         centre_of(T_cam_obj[b], centre_obj[b], centre)
         _to_left(posterior[b], centre, left[b])
         r[0], r[1], r[2], r[3], r[4], r[5] = _remembered(known, of_fit, judged, dt_s[b], limits)
@@ -114,16 +116,17 @@ def _orthonormalise(T: Array, exact: Array) -> None:
 def _update(
     trusted: float,
     failed: bool,
+    held: bool,
     dt: float,
-    velocity: Array,
-    predicted: Array,
+    of_prediction: tuple[Array, Array],
     offset: Array,
     inverses: Array,
     settings: CorrectionSettings,
     new_velocity: Array,
     posterior: Array,
 ) -> None:
-    """Velocity and covariance after a window: as estimated, as far as that is to be trusted; and they fade where nothing confirmed them."""
+    """Velocity and covariance after a window: as estimated, as far as that is to be trusted; none where an object is ``held``."""
+    velocity, predicted = of_prediction
     variance, total = settings.observation_px**2, 0.0
     for j in range(12):
         for k in range(12):
@@ -133,13 +136,13 @@ def _update(
         for k in range(12):
             estimated = variance * inverses[j, k]
             posterior[j, k] = estimated + (1.0 - trusted) * (predicted[j, k] - estimated) if trusted > 0 else predicted[j, k]
-    kept = (0.0 if settings.holds else np.exp(-dt / settings.coast_s)) if failed else 1.0
+    kept = np.exp(-dt / settings.coast_s) if failed else 1.0
     dropped = np.empty(6)
     for k in range(6):
         moving = velocity[k] + trusted * offset[6 + k]
-        new_velocity[k] = 0.0 if failed and settings.holds else kept * moving
+        new_velocity[k] = 0.0 if held else kept * moving
         dropped[k] = moving - new_velocity[k]
-    if settings.holds:
+    if held:
         for j in range(6):
             for k in range(6):
                 posterior[6 + j, 6 + k] += dropped[j] * dropped[k]
@@ -173,6 +176,7 @@ def judged_objects_numba(state: TrackerState, located: Relocalized, dt_s: Float[
     in_view = visible_ratio(scored.fit.contours, objects.image_sizes)
     ratios = scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, scored.texture_agreement, in_view
     measured = torch.stack([*ratios, located.gate_scale])
+    counts = torch.stack([scored.count, scored.fit.matches.near.sum(-1)])
     flags = torch.stack([~scored.measured_ratio.isnan(), scored.is_relocalized])
     remembered = torch.stack(health.references)
     T_last_validated = health.T_last_validated.clone(memory_format=torch.contiguous_format)
@@ -181,9 +185,9 @@ def judged_objects_numba(state: TrackerState, located: Relocalized, dt_s: Float[
     conclude(
         *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance),
         *as_arrays(solution.T_cam_obj, solution.from_prior, solution.hessian),
-        *as_arrays(scored.count, flags, measured, dt_s, objects.centre_obj, objects.diameter_m),
+        *as_arrays(counts, flags, measured, dt_s, objects.centre_obj, objects.diameter_m),
         Limits.from_config(config),
-        filled(CorrectionSettings, config.solver, model, holds=config.motion.without_events == "hold"),
+        filled(CorrectionSettings, config.solver, model, rests=config.motion.without_events == "rest", holds=config.motion.without_events == "hold"),
         *as_arrays(remembered, T_last_validated, T_cam_obj, velocity, covariance, left, status),
     )
     health = replace(health, **References(*remembered.unbind())._asdict(), T_last_validated=T_last_validated)

@@ -226,10 +226,12 @@ class CorrectionSettings(NamedTuple):
     """How :mod:`torchtrack.backends.numba.conclusion` goes on from a verdict.
 
     Args:
-        holds: whether what failed stays where it was.
+        rests: whether what has hardly any events stays where it was.
+        holds: whether all that failed does.
         coast_s: time in which the velocity of what failed fades.
     """
 
+    rests: bool
     holds: bool
     observation_px: float
     coast_s: float

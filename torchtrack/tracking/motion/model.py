@@ -95,10 +95,8 @@ def acceleration_sigma(velocity: Float[Tensor, "b 6"], diameter_m: Float[Tensor,
     return rim_and_centre(config.acceleration_rate_hz * rim_m_s + config.acceleration_floor_m_s2, diameter_m)
 
 
-def fade(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], failed: Bool[Tensor, "b"], config: MotionConfig) -> Float[Tensor, "b 6"]:
+def fade(velocity: Float[Tensor, "b 6"], dt_s: Float[Tensor, "b"], failed: Bool[Tensor, "b"]) -> Float[Tensor, "b 6"]:
     """Velocities where nothing confirmed them: a coasting object must not leave for good."""
-    if config.without_events == "hold":
-        return torch.where(failed[:, None], 0.0, velocity)
     return torch.where(failed[:, None], velocity * torch.exp(-dt_s / COAST_S)[:, None], velocity)
 
 

@@ -101,6 +101,7 @@ class Measured(NamedTuple):
             :class:`torchtrack.tracking.validation.scored_fit.ScoredFit` has them.
         in_view: ratio of the contour inside the image.
         matched: observations that are matched with it.
+        near: observations that are near its contours.
         gate_scale: of the object's first gate: an uncertain one may be so much farther away.
         rotated_rad, moved_diameters: from the prediction to the pose.
         is_moving: whether enough of the contour moves for events to explain it.
@@ -118,6 +119,7 @@ class Measured(NamedTuple):
     rotated_rad: Float[Tensor, "b"]
     moved_diameters: Float[Tensor, "b"]
     matched: Int[Tensor, "b"]
+    near: Int[Tensor, "b"]
     is_moving: Bool[Tensor, "b"]
     is_usable: Bool[Tensor, "b"]
     is_relocalized: Bool[Tensor, "b"]
@@ -140,6 +142,7 @@ class Verdict(NamedTuple):
     Args:
         status: as :class:`torchtrack.tracking.validation.status.Status`.
         failed: objects that go on as predicted.
+        rests: those of them that stay where they were instead: hardly anything fires near them, as what moves before the camera does.
         trusted: how far a pose counts against the prediction, 0 to 1.
         is_smeared: see :func:`smeared`.
         is_certain: poses to be remembered as seen well.
@@ -147,6 +150,7 @@ class Verdict(NamedTuple):
 
     status: Int[Tensor, "b"]
     failed: Bool[Tensor, "b"]
+    rests: Bool[Tensor, "b"]
     trusted: Float[Tensor, "b"]
     is_smeared: Bool[Tensor, "b"]
     is_certain: Bool[Tensor, "b"]
@@ -211,7 +215,7 @@ def verdict(measured: Measured, known: References, limits: Limits) -> Verdict:
     """What each object's pose is worth."""
     reference, hidden = known.reference_explained_ratio, partly_hidden(measured, limits)
     status = judge(measured, hidden, limits)
-    failed = status >= _LOST
+    failed, rests = status >= _LOST, (status == _TOO_FEW_EVENTS) & (measured.near < limits.min_observations)
     trusted = trust(measured, reference, limits)
     trusted = where(failed, 0.0, where(hidden > trusted, hidden, trusted))
     is_smeared = logical_not(failed) & smeared(measured, reference, limits)
@@ -220,7 +224,7 @@ def verdict(measured: Measured, known: References, limits: Limits) -> Verdict:
     # Until a pose is confirmed, what explains much may be others' edges: where the object was before is not to be forgotten for them.
     # So may what a search gave just now: windows before it speak for the pose before.
     is_certain = is_certain & (known.confirmations >= limits.confirmed_by) & logical_not(measured.is_relocalized)
-    return Verdict(status, failed, trusted, is_smeared, is_certain)
+    return Verdict(status, failed, rests, trusted, is_smeared, is_certain)
 
 
 def seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
