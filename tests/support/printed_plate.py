@@ -28,7 +28,7 @@ def rectangle(half_width_m: float, half_height_m: float, x_m: float = 0.0, y_m: 
     return torch.tensor([(corners[i], corners[(i + 1) % 4]) for i in range(4)], dtype=torch.float64)
 
 
-# A frame well inside the border, and what it frames. Nearer, at 5 mm, it is taken for the border: by 23 of 24 motions.
+# A frame well inside the border, and what it frames. Nearer, at 5 mm, it is taken for the border in 23 of 24 tries.
 FRAME, BORDER = rectangle(0.09, 0.065), rectangle(0.1, 0.075)[:2]
 TEXT = [rectangle(0.02, 0.015, x_m, y_m) for x_m in (-0.065, 0.0, 0.065) for y_m in (-0.04, 0.0, 0.04)]
 PRINTED = torch.cat([FRAME, BORDER, *TEXT])

@@ -52,7 +52,7 @@ class TrackedObjects(nn.Module):
         self.image_size = (max(c.height for c in cameras), max(c.width for c in cameras))
         self.groups = nn.ModuleList(group_by_model(objects, self.config.contours))
         self.register_buffer("stream_index", torch.tensor(streams))
-        self.register_buffer("image_sizes", torch.tensor([(cameras[s].height, cameras[s].width) for s in streams]).reshape(-1, 2))
+        self.register_buffer("image_sizes", torch.tensor([(cameras[s].height, cameras[s].width) for s in streams]))
         self.register_buffer("intrinsics", torch.stack([cameras[s].intrinsics() for s in streams]))
         for name, table in zip(("ideal_pixels", "sensor_pixels", "sensor_numbers"), sensor_tables(cameras), strict=True):
             self.register_buffer(name, table)

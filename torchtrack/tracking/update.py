@@ -65,9 +65,8 @@ def judged_objects(state: TrackerState, located: Relocalized, dt_s: Float[Tensor
     prediction, scored = located.prediction, located.scored
     measured, known, limits = measured_of(located), state.health.references, Limits.from_config(config)
     judged = verdict(measured, known, limits)
-    held = {"rest": judged.rests, "predict": torch.zeros_like(judged.failed), "hold": judged.failed}[config.motion.without_events]
-    T_cam_obj = _corrected_pose(state.T_cam_obj, prediction, scored, judged.failed, held)
-    velocity, covariance = _updated_motion(prediction, scored, judged, held, dt_s, config.solver)
+    T_cam_obj = _corrected_pose(state.T_cam_obj, prediction, scored, judged)
+    velocity, covariance = _updated_motion(prediction, scored, judged, dt_s, config.solver)
     centre_cam = lie.transform_points(T_cam_obj, prediction.objects.centre_obj[:, None].double())[:, 0]
     T_last_validated = torch.where(judged.is_certain[:, None, None], T_cam_obj.detach(), state.health.T_last_validated)
     health = replace(state.health, **remembered(known, measured, judged, dt_s, limits)._asdict(), T_last_validated=T_last_validated)
@@ -96,12 +95,10 @@ def measured_of(located: Relocalized) -> Measured:
     )
 
 
-def _corrected_pose(
-    T_before: Float[Tensor, "b 4 4"], prediction: Prediction, scored: ScoredFit, failed: Bool[Tensor, "b"], held: Bool[Tensor, "b"]
-) -> Float[Tensor, "b 4 4"]:
+def _corrected_pose(T_before: Float[Tensor, "b 4 4"], prediction: Prediction, scored: ScoredFit, judged: Verdict) -> Float[Tensor, "b 4 4"]:
     """Poses as estimated; those of objects that failed as predicted, or, of those that are ``held``, as they were before."""
-    T_cam_obj = lie.orthonormalise(torch.where(failed[:, None, None], prediction.T_cam_obj, scored.fit.solution.T_cam_obj).double())
-    held = held | (failed & ~prediction.usable)
+    T_cam_obj = lie.orthonormalise(torch.where(judged.failed[:, None, None], prediction.T_cam_obj, scored.fit.solution.T_cam_obj).double())
+    held = judged.held | (judged.failed & ~prediction.usable)
     return torch.where(held[:, None, None], T_before, T_cam_obj)
 
 
@@ -126,7 +123,7 @@ def _normal_spread(health: TrackHealth, scored: ScoredFit) -> Float[Tensor, "b"]
 
 
 def _updated_motion(
-    prediction: Prediction, scored: ScoredFit, judged: Verdict, held: Bool[Tensor, "b"], dt_s: Float[Tensor, "b"], config: SolverConfig
+    prediction: Prediction, scored: ScoredFit, judged: Verdict, dt_s: Float[Tensor, "b"], config: SolverConfig
 ) -> tuple[Float[Tensor, "b 6"], Float[Tensor, "b 12 12"]]:
     """Velocity and covariance after a window: as estimated, as far as that is to be trusted; of objects that are ``held``, at rest."""
     predicted, solution = prediction.covariance, scored.fit.solution
@@ -137,5 +134,5 @@ def _updated_motion(
     trusted = judged.trusted * (posterior.sum((1, 2)).abs() < torch.inf)
     velocity = prediction.velocity + trusted[:, None] * solution.from_prior[:, 6:]
     covariance = torch.where(trusted[:, None, None] > 0, torch.lerp(predicted, posterior, trusted[:, None, None].double()), predicted)
-    faded = torch.where(held[:, None], 0, fade(velocity, dt_s, judged.failed))
-    return faded, with_dropped(covariance, torch.where(held[:, None], velocity.detach(), 0))
+    held = judged.held[:, None]
+    return torch.where(held, 0, fade(velocity, dt_s, judged.failed)), with_dropped(covariance, torch.where(held, velocity.detach(), 0))

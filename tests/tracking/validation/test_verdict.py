@@ -286,20 +286,23 @@ def test_what_a_search_gave_just_now_is_not_remembered_as_seen_well_by_what_spok
     assert rules.verdict(seen, known, limits()).is_certain.tolist() == [True, False]
 
 
-# ---- the whole, for tensors and for numbers
+# ---- what stays where it was
 
 
-@pytest.mark.parametrize(("matched", "near", "rests"), [(29, 29, True), (29, 30, False), (30, 30, False), (0, 0, True), (0, 400, False)])
-def test_what_hardly_fires_rests_and_what_fires_elsewhere_does_not(matched, near, rests):
+@pytest.mark.parametrize(("matched", "near", "held"), [(29, 29, True), (29, 30, False), (30, 30, False), (0, 0, True), (0, 400, False)])
+def test_what_hardly_fires_rests_and_what_fires_elsewhere_does_not(matched, near, held):
     known = References(*torch.tensor([0.8, 0.8, 0.8, 0.0, 0.0, 4.0])[:, None])
     judged = rules.verdict(measured(matched=matched, near=near), known, limits())
-    assert bool(judged.rests) == rests
+    assert bool(judged.held) == held
     assert bool(judged.failed) == (matched < 30)
 
 
 def test_what_is_out_of_view_does_not_rest():
     known = References(*torch.tensor([0.8, 0.8, 0.8, 0.0, 0.0, 4.0])[:, None])
-    assert not rules.verdict(measured(matched=0, near=0, in_view=0.1), known, limits()).rests
+    assert not rules.verdict(measured(matched=0, near=0, in_view=0.1), known, limits()).held
+
+
+# ---- the whole, for tensors and for numbers
 
 
 def random_cases(count=300):
@@ -319,7 +322,9 @@ def random_cases(count=300):
     return seen, References(*(draw(most) for most in (1, 1, 1, 0.1, 1, 6))), draw(0.02)
 
 
-@pytest.mark.parametrize("settings", [{}, {"disabled": ["partly_hidden"]}, {"validation": {"lost_below": 0.4}}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"disabled": ["partly_hidden"]}, {"validation": {"lost_below": 0.4}}, {"motion": {"without_events": "hold"}}]
+)
 def test_the_source_compiled_for_numbers_decides_as_for_tensors(settings):
     compiler = pytest.importorskip("torchtrack.backends.numba.compiler")
     names = "needed_ratio", "partly_hidden", "trust", "judge", "smeared", "verdict", "seen_well", "confirmations", "remembered"

@@ -79,12 +79,11 @@ def conclude(
         judged = _verdict(of_fit, known, limits)
         status[b] = judged.status
         _orthonormalise(T_prior[b] if judged.failed else T_estimated[b], T_cam_obj[b])
-        held = (judged.failed and settings.holds) or (judged.rests and settings.rests)
-        if held or (judged.failed and not usable[b]):
+        if judged.held or (judged.failed and not usable[b]):
             T_cam_obj[b] = T_before[b]
         inverse(hessian[b], inverses)
         of_prediction = velocity[b], covariance[b]
-        _update(judged.trusted, judged.failed, held, dt_s[b], of_prediction, offset[b], inverses, settings, new_velocity[b], posterior[b])
+        _update(judged.trusted, judged.failed, judged.held, dt_s[b], of_prediction, offset[b], inverses, settings, new_velocity[b], posterior[b])
         centre_of(T_cam_obj[b], centre_obj[b], centre)
         _to_left(posterior[b], centre, left[b])
         r[0], r[1], r[2], r[3], r[4], r[5] = _remembered(known, of_fit, judged, dt_s[b], limits)
@@ -187,7 +186,7 @@ def judged_objects_numba(state: TrackerState, located: Relocalized, dt_s: Float[
         *as_arrays(solution.T_cam_obj, solution.from_prior, solution.hessian),
         *as_arrays(counts, flags, measured, dt_s, objects.centre_obj, objects.diameter_m),
         Limits.from_config(config),
-        filled(CorrectionSettings, config.solver, model, rests=config.motion.without_events == "rest", holds=config.motion.without_events == "hold"),
+        filled(CorrectionSettings, config.solver, model),
         *as_arrays(remembered, T_last_validated, T_cam_obj, velocity, covariance, left, status),
     )
     health = replace(health, **References(*remembered.unbind())._asdict(), T_last_validated=T_last_validated)

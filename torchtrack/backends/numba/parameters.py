@@ -226,13 +226,9 @@ class CorrectionSettings(NamedTuple):
     """How :mod:`torchtrack.backends.numba.conclusion` goes on from a verdict.
 
     Args:
-        rests: whether what has hardly any events stays where it was.
-        holds: whether all that failed does.
         coast_s: time in which the velocity of what failed fades.
     """
 
-    rests: bool
-    holds: bool
     observation_px: float
     coast_s: float
 

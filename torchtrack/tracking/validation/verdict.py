@@ -54,6 +54,7 @@ class Limits(NamedTuple):
         confirmed_from: as :data:`CONFIRMED_FROM`, no less than ``uncertain_below``.
         speaking_windows: as :data:`CONFIRMED_BY`; none where corners alone are observed, which lie on little of a contour.
         confirmed_by: these, and a look at other poses that found none that explains far more, where other poses are tried.
+        rests, holds: whether objects stay where they were that fail where hardly anything fires, and all that fail.
     """
 
     uncertain_below: float
@@ -69,6 +70,8 @@ class Limits(NamedTuple):
     confirmed_from: float
     speaking_windows: float
     confirmed_by: float
+    rests: bool
+    holds: bool
 
     @classmethod
     def from_config(cls, config: TrackerConfig) -> "Limits":
@@ -90,6 +93,8 @@ class Limits(NamedTuple):
             confirmed_from=max(CONFIRMED_FROM, validation.uncertain_below),
             speaking_windows=speaking_windows,
             confirmed_by=speaking_windows + looks,
+            rests=config.motion.without_events == "rest",
+            holds=config.motion.without_events == "hold",
         )
 
 
@@ -142,7 +147,7 @@ class Verdict(NamedTuple):
     Args:
         status: as :class:`torchtrack.tracking.validation.status.Status`.
         failed: objects that go on as predicted.
-        rests: those of them that stay where they were instead: hardly anything fires near them, as what moves before the camera does.
+        held: those of them that stay where they were instead, as those do near which hardly anything fires: what moves does.
         trusted: how far a pose counts against the prediction, 0 to 1.
         is_smeared: see :func:`smeared`.
         is_certain: poses to be remembered as seen well.
@@ -150,7 +155,7 @@ class Verdict(NamedTuple):
 
     status: Int[Tensor, "b"]
     failed: Bool[Tensor, "b"]
-    rests: Bool[Tensor, "b"]
+    held: Bool[Tensor, "b"]
     trusted: Float[Tensor, "b"]
     is_smeared: Bool[Tensor, "b"]
     is_certain: Bool[Tensor, "b"]
@@ -215,7 +220,8 @@ def verdict(measured: Measured, known: References, limits: Limits) -> Verdict:
     """What each object's pose is worth."""
     reference, hidden = known.reference_explained_ratio, partly_hidden(measured, limits)
     status = judge(measured, hidden, limits)
-    failed, rests = status >= _LOST, (status == _TOO_FEW_EVENTS) & (measured.near < limits.min_observations)
+    failed, is_silent = status >= _LOST, (status == _TOO_FEW_EVENTS) & (measured.near < limits.min_observations)
+    held = (failed & limits.holds) | (is_silent & limits.rests)
     trusted = trust(measured, reference, limits)
     trusted = where(failed, 0.0, where(hidden > trusted, hidden, trusted))
     is_smeared = logical_not(failed) & smeared(measured, reference, limits)
@@ -224,7 +230,7 @@ def verdict(measured: Measured, known: References, limits: Limits) -> Verdict:
     # Until a pose is confirmed, what explains much may be others' edges: where the object was before is not to be forgotten for them.
     # So may what a search gave just now: windows before it speak for the pose before.
     is_certain = is_certain & (known.confirmations >= limits.confirmed_by) & logical_not(measured.is_relocalized)
-    return Verdict(status, failed, rests, trusted, is_smeared, is_certain)
+    return Verdict(status, failed, held, trusted, is_smeared, is_certain)
 
 
 def seen_well(before: Float[Tensor, "b"], now: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
