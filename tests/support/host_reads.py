@@ -1,7 +1,7 @@
 """Where a computation would make the CPU wait for a GPU, found on the CPU alone.
 
 Values that are read back, shapes that depend on values, and tensors that are made of Python numbers: on a GPU each of them waits
-until all that was asked of it before is done.
+until all that was asked of it before is done. So does a number that is written to places of a tensor: it comes from the CPU's memory.
 """
 
 import traceback
@@ -23,14 +23,20 @@ class _Watch(TorchDispatchMode):
     def __init__(self, places: list[str]) -> None:
         super().__init__()
         self.places = places
+        # Tensors that Python numbers were made: kept, so that no other takes their place in memory.
+        self._numbers: list[torch.Tensor] = []
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = func._schema.name.removeprefix("aten::")
         made_here = name == "lift_fresh" and args[0].dim() > 0
         counted = name == "repeat_interleave" and func._overloadname in ("Tensor", "self_Tensor")
-        if name in _READS + _CHECKED or made_here or counted or (name.startswith("index") and _by_mask(args)):
+        number_written = name.startswith("index_put") and any(args[2] is number for number in self._numbers)
+        if name in _READS + _CHECKED or made_here or counted or number_written or (name.startswith("index") and _by_mask(args)):
             _note(self.places, name)
-        return func(*args, **(kwargs or {}))
+        made = func(*args, **(kwargs or {}))
+        if name == "lift_fresh":
+            self._numbers.append(made)
+        return made
 
 
 def _by_mask(args) -> bool:

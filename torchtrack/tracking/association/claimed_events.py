@@ -44,7 +44,8 @@ def claimed_pixels(
     # What does not exist is put behind the last sensor.
     stream = torch.where(exists, prediction.objects.stream_index[:, None, None], streams)
     passed_by = torch.zeros(streams + 1, height, width, dtype=torch.bool, device=window_s.device)
-    passed_by[stream, v, u] = True
+    # A number would be a tensor on the CPU, which a CUDA graph cannot wait for.
+    passed_by.index_put_((stream, v, u), torch.ones_like(passed_by[0, 0, 0]))
     return largest_around(passed_by[:-1].float(), CLAIMED_WITHIN_PX) > 0
 
 
