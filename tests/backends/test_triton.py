@@ -16,8 +16,9 @@ from tracked_boxes import follow, moving_box, poses_of, tensors_of, windows
 from torchtrack import Tracker, preset
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.core import dispatch
+from torchtrack.core import dispatch, host_sync
 from torchtrack.core.lie import retract_about
+from torchtrack.tracking.contours.points import Contours
 
 pytest.importorskip("triton", reason="needs Triton: pip install triton")
 from torchtrack.backends.triton import operations  # noqa: F401 - it registers what is accelerated
@@ -77,6 +78,53 @@ def assert_as_the_reference(args, tolerance):
         # A gradient is a sum of forces that nearly cancel.
         scale = float(other.abs().max()) if other.numel() else 1.0
         torch.testing.assert_close(mine, other, rtol=tolerance, atol=tolerance * max(scale, 1.0))
+
+
+# ---- the index of contours
+
+
+INDEX = dispatch.OPERATIONS["tracking.contours.index.index_contours"]
+
+
+def contours_of(*poses, dtype=torch.float32):
+    """Contours of boxes, and the size of their image."""
+    tracker = Tracker([box_model()] * len(poses), SMALL_CAMERA, dtype=dtype, kernels=False).to(DEVICE)
+    return tracker.objects.contours(torch.stack(poses).to(tracker.intrinsics), tracker.config.contours), tracker.image_size
+
+
+@pytest.mark.parametrize("cell_px", [2, 3])
+@pytest.mark.parametrize("radius_px", [7, [3, 25], [0, 12]])
+def test_each_cell_knows_the_contour_that_the_reference_does(cell_px, radius_px, dtype, monkeypatch):
+    contours, size = contours_of(pose(), pose(translation=(0.06, -0.05, 0.6)), dtype=dtype)
+    radius = radius_px if isinstance(radius_px, int) else torch.tensor(radius_px, device=DEVICE)
+    monkeypatch.setattr(host_sync, "read_at_once", lambda values: False)
+    with torch.inference_mode():
+        ours, theirs = INDEX.bodies["cuda"].accelerated(contours, size, radius, cell_px), INDEX.reference(contours, size, radius, cell_px)
+    assert (ours.size, ours.cell_px) == (theirs.size, theirs.cell_px)
+    assert torch.equal(ours.first, theirs.first) and torch.equal(ours.nearest.long(), theirs.nearest)
+    assert (ours.nearest >= 0).any(1).all()
+
+
+def test_a_contour_that_is_nowhere_or_far_outside_is_in_no_cell(monkeypatch):
+    contours, size = contours_of(pose(), pose())
+    pixels = contours.pixels.clone()
+    pixels[0], pixels[1, ::2] = 1e5, torch.nan
+    monkeypatch.setattr(host_sync, "read_at_once", lambda values: False)
+    with torch.inference_mode():
+        index = INDEX.bodies["cuda"].accelerated(replace(contours, pixels=pixels), size, 7, 2)
+    assert (index.nearest[0] == -1).all()
+    assert set(index.nearest[1].unique().tolist()) <= {-1, *range(1, contours.mask.shape[1], 2)}
+
+
+def test_of_too_many_contour_points_the_reference_makes_the_index():
+    contours, size = contours_of(pose())
+    assert INDEX.bodies["cuda"].supports(contours, size, 7, 2)
+    for numbers in ([], [0] * 8193):
+        others = Contours(*(value[:, numbers] for value in vars(contours).values()))
+        assert not INDEX.bodies["cuda"].supports(others, size, 7, 2)
+
+
+# ---- rounds
 
 
 SETTINGS = {
@@ -147,7 +195,9 @@ def test_a_step_turns_about_the_centre_as_the_solver_does(monkeypatch):
 def test_the_seam_takes_it_for_its_device(monkeypatch):
     """Whole windows are tracked through the seam as by the reference."""
     trajectory, events = moving_box(pose(), 2)
-    tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig.model_validate(FEW), dtype=torch.float64).to(DEVICE)
+    # Other poses are tried all alike: an interpreter takes its time.
+    config = TrackerConfig.model_validate(FEW | {"relocalization": {"new_below": 0}})
+    tracker = Tracker([box_model()], SMALL_CAMERA, config, dtype=torch.float64).to(DEVICE)
     state, taken = tracker.init(trajectory.T_cam_obj[:1], 0), []
     accelerated = BODY.accelerated
     monkeypatch.setattr(BODY, "accelerated", lambda *args: taken.append(args) or accelerated(*args))
@@ -196,7 +246,7 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from torchtrack.backends.alignment import DampingSettings, matching_settings
-from torchtrack.backends.triton import matching, solving
+from torchtrack.backends.triton import index, matching, solving
 from torchtrack.config.tracker import TrackerConfig
 
 constants = {"settings": matching_settings(TrackerConfig()), "damping": DampingSettings(1e-6, 1e-12, 1e-9), "velocity_in_window": True, "BLOCK": 128}
@@ -209,6 +259,13 @@ for number in ("fp32", "fp64"):
         source = ASTSource(kernel, signature=kinds, constexprs={name: constants[name] for name in kinds if name in constants})
         compiled = triton.compile(source, target=GPUTarget("cuda", 80, 32), options={"enable_fp_fusion": True})
         print(kernel.__name__, number, len(compiled.asm["cubin"]), ".local" in compiled.asm["ptx"])
+sizes = {"POINTS": 16, "CELLS": 16, "BLOCK": 1024}
+plain = {"exists": "*i1", "radius_px": "*i64", "keys": "*i32", "middle_u": "fp32", "middle_v": "fp32"}
+for kernel in (index.write, index.read):
+    kinds = {name: "constexpr" if name in sizes else plain.get(name, "*fp32" if name == "pixels" else "i32") for name in kernel.arg_names}
+    source = ASTSource(kernel, signature=kinds, constexprs={name: sizes[name] for name in kinds if name in sizes})
+    compiled = triton.compile(source, target=GPUTarget("cuda", 80, 32), options={"enable_fp_fusion": True})
+    print(kernel.__name__, "fp32", len(compiled.asm["cubin"]), ".local" in compiled.asm["ptx"])
 """
 
 
@@ -218,7 +275,7 @@ def test_kernels_compile_for_a_gpu_and_fit_into_its_registers(tmp_path):
     done = subprocess.run([sys.executable, "-c", COMPILED], env=surroundings, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
     lines = [line.split() for line in done.stdout.splitlines()]
-    assert len(lines) == 6
+    assert len(lines) == 8
     assert all(int(size) > 1000 and in_memory == "False" for _, _, size, in_memory in lines)
 
 

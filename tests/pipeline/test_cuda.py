@@ -1,6 +1,7 @@
 """What a GPU needs: that a step never waits for it, and that its poses are those of the CPU."""
 
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,7 +13,9 @@ from torchtrack import Tracker
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import AdaptationConfig, TrackerConfig
 from torchtrack.core import host_sync
+from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.graphs import CompiledStep
+from torchtrack.tracking.step import steady_lane
 from torchtrack.tracking.validation.status import Status
 
 COUNT = 8
@@ -124,6 +127,7 @@ def test_a_cuda_graph_holds_a_steady_step(cuda, scene):
         lambda x: torch.linalg.cholesky(torch.diag(x)),
         lambda x: torch.linalg.solve(torch.diag(x), x),
         lambda x: torch.linalg.inv(torch.diag(x)),
+        lambda x: x.clone().__setitem__(torch.tensor([0, 2]).clone(), 1.0),
     ],
 )
 def test_what_waits_is_found(wait, mode):
@@ -170,6 +174,24 @@ def test_the_ways_of_a_gpu_lead_to_the_poses_of_the_cpu(monkeypatch, scene):
     degrees, millimetres = pose_errors(poses[1], poses[0])
     assert float(degrees.max()) < 0.02
     assert float(millimetres.max()) < 0.1
+
+
+@pytest.mark.parametrize("model", [box_model, bevelled_model])
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_window_of_a_graph_asks_for_nothing_however_uncertain_objects_are(monkeypatch, scene, model):
+    monkeypatch.setattr(host_sync, "read_at_once", lambda values: False)
+    tracker, state, ready = set_up(scene, torch.device("cpu"), model=model)
+    events, end_us = ready[-1]
+    with torch.inference_mode():
+        state, _ = follow(tracker, state, ready[:-1])
+        unseen_s = torch.ones_like(state.health.time_since_validated_s)
+        state = replace(state, health=replace(state.health, time_since_validated_s=unseen_s))
+        monkeypatch.setattr(host_sync.AsyncValue, "to", None)
+        # Constants are made before a graph is recorded.
+        steady_lane(tracker, state, NearbyEvents(events), end_us.expand(tracker.streams))
+        with host_reads() as reads:
+            steady_lane(tracker, state, NearbyEvents(events), end_us.expand(tracker.streams))
+    assert reads == []
 
 
 @pytest.mark.parametrize("model", [box_model, bevelled_model])

@@ -42,7 +42,6 @@ def with_backend(backend):
         return torch_compile(function, options=options, backend=backend, **how)
 
     torch_compile = torch.compile
-    compile_with.__signature__ = graphs.signature(torch_compile)
     return mock.patch.object(torch, "compile", compile_with)
 
 

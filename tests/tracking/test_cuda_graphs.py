@@ -48,8 +48,12 @@ class CalledAgain:
 
     def replay(self):
         self.starts += 1
-        for place, value in zip(cuda_graphs._tensors(*self.results), cuda_graphs._tensors(*self.function(*self.held)), strict=True):
+        values = self.function(*self.held)
+        for place, value in zip(cuda_graphs._tensors(*self.results), cuda_graphs._tensors(*values), strict=True):
             place.copy_(value)
+        for place, value in zip(self.results, values, strict=True):
+            if isinstance(place, graphs.InPlace):
+                place._window = value._window
 
 
 @pytest.fixture
@@ -130,17 +134,8 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
         tracker = Tracker([box_model()] * streams, [SMALL_CAMERA] * streams, TrackerConfig(), list(range(streams)))
         if by_graphs:
             # As on a GPU: there is a graph, and nothing is read back within it.
-            def advance_as_there(*args, tracker=tracker, learns):
-                with pytest.MonkeyPatch.context() as patch, dispatch.backend(wanted=False):
-                    patch.setattr(host_sync, "read_at_once", lambda values: False)
-                    return graphs.steady_advance(tracker, *args, learns=learns)
-
-            tracker.graphs._compiles = True
-            monkeypatch.setattr(
-                graphs.CompiledStep, "_graph", lambda self, device, learns, advance=advance_as_there: CudaGraphs(partial(advance, learns=learns))
-            )
-            monkeypatch.setattr(graphs.CompiledStep, "_near", lambda self, state, events, t_us: graphs.NearbyEvents(events))
-            monkeypatch.setattr(graphs, "_in_bursts", lambda opened, filled, t_us: (opened, filled))
+            by_learning = {learns: CudaGraphs(_as_there(partial(_lane_in_place, tracker, learns=learns))) for learns in (False, True)}
+            _take_windows_by(monkeypatch, lambda self, filled, learns, lanes=by_learning: lanes[learns])
         with torch.inference_mode():
             actual.append(follow(tracker, tracker.init(pose().expand(streams, 4, 4), 0), cut)[1])
     assert sum(graph.starts for graph in recorded) >= COUNT // 3
@@ -150,7 +145,7 @@ def test_a_tracker_finds_the_same_poses_by_graphs(recorded, monkeypatch, streams
 
 def test_trackers_that_are_copied_or_moved_begin_without_graphs():
     tracker = Tracker([box_model()], SMALL_CAMERA)
-    tracker.graphs._graphs[None, None] = graphs.steady_advance
+    tracker.graphs._lanes[None, False] = graphs.steady_lane
     copied = copy.deepcopy(tracker)
     assert copied.graphs._tracker is copied
     assert (len(tracker.graphs), len(copied.graphs)) == (1, 0)
@@ -183,28 +178,29 @@ def _as_there(function):
     return graph
 
 
-@pytest.fixture
-def lanes(monkeypatch):
-    """Numbers of calls of the graph for certain objects, and of the one for all."""
-    calls = {"certain": 0, "lane": 0}
-
-    def counted(name, function):
-        def called(*args):
-            calls[name] += 1
-            return _as_there(function)(*args)
-
-        return called
-
+def _take_windows_by(monkeypatch, lane):
+    """As on a GPU: windows are taken by its graphs."""
     monkeypatch.setattr(graphs.CompiledStep, "_are_for", lambda self, t_us: True)
-    monkeypatch.setattr(
-        graphs.CompiledStep, "_graph", lambda self, device, learns: counted("certain", partial(graphs.steady_advance, self._tracker, learns=learns))
-    )
-    monkeypatch.setattr(
-        graphs.CompiledStep, "_lane", lambda self, filled, learns: counted("lane", partial(graphs.steady_lane, self._tracker, learns=learns))
-    )
+    monkeypatch.setattr(graphs.CompiledStep, "_lane", lane)
+    monkeypatch.setattr(graphs.CompiledStep, "_if_steady", lambda self, before, filled, t_us: self._by_lane(before, filled, t_us, learns=False))
     monkeypatch.setattr(graphs.CompiledStep, "_near", lambda self, state, events, t_us: graphs.NearbyEvents(events))
-    monkeypatch.setattr(graphs, "_in_bursts", lambda opened, filled, t_us: (opened, filled))
-    return calls
+
+
+@pytest.fixture
+def taken(monkeypatch):
+    """Numbers of the windows that the graph took."""
+    numbers = []
+
+    def lane(self, filled, learns):
+        numbers.append(len(numbers))
+        return _as_there(partial(_lane_in_place, self._tracker, learns=learns))
+
+    _take_windows_by(monkeypatch, lane)
+    return numbers
+
+
+def _lane_in_place(*args, **kwargs):
+    return graphs._in_place(*graphs.steady_lane(*args, **kwargs))
 
 
 def _with_one_lost(tracker, batches, known=6):
@@ -234,13 +230,15 @@ def _three_boxes(**search):
     return Tracker([box_model()] * 3, [SMALL_CAMERA] * 3, config, [0, 1, 2], kernels=False)
 
 
-def test_a_lost_object_does_not_take_its_neighbours_out_of_the_graph(lanes, monkeypatch):
-    """The graph for uncertain objects holds, the lost one is found after it, and its neighbours are what they are when nobody is looked for."""
-    batches, taken = _three_streams(9), []
-    monkeypatch.setattr(Tracker, "_advance", lambda self, *args, whole=Tracker._advance, **more: taken.append(args[2]) or whole(self, *args, **more))
+def test_a_lost_object_does_not_take_its_neighbours_out_of_the_graph(taken, monkeypatch):
+    """The graph holds, the lost one is found after it, and its neighbours are what they are when nobody is looked for."""
+    batches, without = _three_streams(9), []
+    monkeypatch.setattr(
+        Tracker, "_advance", lambda self, *args, whole=Tracker._advance, **more: without.append(args[2]) or whole(self, *args, **more)
+    )
     by_graphs = _with_one_lost(_three_boxes(), batches)
-    assert taken == []
-    assert lanes["lane"] >= 1 and lanes["certain"] + lanes["lane"] >= len(batches)
+    assert without == []
+    assert len(taken) == len(batches)
     unsearched = _with_one_lost(_three_boxes(hypotheses=0), batches)
     for searched, alone in zip(by_graphs, unsearched, strict=True):
         for number in (0, 2):
@@ -251,13 +249,3 @@ def test_a_lost_object_does_not_take_its_neighbours_out_of_the_graph(lanes, monk
     for searched, plain in zip(by_graphs, _with_one_lost(_three_boxes(), batches), strict=True):
         torch.testing.assert_close(searched.T_cam_obj, plain.T_cam_obj, rtol=0, atol=1e-5)
         assert torch.equal(searched.status, plain.status)
-
-
-def test_when_all_are_certain_again_the_graph_for_these_is_back(lanes):
-    tracker, batches = _three_boxes(), _three_streams(8)
-    with torch.inference_mode():
-        state, _ = follow(tracker, tracker.init(pose()[None].repeat(3, 1, 1), 0), batches[:6])
-        tracker.graphs._expects_uncertain = True
-        before = dict(lanes)
-        follow(tracker, state, batches[6:])
-    assert (lanes["lane"] - before["lane"], lanes["certain"] - before["certain"]) == (1, 1)

@@ -42,7 +42,7 @@ class Graphs:
 
     def __init__(self, monkeypatch):
         self.calls, self.dropped, self.compiled_for = [], 0, []
-        monkeypatch.setattr(room, "_compiled", self._graph_of)
+        monkeypatch.setattr(room, "compiled", self._graph_of)
 
     def _graph_of(self, function, device):
         if function.__name__ == "_tiles_near":
@@ -228,17 +228,11 @@ def test_events_are_filled_up_with_some_of_no_stream(count, streams):
     assert len(sizes) <= 6
 
 
-def test_an_old_version_of_pytorch_is_told(monkeypatch):
-    monkeypatch.setattr(torch, "compile", lambda model, *, fullgraph=False: model)
-    with pytest.raises(ConfigError, match=r"compiled: PyTorch .* cannot compile a tracker. Update it"):
-        Tracker([box_model()], WIDE_CAMERA, compiled=True)
-
-
 def test_a_compiler_that_fails_is_told(monkeypatch, folder, tmp_path):
     def without_compiler(*args):
         raise RuntimeError("No working C++ compiler found\nand more")
 
-    monkeypatch.setattr(room, "_compiled", lambda function, device: without_compiler)
+    monkeypatch.setattr(room, "compiled", lambda function, device: without_compiler)
     with pytest.raises(ConfigError, match=r"could not be compiled: No working C\+\+ compiler found\. It needs a C\+\+ compiler"):
         run(RunConfig(source=folder / "one.npz", compiled=True, output=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
@@ -261,10 +255,10 @@ def test_a_run_is_the_same_with_graphs(graphs, folder, tmp_path):
     assert outputs[0] == outputs[1]
 
 
-def in_own_process(backend, device="cpu"):
-    """What a tracker that is compiled by a backend gives, in a process in which no types are checked."""
+def in_own_process(script, *args):
+    """What a script of a tracker that is compiled says, in a process in which no types are checked."""
     path = os.pathsep.join([str(TESTS.parents[1]), str(TESTS)])
-    command = [sys.executable, "-W", "error::UserWarning", str(TESTS / "compiled_boxes.py"), backend, str(COUNT), device]
+    command = [sys.executable, "-W", "error::UserWarning", str(TESTS / script), *args]
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout.splitlines()[-1])
@@ -273,16 +267,24 @@ def in_own_process(backend, device="cpu"):
 def test_a_step_is_one_graph_and_its_compiled_poses_are_those_of_a_step():
     """Without a C++ compiler it is made a graph all the same, which runs as it is."""
     has_compiler = shutil.which("g++") or shutil.which("clang++")
-    stated = in_own_process("inductor" if has_compiler else "eager")
+    stated = in_own_process("compiled_boxes.py", "inductor" if has_compiler else "eager", str(COUNT), "cpu")
     assert stated["prepared"] == stated["graphs"] == 1
     assert stated["took"] >= COUNT // 4
     assert stated["apart"] < (1e-5 if has_compiler else 1e-6)
     assert stated["status"] == 0
 
 
+def test_the_graph_of_a_gpu_is_one_and_holds_the_kernels_of_its_backend():
+    pytest.importorskip("triton", reason="needs Triton: pip install triton")
+    stated = in_own_process("compiled_lane.py")
+    assert stated["graphs"] == 1
+    assert stated["operations"] == [["torchtrack.nearest_contours.default", "torchtrack.rounds.default"]]
+    assert stated["apart"] < 1e-4
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no GPU here")
 def test_poses_of_cuda_graphs_are_those_of_the_cpu():
-    stated = in_own_process("inductor", "cuda")
+    stated = in_own_process("compiled_boxes.py", "inductor", str(COUNT), "cuda")
     assert stated["graphs"] == 1
     assert stated["took"] >= COUNT // 4
     assert stated["apart"] < 1e-4

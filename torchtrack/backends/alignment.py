@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.backends.filling import filled
 from torchtrack.config.tracker import SolverConfig, TrackerConfig
 from torchtrack.tracking.association import weights
 from torchtrack.tracking.association.matches import MatchesWithCues
@@ -71,8 +70,25 @@ def knows(config: TrackerConfig) -> bool:
 def matching_settings(config: TrackerConfig) -> MatchingSettings:
     """What matching goes by."""
     step_px, silhouette_px = weights.dark_shifts_px(config)
-    derived = {"dark_shift_px": step_px, "silhouette_dark_shift_px": silhouette_px, "common_variance": weights.common_variance(config)}
-    return filled(MatchingSettings, config.association, config.validation, weights, **derived)
+    # One by one, as a compiler of graphs has to follow it.
+    return MatchingSettings(
+        dark_shift_px=step_px,
+        silhouette_dark_shift_px=silhouette_px,
+        polarity_gain=weights.POLARITY_GAIN,
+        least_agreement=weights.LEAST_AGREEMENT,
+        smeared_share=weights.SMEARED_SHARE,
+        gathered_share=weights.GATHERED_SHARE,
+        least_trust=weights.LEAST_TRUST,
+        concentration=config.association.concentration,
+        polarity=config.association.polarity,
+        slow_px_s=weights.SLOW_PX_S,
+        on_contour_px=weights.ON_CONTOUR_PX,
+        smear_px=weights.SMEAR_PX,
+        patch_bits=weights.PATCH_BITS,
+        patches=weights.PATCHES,
+        min_observations=config.validation.min_observations,
+        common_variance=weights.common_variance(config),
+    )
 
 
 def damping_settings(config: SolverConfig, hessian: Float[Tensor, "b k k"]) -> DampingSettings:

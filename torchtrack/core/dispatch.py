@@ -47,10 +47,16 @@ class Body:
     Args:
         accelerated: the body.
         supports: whether it can do what the arguments ask for.
+        in_graphs: whether a compiler of graphs can follow it.
     """
 
     accelerated: Callable[..., Any]
     supports: Callable[..., bool] | None = None
+    in_graphs: bool = False
+
+    def can(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bool:
+        """Whether it takes a call with these arguments."""
+        return self.supports is None or self.supports(*args, **kwargs)
 
 
 @dataclass
@@ -76,9 +82,7 @@ class Operation:
             return self.reference
         _load(used)
         body = self.bodies.get(used)
-        if body is None or (body.supports is not None and not body.supports(*args, **kwargs)):
-            return self.reference
-        return body.accelerated
+        return body.accelerated if body is not None and body.can(args, kwargs) else self.reference
 
 
 # Every function of the seam, by name: filled as modules are imported.
@@ -94,7 +98,11 @@ def accelerable(reference: Callable[P, R]) -> Callable[P, R]:
     def chosen(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling():
             # Here, not further down: a compiler follows whatever it comes by, and knows plain functions and texts alone.
-            return reference(*args, **kwargs)
+            body = OPERATIONS[name].bodies.get(backend_in_graphs())
+            if body is None or not body.in_graphs or not body.can(args, kwargs):
+                return reference(*args, **kwargs)
+            in_graph: R = body.accelerated(*args, **kwargs)
+            return in_graph
         result: R = OPERATIONS[name].body(args, kwargs)(*args, **kwargs)
         return result
 
@@ -102,17 +110,28 @@ def accelerable(reference: Callable[P, R]) -> Callable[P, R]:
     return chosen
 
 
-def accelerates(chosen: Callable[P, R], supports: Callable[P, bool] | None = None, device: str = "cpu") -> Callable[[Callable[P, R]], Callable[P, R]]:
+def backend_in_graphs() -> str:
+    """The kind of device whose backend may compute in a graph that is being compiled; empty for none. A compiler takes this for a constant."""
+    used = _USED.get() or ""
+    if used:
+        _load(used)
+    return used
+
+
+def accelerates(
+    chosen: Callable[P, R], supports: Callable[P, bool] | None = None, device: str = "cpu", *, in_graphs: bool = False
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorator: this is a backend's body of an :func:`accelerable` function.
 
     Args:
         chosen: that function.
         supports: whether this body can do what the arguments ask for; all of it when not given.
         device: the kind of device that it computes on.
+        in_graphs: whether a compiler of graphs can follow it; what it cannot look into is an operation of PyTorch's.
     """
 
     def registered(accelerated: Callable[P, R]) -> Callable[P, R]:
-        OPERATIONS[chosen.operation].bodies[device] = Body(accelerated, supports)
+        OPERATIONS[chosen.operation].bodies[device] = Body(accelerated, supports, in_graphs)
         return accelerated
 
     return registered

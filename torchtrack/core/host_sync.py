@@ -115,22 +115,12 @@ class SteadyState(HostReads):
 
 
 class UncertainState(SteadyState):
-    """Takes no object to be certain: what uncertain ones need is computed for all. Whether any was is noted."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._uncertain: list[Tensor] = []
+    """Takes no object to be certain: what uncertain ones need is computed for all."""
 
     def ask_within(self, values: Tensor, usual: int, most: int) -> AsyncValue:
         """The values themselves on the device, and the bound for what hangs on the largest of them."""
-        self._uncertain.append((values.detach() != usual).any())
         return AsyncValue(values.detach(), [most] * values.numel())
 
     def none_of(self, values: Tensor) -> bool:
         """Not certain."""
-        self._uncertain.append(values.detach().any())
         return False
-
-    def uncertain(self) -> Tensor:
-        """Whether any value was other than in a steady window."""
-        return torch.stack(self._uncertain).any()

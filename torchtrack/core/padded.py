@@ -1,8 +1,14 @@
-"""The box around the points of each object that count."""
+"""Rows of which some entries count: the box around those of each object, and a choice of them."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
+
+from torchtrack.core import host_sync
+
+# Entries of a short row, of which compiled graphs count one at a time.
+_SHORT = 512
 
 
 def bounds(points: Float[Tensor, "b m k"], mask: Bool[Tensor, "b m"]) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k"]]:
@@ -16,12 +22,25 @@ def select_ranked(mask: Bool[Tensor, "b n"], count: int) -> tuple[Int[Tensor, "b
 
     Deterministic, of static shape, and independent of the other rows.
     """
-    cumulative = mask.cumsum(-1)
+    cumulative = running_count(mask)
     total = cumulative[:, -1:]
     step = torch.arange(count, device=mask.device, dtype=torch.float64)
     rank = (step * (total.double() / max(count, 1)).clamp(min=1)).long() + 1
     index = torch.searchsorted(cumulative, rank)
     return index.clamp(max=mask.shape[1] - 1), rank <= total
+
+
+def running_count(mask: Bool[Tensor, "b n"]) -> Int[Tensor, "b n"]:
+    """How many entries of each row, up to each one, are true."""
+    return by_short_rows(mask) if torch.compiler.is_compiling() and host_sync.on_gpu(mask) else mask.cumsum(-1)
+
+
+def by_short_rows(mask: Bool[Tensor, "b n"]) -> Int[Tensor, "b n"]:
+    """:func:`running_count` of many short rows at once: a compiler makes one program of a long one, and before PyTorch 2.13 it fails to, for many."""
+    rows = pad(mask, (0, -mask.shape[1] % _SHORT)).unflatten(1, (-1, _SHORT)).cumsum(-1)
+    before = rows[..., -1].cumsum(-1) - rows[..., -1]
+    # A search in it needs a row of its own in memory, not a view.
+    return (rows + before[..., None]).flatten(1)[:, : mask.shape[1]].clone(memory_format=torch.contiguous_format)
 
 
 def take_points(values: Float[Tensor, "b n k"], index: Int[Tensor, "b m"]) -> Float[Tensor, "b m k"]:

@@ -1,13 +1,14 @@
 """What the tracker remembers between windows, and what one window gives: both immutable."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.core.field_values import field_values
 from torchtrack.tracking.adaptation.appearance import Appearance
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.corners import Corners
@@ -154,12 +155,14 @@ def joined(states: Sequence[TrackerState]) -> TrackerState:
 
 def _mapped(of_objects: Callable[..., Tensor], of_streams: Callable[..., Tensor], *values: Any) -> Any:
     """A dataclass with its tensors made from those of others of its kind: what belongs to objects, and what belongs to streams."""
-    if not is_dataclass(values[0]):
-        # What is switched off, or a mere number, is the same for all.
-        return of_objects(*values) if torch.is_tensor(values[0]) else values[0]
+    if torch.is_tensor(values[0]):
+        return of_objects(*values)
+    # What is switched off, or a mere number, is the same for all.
+    if values[0] is None or not is_dataclass(values[0]):
+        return values[0]
     kind: Any = type(values[0])
     made = {}
-    for field in fields(kind):
-        inner = [getattr(value, field.name) for value in values]
-        made[field.name] = of_streams(*inner) if field.name in _OF_STREAMS else _mapped(of_objects, of_streams, *inner)
+    for name in field_values(values[0]):
+        inner = [getattr(value, name) for value in values]
+        made[name] = of_streams(*inner) if name in _OF_STREAMS else _mapped(of_objects, of_streams, *inner)
     return kind(**made)

@@ -1,6 +1,6 @@
 """One window of a tracker, from its events to poses: :func:`advance` calls the six stages in their order, and each is a function below."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -38,8 +38,6 @@ from torchtrack.tracking.validation.measures import required_spread
 from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, reference_where_known, score_fit
 from torchtrack.tracking.validation.verdict import Limits, confirmed_status, looked_elsewhere
 
-_READS = host_sync.HostReads()
-
 
 @dataclass(frozen=True)
 class StepInput:
@@ -57,7 +55,7 @@ class StepInput:
     events: NearbyEvents
     t_us: Int[Tensor, "s"]
     is_starting: Bool[Tensor, "b"] | None = None
-    reads: host_sync.HostReads = _READS
+    reads: host_sync.HostReads = field(default_factory=host_sync.HostReads)
     learns: bool = True
     extra_terms: tuple[CostTerm, ...] = ()
 
@@ -222,40 +220,30 @@ def opened(tracked: TrackedObjects, state: TrackerState, events: EventBatch) -> 
 
 
 def steady_advance(
-    tracked: TrackedObjects, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"], *, learns: bool = False
+    tracked: TrackedObjects, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"]
 ) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
-    """:func:`advance` with nothing to decide; and whether anything was, or the window may be called for in parts."""
+    """:func:`advance` with nothing to decide and nothing learned; and whether anything was, or the window may be called for in parts."""
     steady = host_sync.SteadyState()
     steady.ask(of_unknown_motion(state, t_us, tracked.objects, tracked.config), False)
-    return *advance(tracked, state, StepInput(events, t_us, reads=steady, learns=learns)), steady.wrong()
+    return *advance(tracked, state, StepInput(events, t_us, reads=steady, learns=False)), steady.wrong()
 
 
 def steady_lane(
     tracked: TrackedObjects, state: TrackerState, events: NearbyEvents, t_us: Int[Tensor, "s"], *, learns: bool = False
-) -> tuple[TrackerState, StepResult, Bool[Tensor, "3"], "InPlace"]:
+) -> tuple[TrackerState, StepResult, Bool[Tensor, "2"], SteadyWindow]:
     """:func:`steady_advance` that holds however uncertain or lost objects are: what these need is done for all, and nobody is looked for.
 
     Returns:
-        State; result; whether the window may be called for in parts, and so does not hold, whether anybody is to be looked for, and whether anything
-        was uncertain; and the window itself, for :func:`looked_for`.
+        State; result; whether the window may be called for in parts, and so does not hold, and whether anybody is to be looked for; and the window
+        itself, for :func:`looked_for`.
     """
     reads = host_sync.UncertainState()
     reads.ask(of_unknown_motion(state, t_us, tracked.objects, tracked.config), False)
     given = StepInput(events, t_us, reads=reads, learns=learns)
     window = steady_window(tracked, state, given)
-    stated = torch.stack([reads.wrong(), has(window.evidence.triggers, SEARCHED).any(), reads.uncertain()])
-    return *update(tracked, state, window, window.located, given), stated, InPlace(window)
-
-
-class InPlace:
-    """A window that stays where a graph has computed it, until the graph is started again: no dataclass, so that its tensors are not copied."""
-
-    def __init__(self, window: SteadyWindow) -> None:
-        self._window = window
-
-    def window(self) -> SteadyWindow:
-        """The window as it is now. What was computed from it another time is not in it."""
-        return each_tensor(lambda tensor: tensor, self._window)
+    stated = torch.stack([reads.wrong(), has(window.evidence.triggers, SEARCHED).any()])
+    # Without what was computed of it on the way.
+    return *update(tracked, state, window, window.located, given), stated, each_tensor(lambda tensor: tensor, window)
 
 
 def looked_for(

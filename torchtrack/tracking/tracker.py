@@ -174,8 +174,8 @@ class Tracker(TrackedObjects):
         Args:
             state: from :meth:`init`.
         """
-        self.graphs.prepare(state)
-        with torch.inference_mode(), dispatch.backend(wanted=self.kernels):
+        with torch.inference_mode(), dispatch.backend(wanted=self.kernels, values=self.intrinsics):
+            self.graphs.prepare(state)
             if host_sync.read_at_once(self.intrinsics) and dispatch.may_accelerate(self.intrinsics):
                 # Kernels are compiled, or read from the disk, when they are first called: for a window without events.
                 self._advance(state, EventBatch.empty(), state.t_us + 1)

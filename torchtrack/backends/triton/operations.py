@@ -1,5 +1,5 @@
 """All that Triton's kernels accelerate: importing this registers it."""
 
-from torchtrack.backends.triton import rounds
+from torchtrack.backends.triton import index, rounds
 
-__all__ = ["rounds"]
+__all__ = ["index", "rounds"]

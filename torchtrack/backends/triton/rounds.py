@@ -1,9 +1,21 @@
 """The rounds of :func:`torchtrack.tracking.estimation.rounds.align_rounds` on a GPU: three kernels a round, and no value read back."""
 
+from typing import Any, NamedTuple
+
 import torch
 import triton
+from torch import Tensor
 
-from torchtrack.backends.alignment import ROWS, damping_settings, knows, matches_of, matching_settings, observed_rows
+from torchtrack.backends.alignment import (
+    ROWS,
+    DampingSettings,
+    MatchingSettings,
+    damping_settings,
+    knows,
+    matches_of,
+    matching_settings,
+    observed_rows,
+)
 from torchtrack.backends.triton import matching, solving
 from torchtrack.backends.triton.compiler import OPTIONS
 from torchtrack.config.components import Component
@@ -26,39 +38,111 @@ def _supports(start: Start, table: ContourTable, observations: Observations, gat
     return knows(config) and not start.extra_terms and observations.mask.numel() > 0 and table.rows.shape[2] > 0
 
 
-@accelerates(rounds.align_rounds, supports=_supports, device="cuda")
+class _Given(NamedTuple):
+    """What the rounds begin with: observations, contours and their index, objects, and gates."""
+
+    seen: Tensor
+    exists: Tensor
+    place: Tensor
+    table: Tensor
+    nearest: Tensor
+    first: Tensor
+    T_cam_obj: Tensor
+    centre_obj: Tensor
+    intrinsics: Tensor
+    velocity: Tensor
+    predicted_velocity: Tensor
+    information: Tensor
+    offset: Tensor
+    wider: Tensor
+    subcell_lookup: Tensor
+
+
+class _Layout(NamedTuple):
+    """Numbers that the rounds go by, beside settings: of the index, and what is done at all."""
+
+    cell_rows: int
+    cell_columns: int
+    cell_px: float
+    motion_compensation: bool
+    velocity_in_window: bool
+
+
+_KINDS = MatchingSettings, DampingSettings, _Layout
+
+
+@accelerates(rounds.align_rounds, supports=_supports, device="cuda", in_graphs=True)
 def align_rounds_triton(
     start: Start, table: ContourTable, observations: Observations, gates: Gates, config: TrackerConfig
 ) -> tuple[Linearisation, MatchesWithCues, Contours]:
     """Object by object and block by block."""
-    prediction, information = start.prediction, rounds.prior_information(start.prediction, config).contiguous()
-    (batch, count), settings, matched_with = observations.mask.shape, matching_settings(config), config.association
-    T_cam_obj, offset = (value.clone(memory_format=torch.contiguous_format) for value in (start.begin.T_cam_obj, start.from_prior(information)))
-    centre_obj, intrinsics = prediction.objects.centre_obj.contiguous(), prediction.objects.intrinsics.contiguous()
-    gradient, hessian = torch.empty_like(offset), torch.empty_like(information)
-    contour = torch.empty(batch, count, dtype=torch.int64, device=offset.device)
-    is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool, device=offset.device)
-    matches, seen = offset.new_empty(batch, ROWS, count), observed_rows(observations)
-    # What the kernels write to is a copy that lies row by row in memory.
-    place = rounds.first_place(start.begin, observations, config).transpose(1, 2).clone(memory_format=torch.contiguous_format)
-    of_table = table.rows.contiguous(), table.index.nearest.contiguous(), table.index.first.contiguous()
-    layout = *table.index.size, float(table.index.cell_px), OFF_BORDER_PX
-    velocity, next_T_cam_obj = start.begin.velocity, T_cam_obj.clone()
+    prediction, begin, information = start.prediction, start.begin, rounds.prior_information(start.prediction, config)
+    matched_with, index = config.association, table.index
+    layout = _Layout(*index.size, float(index.cell_px), matched_with.motion_compensation, config.uses(Component.VELOCITY_IN_WINDOW))
+    numbers = [*matching_settings(config), *damping_settings(config.solver, information), *layout]
+    given = [
+        *(observed_rows(observations), observations.mask, rounds.first_place(begin, observations, config).transpose(1, 2)),
+        *(table.rows, index.nearest, index.first),
+        *(begin.T_cam_obj, prediction.objects.centre_obj, prediction.objects.intrinsics, begin.velocity, prediction.velocity),
+        *(information, start.from_prior(information), gates.wider, gates.subcell_lookup),
+    ]
+    T_cam_obj, gradient, hessian, offset, contour, is_near, is_matched, matches = _rounds(
+        given, list(matched_with.gates_px), list(map(float, numbers))
+    )
+    return Linearisation(T_cam_obj, gradient, hessian, offset), matches_of(contour, is_near, is_matched, matches), start.contours
+
+
+@torch.library.custom_op("torchtrack::rounds", mutates_args=())
+def _rounds(tensors: list[Tensor], gates_px: list[float], numbers: list[float]) -> list[Tensor]:
+    """All rounds: an operation of PyTorch's, whose inside a compiler of graphs leaves alone.
+
+    Args:
+        tensors: those of :class:`_Given`.
+        numbers: settings of matching and damping, and :class:`_Layout`.
+    """
+    given = _Given(*(tensor.contiguous() for tensor in tensors))
+    settings, damping, layout = _of_their_kinds(numbers)
+    (batch, count), points = given.exists.shape, given.table.shape[2]
+    # What the kernels write to are copies.
+    T_cam_obj, offset, place = given.T_cam_obj.clone(), given.offset.clone(), given.place.clone()
+    gradient, hessian, contour, is_near, is_matched, matches = _room(given)
+    of_index = layout.cell_rows, layout.cell_columns, layout.cell_px, OFF_BORDER_PX
+    velocity, next_T_cam_obj = given.velocity, T_cam_obj.clone()
     with torch.cuda.device_of(offset):
-        for gate_px, wider in zip(matched_with.gates_px, gates.wider, strict=True):
+        for gate_px, wider in zip(gates_px, given.wider, strict=True):
             votes = offset.new_zeros(batch, settings.patches**2, matching.VOTES)
-            moving = velocity.contiguous() if matched_with.motion_compensation else torch.zeros_like(velocity)
+            moving = velocity.contiguous() if layout.motion_compensation else torch.zeros_like(velocity)
             matching.match[batch, triton.cdiv(count, _BLOCK)](
-                seen, observations.mask.contiguous(), place, *of_table, T_cam_obj, centre_obj, moving, intrinsics, wider, gates.subcell_lookup,
-                votes, contour, is_near, is_matched, matches, count, table.rows.shape[2], *layout, gate_px,
+                given.seen, given.exists, place, given.table, given.nearest, given.first, T_cam_obj, given.centre_obj, moving, given.intrinsics,
+                wider, given.subcell_lookup, votes, contour, is_near, is_matched, matches, count, points, *of_index, gate_px,
                 settings=settings, BLOCK=_BLOCK, **OPTIONS,
             )  # fmt: skip
-            matching.believe[(batch,)](seen, votes, is_matched, matches, count, settings=settings, BLOCK=_BLOCK, **OPTIONS)
+            matching.believe[(batch,)](given.seen, votes, is_matched, matches, count, settings=settings, BLOCK=_BLOCK, **OPTIONS)
             solving.solve[(batch,)](
-                matches, information, centre_obj, intrinsics, wider, T_cam_obj, next_T_cam_obj, offset, gradient, hessian, count, gate_px,
-                velocity_in_window=config.uses(Component.VELOCITY_IN_WINDOW), damping=damping_settings(config.solver, information),
-                BLOCK=_BLOCK, **OPTIONS,
+                matches, given.information, given.centre_obj, given.intrinsics, wider, T_cam_obj, next_T_cam_obj, offset, gradient, hessian,
+                count, gate_px, velocity_in_window=layout.velocity_in_window, damping=damping, BLOCK=_BLOCK, **OPTIONS,
             )  # fmt: skip
             T_cam_obj, next_T_cam_obj = next_T_cam_obj, T_cam_obj
-            velocity = prediction.velocity + offset[:, 6:]
-    return Linearisation(T_cam_obj, gradient, hessian, offset), matches_of(contour, is_near, is_matched, matches), start.contours
+            velocity = given.predicted_velocity + offset[:, 6:]
+    return [T_cam_obj, gradient, hessian, offset, contour, is_near, is_matched, matches]
+
+
+@_rounds.register_fake
+def _(tensors: list[Tensor], gates_px: list[float], numbers: list[float]) -> list[Tensor]:
+    given = _Given(*tensors)
+    own = [value.new_empty(value.shape) for value in (given.T_cam_obj, given.offset)]
+    gradient, *others = _room(given)
+    return [own[0], gradient, others[0], own[1], *others[1:]]
+
+
+def _room(given: _Given) -> tuple[Tensor, ...]:
+    """Memory for what the rounds give: gradient, Hessian, contour points, what is near and matched, and rows of matches."""
+    (batch, count), offset = given.exists.shape, given.offset
+    of_observations = (offset.new_empty(batch, count, dtype=kind) for kind in (torch.int64, torch.bool, torch.bool))
+    return offset.new_empty(offset.shape), offset.new_empty(given.information.shape), *of_observations, offset.new_empty(batch, ROWS, count)
+
+
+def _of_their_kinds(numbers: list[float]) -> list[Any]:
+    """Settings and layout, of numbers one after the other."""
+    left = iter(numbers)
+    return [kind(*(of_field(next(left)) for of_field in kind.__annotations__.values())) for kind in _KINDS]

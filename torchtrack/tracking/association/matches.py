@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.core.field_values import field_values
+
 
 @dataclass(frozen=True)
 class Matches:
@@ -53,5 +55,5 @@ def both_coordinates(matches: MatchesWithCues) -> MatchesWithCues:
     """The same matches with the distance in u and in v, as two observations each."""
     axes = torch.eye(2, dtype=matches.targets.dtype, device=matches.targets.device)
     directions = torch.cat([axes[axis].expand_as(matches.targets) for axis in range(2)], 1)
-    twice = {name: torch.cat([value, value], 1) for name, value in vars(matches).items()}
+    twice = {name: torch.cat([value, value], 1) for name, value in field_values(matches).items()}
     return replace(matches, **(twice | {"directions": directions}))

@@ -8,8 +8,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchtrack.core.dispatch import accelerable
+from torchtrack.core.field_values import field_values
 from torchtrack.core.image_velocity import MovingObjects
-from torchtrack.core.padded import take_points
+from torchtrack.core.padded import running_count, take_points
 from torchtrack.tracking.contours.index import ContourIndex
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.frontend.window_events import GOLDEN_RATIO, ObjectEvents
@@ -76,7 +77,7 @@ def event_observations(values: Float[Tensor, "b c 4"], exists: Bool[Tensor, "b c
 
 def join(first: Observations, second: Observations) -> Observations:
     """Observations of both, for each object; none has been judged yet."""
-    names = [name for name in vars(first) if name != "trust"]
+    names = [name for name in field_values(first) if name != "trust"]
     return Observations(*(_one_after_the_other(getattr(first, name), getattr(second, name)) for name in names))
 
 
@@ -86,13 +87,15 @@ def _filled_up(corners: Observations, events: Observations, count: int) -> Obser
     places = max(count, own)
     room, given = count - corners.mask.sum(-1, keepdim=True), events.mask.sum(-1, keepdim=True)
     lot = (torch.arange(events.mask.shape[1], dtype=torch.float64, device=device) * GOLDEN_RATIO).frac()
-    kept = (events.mask & (lot < room.double() / given.clamp(min=1))).cumsum(-1)
+    kept = running_count(events.mask & (lot < room.double() / given.clamp(min=1)))
     is_corner = pad(corners.mask, (0, places - own))
     rank = (~is_corner).cumsum(-1)
     chosen = torch.searchsorted(kept, rank).clamp(max=events.mask.shape[1] - 1)
     index, both = torch.where(is_corner, torch.arange(places, device=device), own + chosen), join(corners, events)
     values = {
-        name: take_points(value, index) if value.dim() == 3 else value.gather(1, index) for name, value in vars(both).items() if name != "trust"
+        name: take_points(value, index) if value.dim() == 3 else value.gather(1, index)
+        for name, value in field_values(both).items()
+        if name != "trust"
     }
     return Observations(**values | {"mask": is_corner | (rank <= kept[:, -1:])})
 

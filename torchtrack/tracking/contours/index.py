@@ -154,7 +154,7 @@ def _first_cells(centre: Float[Tensor, "b m 2"], inside: Bool[Tensor, "b m"], ma
     if host_sync.read_at_once(centre):
         return torch.where(inside[..., None], centre, torch.inf).amin(1).clamp(max=FAR_CELLS) - margin
     # What is farther from the image than its radius, less than a margin, is not inside.
-    return constant((1 - 2 * margin,) * 2, centre.dtype, centre.device).expand(len(centre), 2)
+    return constant((_first_of_image(margin),) * 2, centre.dtype, centre.device).expand(len(centre), 2)
 
 
 def _size(local: Float[Tensor, "b m 2"], image_size: tuple[int, int], margin: int, cell_px: int) -> tuple[int, int]:
@@ -162,8 +162,18 @@ def _size(local: Float[Tensor, "b m 2"], image_size: tuple[int, int], margin: in
     if host_sync.read_at_once(local):
         columns, rows = local.amax((0, 1)).tolist()
         return int(rows) + margin + 1, int(columns) + margin + 1
-    rows, columns = (ceil((side - 1) / cell_px) + 4 * margin - 1 for side in image_size)
+    _, rows, columns = size_of_image(image_size, margin, cell_px)
     return rows, columns
+
+
+def size_of_image(image_size: tuple[int, int], margin: int, cell_px: int) -> tuple[int, int, int]:
+    """First cell, rows and columns of a region that holds the whole image (height, width), and what is within a margin of it."""
+    rows, columns = (ceil((side - 1) / cell_px) + 4 * margin - 1 for side in image_size)
+    return _first_of_image(margin), rows, columns
+
+
+def _first_of_image(margin: int) -> int:
+    return 1 - 2 * margin
 
 
 def _points_by_radius(inside: Tensor, radius: Tensor, radii_px: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor]]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchtrack.core.camera import MIN_DEPTH_M, project
 from torchtrack.core.dispatch import accelerable
+from torchtrack.core.field_values import field_values
 from torchtrack.core.lie import affine, transform_points
 
 # Tangents that the image shows shorter than this (px/m) have no direction in it.
@@ -43,15 +44,15 @@ class Contours:
 
     def of_object(self, number: int) -> "Contours":
         """Those of one object."""
-        return Contours(*(value[number : number + 1] for value in vars(self).values()))
+        return Contours(*(value[number : number + 1] for value in field_values(self).values()))
 
     def rows(self, chosen: Int[Tensor, "k"]) -> "Contours":
         """Those of some objects."""
-        return Contours(*(value.index_select(0, chosen) for value in vars(self).values()))
+        return Contours(*(value.index_select(0, chosen) for value in field_values(self).values()))
 
     def widened(self, count: int) -> "Contours":
         """The same with at least ``count`` places for the points of each object."""
-        return Contours(*(widened(value, count) for value in vars(self).values()))
+        return Contours(*(widened(value, count) for value in field_values(self).values()))
 
 
 def image_normals(
@@ -84,7 +85,7 @@ def projected(
 
 def joined(first: Contours, second: Contours) -> Contours:
     """Contours of both, for each object."""
-    return Contours(*(torch.cat([getattr(first, name), getattr(second, name)], 1) for name in vars(first)))
+    return Contours(*(torch.cat([getattr(first, name), getattr(second, name)], 1) for name in field_values(first)))
 
 
 def widened(values: Tensor, count: int) -> Tensor:

@@ -105,10 +105,9 @@ def _places_for(active: Bool[Tensor, "b e"]) -> int:
 
 def _lengths_px(ends: Float[Tensor, "b e 2 3"], T_cam_obj: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Lengths of edges in the image, zero for those that reach behind the camera, and the depths of their ends."""
-    ends_cam = transform_points(T_cam_obj, ends.flatten(1, 2)).unflatten(1, (-1, 2))
-    start_z, end_z = ends_cam[..., 2].unbind(-1)
-    start_px, end_px = project(ends_cam.flatten(1, 2), intrinsics).unflatten(1, (-1, 2)).unbind(2)
-    lengths = (end_px - start_px).square().sum(-1).sqrt()
+    start_cam, end_cam = (transform_points(T_cam_obj, points) for points in ends.unbind(2))
+    start_z, end_z = start_cam[..., 2], end_cam[..., 2]
+    lengths = (project(end_cam, intrinsics) - project(start_cam, intrinsics)).square().sum(-1).sqrt()
     return lengths * ((start_z > MIN_DEPTH_M) & (end_z > MIN_DEPTH_M)), start_z, end_z
 
 

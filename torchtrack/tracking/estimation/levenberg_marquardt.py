@@ -16,6 +16,7 @@ from torchtrack.config.tracker import SolverConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerable
+from torchtrack.core.field_values import field_values
 from torchtrack.core.lie import small_difference_about
 from torchtrack.core.linalg import solve_factored, solve_positive
 from torchtrack.tracking.estimation.robust_loss import robust_loss, robust_weight
@@ -151,7 +152,9 @@ def solve_pose(
         # Near the optimum, rounding must not decide.
         better = next_cost <= cost * (1 + ROUNDINGS * torch.finfo(cost.dtype).eps)
         damping = torch.where(better, damping * DAMPING_DECAY, damping.clamp(min=DAMPING_START) * DAMPING_GROWTH)
-        new, old = ((*vars(at).values(), *rest) for at, rest in ((next_place, (*next_equations, next_cost)), (place, (gradient, hessian, cost))))
+        new, old = (
+            (*field_values(at).values(), *rest) for at, rest in ((next_place, (*next_equations, next_cost)), (place, (gradient, hessian, cost)))
+        )
         *where, gradient, hessian, cost = _choose(better, new, old)
         place = Place(*where)
     last_place = place.moved(_last_step(gradient, hessian, damping))

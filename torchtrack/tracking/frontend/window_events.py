@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchtrack.core.field_values import field_values
 from torchtrack.core.padded import select_ranked, take_points
 
 GOLDEN_RATIO = 0.6180339887498949
@@ -57,7 +58,7 @@ class WindowEvents:
         return replace(events, mask=events.mask & exists, number=chosen if events.number is None else events.number)
 
     def _with(self, rows: Callable[[Tensor], Tensor]) -> "WindowEvents":
-        values = {name: rows(value) for name, value in vars(self).items() if value is not None}
+        values = {name: rows(value) for name, value in field_values(self).items() if value is not None}
         return WindowEvents(**values)
 
     def draw(self, candidates: Bool[Tensor, "b e"], share: Float[Tensor, "b 1"], count: int) -> tuple[Int[Tensor, "b c"], Bool[Tensor, "b c"]]:
