@@ -37,7 +37,7 @@ def tiny(monkeypatch):
     small = {
         pipeline: {
             "SHAPES": ("lbracket",),
-            "MANY": {"cpu": ((2, 2, 1, 15.0), (2, 2, 2, None))},
+            "MANY": {"cpu": ((2, 2, 1, 15.0, True), (2, 2, 2, None, False))},
             "OUTSIDE_MEV_S": (1.0,),
             "HD": (320, 240),
             "HD_MEV_S": 4.0,
@@ -87,7 +87,7 @@ def test_pipeline(tiny, simulator, tmp_path, capsys):
     content = written(tmp_path, "pipeline")
     names = [entry["name"] for entry in content["results"]]
     assert names[:4] == ["1 object (lbracket), median", "1 object (lbracket), 95 %", "2 objects, median", "2 objects, 95 %"]
-    assert names[4:6] == ["4 objects in 2 streams, median", "4 objects in 2 streams, 95 %"]
+    assert names[4:6] == [f"4 objects in 2 streams, nobody searched for, {what}" for what in ("median", "95 %")]
     alone = [f"{count}, without kernels, {what}" for count in ("1 object (lbracket)", "2 objects") for what in ("median", "95 %")]
     assert names[6:10] == alone
     assert names[10:] == ["1 object with 1 Mev/s outside it over none", "1 object in 320x240 at 4 Mev/s, stream over work"]

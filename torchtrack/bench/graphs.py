@@ -1,6 +1,7 @@
-"""What a GPU's graphs hang on: which of their assumptions fails in how many windows, and the time of each stage and of the longest kernels.
+"""In how many windows something has to be decided, and the time of each stage and of the longest kernels.
 
-Assumptions are those of :func:`torchtrack.tracking.step.steady_advance`, called beside every window, without a graph. Stages and kernels are
+What may have to be is what :func:`torchtrack.tracking.step.steady_advance` takes for granted, noted beside every window, without a graph: on a
+CPU, compiled graphs hang on all of it; on a GPU, whoever is to be searched for is, after the graph. Stages and kernels are
 those of :class:`torch.profiler.profile`, of windows without a graph, as a graph tells no stages; on a CPU, operations stand for kernels.
 """
 
@@ -91,7 +92,7 @@ def measure(setup: Setup) -> Report:
         notes.append(f"{name}: {launched:.0f} kernels a window")
     return Report(
         "graphs",
-        "A window without a graph: assumptions of graphs that fail, stages (with those within), longest kernels",
+        "A window without a graph: what has to be decided, stages (with those within), longest kernels",
         tuple(results),
         tuple(notes),
     )

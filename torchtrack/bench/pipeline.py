@@ -1,7 +1,7 @@
 """How long a step of the tracker takes, with the preset ``default`` and its windows: few and many objects, many events."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,8 +14,12 @@ from torchtrack.run.stepping import cut_windows, steps
 
 # Targets (ms) of the median, and of the step that 95 % are faster than, on one thread of a CPU and on a large GPU.
 ONE_OBJECT_MS: dict[str, tuple[float | None, float | None]] = {"cpu": (4.0, 6.0), "cuda": (1.5, None)}
-# Objects of each further scene, columns of their cells, streams that all have this scene, and the target of the median (ms).
-MANY = {"cpu": ((8, 4, 1, 15.0), (64, 8, 1, 100.0)), "cuda": ((64, 8, 4, 4.0), (64, 8, 64, 25.0))}
+# Objects of each further scene, columns of their cells, streams that all have this scene, the target of the median (ms), and whether lost objects
+# are searched for: of many at their start, some are in every window, and a GPU's steps are those of its searches.
+MANY = {
+    "cpu": ((8, 4, 1, 15.0, True), (64, 8, 1, 100.0, True)),
+    "cuda": ((64, 8, 4, 4.0, False), (64, 8, 64, 25.0, False), (64, 8, 4, None, True)),
+}
 OUTSIDE_MEV_S = (5.0, 20.0)
 HD_MEV_S = 20.0
 # Events outside of all objects may cost what it takes to look at each of them once.
@@ -43,11 +47,13 @@ class _Case:
     streams: int = 1
     compiled: bool = False
     kernels: bool = True
+    searches: bool = True
 
     @property
     def full_name(self) -> str:
         """With how it is tracked."""
-        return _named(self.name, self.compiled) if self.kernels else f"{self.name}, without kernels"
+        name = self.name if self.searches else f"{self.name}, nobody searched for"
+        return _named(name, self.compiled) if self.kernels else f"{name}, without kernels"
 
 
 def measure(setup: Setup) -> Report:
@@ -73,15 +79,13 @@ def _of_scenes(setup: Setup) -> Iterator[_Part]:
     for shape in SHAPES:
         for compiled in setup.ways:
             yield _latency(setup, _Case(f"1 object ({shape})", simulated((shape,)), *ONE_OBJECT_MS[kind], compiled=compiled))
-    for count, columns, streams, target_ms in MANY[kind]:
-        name = _many(count, streams)
+    for many in MANY[kind]:
         # On a CPU, graphs gain little where kernels work on many objects.
         for compiled in setup.ways if kind == "cuda" else (False,):
-            yield _latency(setup, _Case(name, simulated(shapes_of(count), columns), target_ms, streams=streams, compiled=compiled))
+            yield _latency(setup, replace(_of_many(*many), compiled=compiled))
     if backend_is_installed(kind):
         yield _latency(setup, _Case(f"1 object ({SHAPES[0]})", simulated(SHAPES[:1]), kernels=False))
-        count, columns, streams, _ = MANY[kind][0]
-        yield _latency(setup, _Case(_many(count, streams), simulated(shapes_of(count), columns), streams=streams, kernels=False))
+        yield _latency(setup, replace(_of_many(*MANY[kind][0]), kernels=False, median_ms=None))
     yield _outside(setup)
     for compiled in setup.ways:
         yield _real_time(setup, compiled)
@@ -91,7 +95,7 @@ def _latency(setup: Setup, case: _Case) -> _Part:
     """Median and 95 % of the time of a step, each once per repeat, and how well it tracked."""
     name = case.full_name
     setup.show(name)
-    run = started(case.scene, setup.device, case.streams, compiled=case.compiled, kernels=case.kernels)
+    run = started(case.scene, setup.device, case.streams, compiled=case.compiled, kernels=case.kernels, searches=case.searches)
     quality = run.quality(setup.clock)
     repeats = [run.latencies(setup.clock) for _ in range(setup.repeats)]
     median, p95 = ([float(value) for value in np.quantile(repeats, share, axis=1)] for share in (0.5, 0.95))
@@ -99,9 +103,10 @@ def _latency(setup: Setup, case: _Case) -> _Part:
     return results, f"{name}: {case.scene.mev_per_s:.1f} Mev/s, {quality}"
 
 
-def _many(count: int, streams: int) -> str:
-    """The name of so many objects in each of some streams."""
-    return f"{count * streams} objects" + (f" in {streams} streams" if streams > 1 else "")
+def _of_many(count: int, columns: int, streams: int, median_ms: float | None, searches: bool) -> _Case:
+    """So many objects in each of some streams."""
+    name = f"{count * streams} objects" + (f" in {streams} streams" if streams > 1 else "")
+    return _Case(name, simulated(shapes_of(count), columns), median_ms, streams=streams, searches=searches)
 
 
 def _named(name: str, compiled: bool) -> str:

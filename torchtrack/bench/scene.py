@@ -16,7 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.bench.clock import Clock
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.run import RunConfig
+from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.camera import Camera, project
 from torchtrack.core.events import EventBatch, concatenate
 from torchtrack.core.lie import rotation_angle_deg, transform_points
@@ -254,6 +256,7 @@ def started(
     *,
     compiled: bool = False,
     kernels: bool = True,
+    searches: bool = True,
     first_streams: Sequence[EventBatch] = (),
 ) -> Run:
     """A tracker that follows the scene, after its first windows.
@@ -263,7 +266,8 @@ def started(
         device: where the tracker runs.
         streams: how many cameras see the same scene, each in a stream of its own.
         compiled: whether steady windows are taken by compiled graphs.
-        kernels: whether Numba's kernels are used where they apply.
+        kernels: whether kernels of a backend are used where they apply.
+        searches: whether lost objects are searched for.
         first_streams: events of the first streams, where they are not those of the scene.
 
     Raises:
@@ -271,7 +275,8 @@ def started(
     """
     count = len(scene.models)
     index = [stream for stream in range(streams) for _ in range(count)]
-    tracker = Tracker(scene.models * streams, [scene.camera] * streams, None, index, compiled=compiled, kernels=kernels).to(device)
+    config = TrackerConfig() if searches else TrackerConfig(relocalization=RelocalizationConfig(hypotheses=0))
+    tracker = Tracker(scene.models * streams, [scene.camera] * streams, config, index, compiled=compiled, kernels=kernels).to(device)
     state = tracker.init(scene.T_cam_obj.repeat(streams, 1, 1), scene.start_us)
     tracker.prepare(state)
     seen = [*(replace(scene, events=events) for events in first_streams), *[scene] * (streams - len(first_streams))]
