@@ -21,7 +21,9 @@ from torchtrack.tracking.frontend.bursts import no_bursts
 from torchtrack.tracking.frontend.corners import detect_corners
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps
 from torchtrack.tracking.frontend.sensor_view import SensorView
+from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.time_surface import empty_last_event, object_regions, time_surface, update_last_event
+from torchtrack.tracking.step import StepInput, advance, opened, steady_advance
 
 COUNT = 6
 CORNERS = TrackerConfig(corners=CornerConfig(max_corners=20))
@@ -210,6 +212,11 @@ def test_a_tracker_that_reads_nothing_finds_the_same(nothing_is_read, monkeypatc
 # ---- steady steps
 
 
+def steady_step(tracker, state, events, end_us):
+    """A window by the function that compiled graphs are of."""
+    return steady_advance(tracker, opened(tracker, state, events), NearbyEvents(events), torch.as_tensor(end_us).expand_as(state.t_us))
+
+
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("reading", [True, False])
 def test_a_steady_step_is_a_step(nothing_is_read, scene, reading):
@@ -219,9 +226,11 @@ def test_a_steady_step_is_a_step(nothing_is_read, scene, reading):
         state, _ = follow(boxes, boxes.init(torch.stack(starts), 0), cut[:-1])
         if not reading:
             nothing_is_read()
-        *steady, wrong = boxes.steady_step(state, *cut[-1])
+        *steady, wrong = steady_step(boxes, state, *cut[-1])
         assert not wrong
-        for result, other in zip(steady, boxes.step(state, *cut[-1]), strict=True):
+        events, end_us = cut[-1]
+        given = StepInput(NearbyEvents(events), torch.as_tensor(end_us).expand_as(state.t_us), learns=False)
+        for result, other in zip(steady, advance(boxes, opened(boxes, state, events), given), strict=True):
             assert_same(result, other)
 
 
@@ -231,7 +240,7 @@ def test_a_steady_step_says_when_it_does_not_hold(nothing_is_read, monkeypatch, 
     # Made before anything is patched: other tests share it.
     boxes, state, _, window, _ = started(config=STEADY)
     monkeypatch.setattr(initialization, "_EVENTS_OF_A_PART", 20)
-    *_, wrong = boxes.steady_step(state, *window)
+    *_, wrong = steady_step(boxes, state, *window)
     assert not wrong
     if not reading:
         nothing_is_read()
@@ -242,5 +251,5 @@ def test_a_steady_step_says_when_it_does_not_hold(nothing_is_read, monkeypatch, 
         uncertain[:, :6, :6] += torch.eye(6) * (0.05 if reason == "searched" else 0.005) ** 2
     # No window explains twice as much as all there is.
     usual_score = state.health.mean_score + (2 if reason == "lost" else 0)
-    *_, wrong = boxes.steady_step(changed(state, covariance=uncertain, mean_score=usual_score), *window)
+    *_, wrong = steady_step(boxes, changed(state, covariance=uncertain, mean_score=usual_score), *window)
     assert wrong

@@ -88,26 +88,6 @@ def test_the_gpu_finds_the_poses_of_the_cpu(cuda, scene, mode):
     assert float(millimetres.max()) < 0.1
 
 
-@pytest.mark.parametrize("scene", SCENES)
-def test_a_cuda_graph_holds_a_steady_step(cuda, scene):
-    tracker, state, ready = set_up(scene, cuda, ONE_POSE)
-    with torch.inference_mode():
-        state, _ = follow(tracker, state, ready[:-1])
-        aside = torch.cuda.Stream()
-        aside.wait_stream(torch.cuda.current_stream())
-        # Kernels are loaded, and constants made, before the capture.
-        with torch.cuda.stream(aside):
-            tracker.steady_step(state, *ready[-1])
-        torch.cuda.current_stream().wait_stream(aside)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            _, held, wrong = tracker.steady_step(state, *ready[-1])
-        graph.replay()
-        _, result = tracker.step(state, *ready[-1])
-    assert not wrong
-    torch.testing.assert_close(held.T_cam_obj, result.T_cam_obj, rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 @pytest.mark.parametrize(
     "wait",
@@ -191,18 +171,4 @@ def test_the_window_of_a_graph_asks_for_nothing_however_uncertain_objects_are(mo
         steady_lane(tracker, state, NearbyEvents(events), end_us.expand(tracker.streams))
         with host_reads() as reads:
             steady_lane(tracker, state, NearbyEvents(events), end_us.expand(tracker.streams))
-    assert reads == []
-
-
-@pytest.mark.parametrize("model", [box_model, bevelled_model])
-@pytest.mark.parametrize("scene", SCENES)
-def test_a_steady_step_asks_for_nothing(monkeypatch, scene, model):
-    """A CUDA graph cannot hold so much as an answer that is waited for."""
-    monkeypatch.setattr(host_sync, "read_at_once", lambda values: False)
-    tracker, state, ready = set_up(scene, torch.device("cpu"), model=model)
-    with torch.inference_mode():
-        state, _ = follow(tracker, state, ready[:-1])
-        monkeypatch.setattr(host_sync.AsyncValue, "to", None)
-        with host_reads() as reads:
-            tracker.steady_step(state, *ready[-1])
     assert reads == []

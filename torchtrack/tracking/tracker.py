@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from torch import Tensor, nn
 
 from torchtrack.config.tracker import TrackerConfig
@@ -45,7 +45,7 @@ class Tracker(TrackedObjects):
             ``[b, n]``, 0 to 1, which multiplies into its weight. Gradients of poses reach it. When not given, the one that
             comes with the package, for what ``association.weighting_network`` says. Other poses that a search tries are aligned
             without it.
-        compiled: whether steady windows are taken by compiled graphs, see :mod:`torchtrack.tracking.graphs`.
+        compiled: whether windows are taken by compiled graphs, on a CPU steady ones, see :mod:`torchtrack.tracking.graphs`.
         kernels: whether kernels of Numba, and on a GPU of Triton, are used where they apply: :mod:`torchtrack.core.dispatch`.
 
     Raises:
@@ -149,24 +149,6 @@ class Tracker(TrackedObjects):
         check_step(state.t_us, events, t_us)
         with torch.autocast(t_us.device.type, enabled=False), dispatch.backend(wanted=self.kernels, values=self.intrinsics):
             return self._tracked(state, events, t_us, extra_terms)
-
-    def steady_step(
-        self, state: TrackerState, events: EventBatch, t_end_us: int | Int[Tensor, "s"]
-    ) -> tuple[TrackerState, StepResult, Bool[Tensor, ""]]:
-        """:meth:`step` where nothing has to be decided, so that a CUDA graph can hold it.
-
-        No object is searched for or looked for farther away than as configured, and no window is taken in parts. A graph is of
-        as many events as it is captured with, and learns contours or not as the window's number then says.
-
-        Returns:
-            State, result, and whether any of this was called for: then they do not hold, and :meth:`step` is to take the window.
-        """
-        t_us, steady = self._window_end(state, events, t_end_us), host_sync.SteadyState()
-        with torch.autocast(t_us.device.type, enabled=False):
-            steady.ask(to_be_parted(state, events, t_us, self.objects, self.config), False)
-            given = StepInput(NearbyEvents(events), t_us, reads=steady)
-            done = _counted(advance(self, opened(self, state, events), given))
-        return *done, steady.wrong()
 
     def prepare(self, state: TrackerState) -> None:
         """Compile what is compiled, before the first window: graphs take a minute or more, kernels half of that, and a live camera does not wait.
