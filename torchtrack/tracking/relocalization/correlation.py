@@ -14,6 +14,7 @@ from torch.fft import irfft2, rfft2
 from torch.nn.functional import avg_pool2d
 
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core import host_sync
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.neighbours import largest_around
 from torchtrack.tracking.contours.points import Contours
@@ -28,8 +29,8 @@ _SIGMAS, _DIAMETERS = 2.5, 1.3
 _BLUR, _AROUND = 1, 3
 # Shifts that are kept of each rotation, the best within so many cells to each side.
 SHIFTS, APART = 3, 2
-# Outlines that are correlated together: what they need stays in a processor's nearer memory.
-_TOGETHER = 32
+# Outlines that are correlated together: what they need stays in a processor's nearer memory. On a GPU, what is asked for is what takes time.
+_TOGETHER, _TOGETHER_ON_GPU = 32, 1024
 # What is no shift at all: less than any correlation.
 NONE = -9.0
 # Of the rotations that are tried, the best of so many are pulled onto the events: 512 of 1000 (see :mod:`relocalization.sampling`).
@@ -126,7 +127,8 @@ def highest(
         The fit, :data:`NONE` where there are not so many shifts, and the cell that each shift is in.
     """
     spectrum = rfft2(denser.roll((SIDE // 2, SIDE // 2), (0, 1)))
-    split = zip(outlines.pixels.split(_TOGETHER), outlines.mask.split(_TOGETHER), strict=True)
+    together = _TOGETHER_ON_GPU if host_sync.on_gpu(denser) else _TOGETHER
+    split = zip(outlines.pixels.split(together), outlines.mask.split(together), strict=True)
     best, place = zip(*(peaks(_correlation(spectrum, square.counts(*some)), allowed) for some in split), strict=True)
     return torch.cat(best), torch.cat(place)
 
