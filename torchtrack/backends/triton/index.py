@@ -10,20 +10,17 @@ from torchtrack.backends.triton.compiler import OPTIONS, kernel
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerates
-from torchtrack.tracking.contours.index import DISTANCE_STEPS, ContourIndex, index_contours, radii, reach, size_of_image
+from torchtrack.tracking.contours.index import DISTANCE_STEPS, ContourIndex, index_contours, key_type, radii, reach, size_of_image
 from torchtrack.tracking.contours.points import Contours
 
 # As torchtrack.tracking.contours.index has them, which a kernel cannot import.
 _STEPS, _HALF_DIAGONAL = tl.constexpr(DISTANCE_STEPS), tl.constexpr(0.5**0.5)
 # Contour points that a program takes, cells of a row that it writes at once, and cells that it reads at once.
 _POINTS, _CELLS, _READ = 16, 16, 1024
-_NONE = 2**31 - 1
-# An operation's results must not depend on how many points there are: distance and number share 32 bits.
-_MOST_POINTS = 2**13
 
 
 def _supports(contours: Contours, image_size: tuple[int, int], radius_px: int | Tensor | host_sync.AsyncValue, cell_px: int) -> bool:
-    return 0 < contours.mask.shape[1] <= _MOST_POINTS and contours.pixels.dtype in (torch.float32, torch.float64)
+    return contours.mask.shape[1] > 0 and contours.pixels.dtype in (torch.float32, torch.float64)
 
 
 @accelerates(index_contours, supports=_supports, device="cuda", in_graphs=True)
@@ -32,34 +29,37 @@ def index_contours_triton(
 ) -> ContourIndex:
     """All points at once; of those as near to a cell, the first stays."""
     answer = radii(radius_px, contours)
-    first, rows, columns = size_of_image(image_size, reach(max([0, *answer.numbers()]), cell_px) + 2, cell_px)
-    nearest = _nearest(contours.pixels, contours.mask, answer.on_device, [rows, columns, first, cell_px, *image_size])
+    farthest_px = max([0, *answer.numbers()])
+    first, rows, columns = size_of_image(image_size, reach(farthest_px, cell_px) + 2, cell_px)
+    layout, dtype = [rows, columns, first, cell_px, *image_size], key_type(farthest_px, contours.mask.shape[1])
+    nearest = _nearest(contours.pixels, contours.mask, answer.on_device, layout, dtype)
     low = constant((first, first), contours.pixels.dtype, contours.pixels.device).expand(len(nearest), 2)
     return ContourIndex(low, (rows, columns), cell_px, nearest, contours.pixels, answer)
 
 
 @torch.library.custom_op("torchtrack::nearest_contours", mutates_args=())
-def _nearest(pixels: Tensor, mask: Tensor, radius_px: Tensor, layout: list[int]) -> Tensor:
+def _nearest(pixels: Tensor, mask: Tensor, radius_px: Tensor, layout: list[int], dtype: torch.dtype) -> Tensor:
     """Number of the point nearest to each cell ``[b, p]``, -1 for none.
 
     Args:
         layout: rows, columns and first cell of the region, side of a cell (px), height and width of the image.
+        dtype: that holds a distance and a number.
     """
     rows, columns, first, cell_px, height, width = layout
-    (batch, count), cells = mask.shape, rows * columns
-    keys = torch.full((batch, cells), _NONE, dtype=torch.int32, device=pixels.device)
+    (batch, count), cells, none = mask.shape, rows * columns, torch.iinfo(dtype).max
+    keys = torch.full((batch, cells), none, dtype=dtype, device=pixels.device)
     with torch.cuda.device_of(pixels):
         write[batch, triton.cdiv(count, _POINTS)](
             pixels.contiguous(), mask.contiguous(), radius_px.contiguous(), keys, count, cells, columns, first, cell_px,
             0.5 * (width - 1), 0.5 * (height - 1), POINTS=_POINTS, CELLS=_CELLS, **OPTIONS,
         )  # fmt: skip
-        read[batch, triton.cdiv(cells, _READ)](keys, radius_px.contiguous(), count, cells, BLOCK=_READ, **OPTIONS)
+        read[batch, triton.cdiv(cells, _READ)](keys, count, cells, NONE=none, BLOCK=_READ, **OPTIONS)
     return keys
 
 
 @_nearest.register_fake
-def _(pixels: Tensor, mask: Tensor, radius_px: Tensor, layout: list[int]) -> Tensor:
-    return torch.empty(len(mask), layout[0] * layout[1], dtype=torch.int32, device=pixels.device)
+def _(pixels: Tensor, mask: Tensor, radius_px: Tensor, layout: list[int], dtype: torch.dtype) -> Tensor:
+    return torch.empty(len(mask), layout[0] * layout[1], dtype=dtype, device=pixels.device)
 
 
 @kernel
@@ -97,13 +97,13 @@ def write(
             far = tl.floor((aside * aside + (along * along)[:, None]) * _STEPS)
             is_near = inside[:, None] & (far <= farthest) & (across <= reach)[None, :]
             cell = own[:, None] + down * columns + across[None, :]
-            tl.atomic_min(cell, far.to(tl.int32) * count + i[:, None], is_near)
+            tl.atomic_min(cell, far.to(keys.dtype.element_ty) * count + i[:, None], is_near)
 
 
 @kernel
-def read(keys, radius_px, count, cells, BLOCK: tl.constexpr):
-    """Put in each cell's place the number of the point that is nearest to it, or -1."""
+def read(keys, count, cells, NONE: tl.constexpr, BLOCK: tl.constexpr):
+    """Put in each cell's place the number of the point that is nearest to it, or -1 for none."""
     b = tl.program_id(0).to(tl.int64)
     cell = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     key = tl.load(keys + b * cells + cell, cell < cells, 0)
-    tl.store(keys + b * cells + cell, tl.where(key < 2147483647, key % count, -1), cell < cells)
+    tl.store(keys + b * cells + cell, tl.where(key < NONE, key % count, -1), cell < cells)

@@ -125,8 +125,7 @@ def index_contours(
         # Those that are not inside write, too: not all of them to one cell, where each would wait for the others.
         spread = torch.arange(count, device=local.device) % (columns - 2 * margin) + margin
         local[..., 0] = torch.where(inside, local[..., 0], spread.to(local.dtype))
-    # Distance and number of a point in one integer, as narrow as will do.
-    dtype = torch.int32 if DISTANCE_STEPS * (max([0, *radii_px]) + 1) ** 2 * count < 2**31 else torch.int64
+    dtype = key_type(max([0, *radii_px]), count)
     keys = torch.full((batch * rows * columns,), torch.iinfo(dtype).max, dtype=dtype, device=radius.device)
     # Points that are not inside are too far from their cells to write anything.
     to_centre = torch.where(inside[..., None], cell_px * centre - contours.pixels, _FAR_PX)
@@ -205,6 +204,11 @@ def _write(keys: Tensor, points: tuple[Tensor, Tensor, Tensor], radius_px: int, 
     key = steps.clamp_(0, DISTANCE_STEPS * radius_px**2 + 1).to(keys.dtype).mul_(count).add_(number[:, None])
     around = torch.add(column, row, alpha=columns).long()
     keys.scatter_reduce_(0, (cell[:, None] + around).flatten(), key.flatten(), "amin")
+
+
+def key_type(radius_px: int, count: int) -> torch.dtype:
+    """Of an integer that holds the distance and the number of any of ``count`` points: as narrow as will do."""
+    return torch.int32 if DISTANCE_STEPS * (radius_px + 1) ** 2 * count < 2**31 else torch.int64
 
 
 def reach(radius_px: int, cell_px: int) -> int:
