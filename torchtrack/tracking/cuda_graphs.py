@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtrack.core.field_values import field_values
 from torchtrack.tracking.state import each_tensor
 
 _Function = Callable[..., tuple[Any, ...]]
@@ -98,7 +99,7 @@ def _tensors(*values: Any) -> Iterator[Tensor]:
         if torch.is_tensor(value):
             yield value
         elif is_dataclass(value):
-            yield from _tensors(*(getattr(value, field) for field in value.__dataclass_fields__))
+            yield from _tensors(*field_values(value).values())
 
 
 def _copied(recorded: _Recorded) -> tuple[Any, ...]:

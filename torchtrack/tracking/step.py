@@ -242,8 +242,7 @@ def steady_lane(
     given = StepInput(events, t_us, reads=reads, learns=learns)
     window = steady_window(tracked, state, given)
     stated = torch.stack([reads.wrong(), has(window.evidence.triggers, SEARCHED).any()])
-    # Without what was computed of it on the way.
-    return *update(tracked, state, window, window.located, given), stated, each_tensor(lambda tensor: tensor, window)
+    return *update(tracked, state, window, window.located, given), stated, window
 
 
 def looked_for(

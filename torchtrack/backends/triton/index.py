@@ -10,11 +10,11 @@ from torchtrack.backends.triton.compiler import OPTIONS, kernel
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
 from torchtrack.core.dispatch import accelerates
-from torchtrack.tracking.contours.index import DISTANCE_STEPS, ContourIndex, index_contours, key_type, radii, reach, size_of_image
+from torchtrack.tracking.contours.index import DISTANCE_STEPS, HALF_DIAGONAL, ContourIndex, index_contours, key_type, radii, reach, size_of_image
 from torchtrack.tracking.contours.points import Contours
 
-# As torchtrack.tracking.contours.index has them, which a kernel cannot import.
-_STEPS, _HALF_DIAGONAL = tl.constexpr(DISTANCE_STEPS), tl.constexpr(0.5**0.5)
+# As kernels take them.
+_STEPS, _HALF_DIAGONAL = tl.constexpr(DISTANCE_STEPS), tl.constexpr(HALF_DIAGONAL)
 # Contour points that a program takes, cells of a row that it writes at once, and cells that it reads at once.
 _POINTS, _CELLS, _READ = 16, 16, 1024
 

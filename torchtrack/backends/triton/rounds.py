@@ -103,9 +103,9 @@ def _rounds(tensors: list[Tensor], gates_px: list[float], numbers: list[float]) 
     given = _Given(*(tensor.contiguous() for tensor in tensors))
     settings, damping, layout = _of_their_kinds(numbers)
     (batch, count), points = given.exists.shape, given.table.shape[2]
+    T_cam_obj, gradient, hessian, offset, contour, is_near, is_matched, matches = _room(given)
     # What the kernels write to are copies.
-    T_cam_obj, offset, place = given.T_cam_obj.clone(), given.offset.clone(), given.place.clone()
-    gradient, hessian, contour, is_near, is_matched, matches = _room(given)
+    T_cam_obj, offset, place = T_cam_obj.copy_(given.T_cam_obj), offset.copy_(given.offset), given.place.clone()
     of_index = layout.cell_rows, layout.cell_columns, layout.cell_px, OFF_BORDER_PX
     velocity, next_T_cam_obj = given.velocity, T_cam_obj.clone()
     with torch.cuda.device_of(offset):
@@ -129,17 +129,15 @@ def _rounds(tensors: list[Tensor], gates_px: list[float], numbers: list[float]) 
 
 @_rounds.register_fake
 def _(tensors: list[Tensor], gates_px: list[float], numbers: list[float]) -> list[Tensor]:
-    given = _Given(*tensors)
-    own = [value.new_empty(value.shape) for value in (given.T_cam_obj, given.offset)]
-    gradient, *others = _room(given)
-    return [own[0], gradient, others[0], own[1], *others[1:]]
+    return _room(_Given(*tensors))
 
 
-def _room(given: _Given) -> tuple[Tensor, ...]:
-    """Memory for what the rounds give: gradient, Hessian, contour points, what is near and matched, and rows of matches."""
+def _room(given: _Given) -> list[Tensor]:
+    """Memory for what the rounds give: poses, gradients, Hessians and offsets; contour points, what is near and matched, and rows of matches."""
     (batch, count), offset = given.exists.shape, given.offset
+    of_objects = (like.new_empty(like.shape) for like in (given.T_cam_obj, offset, given.information, offset))
     of_observations = (offset.new_empty(batch, count, dtype=kind) for kind in (torch.int64, torch.bool, torch.bool))
-    return offset.new_empty(offset.shape), offset.new_empty(given.information.shape), *of_observations, offset.new_empty(batch, ROWS, count)
+    return [*of_objects, *of_observations, offset.new_empty(batch, ROWS, count)]
 
 
 def _of_their_kinds(numbers: list[float]) -> list[Any]:
