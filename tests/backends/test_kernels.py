@@ -301,7 +301,7 @@ def test_marks_of_poses(each, dtype):
     outlines = replace(outlines, tangents_obj=uniform(*outlines.points_obj.shape, low=-1, seed=5, dtype=dtype))
     offsets = torch.nn.functional.pad(random_twist(40, rotation_rad=0.01, translation_m=3.0).to(dtype), (0, 7))
     offsets[3, :6] = torch.nan
-    image = uniform(IMAGE_SIZE[0] + 4, IMAGE_SIZE[1] + 4, high=3, seed=7, dtype=dtype)
+    image = uniform(1, IMAGE_SIZE[0] + 4, IMAGE_SIZE[1] + 4, high=3, seed=7, dtype=dtype)
     by_kernels, plain = both_ways(lambda: score_outlines(outlines, prediction.poses_at(offsets[:, :6]), camera, image))
     known = torch.arange(40) != 3
     torch.testing.assert_close(by_kernels[known], plain[known], rtol=1e-4, atol=1e-9 if dtype == torch.float64 else 0.03)

@@ -76,10 +76,10 @@ def test_events_of_several_objects_are_not_copied_for_each():
     assert isinstance(events, SharedEvents)
     assert events.shared.mask.shape[0] == 1
     for number in range(4):
-        single, row = entries_of(events.of_object(number), 0), entries_of(events.rows(), number)
+        single, row = entries_of(events.of_objects(torch.tensor([number])), 0), entries_of(events.rows(), number)
         assert all(torch.equal(single[name], row[name]) for name in row)
     assert int(events.counts()[3]) == 0
-    assert not events.of_object(3).mask.any()
+    assert not events.of_objects(torch.tensor([3])).mask.any()
     some = events.of_objects(torch.tensor([2, 0]))
     for row, number in enumerate((2, 0)):
         single, own = entries_of(some, row), entries_of(events.rows(), number)

@@ -17,7 +17,7 @@ from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.motion.predict import forecast
-from torchtrack.tracking.relocalization.lost_object import Relocalized
+from torchtrack.tracking.relocalization.lost_objects import Relocalized
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import Status

@@ -6,7 +6,7 @@ from torchtrack.tracking.relocalization import hypotheses, last_seen, schedule, 
 from torchtrack.tracking.relocalization.acceptance import AcceptanceTest
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen
-from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
+from torchtrack.tracking.relocalization.lost_objects import LostObjects, Relocalized
 from torchtrack.tracking.relocalization.refine import exchanged, refined
 
 # Of an object that is seen well, in a window in which it is time for nothing.
@@ -42,12 +42,13 @@ def acceptance_test(margin=0.1, min_score=0.0, min_inlier_ratio=0.0, min_matches
 
 def lost_object(tracker, prediction, seen, scored, sigma_px, config=None):
     """The first object of a tracker, to try other poses for."""
-    return LostObject(
-        number=0,
+    return LostObjects(
+        numbers=(0,),
         window=Relocalized(scored, prediction, torch.ones_like(scored.score)),
         widened=prediction,
-        sigma_px=sigma_px,
-        events=seen.of_object(0),
+        sigma_px=torch.full_like(scored.score[:1], sigma_px),
+        is_wide=sigma_px > tracker.config.relocalization.wide_sigma_px,
+        events=seen.of_objects(torch.tensor([0])),
         last_seen=LastSeen(prediction.T_cam_obj.double(), prediction.covariance),
         config=config or tracker.config,
     )
@@ -57,7 +58,7 @@ def searched(lost, test=None, propose=hypotheses.around_prediction):
     """The fits of a window with other poses tried for the object."""
     proposed = propose(lost)
     tried = refined(proposed, lost)
-    choice = (test or acceptance_test()).row(0).choose(tried, proposed, lost)
+    choice = (test or acceptance_test()).rows(lost.rows).choose(tried, proposed, lost)
     return exchanged(lost, proposed, tried, choice).scored
 
 

@@ -1,7 +1,7 @@
 """Rows of which some entries count: the box around those of each object, and a choice of them."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -41,6 +41,24 @@ def by_short_rows(mask: Bool[Tensor, "b n"]) -> Int[Tensor, "b n"]:
     before = rows[..., -1].cumsum(-1) - rows[..., -1]
     # A search in it needs a row of its own in memory, not a view.
     return (rows + before[..., None]).flatten(1)[:, : mask.shape[1]].clone(memory_format=torch.contiguous_format)
+
+
+def repeated(values: Shaped[Tensor, "k *c"], count: int) -> Shaped[Tensor, "n *c"]:
+    """Each row as often in turn as makes ``count`` of them; a single one without a copy."""
+    return values[:, None].expand(-1, count // len(values), *values.shape[1:]).flatten(0, 1)
+
+
+def put_rows(
+    values: Shaped[Tensor, "b *c"], rows: Int[Tensor, "k"], others: Shaped[Tensor, "k *c"], taken: Bool[Tensor, "k"]
+) -> Shaped[Tensor, "b *c"]:
+    """The values with others in the place of some rows, where these are ``taken``."""
+    chosen = torch.where(taken.view(-1, *[1] * (values.dim() - 1)), others, values.index_select(0, rows))
+    return values.index_copy(0, rows, chosen)
+
+
+def rows_in_all(chosen: Int[Tensor, "k c"], count: int) -> Int[Tensor, "n"]:
+    """Numbers of rows among all, of rows that were chosen from ``count`` of each of some objects."""
+    return (chosen + count * torch.arange(len(chosen), device=chosen.device)[:, None]).flatten()
 
 
 def take_points(values: Float[Tensor, "b n k"], index: Int[Tensor, "b m"]) -> Float[Tensor, "b m k"]:

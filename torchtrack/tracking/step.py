@@ -29,7 +29,7 @@ from torchtrack.tracking.initialization import of_unknown_motion
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence, gather_evidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen
-from torchtrack.tracking.relocalization.lost_object import Relocalized
+from torchtrack.tracking.relocalization.lost_objects import Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, has, triggered
 from torchtrack.tracking.state import StepResult, TrackerState, each_tensor

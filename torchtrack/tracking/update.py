@@ -19,7 +19,7 @@ from torchtrack.tracking.estimation.rounds import Fit
 from torchtrack.tracking.frontend.corners import Corners
 from torchtrack.tracking.motion.model import MotionState, fade, with_dropped
 from torchtrack.tracking.motion.prediction import Prediction
-from torchtrack.tracking.relocalization.lost_object import Relocalized
+from torchtrack.tracking.relocalization.lost_objects import Relocalized
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.health import TrackHealth
 from torchtrack.tracking.validation.measures import visible_ratio

@@ -214,8 +214,8 @@ def test_nothing_is_asked_of_events_while_all_is_seen():
 def test_copies_of_an_object_expect_what_it_does():
     tracker, _, _ = tracked()
     objects = replace(tracker.objects, polarity=torch.linspace(-1, 1, 8)[None])
-    assert torch.equal(objects.copies(0, 3).polarity, torch.linspace(-1, 1, 8).expand(3, 8))
-    assert tracker.objects.copies(0, 3).polarity is None
+    assert torch.equal(objects.copies([0], 3).polarity, torch.linspace(-1, 1, 8).expand(3, 8))
+    assert tracker.objects.copies([0], 3).polarity is None
 
 
 def test_what_was_not_tracked_is_not_remembered():

@@ -7,7 +7,7 @@ from helpers import SMALL_CAMERA, box_model, pose
 from torchtrack import Tracker
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.object_model import contour_source
-from torchtrack.tracking.contours.objects import repeat_row
+from torchtrack.tracking.contours.objects import copied_rows
 
 CONTOURS = ContourConfig()
 SPLAT = ContourConfig(source="splat", texture=False, creases=False)
@@ -75,7 +75,7 @@ def test_some_objects_are_seen_as_among_all():
 def test_copies_share_all_tensors_but_the_list_of_members(number):
     cube = box_model((0.1, 0.1, 0.1))
     objects = batch_of(box_model(), cube, box_model(), streams=[1, 0, 0])
-    copies = objects.copies(number, 4)
+    copies = objects.copies([number], 4)
     (model,) = copies.models
     (original,) = [each for each in objects.models if number in each.members.tolist()]
     for name, value in original.named_buffers():
@@ -90,7 +90,7 @@ def test_copies_share_all_tensors_but_the_list_of_members(number):
 
 def test_copying_leaves_the_originals_as_they_were():
     objects = batch_of(box_model(), box_model((0.1, 0.1, 0.1)), box_model())
-    objects.copies(0, 7)
+    objects.copies([0], 7)
     assert [model.members.tolist() for model in objects.models] == [[0, 2], [1]]
 
 
@@ -100,7 +100,7 @@ def test_copies_hide_neither_one_another_nor_themselves(monkeypatch, config, exa
     monkeypatch.setattr(contour_source, "EXACT_FACES", exact_faces)
     objects = batch_of(box_model(), box_model(PLATE_EXTENTS_M))
     poses = torch.stack([pose(), pose(translation=(0.0, 0.0, 0.4)), pose(translation=(0.01, 0.0, 0.7))]).float()
-    together = objects.copies(0, 3).contours(poses, config)
+    together = objects.copies([0], 3).contours(poses, config)
     alone = batch_of(box_model())
     for row in range(3):
         assert same_contours(together, alone.contours(poses[row : row + 1], config), row, 0)
@@ -108,6 +108,20 @@ def test_copies_hide_neither_one_another_nor_themselves(monkeypatch, config, exa
 
 def test_a_row_is_repeated_without_a_copy():
     values = torch.arange(12.0).view(3, 4)
-    repeated = repeat_row(values, 1, 5)
+    repeated = copied_rows(values, [1], 5)
     assert repeated.tolist() == [[4, 5, 6, 7]] * 5
     assert repeated.data_ptr() == values[1].data_ptr()
+    assert copied_rows(values, range(3)).data_ptr() == values.data_ptr()
+
+
+@pytest.mark.parametrize("numbers", [(2, 0), (0, 1, 2), (1, 2)])
+def test_copies_of_several_objects_come_in_turn_and_each_is_its_own(numbers):
+    objects = batch_of(box_model(), box_model(PLATE_EXTENTS_M), box_model(), streams=[0, 1, 0])
+    poses = torch.stack([pose(translation=(0.0, 0.01 * row, 0.5)) for row in range(2 * len(numbers))]).float()
+    copies = objects.copies(numbers, 2)
+    assert copies.stream_index.tolist() == list(range(2 * len(numbers)))
+    torch.testing.assert_close(copies.diameter_m, objects.diameter_m[list(numbers)].repeat_interleave(2))
+    together = copies.contours(poses, CONTOURS)
+    for row in range(2 * len(numbers)):
+        alone = objects.copies([numbers[row // 2]]).contours(poses[row : row + 1], CONTOURS)
+        assert torch.equal(together.points_obj[row][together.mask[row]], alone.points_obj[0][alone.mask[0]])

@@ -91,7 +91,7 @@ def test_a_moved_prediction_has_pose_and_velocity_moved(dtype):
 
 def test_copies_are_of_one_object():
     prediction = boxes(torch.stack([pose(), pose((0.1, 0.2, 0.3))]), random_covariance(2), torch.arange(12.0).view(2, 6))
-    copies = prediction.copies(1, 5)
+    copies = prediction.copies([1], 5)
     for name in ("T_cam_obj", "usable", "velocity", "covariance"):
         ours, given = getattr(copies, name), getattr(prediction, name)
         assert ours.shape == (5, *given.shape[1:])
@@ -102,9 +102,9 @@ def test_copies_are_of_one_object():
 def test_one_prediction_takes_the_place_of_another_where_it_is_taken():
     rotations, speeds = ((0.5, 0.6, 0.1), (0.1, 0.2, 0.3)), torch.arange(12.0).view(2, 1, 6)
     own, other = (boxes(pose(rotations[row])[None], random_covariance(seed=row), speeds[row]) for row in range(2))
-    three = own.copies(0, 3)
+    three = own.copies([0], 3)
     for taken in (True, False):
-        now = three.exchanged(1, other, torch.tensor(taken))
+        now = three.exchanged(torch.tensor([1]), other, torch.tensor([taken]))
         expected = [own, other if taken else own, own]
         for name in ("T_cam_obj", "velocity", "covariance"):
             assert torch.equal(getattr(now, name), torch.cat([getattr(p, name) for p in expected])), name

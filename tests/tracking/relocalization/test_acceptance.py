@@ -30,29 +30,29 @@ def scored_as(score, inlier_ratio, count):
 
 def test_a_pose_passes_that_matches_enough_events_which_gather_enough():
     tried = scored_as([0.9] * 5, [0.6, 0.4, torch.nan, 0.6, 0.6], [100, 100, 100, 99, 29])
-    passed = acceptance_test(min_inlier_ratio=0.5, min_matches=100.0).row(0).is_passed(tried, CONFIG)
+    passed = acceptance_test(min_inlier_ratio=0.5, min_matches=100.0).is_passed(tried, CONFIG)
     assert passed.tolist() == [True, False, True, False, False]
     # Never by fewer than any fit needs.
-    assert acceptance_test().row(0).is_passed(tried, CONFIG).tolist() == [True, True, True, True, False]
+    assert acceptance_test().is_passed(tried, CONFIG).tolist() == [True, True, True, True, False]
 
 
 def test_the_score_to_surpass_is_better_than_ones_own_by_the_margin_and_no_less_than_the_least():
     own = scored_as([0.5, 0.7, 0.5], [torch.nan] * 3, [100, 100, 10])
     test = AcceptanceTest(torch.full((3,), 0.1), torch.full((3,), 0.65), torch.zeros(3), torch.zeros(3))
     # Of a fit by too few events nothing counts.
-    assert [float(test.row(number).asked_score(own, number, CONFIG)) for number in range(3)] == pytest.approx([0.65, 0.8, 0.65])
+    assert test.asked_score(own.count, own.score, CONFIG).tolist() == pytest.approx([0.65, 0.8, 0.65])
 
 
-def test_a_row_is_the_test_of_a_single_object():
-    test = AcceptanceTest(*torch.arange(12.0).view(4, 3).unbind(0)).row(1)
-    assert [float(value) for value in vars(test).values()] == [1.0, 4.0, 7.0, 10.0]
+def test_rows_are_the_test_of_some_objects():
+    test = AcceptanceTest(*torch.arange(12.0).view(4, 3).unbind(0)).rows(torch.tensor([2, 1]))
+    assert [value.tolist() for value in vars(test).values()] == [[2.0, 1.0], [5.0, 4.0], [8.0, 7.0], [11.0, 10.0]]
 
 
 def test_of_poses_that_explain_as_much_the_most_expected_is_taken():
     """Turns of a vase about its axis all explain the same: the best of them by a hair is chance."""
     from_prior = torch.zeros(4, 12)
     from_prior[:, 1] = torch.tensor([0.5, 0.01, 0.0, 0.3])
-    share, covariance = torch.tensor([0.9, 0.89, 0.6, 0.885]), 1e-2 * torch.eye(12, dtype=torch.float64)
+    share, covariance = torch.tensor([0.9, 0.89, 0.6, 0.885]), 1e-2 * torch.eye(12, dtype=torch.float64)[None]
     assert likeliest(share, from_prior, covariance).tolist() == [1]
     assert likeliest(share, from_prior.index_fill(0, torch.tensor([1]), torch.nan), covariance).tolist() == [3]
     assert likeliest(torch.tensor([0.9, 0.8, 0.6, 0.0]), from_prior, covariance).tolist() == [0]
@@ -62,16 +62,16 @@ def test_what_a_prediction_does_not_allow_is_not_likely():
     """In standard deviations; what is not a number is none."""
     offsets = torch.zeros(5, 12)
     offsets[1, 0], offsets[2, 0], offsets[3, :6], offsets[4, 2] = 0.4, 0.42, 0.18, torch.nan
-    assert is_likely(offsets, 1e-2 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True, False, False, False]
+    assert is_likely(offsets, 1e-2 * torch.eye(12, dtype=torch.float64)[None]).tolist() == [True, True, False, False, False]
     wide = torch.full((1, 12), 5.0)
-    assert is_likely(torch.cat([offsets[:1], wide]), 25.0 * torch.eye(12, dtype=torch.float64)).tolist() == [True, True]
+    assert is_likely(torch.cat([offsets[:1], wide]), 25.0 * torch.eye(12, dtype=torch.float64)[None]).tolist() == [True, True]
 
 
 def test_events_on_texture_contradict_poses_where_they_agree_at_the_objects_own():
     tried = replace(scored_as([0.9] * 3, [torch.nan] * 3, [100] * 3), texture_agreement=torch.tensor([0.5, 0.9, torch.nan]))
-    assert is_contradicted(tried, torch.tensor(0.9)).tolist() == [True, False, False]
+    assert is_contradicted(tried, torch.tensor([0.9])).tolist() == [True, False, False]
     for own_agreement in (0.5, torch.nan):
-        assert not is_contradicted(tried, torch.tensor(own_agreement)).any()
+        assert not is_contradicted(tried, torch.tensor([own_agreement])).any()
 
 
 # ---- what it leaves

@@ -13,14 +13,14 @@ from torchtrack.tracking.relocalization.event_image import event_density
 from torchtrack.tracking.relocalization.view_sphere import outlines_at
 
 IMAGE_SIZE = (SMALL_CAMERA.height, SMALL_CAMERA.width)
-LOOSE = torch.diag(torch.tensor([0.3] * 3 + [0.05] * 3, dtype=torch.float64).square())
+LOOSE = torch.diag(torch.tensor([0.3] * 3 + [0.05] * 3, dtype=torch.float64).square())[None]
 
 
 def of_box(dtype=torch.float32):
     """A prediction of a box in motion, the image of its events, and its true pose."""
     _, prediction, seen, _, T_true = in_motion(dtype=dtype)
     density = event_density(prediction.carried(seen.pixels, seen.age_s), seen.mask, IMAGE_SIZE)
-    return prediction, avg_pool2d(density.clamp(max=3)[None], 3, 1, 1)[0], T_true
+    return prediction, avg_pool2d(density.clamp(max=3), 3, 1, 1), T_true
 
 
 def displaced(prediction, *offsets):

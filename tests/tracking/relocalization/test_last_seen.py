@@ -108,7 +108,7 @@ def test_others_are_as_certain_as_before():
 
 def test_of_what_slipped_all_is_less_certain_alike():
     _, prediction, *_ = in_motion()
-    wider = less_certain(prediction.copies(0, 1), 0.5, 2.5).covariance
+    wider = less_certain(prediction, torch.tensor([0.5]), torch.tensor([2.5])).covariance
     torch.testing.assert_close(wider, 25 * prediction.covariance)
 
 

@@ -12,10 +12,11 @@ from tracked_boxes import WINDOW_US, follow, in_motion, moving_box, poses_of, st
 from torchtrack import Tracker
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.dispatch import backend
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
-from torchtrack.tracking.relocalization import refine
-from torchtrack.tracking.relocalization.hypotheses import around_prediction, sampled_around
+from torchtrack.tracking.relocalization import hypotheses, refine
+from torchtrack.tracking.relocalization.hypotheses import around_prediction
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
 from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, Trigger, triggered
@@ -63,8 +64,8 @@ def test_a_further_source_needs_no_change_of_the_loop():
     lost, seen, T_true = displaced_and_lost()
 
     def oracle(seen_by_it):
-        known = replace(seen_by_it.predicted(), T_cam_obj=T_true.float())
-        return replace(sampled_around(seen_by_it, known, 1.0, seen_by_it.contours()), replaces_prediction=True)
+        known = replace(seen_by_it.widened, T_cam_obj=T_true.float())
+        return replace(around_prediction(replace(seen_by_it, widened=known)), replaces_prediction=True)
 
     further = Source(Trigger.LOST, oracle, lambda *_: acceptance_test())
     given = evidence(triggers=int(Trigger.LOST))
@@ -150,7 +151,7 @@ def test_a_box_that_slipped_is_found_however_sure_it_is_of_itself(farther):
 @pytest.mark.parametrize("config", [UNSEARCHED, SEARCHED.model_copy(update={"solver": SEARCHED.solver.model_copy(update={"prior": False})})])
 def test_without_hypotheses_or_a_prior_nothing_is_searched_for(config, monkeypatch):
     searched = []
-    monkeypatch.setattr(f"{LOOP}._tried", lambda lost, calls: searched.append(lost.number) or lost.window)
+    monkeypatch.setattr(f"{LOOP}._tried", lambda lost, *_: searched.extend(lost.numbers) or lost.window)
     displaced_runs(config, 100.0, count=2)
     assert searched == []
 
@@ -158,7 +159,7 @@ def test_without_hypotheses_or_a_prior_nothing_is_searched_for(config, monkeypat
 @torch.no_grad()
 def test_while_all_goes_well_nothing_is_searched_for(monkeypatch):
     searched = []
-    monkeypatch.setattr(f"{LOOP}._tried", lambda lost, calls: searched.append(lost.number) or lost.window)
+    monkeypatch.setattr(f"{LOOP}._tried", lambda lost, *_: searched.extend(lost.numbers) or lost.window)
     _, events = moving_box(pose(), 10)
     # As a new object it would be, once in a while.
     tracker = Tracker([box_model()], SMALL_CAMERA, TrackerConfig(relocalization=RelocalizationConfig(new_below=0)))
@@ -190,6 +191,64 @@ def test_a_search_for_one_changes_nothing_for_its_neighbours(dtype):
     assert not torch.equal(poses_of(runs["with"], 1), poses_of(runs["without"], 1))
 
 
+# ---- as a batch
+
+
+@torch.no_grad()
+def lost_boxes():
+    """A tracker of four boxes in streams of their own, which are ten degrees off, and two of them very uncertain; their state, and a window."""
+    streams = [moving_box(pose(), 4, seed=s, stream=s)[1] for s in range(4)]
+    batches = [(concatenate([stream.slice_time(k * WINDOW_US, (k + 1) * WINDOW_US) for stream in streams]), (k + 1) * WINDOW_US) for k in range(4)]
+    config = TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, new_below=0))
+    tracker = Tracker([box_model()] * 4, [SMALL_CAMERA] * 4, config, stream_index=[0, 1, 2, 3], dtype=torch.float64)
+    state, _ = follow(tracker, tracker.init(pose()[None].repeat(4, 1, 1), 0), batches[:3])
+    T_cam_obj = retract_about(state.T_cam_obj, DISPLACED * torch.tensor([[1.0], [-1.0], [1.3], [0.9]]).double(), tracker.centre_obj.double())
+    uncertain = torch.tensor([1e2, 1e4, 1e2, 1e4])[:, None, None] * state.motion.covariance
+    return tracker, changed(state, T_cam_obj=T_cam_obj, covariance=uncertain, confirmations=torch.full((4,), 9.0)), batches[3]
+
+
+@torch.no_grad()
+def looked_for_together(tracker, state, window, together, monkeypatch):
+    """The result of a window in which so many objects are tried together, and how many were."""
+    sizes = []
+    monkeypatch.setattr(f"{LOOP}._TOGETHER", together)
+    monkeypatch.setattr(f"{LOOP}.refined", lambda hypotheses, lost: sizes.append(len(lost.numbers)) or refine.refined(hypotheses, lost))
+    return tracker.step(state, *window)[1], sizes
+
+
+@pytest.mark.parametrize("kernels", [True, False])
+def test_objects_that_are_tried_together_are_found_as_each_alone(kernels, monkeypatch):
+    tracker, state, window = lost_boxes()
+    with backend(wanted=kernels):
+        alone, sizes = looked_for_together(tracker, state, window, 1, monkeypatch)
+        assert sizes == [1, 1, 1, 1]
+        together, sizes = looked_for_together(tracker, state, window, 8, monkeypatch)
+    # What hardly anything is known of is tried apart.
+    assert sizes == [2, 2]
+    torch.testing.assert_close(together.T_cam_obj, alone.T_cam_obj, rtol=0, atol=1e-7)
+    torch.testing.assert_close(together.quality, alone.quality, rtol=0, atol=1e-6)
+    assert torch.equal(together.status, alone.status) and float((together.T_cam_obj - state.T_cam_obj).abs().amax((1, 2)).min()) > 1e-2
+
+
+@pytest.mark.parametrize("sampler", ["sample_near", "sample_anywhere"])
+@pytest.mark.parametrize("kernels", [True, False])
+def test_hypotheses_that_are_no_numbers_spoil_no_other_that_is_tried_with_them(kernels, sampler, monkeypatch):
+    """Of the two that are tried together, the first one's."""
+    tracker, state, window = lost_boxes()
+    whole = getattr(hypotheses, sampler)
+    first = torch.arange(tracker.config.relocalization.hypotheses)
+    with backend(wanted=kernels):
+        expected, _ = looked_for_together(tracker, state, window, 8, monkeypatch)
+        monkeypatch.setattr(hypotheses, sampler, lambda *given: whole(*given).index_fill(0, first, torch.nan))
+        spoilt, sizes = looked_for_together(tracker, state, window, 8, monkeypatch)
+    assert sizes == [2, 2]
+    number = 0 if sampler == "sample_near" else 1
+    others = [other for other in range(4) if other != number]
+    torch.testing.assert_close(spoilt.T_cam_obj[others], expected.T_cam_obj[others], rtol=0, atol=1e-7)
+    assert torch.equal(spoilt.status[others], expected.status[others])
+    assert torch.isfinite(spoilt.T_cam_obj).all() and not torch.equal(spoilt.T_cam_obj[number], expected.T_cam_obj[number])
+
+
 @torch.no_grad()
 def test_the_work_of_a_window_is_bounded_however_many_are_lost(monkeypatch):
     """Of four that are lost, one is looked for in a window, each in its turn, by as many hypotheses as one that is lost alone."""
@@ -197,7 +256,7 @@ def test_the_work_of_a_window_is_bounded_however_many_are_lost(monkeypatch):
     whole = refine.refined
     monkeypatch.setattr(
         "torchtrack.tracking.relocalization.relocalize.refined",
-        lambda hypotheses, lost: aligned.append((lost.number, len(hypotheses.offsets))) or whole(hypotheses, lost),
+        lambda hypotheses, lost: aligned.append((*lost.numbers, len(hypotheses.offsets))) or whole(hypotheses, lost),
     )
     _, events = moving_box(pose(), 8)
     config = TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, new_below=0, objects=1))
@@ -223,7 +282,7 @@ def test_without_enough_events_there_is_nothing_to_search_in(count, times, monke
     searched = []
     # The look at its rivals is made at its start.
     tracker, state, _, _, _ = started(config=TrackerConfig(relocalization=RelocalizationConfig(interval_us=0, new_below=0)))
-    monkeypatch.setattr(f"{LOOP}._tried", lambda lost, calls: searched.append(lost.number) or lost.window)
+    monkeypatch.setattr(f"{LOOP}._tried", lambda lost, *_: searched.extend(lost.numbers) or lost.window)
     noise = random_events(count, width=200, height=150, duration_us=WINDOW_US)
     after, result = tracker.step(changed(state, covariance=1e3 * state.motion.covariance), replace(noise, t_us=noise.t_us + 25_000), 30_000)
     assert len(searched) == times

@@ -48,9 +48,9 @@ def chosen(rivals, from_prior_rad=0.1, agreements=(torch.nan, torch.nan)):
     values = {"measured_ratio": share, "count": count, "inlier_ratio": inliers, "texture_agreement": agreement}
     tried = replace(scored, **values, ratio_at_rest=torch.zeros(rows), reference_inlier_ratio=torch.zeros(rows))
     tried = replace(tried, fit=replace(tried.fit, solution=replace(tried.fit.solution, from_prior=offsets)))
-    covariance = turned(prediction, tracker.config).covariance[0]
+    covariance = turned(prediction, tracker.config).covariance
     hypotheses = Hypotheses(prediction, offsets, covariance, (seen.pixels, seen.mask), is_wide=True)
-    choice = explains_far_more(evidence(), own, tracker.config).row(0).choose(tried, hypotheses, lost)
+    choice = explains_far_more(evidence(), own, tracker.config).rows(lost.rows).choose(tried, hypotheses, lost)
     return int(choice.row), bool(choice.is_accepted)
 
 
@@ -171,7 +171,7 @@ def test_a_right_start_is_confirmed_as_soon_as_without_the_look_and_poses_are_th
 
 def test_one_look_is_made_for_a_start(monkeypatch):
     looks = []
-    monkeypatch.setattr(f"{LOOP}._tried", lambda lost, calls: looks.extend(source.triggers for source, _ in calls) or lost.window)
+    monkeypatch.setattr(f"{LOOP}._tried", lambda lost, source, test: looks.append(source.triggers) or lost.window)
     statuses(TrackerConfig())
     assert looks.count(Trigger.UNCONFIRMED) == 1
 

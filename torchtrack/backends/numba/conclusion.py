@@ -18,7 +18,7 @@ from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking import update
 from torchtrack.tracking.motion import model
 from torchtrack.tracking.motion.model import MotionState
-from torchtrack.tracking.relocalization.lost_object import Relocalized
+from torchtrack.tracking.relocalization.lost_objects import Relocalized
 from torchtrack.tracking.state import TrackerState
 from torchtrack.tracking.validation import verdict
 from torchtrack.tracking.validation.measures import visible_ratio

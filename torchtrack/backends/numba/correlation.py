@@ -8,7 +8,6 @@ from torch import Tensor
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.core.dispatch import accelerates
-from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.relocalization import correlation
 from torchtrack.tracking.relocalization.correlation import Square
 
@@ -123,12 +122,12 @@ def _is_peak(fit: Array, allowed: Array, row: int, column: int, apart: int) -> b
 
 @accelerates(correlation.highest)
 def highest_numba(
-    denser: Float[Tensor, "h w"], outlines: Contours, square: Square, allowed: Bool[Tensor, "h w"]
+    denser: Float[Tensor, "h w"], pixels: Float[Tensor, "n m 2"], mask: Bool[Tensor, "n m"], square: Square, allowed: Bool[Tensor, "h w"]
 ) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
     """Outline by outline, and cell by cell of each."""
-    count = len(outlines.mask)
+    count = len(mask)
     best, place = denser.new_full((count, correlation.SHIFTS), correlation.NONE), torch.empty(count, correlation.SHIFTS, dtype=torch.int64)
     around = np.pad(denser.numpy(), correlation.SIDE // 2, mode="wrap")
-    of_square = as_arrays(square.middle, square.cell_px.reshape(1))
-    highest(*as_arrays(outlines.pixels, outlines.mask), *of_square, around, *as_arrays(allowed), correlation.APART, *as_arrays(best, place))
+    of_square = as_arrays(square.middle[0], square.cell_px)
+    highest(*as_arrays(pixels, mask), *of_square, around, *as_arrays(allowed), correlation.APART, *as_arrays(best, place))
     return best, place

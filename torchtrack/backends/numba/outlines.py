@@ -23,7 +23,7 @@ def score_outlines(
     T_cam_obj: Array,
     intrinsics: Array,
     settings: ShowingSettings,
-    image: Array,
+    images: Array,
     border_px: int,
     beside_px: float,
     scores: Array,
@@ -31,15 +31,16 @@ def score_outlines(
     """How much denser events are on contours at some poses than beside them: :func:`torchtrack.tracking.relocalization.sampling.score_outlines`.
 
     Args:
-        points_obj, tangents_obj, mask: ``[n, 3, m]`` and ``[n, m]`` of each pose; or one row for all.
-        T_cam_obj: ``[n, 4, 4]``.
-        intrinsics: ``[4]``.
-        image: ``[h, w]``, with a border.
+        points_obj, tangents_obj, mask: ``[n, 3, m]`` and ``[n, m]`` of each pose; or one row for all of an object.
+        T_cam_obj: ``[n, 4, 4]``, as many in turn of each object.
+        intrinsics: ``[k, 4]``.
+        images: ``[k, h, w]``, with a border.
         scores: ``[n]``, filled.
     """
-    of_lens, flat, height, width = lens(intrinsics), image.ravel(), float(image.shape[0]), float(image.shape[1])
+    height, width = float(images.shape[1]), float(images.shape[2])
     for n in range(len(scores)):
-        row, pose, total, count = n if len(mask) > 1 else 0, entries(T_cam_obj[n]), 0.0, 0
+        k, row = n * len(images) // len(scores), n * len(mask) // len(scores)
+        of_lens, flat, pose, total, count = lens(intrinsics[k]), images[k].ravel(), entries(T_cam_obj[n]), 0.0, 0
         for i in range(mask.shape[1]):
             x, y, z = placed(pose, points_obj[row, 0, i], points_obj[row, 1, i], points_obj[row, 2, i])
             inverse = inverse_depth(z)
@@ -65,11 +66,11 @@ def at(image: Array, width: float, height: float, u: float, v: float, border_px:
 
 @accelerates(sampling.score_outlines)
 def score_outlines_numba(
-    outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"], image: Float[Tensor, "h w"]
+    outlines: Contours, T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "k 4"], images: Float[Tensor, "k h w"]
 ) -> Float[Tensor, "n"]:
     """Point by point."""
-    scores = image.new_empty(len(T_cam_obj))
+    scores = images.new_empty(len(T_cam_obj))
     given = as_arrays(outlines.points_obj.transpose(1, 2), outlines.tangents_obj.transpose(1, 2), outlines.mask)
-    seen = as_arrays(T_cam_obj, intrinsics[0])
-    score_outlines(*given, *seen, SHOWING, *as_arrays(image), BORDER_PX, sampling.AROUND_PX, scores.numpy())
+    seen = as_arrays(T_cam_obj, intrinsics)
+    score_outlines(*given, *seen, SHOWING, *as_arrays(images), BORDER_PX, sampling.AROUND_PX, scores.numpy())
     return scores

@@ -62,7 +62,7 @@ class EventLines:
         """
         velocity_px = sharpest_velocity(*_some(pixels, fraction, box), side_px)
         places = pixels - velocity_px * fraction[:, None]
-        density = event_density(places[None], torch.ones(1, len(places), dtype=torch.bool), (side_px, side_px))
+        density = event_density(places[None], torch.ones(1, len(places), dtype=torch.bool), (side_px, side_px))[0]
         inner = density[2:-2, 2:-2]
         enough = _usual_density(inner)
         level = (inner / enough).clamp(max=1)

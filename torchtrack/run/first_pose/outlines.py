@@ -75,10 +75,10 @@ class ViewedObject:
         count, outlines = len(T_view_obj), self.at(T_view_obj)
         prediction = self._prediction(T_view_obj)
         sigmas = torch.tensor([_UNKNOWN_RAD] * 3 + [_UNKNOWN_DIAMETERS * float(self.tracked.diameter_m[0])] * 3, dtype=torch.float64)
-        return pulled(prediction, prediction.T_cam_obj[:count], outlines, density, torch.diag(sigmas**2), reaches_px)
+        return pulled(prediction, prediction.T_cam_obj[:count], outlines, density[None], torch.diag(sigmas**2)[None], reaches_px)
 
     def _prediction(self, T_view_obj: Float[Tensor, "n 4 4"]) -> Prediction:
         count = len(T_view_obj)
-        objects = self.tracked.objects.copies(0, count)
+        objects = self.tracked.objects.copies([0], count)
         nothing = torch.zeros(count, 6)
         return Prediction(objects, T_view_obj, torch.ones(count, dtype=torch.bool), nothing, torch.eye(12, dtype=torch.float64).repeat(count, 1, 1))

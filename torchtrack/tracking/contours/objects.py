@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.linalg import vecdot
 
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M
+from torchtrack.core.padded import repeated
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
 from torchtrack.tracking.contours.points import Contours, assemble, joined
 from torchtrack.tracking.contours.sampling import mesh_contours
@@ -115,18 +116,30 @@ class ObjectBatch:
         shape, shared = self.image_shape, self.shared
         return ObjectBatch(models, intrinsics, centre_obj, half_extent, diameter_m, stream_index, sizes, shape, shared, learned, polarity)
 
-    def copies(self, number: int, count: int) -> "ObjectBatch":
-        """One object many times, each in a stream of its own: copies do not hide one another."""
-        streams = torch.arange(count, device=self.stream_index.device)
-        model = next(model for model in self.models if number in model.numbers).with_members(streams, range(count))
+    def copies(self, numbers: Sequence[int], count: int = 1) -> "ObjectBatch":
+        """Some objects, each ``count`` times in turn and in a stream of its own: copies do not hide one another."""
+        streams = torch.arange(len(numbers) * count, device=self.stream_index.device)
+        places = [(model, [row for row, number in enumerate(numbers) if number in model.numbers]) for model in self.models]
+        models = [model.with_members(*_copied(streams, rows, count)) for model, rows in places if rows]
         own = self.intrinsics, self.centre_obj, self.half_extent, self.diameter_m
-        intrinsics, centre_obj, half_extent, diameter_m = (repeat_row(value, number, count) for value in own)
-        learned = None if self.learned is None else LearnedPoints(*(repeat_row(value, number, count) for value in vars(self.learned).values()))
-        polarity = None if self.polarity is None else repeat_row(self.polarity, number, count)
-        sizes, shape = repeat_row(self.image_sizes, number, count), (count, *self.image_size)
-        return ObjectBatch([model], intrinsics, centre_obj, half_extent, diameter_m, streams, sizes, shape, False, learned, polarity)
+        intrinsics, centre_obj, half_extent, diameter_m = (copied_rows(value, numbers, count) for value in own)
+        learned = None if self.learned is None else LearnedPoints(*(copied_rows(value, numbers, count) for value in vars(self.learned).values()))
+        polarity = None if self.polarity is None else copied_rows(self.polarity, numbers, count)
+        sizes, shape = copied_rows(self.image_sizes, numbers, count), (len(streams), *self.image_size)
+        return ObjectBatch(models, intrinsics, centre_obj, half_extent, diameter_m, streams, sizes, shape, False, learned, polarity)
 
 
-def repeat_row(values: Tensor, number: int, count: int) -> Tensor:
-    """One row of a tensor ``count`` times, without a copy."""
-    return values[number : number + 1].expand(count, *values.shape[1:])
+def copied_rows(values: Shaped[Tensor, "b *c"], numbers: Sequence[int], count: int = 1) -> Shaped[Tensor, "n *c"]:
+    """Some rows of a tensor, each ``count`` times in turn; a single one without a copy, and all of them once as they are."""
+    if len(numbers) == 1:
+        values = values[numbers[0] : numbers[0] + 1]
+    elif list(numbers) != list(range(len(values))):
+        # No index is made of numbers, for which a GPU would be waited for.
+        values = torch.cat([values[number : number + 1] for number in numbers])
+    return repeated(values, len(numbers) * count)
+
+
+def _copied(streams: Int[Tensor, "n"], rows: Sequence[int], count: int) -> tuple[Int[Tensor, "k"], list[int]]:
+    """The streams of the copies of some rows, and their numbers."""
+    numbers = [number for row in rows for number in range(row * count, (row + 1) * count)]
+    return torch.cat([streams[row * count : (row + 1) * count] for row in rows]), numbers

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.core.field_values import field_values
-from torchtrack.core.padded import select_ranked, take_points
+from torchtrack.core.padded import repeated, select_ranked, take_points
 
 GOLDEN_RATIO = 0.6180339887498949
 
@@ -49,8 +49,8 @@ class WindowEvents:
         return self._with(lambda value: value[chosen])
 
     def repeated(self, count: int) -> "WindowEvents":
-        """The events of one object, for ``count`` of its kind."""
-        return self._with(lambda value: value.expand(count, *value.shape[1:]))
+        """The events of each object as often in turn as makes ``count`` rows."""
+        return self._with(lambda value: repeated(value, count))
 
     def only(self, chosen: Int[Tensor, "b c"], exists: Bool[Tensor, "b c"]) -> "WindowEvents":
         """Some events of each object: their indices, and which of these exist."""
@@ -97,12 +97,6 @@ class SharedEvents:
     def counts(self) -> Int[Tensor, "b"]:
         """How many each object has."""
         return self.count
-
-    def of_object(self, number: int) -> WindowEvents:
-        """The events of one object."""
-        count = max(int(self.count[number]), 1)
-        exists = torch.arange(count)[None] < self.count[number]
-        return self.shared.only(torch.where(exists, self.own[number : number + 1, :count], 0).long(), exists)
 
 
 # A window's events for each object, laid out one way or the other.

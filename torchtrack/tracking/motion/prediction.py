@@ -1,9 +1,10 @@
 """Where objects are expected at a window's end, how they move, and how certain that is."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.core.camera import MIN_DEPTH_M
@@ -12,8 +13,8 @@ from torchtrack.core.dispatch import accelerable
 from torchtrack.core.image_velocity import MovingObjects, pixel_velocity, pose_jacobian
 from torchtrack.core.lie import retract_about, transform_points
 from torchtrack.core.linalg import inverse
-from torchtrack.core.padded import select_ranked, take_points
-from torchtrack.tracking.contours.objects import ObjectBatch, repeat_row
+from torchtrack.core.padded import put_rows, repeated, select_ranked, take_points
+from torchtrack.tracking.contours.objects import ObjectBatch, copied_rows
 from torchtrack.tracking.contours.points import Contours
 
 # Nothing that is tracked is farther away (m).
@@ -83,26 +84,21 @@ class Prediction:
         return Prediction(self.objects, T_cam_obj, self.usable, velocity, self.covariance)
 
     def poses_at(self, offsets: Float[Tensor, "n 6"]) -> Float[Tensor, "n 4 4"]:
-        """Poses of the one object that this is of, some way from the predicted one."""
+        """Poses some way from the predicted ones: as many in turn of each object."""
         count = len(offsets)
-        return retract_about(self.T_cam_obj.expand(count, 4, 4), offsets, self.objects.centre_obj.expand(count, 3))
+        return retract_about(repeated(self.T_cam_obj, count), offsets, repeated(self.objects.centre_obj, count))
 
-    def copies(self, number: int, count: int) -> "Prediction":
-        """One object's prediction many times, each in a stream of its own."""
+    def copies(self, numbers: Sequence[int], count: int = 1) -> "Prediction":
+        """The predictions of some objects, each ``count`` times in turn and in a stream of its own."""
         T_cam_obj, usable, velocity, covariance = (
-            repeat_row(value, number, count) for value in (self.T_cam_obj, self.usable, self.velocity, self.covariance)
+            copied_rows(value, numbers, count) for value in (self.T_cam_obj, self.usable, self.velocity, self.covariance)
         )
-        return Prediction(self.objects.copies(number, count), T_cam_obj, usable, velocity, covariance)
+        return Prediction(self.objects.copies(numbers, count), T_cam_obj, usable, velocity, covariance)
 
-    def exchanged(self, number: int, other: "Prediction", taken: Bool[Tensor, ""]) -> "Prediction":
-        """The prediction with that of one object, ``other``, in the place of its own, where that is ``taken``."""
-
-        def put(mine: Tensor, theirs: Tensor) -> Tensor:
-            value = mine.clone()
-            value[number] = torch.where(taken, theirs[0], mine[number])
-            return value
-
-        T_cam_obj, velocity, covariance = (put(getattr(self, name), getattr(other, name)) for name in ("T_cam_obj", "velocity", "covariance"))
+    def exchanged(self, rows: Int[Tensor, "k"], other: "Prediction", taken: Bool[Tensor, "k"]) -> "Prediction":
+        """The prediction with those of some objects, ``other``, in the place of their own, where that is ``taken``."""
+        names = ("T_cam_obj", "velocity", "covariance")
+        T_cam_obj, velocity, covariance = (put_rows(getattr(self, name), rows, getattr(other, name), taken) for name in names)
         return Prediction(self.objects, T_cam_obj, self.usable, velocity, covariance)
 
     @accelerable

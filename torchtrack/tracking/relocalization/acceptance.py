@@ -10,11 +10,14 @@ from torch import Tensor
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
+from torchtrack.core.field_values import field_values
+from torchtrack.core.padded import repeated, rows_in_all
 from torchtrack.tracking.contours.points import Contours
+from torchtrack.tracking.relocalization.event_image import Places
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
 from torchtrack.tracking.relocalization.line_ends import running_on
-from torchtrack.tracking.relocalization.lost_object import LostObject
+from torchtrack.tracking.relocalization.lost_objects import LostObjects
 from torchtrack.tracking.relocalization.triggers import DRIFTS, Trigger, has
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.verdict import AGREES_FROM, VALIDATED_FROM
@@ -34,26 +37,26 @@ _FAR_MORE = 2.0
 
 @dataclass(frozen=True)
 class Choice:
-    """Which of some hypotheses is the best.
+    """Which of each object's hypotheses is the best.
 
     Args:
-        row: of the best.
+        row: of the best, among those of all objects.
         is_accepted: whether it takes the place of the object's own pose.
     """
 
-    row: Int[Tensor, "1"]
-    is_accepted: Bool[Tensor, "1"]
+    row: Int[Tensor, "k"]
+    is_accepted: Bool[Tensor, "k"]
 
 
 @runtime_checkable
 class Acceptance(Protocol):
     """Chooses between hypotheses."""
 
-    def row(self, number: int) -> "Acceptance":
-        """What is asked of a single object."""
+    def rows(self, chosen: Int[Tensor, "k"]) -> "Acceptance":
+        """What is asked of some objects."""
 
-    def choose(self, tried: ScoredFit, hypotheses: Hypotheses, lost: LostObject) -> Choice:
-        """The best of the hypotheses, and whether it is accepted."""
+    def choose(self, tried: ScoredFit, hypotheses: Hypotheses, lost: LostObjects) -> Choice:
+        """The best of each object's hypotheses, and whether it is accepted."""
 
 
 @dataclass(frozen=True)
@@ -67,36 +70,38 @@ class AcceptanceTest:
         min_matches: how many observations it has to match.
     """
 
-    margin: Float[Tensor, "*b"]
-    min_score: Float[Tensor, "*b"]
-    min_inlier_ratio: Float[Tensor, "*b"]
-    min_matches: Float[Tensor, "*b"]
+    margin: Float[Tensor, "b"]
+    min_score: Float[Tensor, "b"]
+    min_inlier_ratio: Float[Tensor, "b"]
+    min_matches: Float[Tensor, "b"]
 
-    def row(self, number: int) -> "AcceptanceTest":
-        """What is asked of a single object."""
-        return AcceptanceTest(self.margin[number], self.min_score[number], self.min_inlier_ratio[number], self.min_matches[number])
+    def rows(self, chosen: Int[Tensor, "k"]) -> "AcceptanceTest":
+        """What is asked of some objects."""
+        return AcceptanceTest(*(value.index_select(0, chosen) for value in field_values(self).values()))
 
-    def choose(self, tried: ScoredFit, hypotheses: Hypotheses, lost: LostObject) -> Choice:
+    def choose(self, tried: ScoredFit, hypotheses: Hypotheses, lost: LostObjects) -> Choice:
         """The hypothesis with the best score, and of those about as good the one that the prediction expects most."""
         config, prediction, offsets = lost.config, hypotheses.prediction, tried.fit.solution.from_prior
         own = lost.window.scored
         eligible = self.is_passed(tried, config) & is_likely(offsets, hypotheses.covariance)
-        eligible = eligible & ~is_contradicted(tried, own.texture_agreement[lost.number])
-        score, asked = torch.where(eligible, tried.score, 0), self.asked_score(own, lost.number, config)
+        eligible = eligible & ~is_contradicted(tried, own.texture_agreement[lost.rows])
+        score, asked = torch.where(eligible, tried.score, 0), self.asked_score(own.count[lost.rows], own.score[lost.rows], config)
         if config.uses(Component.LINE_ENDS) and hypotheses.is_wide:
-            score = less_where_lines_run_on(score, score > asked, tried.fit.contours, hypotheses.places, prediction.objects.image_size)
-        best = likeliest(score, offsets, prediction.covariance[0])
+            concerned = score > repeated(asked, len(score))
+            score = less_where_lines_run_on(score, concerned, tried.fit.contours, hypotheses.places, prediction.objects.image_size)
+        best = likeliest(score, offsets, prediction.covariance)
         return Choice(best, score.index_select(0, best) > asked)
 
     def is_passed(self, tried: ScoredFit, config: TrackerConfig) -> Bool[Tensor, "n"]:
         """Which hypotheses match enough observations that gather enough."""
+        least = self.min_matches.clamp(min=config.validation.min_observations)
         # Written so that what does not tell how far it gathers passes.
-        gathers = ~(tried.inlier_ratio < self.min_inlier_ratio)
-        return (tried.count >= self.min_matches.clamp(min=config.validation.min_observations)) & gathers
+        gathers = ~(tried.inlier_ratio < repeated(self.min_inlier_ratio, len(tried.count)))
+        return (tried.count >= repeated(least, len(tried.count))) & gathers
 
-    def asked_score(self, scored: ScoredFit, number: int, config: TrackerConfig) -> Float[Tensor, ""]:
-        """The score that has to be surpassed."""
-        own = torch.where(scored.count[number] >= config.validation.min_observations, scored.score[number], 0.0)
+    def asked_score(self, own_count: Int[Tensor, "k"], own_score: Float[Tensor, "k"], config: TrackerConfig) -> Float[Tensor, "k"]:
+        """The score that has to be surpassed: by so many matched observations, each object's own pose has so much."""
+        own = torch.where(own_count >= config.validation.min_observations, own_score, 0.0)
         return torch.maximum(own + self.margin, self.min_score)
 
 
@@ -144,37 +149,41 @@ def _matches(scored: ScoredFit) -> Float[Tensor, "b"]:
 # ---- what they compare
 
 
-def is_contradicted(tried: ScoredFit, own_agreement: Float[Tensor, ""]) -> Bool[Tensor, "n"]:
+def is_contradicted(tried: ScoredFit, own_agreement: Float[Tensor, "k"]) -> Bool[Tensor, "n"]:
     """Which poses events on texture contradict, where they agree at the object's own pose; where motion is not known yet, they do at no pose."""
-    return (own_agreement >= AGREES_FROM) & (tried.texture_agreement < AGREES_FROM)
+    return repeated(own_agreement >= AGREES_FROM, len(tried.count)) & (tried.texture_agreement < AGREES_FROM)
 
 
-def is_likely(from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Bool[Tensor, "n"]:
+def is_likely(from_prior: Float[Tensor, "n d"], covariance: Float[Tensor, "k 12 12"]) -> Bool[Tensor, "n"]:
     """Which poses lie where all but one in a hundred of a covariance do: edges of what hides an object explain much of it, farther away."""
-    return _squared_deviations(from_prior[:, :6], covariance[:6, :6]) < _LIKELY
+    return _squared_deviations(from_prior[:, :6], covariance[:, :6, :6]) < _LIKELY
 
 
-def _squared_deviations(offsets: Float[Tensor, "n k"], covariance: Float[Tensor, "k k"]) -> Float[Tensor, "n"]:
+def _squared_deviations(offsets: Float[Tensor, "n d"], covariance: Float[Tensor, "k d d"]) -> Float[Tensor, "n"]:
     """Squared distance of offsets in standard deviations (Mahalanobis)."""
     root = torch.linalg.cholesky_ex(covariance).L
-    return torch.linalg.solve_triangular(root, offsets.to(root.dtype).T, upper=False).square().sum(0)
+    of_objects = offsets.to(root.dtype).unflatten(0, (len(root), -1)).mT
+    return torch.linalg.solve_triangular(root, of_objects, upper=False).square().sum(1).flatten()
 
 
 def less_where_lines_run_on(
     score: Float[Tensor, "n"],
     concerned: Bool[Tensor, "n"],
     contours: Contours,
-    places: tuple[Float[Tensor, "1 e 2"], Bool[Tensor, "1 e"]],
+    places: Places,
     image_size: tuple[int, int],
 ) -> Float[Tensor, "n"]:
     """Scores of poses, less where the lines that explain them are of something larger; of those alone that are ``concerned``, which saves time."""
     if host_sync.none_of(concerned):
         return score
     rows = concerned.nonzero()[:, 0] if host_sync.read_at_once(concerned) else torch.arange(len(score), device=score.device)
-    return score.index_copy(0, rows, score[rows] * (1 - running_on(contours.rows(rows), places, image_size)))
+    number = rows // (len(score) // len(places[0]))
+    return score.index_copy(0, rows, score[rows] * (1 - running_on(contours.rows(rows), number, places, image_size)))
 
 
-def likeliest(score: Float[Tensor, "n"], from_prior: Float[Tensor, "n k"], covariance: Float[Tensor, "12 12"]) -> Int[Tensor, "1"]:
+def likeliest(score: Float[Tensor, "n"], from_prior: Float[Tensor, "n d"], covariance: Float[Tensor, "k 12 12"]) -> Int[Tensor, "k"]:
     """Of the poses that explain as much as the best does, the one that the prediction expects most: a rotation of a vase explains nothing."""
-    away = _squared_deviations(from_prior, covariance)
-    return torch.where(score >= score.max() - AS_MUCH, away.nan_to_num(torch.inf), torch.inf).argmin()[None]
+    score, away = (value.unflatten(0, (len(covariance), -1)) for value in (score, _squared_deviations(from_prior, covariance)))
+    as_good = score >= score.amax(1, keepdim=True) - AS_MUCH
+    best = torch.where(as_good, away.nan_to_num(torch.inf), torch.inf).argmin(1, keepdim=True)
+    return rows_in_all(best, score.shape[1])

@@ -17,6 +17,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.neighbours import largest_around
+from torchtrack.core.padded import repeated, rows_in_all
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.view_sphere import outlines_by_view
@@ -39,19 +40,23 @@ _KEPT_RATIO = 0.512
 
 @dataclass(frozen=True)
 class Square:
-    """A part of the image, in cells.
+    """A part of the image, in cells; of each of some objects, or of a single one.
 
     Args:
         middle: pixel in its middle.
         cell_px: side of a cell.
     """
 
-    middle: Float[Tensor, "2"]
-    cell_px: Float[Tensor, ""]
+    middle: Float[Tensor, "k 2"]
+    cell_px: Float[Tensor, "k"]
 
-    def counts(self, pixels: Float[Tensor, "k n 2"], mask: Bool[Tensor, "k n"]) -> Float[Tensor, "k h w"]:
-        """How many of the pixels of each row are in each cell."""
-        place = ((pixels - self.middle) / self.cell_px + SIDE // 2).round().nan_to_num(-1.0)
+    def of_object(self, number: int) -> "Square":
+        """That of one object."""
+        return Square(self.middle[number : number + 1], self.cell_px[number : number + 1])
+
+    def counts(self, pixels: Float[Tensor, "n m 2"], mask: Bool[Tensor, "n m"]) -> Float[Tensor, "n h w"]:
+        """How many of the pixels of each row are in each cell of the object's square, or of the single one."""
+        place = ((pixels - self.middle[:, None]) / self.cell_px[:, None, None] + SIDE // 2).round().nan_to_num(-1.0)
         inside = mask & (place >= 0).all(-1) & (place < SIDE).all(-1)
         u, v = torch.where(inside[..., None], place, 0).long().unbind(-1)
         cells = pixels.new_zeros(len(pixels), SIDE**2)
@@ -64,62 +69,67 @@ def kept_rotations(config: TrackerConfig) -> int:
 
 
 def shifted(
-    prediction: Prediction, steps: Float[Tensor, "n 6"], sigma_m: Float[Tensor, ""], places: tuple[Tensor, Tensor], config: TrackerConfig
-) -> tuple[Float[Tensor, "k 6"], Contours]:
-    """Offsets of an object's pose with most events on its contours, as many as :func:`kept_rotations` says, best first; and its outlines.
+    prediction: Prediction, steps: Float[Tensor, "n 6"], sigma_m: Float[Tensor, "k"], places: tuple[Tensor, Tensor], config: TrackerConfig
+) -> tuple[Float[Tensor, "m 6"], Contours]:
+    """Offsets of poses with most events on the contours, as many of each object as :func:`kept_rotations` says, best first; and the outlines.
 
     Args:
-        prediction: of the object.
-        steps: offsets to try; of their moves, the way towards the camera alone.
+        prediction: of the objects.
+        steps: offsets to try, as many in turn of each object; of their moves, the way towards the camera alone.
         sigma_m: standard deviation of the moves across the image.
-        places: pixels ``[1, e, 2]`` of the events at the window's end, and which of them exist.
+        places: pixels ``[k, e, 2]`` of the events at the window's end, and which of them exist.
     """
-    objects, centre = prediction.objects, prediction.centre_cam[0]
-    focal = objects.intrinsics[0, :2]
-    ray, sigma_px = centre / centre[2], sigma_m * focal[0] / centre[2]
-    cell_px = (_DIAMETERS * objects.size_px(prediction.T_cam_obj)[0] + 2 * _SIGMAS * sigma_px) / SIDE
-    square = Square(ray[:2] * focal + objects.intrinsics[0, 2:], cell_px)
-    steps = torch.cat([steps[:, :3], steps[:, 5:] * ray], 1)
+    objects, depth_m = prediction.objects, prediction.centre_cam[:, 2:]
+    focal = objects.intrinsics[:, :2]
+    ray, sigma_px = prediction.centre_cam / depth_m, sigma_m * focal[:, 0] / depth_m[:, 0]
+    cell_px = (_DIAMETERS * objects.size_px(prediction.T_cam_obj) + 2 * _SIGMAS * sigma_px) / SIDE
+    square = Square(ray[:, :2] * focal + objects.intrinsics[:, 2:], cell_px)
+    steps = torch.cat([steps[:, :3], steps[:, 5:] * repeated(ray, len(steps))], 1)
     outlines = outlines_by_view(prediction, prediction.poses_at(steps), config)
     number, shift = _best(square, places, outlines, sigma_px / cell_px, kept_rotations(config))
-    moved_m = shift * cell_px * ((centre[2] + steps[number, 5:]) / focal)
+    cell_px, depth_m, focal = (repeated(values, len(number)) for values in (cell_px[:, None], depth_m, focal))
+    moved_m = shift * cell_px * ((depth_m + steps[number, 5:]) / focal)
     return torch.cat([steps[number, :3], steps[number, 3:5] + moved_m, steps[number, 5:]], 1), outlines.rows(number)
 
 
 def _best(
-    square: Square, places: tuple[Tensor, Tensor], outlines: Contours, sigma_cells: Float[Tensor, ""], count: int
-) -> tuple[Int[Tensor, "k"], Float[Tensor, "k 2"]]:
-    """Numbers of the outlines that fit best, and their shifts (cells)."""
+    square: Square, places: tuple[Tensor, Tensor], outlines: Contours, sigma_cells: Float[Tensor, "k"], count: int
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]]:
+    """Numbers of the outlines of each object that fit best, and their shifts (cells)."""
     step = torch.arange(SIDE, dtype=sigma_cells.dtype, device=sigma_cells.device) - SIDE // 2
-    allowed = step[:, None].square() + step.square() <= (_SIGMAS * sigma_cells).square()
-    best, place = (values.flatten() for values in highest(_denser(square.counts(*places)[0] / square.cell_px), outlines, square, allowed))
-    chosen = best.topk(min(count, best.numel())).indices
-    place = place[chosen]
-    return chosen // SHIFTS, torch.stack([step[place % SIDE], step[place // SIDE]], -1)
+    allowed = step[:, None].square() + step.square() <= (_SIGMAS * sigma_cells).square()[:, None, None]
+    denser, objects = _denser(square.counts(*places) / square.cell_px[:, None, None]), range(len(sigma_cells))
+    of_objects = zip(*(values.tensor_split(len(objects)) for values in (outlines.pixels, outlines.mask)), strict=True)
+    fits = [highest(denser[k], *own, square.of_object(k), allowed[k]) for k, own in zip(objects, of_objects, strict=True)]
+    best, place = (torch.stack(values).flatten(1) for values in zip(*fits, strict=True))
+    chosen = best.topk(min(count, best.shape[1])).indices
+    place = place.gather(1, chosen).flatten()
+    return rows_in_all(chosen // SHIFTS, best.shape[1] // SHIFTS), torch.stack([step[place % SIDE], step[place // SIDE]], -1)
 
 
-def _denser(events: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+def _denser(events: Float[Tensor, "k h w"]) -> Float[Tensor, "k h w"]:
     """How much denser events are than around them, of which one for each pixel of a contour through the cell is enough."""
     enough = events.clamp(max=1)
     return _blurred(enough, _BLUR) - _blurred(enough, _AROUND)
 
 
-def _blurred(cells: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
+def _blurred(cells: Float[Tensor, "k h w"], radius: int) -> Float[Tensor, "k h w"]:
     """The mean over so many cells to each side, one way after the other."""
     side = 2 * radius + 1
-    return avg_pool2d(avg_pool2d(cells[None], (side, 1), 1, (radius, 0)), (1, side), 1, (0, radius))[0]
+    return avg_pool2d(avg_pool2d(cells, (side, 1), 1, (radius, 0)), (1, side), 1, (0, radius))
 
 
 @accelerable
 def highest(
-    denser: Float[Tensor, "h w"], outlines: Contours, square: Square, allowed: Bool[Tensor, "h w"]
+    denser: Float[Tensor, "h w"], pixels: Float[Tensor, "n m 2"], mask: Bool[Tensor, "n m"], square: Square, allowed: Bool[Tensor, "h w"]
 ) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
     """Of each outline, the shifts with most events on it, more than around it, and how many more for each of its points; no two of them are close.
 
-    By spectra; where few shifts are allowed, kernels take less time to add up each of them.
+    All outlines are of one object. By spectra; where few shifts are allowed, kernels take less time to add up each of them.
 
     Args:
         denser: how much denser events are in each cell than around it.
+        pixels: of the outlines' points, and ``mask``, which of them exist.
         square: of the cells.
         allowed: which shifts count; none at all is in the middle.
 
@@ -128,7 +138,7 @@ def highest(
     """
     spectrum = rfft2(denser.roll((SIDE // 2, SIDE // 2), (0, 1)))
     together = _TOGETHER_ON_GPU if host_sync.on_gpu(denser) else _TOGETHER
-    split = zip(outlines.pixels.split(together), outlines.mask.split(together), strict=True)
+    split = zip(pixels.split(together), mask.split(together), strict=True)
     best, place = zip(*(peaks(_correlation(spectrum, square.counts(*some)), allowed) for some in split), strict=True)
     return torch.cat(best), torch.cat(place)
 

@@ -13,6 +13,7 @@ from torchtrack.config.tracker import SolverConfig
 from torchtrack.core.dispatch import accelerable
 from torchtrack.core.lie import difference_about
 from torchtrack.core.linalg import inverse
+from torchtrack.core.padded import repeated
 from torchtrack.tracking.contours.points import Contours, reproject
 from torchtrack.tracking.estimation.levenberg_marquardt import solve_pose
 from torchtrack.tracking.estimation.terms import PoseProblem
@@ -30,25 +31,25 @@ _SOLVER = SolverConfig(iterations=1, loss="huber")
 
 def pulled(
     prediction: Prediction,
-    T_cam_obj: Float[Tensor, "k 4 4"],
+    T_cam_obj: Float[Tensor, "n 4 4"],
     outlines: Contours,
-    image: Float[Tensor, "h w"],
-    covariance: Float[Tensor, "6 6"],
+    images: Float[Tensor, "k h w"],
+    covariance: Float[Tensor, "k 6 6"],
     reaches_px: tuple[float, ...],
-) -> Float[Tensor, "k 4 4"]:
-    """Poses of an object, each moved to where its contours lie on events.
+) -> Float[Tensor, "n 4 4"]:
+    """Poses of objects, each moved to where its contours lie on events.
 
     Args:
-        prediction: of the object, with the ``covariance`` of its pose.
-        T_cam_obj: where each begins.
+        prediction: of the objects, with the ``covariance`` of their poses.
+        T_cam_obj: where each begins, as many in turn of each object.
         outlines: contours of each there, or at a pose that is not far off.
-        image: how many events there are at every pixel, as :mod:`torchtrack.tracking.relocalization.event_image` has it.
+        images: how many events there are at every pixel, as :mod:`torchtrack.tracking.relocalization.event_image` has it.
         reaches_px: how far contour points look, a step of the solver each.
     """
-    information = (_FIND_PX**2 * inverse(covariance[None])).to(T_cam_obj.dtype)
+    information = (_FIND_PX**2 * inverse(covariance)).to(T_cam_obj.dtype)
     for reach_px in reaches_px:
-        outlines = reproject(outlines, T_cam_obj, prediction.objects.intrinsics.expand(len(T_cam_obj), 4))
-        targets, weights = strongest_along_normals(outlines, image, reach_px)
+        outlines = reproject(outlines, T_cam_obj, repeated(prediction.objects.intrinsics, len(T_cam_obj)))
+        targets, weights = strongest_along_normals(outlines, images, reach_px)
         problem = _problem(prediction, outlines, targets, weights, reach_px, information)
         offset = difference_about(problem.T_prior, T_cam_obj, problem.centre_obj)
         T_cam_obj = solve_pose(problem, T_cam_obj, _SOLVER, offset).T_cam_obj
@@ -56,17 +57,20 @@ def pulled(
 
 
 @accelerable
-def strongest_along_normals(outlines: Contours, image: Float[Tensor, "h w"], reach_px: float) -> tuple[Float[Tensor, "k m 2"], Float[Tensor, "k m"]]:
-    """Where each contour point has most events along its normal, rather near by, and how much that counts."""
-    steps_px = torch.linspace(-reach_px, reach_px, LOOKS, dtype=image.dtype, device=image.device)
+def strongest_along_normals(
+    outlines: Contours, images: Float[Tensor, "k h w"], reach_px: float
+) -> tuple[Float[Tensor, "n m 2"], Float[Tensor, "n m"]]:
+    """Where each contour point has most events along its normal, rather near by, and how much that counts; as many outlines in turn of each image."""
+    steps_px = torch.linspace(-reach_px, reach_px, LOOKS, dtype=images.dtype, device=images.device)
     looked_at = outlines.pixels[:, :, None] + steps_px[:, None] * outlines.normals[:, :, None]
-    there = look_up(image, looked_at) * (1 - steps_px.abs() / (reach_px + 1))
+    number = repeated(torch.arange(len(images), device=images.device), len(outlines.mask))
+    there = look_up(images, number, looked_at) * (1 - steps_px.abs() / (reach_px + 1))
     most, place = there.max(-1)
     return torch.addcmul(outlines.pixels, outlines.normals, steps_px[place][..., None]), most * outlines.mask
 
 
 def _problem(
-    prediction: Prediction, outlines: Contours, targets: Tensor, weights: Tensor, reach_px: float, information: Float[Tensor, "1 6 6"]
+    prediction: Prediction, outlines: Contours, targets: Tensor, weights: Tensor, reach_px: float, information: Float[Tensor, "k 6 6"]
 ) -> PoseProblem:
     """The least squares problem of contour points and where most events are."""
     objects, count = prediction.objects, len(targets)
@@ -75,9 +79,9 @@ def _problem(
         targets=targets,
         directions=outlines.normals,
         weights=weights,
-        intrinsics=objects.intrinsics.expand(count, 4),
-        centre_obj=objects.centre_obj.expand(count, 3),
+        intrinsics=repeated(objects.intrinsics, count),
+        centre_obj=repeated(objects.centre_obj, count),
         scale_px=torch.full_like(weights[:, 0], reach_px),
-        T_prior=prediction.T_cam_obj.expand(count, 4, 4),
-        prior_information=information.expand(count, 6, 6),
+        T_prior=repeated(prediction.T_cam_obj, count),
+        prior_information=repeated(information, count),
     )

@@ -1,5 +1,6 @@
 """Where an object may be that is not where it is predicted: drifted off, or as it was last seen."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -7,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
-from torchtrack.tracking.contours.objects import ObjectBatch
+from torchtrack.tracking.contours.objects import ObjectBatch, copied_rows
 from torchtrack.tracking.motion.model import covariance_at_rest, rim_and_centre
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.state import TrackerState
@@ -32,12 +33,13 @@ def with_drift(prediction: Prediction, is_adrift: Bool[Tensor, "b"], drift_s: Fl
     return replace(prediction, covariance=prediction.covariance + is_adrift[:, None, None] * (root @ root.mT))
 
 
-def less_certain(prediction: Prediction, sigma_px: float, wider_px: float) -> Prediction:
-    """The prediction, of an object alone, as if its standard deviation in the image, ``sigma_px``, were ``wider_px``.
+def less_certain(prediction: Prediction, sigma_px: Float[Tensor, "k"], wider_px: Float[Tensor, "k"]) -> Prediction:
+    """The prediction as if its standard deviation in the image, ``sigma_px``, were ``wider_px``.
 
     A pose that slipped was sure of itself all the while: its covariance tells the directions it can be off in, but not how far.
     """
-    return replace(prediction, covariance=prediction.covariance * (wider_px / max(sigma_px, 1e-6)) ** 2)
+    times = (wider_px.double() / sigma_px.double().clamp(min=1e-6)).square()
+    return replace(prediction, covariance=prediction.covariance * times[:, None, None])
 
 
 # Standard deviations: rotation (rad), and depth (as a share of it).
@@ -80,11 +82,11 @@ class LastSeen:
         """The state with objects that are ``lost`` at rest where they were last seen well."""
         return replace(state, motion=state.motion.at_rest(lost, self.T_cam_obj, self.covariance))
 
-    def prediction(self, number: int, prediction: Prediction) -> Prediction:
-        """The prediction of an object alone, at rest there."""
-        alone, own = prediction.copies(number, 1), slice(number, number + 1)
-        T_cam_obj, velocity = self.T_cam_obj[own].to(alone.T_cam_obj.dtype), torch.zeros_like(alone.velocity)
-        return Prediction(alone.objects, T_cam_obj, torch.ones_like(alone.usable), velocity, self.covariance[own])
+    def prediction(self, numbers: Sequence[int], prediction: Prediction) -> Prediction:
+        """The prediction of some objects, at rest there."""
+        some = prediction.copies(numbers)
+        T_cam_obj, covariance = (copied_rows(values, numbers) for values in (self.T_cam_obj, self.covariance))
+        return Prediction(some.objects, T_cam_obj.to(some.T_cam_obj.dtype), torch.ones_like(some.usable), torch.zeros_like(some.velocity), covariance)
 
 
 def anywhere(covariance: Float[Tensor, "b 12 12"], chosen: Bool[Tensor, "b"]) -> Float[Tensor, "b 12 12"]:

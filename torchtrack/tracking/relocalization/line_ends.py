@@ -5,14 +5,14 @@ nothing but its two edges. What gives it away is that its events go on, in line,
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.core import host_sync
 from torchtrack.core.neighbours import largest_around
 from torchtrack.core.padded import select_ranked, take_points
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.relocalization.event_image import event_density, look_up
+from torchtrack.tracking.relocalization.event_image import Places, event_density, look_up
 
 # Contour points that are looked at, at most.
 _POINTS = 256
@@ -26,11 +26,11 @@ _NOWHERE_PX = 1e5
 _GRANTED = 3.0
 
 
-def running_on(contours: Contours, places: tuple[Float[Tensor, "1 e 2"], Bool[Tensor, "1 e"]], image_size: tuple[int, int]) -> Float[Tensor, "n"]:
+def running_on(contours: Contours, number: Int[Tensor, "n"], places: Places, image_size: tuple[int, int]) -> Float[Tensor, "n"]:
     """Of the ends of straight contours with events on them, the ratio beyond which the events go on; small where there are few ends.
 
     Args:
-        contours: of one object at each of some poses.
+        contours: of an object at each of some poses, and the ``number`` of its row of ``places``.
         places: pixels of the events at the window's end, and which of them exist.
         image_size: height and width (px).
     """
@@ -40,17 +40,17 @@ def running_on(contours: Contours, places: tuple[Float[Tensor, "1 e 2"], Bool[Te
     pixels, normals = take_points(contours.pixels, chosen), take_points(contours.normals, chosen)
     along = torch.stack([-normals[..., 1], normals[..., 0]], -1)
     own = torch.where(exists[..., None], pixels, _NOWHERE_PX)
-    seen = exists & (look_up(fired, pixels) > 0)
+    seen = exists & (look_up(fired, number, pixels) > 0)
     ends, running = torch.zeros_like(pixels[:, 0, 0]), torch.zeros_like(pixels[:, 0, 0])
     for forward in (along, -along):
         is_end, runs_on = seen, seen
         for step_px in _BEFORE_PX:
             before = pixels - step_px * forward
-            is_end = _with_point(own, before, _ON_PX, is_end & (look_up(fired, before) > 0))
+            is_end = _with_point(own, before, _ON_PX, is_end & (look_up(fired, number, before) > 0))
         for step_px in _BEYOND_PX:
             beyond = pixels + step_px * forward
             is_end = is_end & ~_with_point(own, beyond, _OFF_PX, is_end)
-            runs_on = runs_on & (look_up(fired, beyond) > 0)
+            runs_on = runs_on & (look_up(fired, number, beyond) > 0)
         ends, running = ends + is_end.sum(-1), running + (is_end & runs_on).sum(-1)
     return running / (ends + _GRANTED)
 

@@ -3,23 +3,25 @@
 from dataclasses import fields, replace
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from torchtrack.core import host_sync
+from torchtrack.core.padded import put_rows, repeated
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.estimation.rounds import Fit, Start, align, index_for
 from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.relocalization.acceptance import Choice
 from torchtrack.tracking.relocalization.hypotheses import Hypotheses
-from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
+from torchtrack.tracking.relocalization.lost_objects import LostObjects, Relocalized
 from torchtrack.tracking.validation.scored_fit import ScoredFit, score_fit
 
 
-def refined(hypotheses: Hypotheses, lost: LostObject) -> ScoredFit:
-    """The hypotheses aligned on the events of their object, and scored."""
-    config, scored, number, offsets = lost.config, lost.window.scored, lost.number, hypotheses.offsets
-    rows = hypotheses.prediction.copies(0, len(offsets))
+def refined(hypotheses: Hypotheses, lost: LostObjects) -> ScoredFit:
+    """The hypotheses aligned on the events of their objects, and scored."""
+    config, scored, offsets, objects = lost.config, lost.window.scored, hypotheses.offsets, range(len(lost.numbers))
+    rows = hypotheses.prediction.copies(objects, len(offsets) // len(objects))
     begin = rows.moved(offsets)
     contours = rows.objects.contours(begin.T_cam_obj, config.contours)
     tight = torch.ones_like(offsets[:, 0])
@@ -27,33 +29,29 @@ def refined(hypotheses: Hypotheses, lost: LostObject) -> ScoredFit:
     events = lost.events.repeated(len(offsets))
     observations = select_events(events, index, begin.moving(compensated=True), config.association.max_events)
     fit = align(Start(rows, contours, index, tight, offsets), observations, config)
-    references = (value[number].expand_as(tight) for value in (scored.reference_inlier_ratio, scored.required_spread))
+    references = (repeated(value[lost.rows], len(offsets)) for value in (scored.reference_inlier_ratio, scored.required_spread))
     tried = score_fit(rows, fit, config, torch.zeros_like(tight), *references)
     return replace(tried, is_relocalized=torch.ones_like(tried.is_relocalized))
 
 
-def exchanged(lost: LostObject, hypotheses: Hypotheses, tried: ScoredFit, choice: Choice) -> Relocalized:
-    """What the window gave, with the chosen hypothesis in the place of the object's own pose, where that is accepted."""
-    window, number, accepted = lost.window, lost.number, choice.is_accepted
+def exchanged(lost: LostObjects, hypotheses: Hypotheses, tried: ScoredFit, choice: Choice) -> Relocalized:
+    """What the window gave, with the chosen hypotheses in the place of the objects' own poses, where they are accepted."""
+    window, accepted = lost.window, choice.is_accepted
     if host_sync.none_of(accepted):
         return window
-    scored, prediction, gate_scale = replaced(window.scored, number, tried, choice), window.prediction, window.gate_scale
+    scored, prediction, gate_scale = replaced(window.scored, lost.rows, tried, choice), window.prediction, window.gate_scale
     if hypotheses.replaces_prediction:
-        prediction = prediction.exchanged(number, hypotheses.prediction, accepted[0])
+        prediction = prediction.exchanged(lost.rows, hypotheses.prediction, accepted)
     if hypotheses.gate_scale is not None:
-        own = torch.arange(len(gate_scale), device=gate_scale.device) == number
-        gate_scale = torch.where(own & accepted, hypotheses.gate_scale, gate_scale)
+        gate_scale = put_rows(gate_scale, lost.rows, hypotheses.gate_scale, accepted)
     return replace(window, scored=scored, prediction=prediction, gate_scale=gate_scale)
 
 
-def replaced(scored: ScoredFit, number: int, tried: ScoredFit, choice: Choice) -> ScoredFit:
-    """``scored`` with the pose, contours and quality of an object from the chosen row of what was tried, where that is accepted."""
+def replaced(scored: ScoredFit, rows: Int[Tensor, "k"], tried: ScoredFit, choice: Choice) -> ScoredFit:
+    """``scored`` with the pose, contours and quality of some objects from the chosen rows of what was tried, where these are accepted."""
 
     def put(mine: Tensor, theirs: Tensor) -> Tensor:
-        value = mine.clone()
-        accepted = choice.is_accepted.view([1] * mine.dim())
-        value[number] = torch.where(accepted, theirs.index_select(0, choice.row), mine[number : number + 1])[0]
-        return value
+        return put_rows(mine, rows, theirs.index_select(0, choice.row), choice.is_accepted)
 
     mine, theirs = scored.fit, tried.fit
     solution = Linearisation(*(put(value, getattr(theirs.solution, name)) for name, value in vars(mine.solution).items()))

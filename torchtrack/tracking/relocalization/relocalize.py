@@ -1,6 +1,6 @@
-"""The loop of relocalization: for each object with a trigger, each source that the trigger calls for; propose, refine, accept."""
+"""The loop of relocalization: of each source in turn, the objects that a trigger calls it for, as compact batches; propose, refine, accept."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core import host_sync
+from torchtrack.core.constants import constant
 from torchtrack.core.host_sync import AsyncValue
 from torchtrack.tracking.estimation.rounds import gate_scale_of
 from torchtrack.tracking.frontend.window_events import ObjectEvents
@@ -16,10 +18,14 @@ from torchtrack.tracking.relocalization.acceptance import Acceptance
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
 from torchtrack.tracking.relocalization.last_seen import LastSeen, with_drift
 from torchtrack.tracking.relocalization.looks import Asks, among, in_turn
-from torchtrack.tracking.relocalization.lost_object import LostObject, Relocalized
+from torchtrack.tracking.relocalization.lost_objects import LostObjects, Relocalized
 from torchtrack.tracking.relocalization.refine import exchanged, refined
 from torchtrack.tracking.relocalization.sources import SOURCES, Source
 from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, DRIFTS, Trigger, has
+
+# Objects that are tried together: what they need stays in a processor's nearer memory. On a GPU, it is what is asked for that takes time; of so
+# many, hypotheses need a gigabyte or two.
+_TOGETHER, _TOGETHER_ON_GPU = 1, 8
 
 
 def relocalize(
@@ -51,14 +57,15 @@ def relocalize(
     asking = _asking(window, evidence, sources)
     looks = in_turn(asking, config.relocalization.objects)
     window = replace(window, looked=among([asks.number for asks in looks], drifts))
-    sigmas_px = AsyncValue.to(sigma_px).numbers()
+    is_wide = AsyncValue.to(sigma_px > config.relocalization.wide_sigma_px).numbers()
     for comes_last in (False, True):
-        for asks in looks:
-            number = asks.number
-            calls = [pair for pair in zip(sources, tests, strict=True) if pair[0].comes_last == comes_last and pair[0].is_called_for(asks.flags)]
-            if calls:
-                lost = LostObject(number, window, widened, sigmas_px[number], events.of_object(number), last_seen, config)
-                window = _tried(lost, calls)
+        for source, test in zip(sources, tests, strict=True):
+            called = [asks.number for asks in looks if source.comes_last == comes_last and source.is_called_for(asks.flags)]
+            groups = [[number for number in called if is_wide[number] == known] for known in (False, True)] if source.in_two_ways else [called]
+            for numbers in _batches(groups, _TOGETHER_ON_GPU if host_sync.on_gpu(sigma_px) else _TOGETHER):
+                rows = constant(numbers, torch.int64, sigma_px.device)
+                of_them = sigma_px[rows], is_wide[numbers[0]], events.of_objects(rows)
+                window = _tried(LostObjects(numbers, window, widened, *of_them, last_seen, config), source, test)
         if not comes_last:
             window = _settled(window, drifts, widened, gate_scale_of(sigma_px, config))
     return window
@@ -75,14 +82,17 @@ def _asking(window: Relocalized, evidence: TriggerEvidence, sources: Sequence[So
     return [asks for asks in asking if any(source.is_called_for(asks.flags) for source in sources)]
 
 
-def _tried(lost: LostObject, calls: Iterable[tuple[Source, Acceptance]]) -> Relocalized:
-    """What the window gives with the hypotheses of some sources tried for an object, one after the other."""
-    for source, test in calls:
-        hypotheses = source.propose(lost)
-        tried = refined(hypotheses, lost)
-        choice = test.row(lost.number).choose(tried, hypotheses, lost)
-        lost = replace(lost, window=exchanged(lost, hypotheses, tried, choice))
-    return lost.window
+def _batches(groups: Iterable[Sequence[int]], together: int) -> Iterator[tuple[int, ...]]:
+    """The numbers of each group, no more than so many ``together``."""
+    for numbers in groups:
+        yield from (tuple(numbers[begin : begin + together]) for begin in range(0, len(numbers), together))
+
+
+def _tried(lost: LostObjects, source: Source, test: Acceptance) -> Relocalized:
+    """What the window gives with the hypotheses of a source tried for some objects."""
+    hypotheses = source.propose(lost)
+    tried = refined(hypotheses, lost)
+    return exchanged(lost, hypotheses, tried, test.rows(lost.rows).choose(tried, hypotheses, lost))
 
 
 def _settled(window: Relocalized, drifts: Bool[Tensor, "b"], widened: Prediction, gate_scale: Float[Tensor, "b"]) -> Relocalized:

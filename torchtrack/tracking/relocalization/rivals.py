@@ -8,14 +8,17 @@ there is one that explains more of the contour, by more events, which gather mor
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.padded import repeated, rows_in_all
 from torchtrack.tracking.motion.model import covariance_at_rest
 from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.acceptance import AS_MUCH, Choice, is_likely
 from torchtrack.tracking.relocalization.evidence import TriggerEvidence
-from torchtrack.tracking.relocalization.hypotheses import Hypotheses, anywhere_scale, sampled_elsewhere
-from torchtrack.tracking.relocalization.lost_object import LostObject
+from torchtrack.tracking.relocalization.hypotheses import Hypotheses, anywhere_scale, sampled_anywhere
+from torchtrack.tracking.relocalization.lost_objects import LostObjects
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.verdict import AGREES_FROM
 
@@ -34,7 +37,7 @@ _FAR_MORE = 1.6
 
 
 def turned(prediction: Prediction, config: TrackerConfig) -> Prediction:
-    """The prediction, of an object alone, as uncertain as what was put in its place but turned wrong."""
+    """The prediction as uncertain as what was put in its place but turned wrong."""
     objects = prediction.objects
     across_m, depth_m = _ACROSS_DIAMETERS * objects.diameter_m.double(), _DEPTH_SHARE * objects.depth_m(prediction.T_cam_obj).double()
     rotation_rad = torch.full_like(depth_m, _TURNED_RAD)
@@ -42,15 +45,14 @@ def turned(prediction: Prediction, config: TrackerConfig) -> Prediction:
     return replace(prediction, covariance=covariance_at_rest(pose, objects.diameter_m, config.motion))
 
 
-def turned_far(lost: LostObject) -> Hypotheses:
-    """Turned far from the object's prediction, in its place."""
-    prediction = turned(lost.window.prediction.detached().copies(lost.number, 1), lost.config)
+def turned_far(lost: LostObjects) -> Hypotheses:
+    """Turned far from the objects' predictions, in their places."""
+    prediction = turned(lost.window.prediction.detached().copies(lost.numbers), lost.config)
     search = lost.config.relocalization
     search = search.model_copy(update={"rotations": max(int(_ROTATIONS_RATIO * search.rotations), 1)})
     lost = replace(lost, config=lost.config.model_copy(update={"relocalization": search}))
-    hypotheses = sampled_elsewhere(lost, prediction, 2 * search.wide_sigma_px)
     # One that is accepted is no jump.
-    return replace(hypotheses, gate_scale=anywhere_scale(lost))
+    return replace(sampled_anywhere(lost, prediction), replaces_prediction=True, gate_scale=anywhere_scale(lost))
 
 
 def explains_far_more(evidence: TriggerEvidence, scored: ScoredFit, config: TrackerConfig) -> "FarMore":
@@ -62,20 +64,21 @@ def explains_far_more(evidence: TriggerEvidence, scored: ScoredFit, config: Trac
 class FarMore:
     """Accepts what explains far more than the object's own pose."""
 
-    def row(self, number: int) -> "FarMore":
+    def rows(self, chosen: Int[Tensor, "k"]) -> "FarMore":
         """The same is asked of each object."""
         return self
 
-    def choose(self, tried: ScoredFit, hypotheses: Hypotheses, lost: LostObject) -> Choice:
-        """The rival that explains most."""
-        own, number = lost.window.scored, lost.number
+    def choose(self, tried: ScoredFit, hypotheses: Hypotheses, lost: LostObjects) -> Choice:
+        """The rival of each object that explains most."""
+        own, rows, count = lost.window.scored, lost.rows, len(tried.count)
         values = ((tried.score, own.score), (tried.count, own.count), (tried.inlier_ratio, own.inlier_ratio))
         # Of what does not tell how far it gathers nothing is better.
-        times = torch.stack([theirs / mine[number].clamp(min=1e-6) for theirs, mine in values])
+        times = torch.stack([theirs / repeated(mine[rows], count).clamp(min=1e-6) for theirs, mine in values])
         # What texture contradicts gives way to what is about as good and is not contradicted.
-        is_wrong = own.texture_agreement[number] < AGREES_FROM
-        eligible = (times >= torch.where(is_wrong, 1 - AS_MUCH, 1)).all(0) & (tried.count >= lost.config.validation.min_observations)
+        is_wrong = own.texture_agreement[rows] < AGREES_FROM
+        least = repeated(torch.where(is_wrong, 1 - AS_MUCH, 1.0), count)
+        eligible = (times >= least).all(0) & (tried.count >= lost.config.validation.min_observations)
         eligible = eligible & is_likely(tried.fit.solution.from_prior, hypotheses.covariance) & ~(tried.texture_agreement < AGREES_FROM)
-        more = torch.where(eligible, times.prod(0), 0)
-        best = more.argmax()[None]
-        return Choice(best, more.index_select(0, best) > torch.where(is_wrong, 0, _FAR_MORE))
+        more = torch.where(eligible, times.prod(0), 0).unflatten(0, (len(rows), -1))
+        best = rows_in_all(more.argmax(1, keepdim=True), more.shape[1])
+        return Choice(best, more.flatten().index_select(0, best) > torch.where(is_wrong, 0, _FAR_MORE))

@@ -1,4 +1,4 @@
-"""The outlines of an object from all around: what contours of hundreds of poses are taken from, and moved to where these are."""
+"""The outlines of objects from all around: what contours of hundreds of poses are taken from, and moved to where these are."""
 
 import math
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.constants import constant
-from torchtrack.core.padded import select_ranked, take_points
+from torchtrack.core.padded import repeated, rows_in_all, select_ranked, take_points
 from torchtrack.tracking.contours.points import Contours, assemble
 from torchtrack.tracking.motion.prediction import Prediction
 
@@ -30,11 +30,11 @@ def view_directions(count: int, device: torch.device | None = None) -> Float[Ten
 
 
 def outlines_by_view(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], config: TrackerConfig) -> Contours:
-    """The contours of an object at each of some poses: those of the view from all around that is nearest to how it is seen there.
+    """The contours of objects at each of some poses: those of the view from all around that is nearest to how it is seen there.
 
     Args:
-        prediction: of the object alone; views are taken from its depth.
-        T_cam_obj: the poses.
+        prediction: of the objects; views are taken from their depths.
+        T_cam_obj: the poses, as many in turn of each object.
     """
     objects = prediction.objects
     towards = view_directions(_VIEWS, T_cam_obj.device).to(T_cam_obj.dtype)
@@ -43,12 +43,13 @@ def outlines_by_view(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], 
         used, view = view.unique(return_inverse=True)
         towards = towards[used]
     outlines = outlines_from(prediction, towards, config)
-    return moved_to(outlines, view, T_cam_obj, objects.intrinsics)
+    number = rows_in_all(view.unflatten(0, (len(objects.centre_obj), -1)), len(towards))
+    return moved_to(outlines, number, T_cam_obj, objects.intrinsics)
 
 
-def nearest_view(T_cam_obj: Float[Tensor, "n 4 4"], centre_obj: Float[Tensor, "#n 3"], towards: Float[Tensor, "v 3"]) -> Int[Tensor, "n"]:
+def nearest_view(T_cam_obj: Float[Tensor, "n 4 4"], centre_obj: Float[Tensor, "k 3"], towards: Float[Tensor, "v 3"]) -> Int[Tensor, "n"]:
     """Which of some directions is nearest to the one that the camera is in, as the object at each pose has it."""
-    camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])[..., 0] - centre_obj
+    camera_obj = -torch.bmm(T_cam_obj[:, :3, :3].transpose(1, 2), T_cam_obj[:, :3, 3:])[..., 0] - repeated(centre_obj, len(T_cam_obj))
     # The longer a vector, the larger its products, which changes nothing of which of them is the largest.
     return (camera_obj @ towards.T).argmax(1)
 
@@ -64,8 +65,9 @@ def thinned(contours: Contours) -> Contours:
 
 
 def outlines_at(prediction: Prediction, T_cam_obj: Float[Tensor, "n 4 4"], config: TrackerConfig) -> Contours:
-    """The contours of an object as they are seen at each of some poses."""
-    return thinned(prediction.objects.copies(0, len(T_cam_obj)).contours(T_cam_obj, config.contours))
+    """The contours of objects as they are seen at each of some poses, as many in turn of each object."""
+    objects = range(len(prediction.T_cam_obj))
+    return thinned(prediction.objects.copies(objects, len(T_cam_obj) // len(objects)).contours(T_cam_obj, config.contours))
 
 
 def rotations_from(towards: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 3"]:
@@ -78,17 +80,18 @@ def rotations_from(towards: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 3"]:
 
 
 def outlines_from(prediction: Prediction, towards: Float[Tensor, "v 3"], config: TrackerConfig) -> Contours:
-    """The outlines of an object straight before the camera, which it sees from some directions."""
-    rotation = rotations_from(towards)
-    ahead = torch.nn.functional.pad(prediction.centre_cam[:, 2:], (2, 0))
-    translation = ahead - (rotation @ prediction.objects.centre_obj[0])
-    poses = torch.eye(4, dtype=towards.dtype, device=towards.device).repeat(len(towards), 1, 1)
+    """The outlines of objects straight before the camera, which it sees from some directions: all of each object in turn."""
+    count = len(prediction.T_cam_obj) * len(towards)
+    rotation = rotations_from(towards).repeat(len(prediction.T_cam_obj), 1, 1)
+    ahead = torch.nn.functional.pad(repeated(prediction.centre_cam[:, 2:], count), (2, 0))
+    translation = ahead - (rotation @ repeated(prediction.objects.centre_obj, count)[..., None])[..., 0]
+    poses = torch.eye(4, dtype=towards.dtype, device=towards.device).repeat(count, 1, 1)
     poses[:, :3] = torch.cat([rotation, translation[..., None]], 2)
     return outlines_at(prediction, poses, config)
 
 
-def moved_to(outlines: Contours, view: Int[Tensor, "n"], T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "1 4"]) -> Contours:
+def moved_to(outlines: Contours, view: Int[Tensor, "n"], T_cam_obj: Float[Tensor, "n 4 4"], intrinsics: Float[Tensor, "k 4"]) -> Contours:
     """The contour points of a view each, seen from other poses."""
     of_views = (outlines.points_obj, outlines.tangents_obj, outlines.kind, outlines.mask)
     points, tangents, kind, mask = (values.index_select(0, view) for values in of_views)
-    return assemble(points, tangents, kind, mask, T_cam_obj, intrinsics.expand(len(view), 4))
+    return assemble(points, tangents, kind, mask, T_cam_obj, repeated(intrinsics, len(view)))

@@ -1,11 +1,13 @@
-"""What relocalization works on: what a window gave so far, and an object of it that other poses are tried for."""
+"""What relocalization works on: what a window gave so far, and objects of it that other poses are tried for."""
 
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float
+import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.constants import constant, once
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.window_events import WindowEvents
 from torchtrack.tracking.motion.prediction import Prediction
@@ -31,30 +33,37 @@ class Relocalized:
 
 
 @dataclass(frozen=True)
-class LostObject:
-    """An object that other poses are tried for, as the sources of hypotheses see it.
+class LostObjects:
+    """Objects that other poses are tried for, a compact batch, as the sources of hypotheses see it.
 
     Args:
-        number: of the object.
+        numbers: of the objects.
         window: what the window gave so far, for all objects.
         widened: the predictions of all objects, of those that drift as uncertain as that makes them.
-        sigma_px: standard deviation of the object's widened prediction in the image.
-        events: of the object.
+        sigma_px: standard deviation of these objects' widened predictions in the image.
+        is_wide: whether hardly anything is known of where they are, from these predictions.
+        events: of these objects.
         last_seen: where objects were validated for the last time.
     """
 
-    number: int
+    numbers: tuple[int, ...]
     window: Relocalized
     widened: Prediction
-    sigma_px: float
+    sigma_px: Float[Tensor, "k"]
+    is_wide: bool
     events: WindowEvents
     last_seen: LastSeen
     config: TrackerConfig
 
+    @once
+    def rows(self) -> Int[Tensor, "k"]:
+        """Their numbers as an index of all objects."""
+        return constant(self.numbers, torch.int64, self.sigma_px.device)
+
     def predicted(self) -> Prediction:
-        """The widened prediction of the object alone."""
-        return self.widened.copies(self.number, 1)
+        """Their widened predictions."""
+        return self.widened.copies(self.numbers)
 
     def contours(self) -> Contours:
-        """Its contours where it is by now."""
-        return self.window.scored.fit.contours.of_object(self.number)
+        """Their contours where they are by now."""
+        return self.window.scored.fit.contours.rows(self.rows)
