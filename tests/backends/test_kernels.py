@@ -19,11 +19,12 @@ from torchtrack.tracking.association.matches import MatchesWithCues
 from torchtrack.tracking.association.nearest import contour_table
 from torchtrack.tracking.association.observations import select_events
 from torchtrack.tracking.association.polarity import remembered
+from torchtrack.tracking.contours.depth_buffer import Scene
 from torchtrack.tracking.contours.index import index_contours
 from torchtrack.tracking.contours.objects import ObjectBatch
 from torchtrack.tracking.contours.points import assemble, reproject
 from torchtrack.tracking.contours.sampling import mesh_contours
-from torchtrack.tracking.contours.visibility import Scene, remove_hidden
+from torchtrack.tracking.contours.visibility import remove_hidden
 from torchtrack.tracking.frontend.arrival_flow import arrival_flow
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US, update_bursts
 from torchtrack.tracking.frontend.sensor_maps import SensorMaps

@@ -118,7 +118,7 @@ class TableSettings(NamedTuple):
 
 
 class GridSettings(NamedTuple):
-    """What :mod:`torchtrack.backends.numba.visibility` goes by: the layout of depth buffers.
+    """What :mod:`torchtrack.backends.numba.depth_buffer` goes by: the layout of depth buffers.
 
     Args:
         rows, columns: of each stream's.
@@ -126,7 +126,9 @@ class GridSettings(NamedTuple):
         height, width: of the image (px).
         steps_per_m: depths are compared in so many parts of a metre.
         least_depth_m: what is nearer is not drawn.
+        object_bits, nothing: how depths are kept: above so many bits for the object's number; and what is kept where there is nothing.
         samples_per_cell: so many surface samples for each cell of the square around an object are enough.
+        most_cells: holes are closed up to so many cells from a sample.
     """
 
     rows: int
@@ -136,7 +138,10 @@ class GridSettings(NamedTuple):
     width: int
     steps_per_m: float
     least_depth_m: float
+    object_bits: int
+    nothing: int
     samples_per_cell: int
+    most_cells: int
 
 
 class SamplingSettings(NamedTuple):

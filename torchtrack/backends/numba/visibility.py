@@ -1,4 +1,4 @@
-"""Hidden contour points: :func:`torchtrack.tracking.contours.visibility.hidden_by_faces` and the depth buffer there, object by object."""
+"""Contour points behind an object's own faces, face by face: :func:`torchtrack.tracking.contours.visibility.hidden_by_self`."""
 
 import numpy as np
 import torch
@@ -6,18 +6,14 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
-from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.geometry import Numbers, entries, inverse_depth, lens, placed, turned
+from torchtrack.backends.numba.compiler import Array, kernel
+from torchtrack.backends.numba.geometry import Numbers, entries, placed, turned
 from torchtrack.backends.numba.models import arrays_of
-from torchtrack.backends.numba.parameters import GridSettings
-from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.contours import visibility
+from torchtrack.tracking.contours.depth_buffer import Scene
 from torchtrack.tracking.contours.points import Contours
-from torchtrack.tracking.contours.visibility import Scene
 
-# Deeper than what there is nothing at.
-_DEEPEST = np.iinfo(np.int64).max
 # Dot products of a face with a point: within its three edges, and behind its plane.
 _TESTS = 4
 
@@ -91,147 +87,6 @@ def _deepen(tests: Array, x: Array, y: Array, z: Array, deepest: Array) -> None:
         deepest[i] = least if least > deepest[i] else deepest[i]
 
 
-@kernel(fastmath=FAST)
-def _cell(u: float, v: float, first: Numbers, rows_before: int, grid: GridSettings) -> int:
-    """The cell of a depth buffer that a pixel falls into; what lies outside falls into the outermost, what is not a number into the first."""
-    column, row = np.rint(u / grid.side_px) - first[0], np.rint(v / grid.side_px) - first[1]
-    # Written so that what is not a number finds a cell, too.
-    column, row = min(column if column > 0 else 0.0, grid.columns - 1.0), min(row if row > 0 else 0.0, grid.rows - 1.0)
-    return int((row + rows_before) * grid.columns + column)
-
-
-@kernel()
-def around(pixels: Array, mask: Array, stream_index: Array, cell_px: float, height: int, width: int, first: Array) -> tuple[int, int]:
-    """Rows and columns of depth buffers that hold what is asked for: :meth:`torchtrack.tracking.contours.visibility.DepthGrid.around`.
-
-    Args:
-        pixels, mask: ``[b, 2, m]`` and ``[b, m]``.
-        height, width: of the image (px); pixels outside it are not asked for.
-        first: ``[s, 2]``, filled: first cell (column, row) of each stream's buffer.
-    """
-    last = np.full(first.shape, -np.inf)
-    first[:] = np.inf
-    for b in range(len(mask)):
-        low, high = first[stream_index[b]], last[stream_index[b]]
-        for i in range(mask.shape[1]):
-            u, v = pixels[b, 0, i], pixels[b, 1, i]
-            if mask[b, i] and u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1:
-                low[0], low[1], high[0], high[1] = min(low[0], u), min(low[1], v), max(high[0], u), max(high[1], v)
-    columns, rows = 0.0, 0.0
-    for s in range(len(first)):
-        if not np.isfinite(first[s, 0]):
-            first[s] = 0.0
-            continue
-        for k in range(2):
-            # Beside the pixels, and one more that takes what lies outside.
-            first[s, k], last[s, k] = np.floor(first[s, k] / cell_px) - 2.0, np.ceil(last[s, k] / cell_px) + 2.0
-        columns, rows = max(columns, last[s, 0] - first[s, 0]), max(rows, last[s, 1] - first[s, 1])
-    return int(rows) + 1, int(columns) + 1
-
-
-@kernel()
-def _every(samples: int, T_cam_obj: Array, intrinsics: Array, diameter_m: float, grid: GridSettings) -> int:
-    """The so manieth surface sample of an object that is taken, a power of two: :func:`tracking.contours.visibility.depth_buffer` halves them so."""
-    size_cells = diameter_m * intrinsics[0] / max(T_cam_obj[2, 3], grid.least_depth_m) / grid.side_px
-    spare, every = samples / max(grid.samples_per_cell * size_cells * size_cells, 1.0), 1
-    while 2 * every <= spare:
-        every *= 2
-    return every
-
-
-@kernel(fastmath=FAST)
-def draw(
-    members: Array,
-    drawn: Array,
-    samples: Array,
-    T_cam_obj: Array,
-    intrinsics: Array,
-    diameters_m: Array,
-    stream_index: Array,
-    first: Array,
-    grid: GridSettings,
-    depth: Array,
-    owner: Array,
-) -> None:
-    """Draw surface samples of objects of one model into depth buffers; of objects as near, the first stays.
-
-    Args:
-        members: numbers of the objects, and which of all are ``drawn [b]``.
-        samples: ``[3, n]``, in the object's frame.
-        first: ``[s, 2]``, first cell of each stream's buffer.
-        depth, owner: ``[p]``, depths in whole steps, and the object of each; changed.
-    """
-    cells, steps = np.empty(samples.shape[1], np.int32), np.empty(samples.shape[1], np.int64)
-    for b in members:
-        if not drawn[b]:
-            continue
-        every = _every(samples.shape[1], T_cam_obj[b], intrinsics[b], diameters_m[b], grid)
-        taken, stream = samples if every == 1 else samples[:, ::every].copy(), stream_index[b]
-        _place(taken, entries(T_cam_obj[b]), lens(intrinsics[b]), (first[stream, 0], first[stream, 1]), stream * grid.rows, grid, cells, steps)
-        for i in range(taken.shape[1]):
-            cell = np.uint64(cells[i])
-            if steps[i] < depth[cell] or (steps[i] == depth[cell] and b < owner[cell]):
-                depth[cell], owner[cell] = steps[i], b
-
-
-@kernel(fastmath=FAST)
-def _place(
-    samples: Array,
-    pose: Numbers,
-    intrinsics: Numbers,
-    first: Numbers,
-    rows_before: int,
-    grid: GridSettings,
-    cells: Array,
-    steps: Array,
-) -> None:
-    """Cells of surface samples, and their depths in whole steps, several at once; deeper than all else what is not before the camera."""
-    points_x, points_y, points_z = samples[0], samples[1], samples[2]
-    for i in range(samples.shape[1]):
-        x, y, z = placed(pose, points_x[i], points_y[i], points_z[i])
-        inverse = inverse_depth(z)
-        cells[i] = _cell(x * inverse * intrinsics[0] + intrinsics[2], y * inverse * intrinsics[1] + intrinsics[3], first, rows_before, grid)
-        steps[i] = np.int64(z * grid.steps_per_m) if z > grid.least_depth_m else _DEEPEST
-
-
-@kernel(fastmath=FAST)
-def hide_in_buffer(
-    points_cam: Array,
-    pixels: Array,
-    normals: Array,
-    mask: Array,
-    exact: Array,
-    margin_m: Array,
-    stream_index: Array,
-    first: Array,
-    grid: GridSettings,
-    depth: Array,
-    owner: Array,
-    hidden: Array,
-) -> None:
-    """Mark points in the image behind a surface in the depth buffer, there and a cell to each side of their contour.
-
-    Args:
-        points_cam, pixels, normals: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``; ``mask [b, m]``.
-        exact: ``[b]``, objects that their own surface does not count for.
-        margin_m: ``[b]``, how far behind it is hidden.
-        hidden: ``[b, m]``, changed.
-    """
-    for b in range(len(mask)):
-        stream = stream_index[b]
-        own_first, rows_before = (first[stream, 0], first[stream, 1]), stream * grid.rows
-        for i in range(mask.shape[1]):
-            u, v = pixels[b, 0, i], pixels[b, 1, i]
-            if not mask[b, i] or not (u >= 0 and v >= 0 and u <= grid.width - 1 and v <= grid.height - 1):
-                continue
-            behind, farthest_m = True, points_cam[b, 2, i] - margin_m[b]
-            for side in (0.0, -grid.side_px, grid.side_px):
-                cell = _cell(u + side * normals[b, 0, i], v + side * normals[b, 1, i], own_first, rows_before, grid)
-                counts = not exact[b] or owner[cell] != b
-                behind = behind and counts and farthest_m > depth[cell] / grid.steps_per_m
-            hidden[b, i] = hidden[b, i] or behind
-
-
 @kernel()
 def meet(pixels: Array, mask: Array, depth_m: Array, stream_index: Array, diameters_m: Array, beside_px: float, meets: Array) -> None:
     """Which objects may be before another one of their stream: :func:`torchtrack.tracking.contours.visibility.may_overlap_others`.
@@ -275,27 +130,4 @@ def hidden_by_self_numba(scene: Scene, contours: Contours) -> Bool[Tensor, "b m"
         of_model = arrays_of(model)
         if len(of_model.faces[0]):
             hide_behind_faces(of_model.members, T_cam_obj, *of_model.faces, tolerance_m, *points, hidden.numpy())
-    return hidden
-
-
-@accelerates(visibility.hidden_in_buffer)
-def hidden_in_buffer_numba(scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"], exact: Bool[Tensor, "b 1"]) -> Bool[Tensor, "b m"]:
-    """Sample by sample and point by point."""
-    streams, height, width = scene.image_shape
-    hidden, margin_m, first = torch.zeros_like(contours.mask), visibility.DEPTH_MARGIN * scene.diameters_m, np.empty((streams, 2))
-    points_cam, pixels, normals, mask = as_arrays(
-        *(value.transpose(1, 2) for value in (contours.points_cam, contours.pixels, contours.normals)), contours.mask
-    )
-    T_cam_obj, intrinsics, stream_index, diameters_m = as_arrays(scene.T_cam_obj, scene.intrinsics, scene.stream_index, scene.diameters_m)
-    cell_px = float(visibility.DEPTH_CELL_PX)
-    rows, columns = around(pixels, mask, stream_index, cell_px, height, width, first)
-    steps_per_m, enough = visibility.DEPTH_STEPS_PER_M, visibility.SAMPLES_PER_CELL
-    settings = GridSettings(rows, columns, cell_px, height, width, steps_per_m, MIN_DEPTH_M, enough)
-    depth, owner = (np.full(streams * rows * columns, value) for value in (visibility.NOTHING, len(drawn)))
-    is_drawn = drawn.numpy()
-    for model in scene.models:
-        of_model = arrays_of(model)
-        draw(of_model.members, is_drawn, of_model.surface, T_cam_obj, intrinsics, diameters_m, stream_index, first, settings, depth, owner)
-    own = as_arrays(exact[:, 0], margin_m)
-    hide_in_buffer(points_cam, pixels, normals, mask, *own, stream_index, first, settings, depth, owner, hidden.numpy())
     return hidden

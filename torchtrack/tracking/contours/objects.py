@@ -12,10 +12,11 @@ from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M
 from torchtrack.core.padded import repeated
 from torchtrack.object_model.contour_source import ContourKind, ContourModel
+from torchtrack.tracking.contours.depth_buffer import Scene
 from torchtrack.tracking.contours.points import Contours, assemble, joined
 from torchtrack.tracking.contours.sampling import mesh_contours
 from torchtrack.tracking.contours.splat import splat_contours
-from torchtrack.tracking.contours.visibility import Scene, remove_hidden
+from torchtrack.tracking.contours.visibility import remove_hidden
 
 
 @dataclass(frozen=True)
