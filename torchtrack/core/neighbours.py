@@ -3,12 +3,12 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
 
-def over_3x3(image: Shaped[Tensor, "*n h w"], combine: Callable[[Tensor, Tensor], Tensor], beyond: float | int = 0.0) -> Shaped[Tensor, "*n h w"]:
+def over_3x3(image: Float[Tensor, "*n h w"], combine: Callable[[Tensor, Tensor], Tensor], beyond: float = 0.0) -> Float[Tensor, "*n h w"]:
     """What the 3x3 pixels around every pixel come to, such as their sum. On a CPU, pooling takes tens of times longer.
 
     Args:

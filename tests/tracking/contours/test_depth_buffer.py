@@ -39,14 +39,14 @@ def test_the_depth_buffer_holds_the_nearest_surface_and_whose_it_is():
     assert float(depth_m[2, 2]) > 1e6
 
 
-@pytest.mark.parametrize("reach", range(MOST_CELLS + 1))
-def test_closing_is_that_of_a_library(reach):
+@pytest.mark.parametrize("side", range(1, MOST_CELLS + 1))
+def test_closing_is_that_of_a_library(side):
     depths = torch.randint(1, 1000, (2, 23, 31), generator=generator())
     depths[torch.rand(depths.shape, generator=generator(1)) < 0.4] = NOTHING
-    side = 2 * reach + 1
-    for ours, given in zip(closed(depths, reach), depths, strict=True):
-        nearer = minimum_filter(given.numpy(), side, mode="constant", cval=NOTHING)
-        assert np.array_equal(ours.numpy(), maximum_filter(nearer, side, mode="constant", cval=0))
+    for ours, given in zip(closed(depths, side), depths, strict=True):
+        # A square that ends at each cell, and one that begins there.
+        nearer = minimum_filter(given.numpy(), side, mode="constant", cval=NOTHING, origin=(side - 1) // 2)
+        assert np.array_equal(ours.numpy(), maximum_filter(nearer, side, mode="constant", cval=0, origin=-(side // 2)))
 
 
 def test_holes_are_closed_and_what_a_surface_ends_at_stays():
@@ -54,8 +54,9 @@ def test_holes_are_closed_and_what_a_surface_ends_at_stays():
     surface[0, 4:14, 5:15] = 7
     pierced = surface.clone()
     pierced[0, 6, 7] = pierced[0, 9:11, 9:11] = NOTHING
-    assert torch.equal(closed(pierced, 1)[0, 6, 7], torch.tensor(7))
-    assert torch.equal(closed(pierced, 1), surface) and torch.equal(closed(surface, MOST_CELLS), surface)
+    # Holes of one cell, and of two by two.
+    assert int(closed(pierced, 2)[0, 6, 7]) == 7 and int(closed(pierced, 2)[0, 9, 9]) == NOTHING
+    assert torch.equal(closed(pierced, 3), surface) and torch.equal(closed(surface, MOST_CELLS), surface)
 
 
 @pytest.mark.parametrize("size_px", [100, 250, 500, 1000])

@@ -57,17 +57,17 @@ def around(pixels: Array, mask: Array, stream_index: Array, cell_px: float, heig
 
 @kernel()
 def _density(samples: int, T_cam_obj: Array, intrinsics: Array, diameter_m: float, grid: GridSettings) -> tuple[int, int]:
-    """The so manieth surface sample of an object that is taken, a power of two, and how many cells holes between them reach.
+    """The so manieth surface sample of an object that is taken, a power of two, and the side of squares that fit into no hole between them.
 
     As :func:`torchtrack.tracking.contours.depth_buffer.depth_buffer` has them.
     """
     size_cells = diameter_m * intrinsics[0] / max(T_cam_obj[2, 3], grid.least_depth_m) / grid.side_px
-    spare, every, reach = samples / max(grid.samples_per_cell * size_cells * size_cells, 1.0), 1, 0
+    spare, every, side = samples / max(grid.samples_per_cell * size_cells * size_cells, 1.0), 1, 1
     while 2 * every <= spare:
         every *= 2
-    while reach < grid.most_cells and (2 * reach + 1) ** 2 * spare < 1.0:
-        reach += 1
-    return every, reach
+    while side < grid.most_cells and side**2 * spare * grid.samples_per_cell < grid.samples_per_square:
+        side += 1
+    return every, side
 
 
 @kernel(fastmath=FAST)
@@ -90,16 +90,16 @@ def draw(
         members: numbers of the objects, and which of all are ``drawn [b]``.
         samples: ``[3, n]``, in the object's frame.
         first: ``[s, 2]``, first cell of each stream's buffer.
-        nearest: ``[r, p]``, depths in whole steps with the object in the low bits, of objects with holes that reach ``r`` cells; changed.
-        used: ``[r]``, whether anything was drawn there; changed.
+        nearest: ``[k, p]``, depths in whole steps with the object in the low bits; a row for each size of holes; changed.
+        used: ``[k]``, whether anything was drawn there; changed.
     """
     cells, keys = np.empty(samples.shape[1], np.int32), np.empty(samples.shape[1], np.int64)
     for b in members:
         if not drawn[b]:
             continue
-        every, reach = _density(samples.shape[1], T_cam_obj[b], intrinsics[b], diameters_m[b], grid)
-        taken, stream, own = samples if every == 1 else samples[:, ::every].copy(), stream_index[b], nearest[reach]
-        used[reach] = True
+        every, side = _density(samples.shape[1], T_cam_obj[b], intrinsics[b], diameters_m[b], grid)
+        taken, stream, own = samples if every == 1 else samples[:, ::every].copy(), stream_index[b], nearest[side - 1]
+        used[side - 1] = True
         _place(taken, entries(T_cam_obj[b]), lens(intrinsics[b]), (first[stream, 0], first[stream, 1]), stream * grid.rows, grid, cells, keys)
         for i in range(taken.shape[1]):
             cell = np.uint64(cells[i])
@@ -107,37 +107,38 @@ def draw(
 
 
 @kernel()
-def close(nearest: Array, reach: int) -> None:
-    """Close holes that reach so many cells: :func:`torchtrack.tracking.contours.depth_buffer.closed`.
+def close(nearest: Array, side: int) -> None:
+    """Close holes that a square of so many cells does not fit into: :func:`torchtrack.tracking.contours.depth_buffer.closed`.
 
     Args:
         nearest: ``[s, h, w]``, changed.
     """
     for s in range(len(nearest)):
-        # The largest value around a cell is the smallest of what they are with the other sign.
-        for _ in range(2):
-            _least_around(nearest[s], reach)
+        # The largest value is the smallest of what they are with the other sign.
+        for forward in (False, True):
+            _put_least(nearest[s], side, forward)
             for i in range(nearest.shape[1]):
                 for j in range(nearest.shape[2]):
                     nearest[s, i, j] = -nearest[s, i, j]
 
 
 @kernel()
-def _least_around(values: Array, reach: int) -> None:
-    """Put the smallest of the square that reaches so many cells to each side into each cell; one way after the other, several cells at once."""
+def _put_least(values: Array, side: int, forward: bool) -> None:
+    """Put the smallest of the square that begins at each cell, or ends there, into it; one way after the other, several cells at once."""
     rows, columns = values.shape
     across = values.copy()
     for i in range(rows):
-        for k in range(1, min(reach, columns - 1) + 1):
+        for k in range(1, min(side, columns)):
+            first, into = (k, 0) if forward else (0, k)
             for j in range(columns - k):
-                across[i, j] = min(across[i, j], values[i, j + k])
-            for j in range(columns - k):
-                across[i, j + k] = min(across[i, j + k], values[i, j])
+                across[i, into + j] = min(across[i, into + j], values[i, first + j])
     values[:] = across
     for i in range(rows):
-        for k in range(max(i - reach, 0), min(i + reach + 1, rows)):
-            for j in range(columns):
-                values[i, j] = min(values[i, j], across[k, j])
+        for k in range(1, side):
+            other = i + k if forward else i - k
+            if 0 <= other < rows:
+                for j in range(columns):
+                    values[i, j] = min(values[i, j], across[other, j])
 
 
 @kernel(fastmath=FAST)
@@ -210,15 +211,16 @@ def hidden_in_buffer_numba(scene: Scene, contours: Contours, drawn: Bool[Tensor,
     cell_px = float(depth_buffer.DEPTH_CELL_PX)
     rows, columns = around(pixels, mask, stream_index, cell_px, height, width, first)
     depths = depth_buffer.DEPTH_STEPS_PER_M, MIN_DEPTH_M, depth_buffer.OBJECT_BITS, depth_buffer.NOTHING
-    settings = GridSettings(rows, columns, cell_px, height, width, *depths, depth_buffer.SAMPLES_PER_CELL, depth_buffer.MOST_CELLS)
-    of_each = np.full((depth_buffer.MOST_CELLS + 1, streams * rows * columns), depth_buffer.NOTHING)
+    squares = depth_buffer.SAMPLES_PER_CELL, depth_buffer.SAMPLES_PER_SQUARE, depth_buffer.MOST_CELLS
+    settings = GridSettings(rows, columns, cell_px, height, width, *depths, *squares)
+    of_each = np.full((depth_buffer.MOST_CELLS, streams * rows * columns), depth_buffer.NOTHING)
     used, is_drawn = np.zeros(len(of_each), np.bool_), drawn.numpy()
     for model in scene.models:
         of_model = arrays_of(model)
         draw(of_model.members, is_drawn, of_model.surface, T_cam_obj, intrinsics, diameters_m, stream_index, first, settings, of_each, used)
     nearest = of_each[0]
-    for reach in used[1:].nonzero()[0] + 1:
-        close(of_each[reach].reshape(streams, rows, columns), reach)
-        np.minimum(nearest, of_each[reach], out=nearest)
+    for row in used[1:].nonzero()[0] + 1:
+        close(of_each[row].reshape(streams, rows, columns), row + 1)
+        np.minimum(nearest, of_each[row], out=nearest)
     hide_in_buffer(points_cam, pixels, normals, mask, *as_arrays(exact[:, 0], margin_m), stream_index, first, settings, nearest, hidden.numpy())
     return hidden

@@ -128,7 +128,8 @@ class GridSettings(NamedTuple):
         least_depth_m: what is nearer is not drawn.
         object_bits, nothing: how depths are kept: above so many bits for the object's number; and what is kept where there is nothing.
         samples_per_cell: so many surface samples for each cell of the square around an object are enough.
-        most_cells: holes are closed up to so many cells from a sample.
+        samples_per_square: holes are closed that are smaller than a square of so many samples.
+        most_cells: squares have no more cells a side.
     """
 
     rows: int
@@ -141,6 +142,7 @@ class GridSettings(NamedTuple):
     object_bits: int
     nothing: int
     samples_per_cell: int
+    samples_per_square: int
     most_cells: int
 
 
