@@ -61,7 +61,7 @@ def relocalize(
     for comes_last in (False, True):
         for source, test in zip(sources, tests, strict=True):
             called = [asks.number for asks in looks if source.comes_last == comes_last and source.is_called_for(asks.flags)]
-            groups = [[number for number in called if is_wide[number] == known] for known in (False, True)] if source.in_two_ways else [called]
+            groups = [[number for number in called if is_wide[number] == wide] for wide in (False, True)] if source.in_two_ways else [called]
             for numbers in _batches(groups, _TOGETHER_ON_GPU if host_sync.on_gpu(sigma_px) else _TOGETHER):
                 rows = constant(numbers, torch.int64, sigma_px.device)
                 of_them = sigma_px[rows], is_wide[numbers[0]], events.of_objects(rows)
