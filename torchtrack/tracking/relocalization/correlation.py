@@ -20,6 +20,7 @@ from torchtrack.core.neighbours import largest_around
 from torchtrack.core.padded import repeated, rows_in_all
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.motion.prediction import Prediction
+from torchtrack.tracking.relocalization.event_image import Places
 from torchtrack.tracking.relocalization.view_sphere import outlines_by_view
 
 # Cells a side of the square in which events and outlines are compared.
@@ -69,7 +70,7 @@ def kept_rotations(config: TrackerConfig) -> int:
 
 
 def shifted(
-    prediction: Prediction, steps: Float[Tensor, "n 6"], sigma_m: Float[Tensor, "k"], places: tuple[Tensor, Tensor], config: TrackerConfig
+    prediction: Prediction, steps: Float[Tensor, "n 6"], sigma_m: Float[Tensor, "k"], places: Places, config: TrackerConfig
 ) -> tuple[Float[Tensor, "m 6"], Contours]:
     """Offsets of poses with most events on the contours, as many of each object as :func:`kept_rotations` says, best first; and the outlines.
 
@@ -77,7 +78,7 @@ def shifted(
         prediction: of the objects.
         steps: offsets to try, as many in turn of each object; of their moves, the way towards the camera alone.
         sigma_m: standard deviation of the moves across the image.
-        places: pixels ``[k, e, 2]`` of the events at the window's end, and which of them exist.
+        places: of the events of each object.
     """
     objects, depth_m = prediction.objects, prediction.centre_cam[:, 2:]
     focal = objects.intrinsics[:, :2]
@@ -93,7 +94,7 @@ def shifted(
 
 
 def _best(
-    square: Square, places: tuple[Tensor, Tensor], outlines: Contours, sigma_cells: Float[Tensor, "k"], count: int
+    square: Square, places: Places, outlines: Contours, sigma_cells: Float[Tensor, "k"], count: int
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]]:
     """Numbers of the outlines of each object that fit best, and their shifts (cells)."""
     step = torch.arange(SIDE, dtype=sigma_cells.dtype, device=sigma_cells.device) - SIDE // 2
