@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -64,6 +64,20 @@ class Light:
         return (light / max(np.linalg.norm(light), 1e-12)).astype(np.float32)
 
 
+class Picture(NamedTuple):
+    """What is drawn into.
+
+    Args:
+        luminance: linear; that of the background at first.
+        depth: m; infinite where there is no object.
+        object_index: number of the object that is seen, -1 where there is none.
+    """
+
+    luminance: Float[ndarray, "rows columns"]
+    depth: Float[ndarray, "rows columns"]
+    object_index: Int[ndarray, "rows columns"]
+
+
 @runtime_checkable
 class Drawer(Protocol):
     """Draws the objects of one scene, sample by sample."""
@@ -72,15 +86,8 @@ class Drawer(Protocol):
         """Set poses and light for the next image; returns corners of every object in the camera frame."""
         ...
 
-    def draw(
-        self,
-        region: Region,
-        numbers: Sequence[int],
-        luminance: Float[ndarray, "rows columns"],
-        depth: Float[ndarray, "rows columns"],
-        object_index: Int[ndarray, "rows columns"],
-    ) -> None:
-        """Draw some of the objects into one region, over the background that ``luminance`` holds."""
+    def draw(self, region: Region, numbers: Sequence[int], picture: Picture) -> None:
+        """Draw some of the objects into one region, over the background that its picture holds."""
         ...
 
 

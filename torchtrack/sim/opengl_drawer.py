@@ -10,11 +10,11 @@ from typing import Any
 
 import moderngl
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 
 from torchtrack.errors import MissingExtraError
-from torchtrack.sim.drawing import Light, Region, sample_offsets
+from torchtrack.sim.drawing import Light, Picture, Region, sample_offsets
 from torchtrack.sim.surface import Scene
 
 _VERTEX = """
@@ -134,16 +134,9 @@ class OpenGLDrawer:
         program["light"], program["ambient"], program["diffuse"] = tuple(light.unit.tolist()), light.ambient, light.diffuse
         return [points @ T[:3, :3].T + T[:3, 3] for points, T in zip(self._points, T_cam_obj, strict=True)]
 
-    def draw(
-        self,
-        region: Region,
-        numbers: Sequence[int],
-        luminance: Float[ndarray, "rows columns"],
-        depth: Float[ndarray, "rows columns"],
-        object_index: Int[ndarray, "rows columns"],
-    ) -> None:
-        """Draw some of the objects into one region, over the background that ``luminance`` holds."""
-        height, width = luminance.shape
+    def draw(self, region: Region, numbers: Sequence[int], picture: Picture) -> None:
+        """Draw some of the objects into one region, over the background that its picture holds."""
+        height, width = picture.luminance.shape
         tiles, samples, pixels = self._room((width, height))
         self._draw_tiles(tiles, region, numbers, (width, height))
         pixels.use()
@@ -153,9 +146,9 @@ class OpenGLDrawer:
         self._gather["tiles"], self._gather["size"], self._gather["n"] = 0, (width, height), self._n
         self._whole.render()
         result = np.frombuffer(pixels.read((0, 0, width, height), 4, dtype="f4"), dtype=np.float32).reshape(height, width, 4)
-        luminance[:] = result[..., 0] + result[..., 1] * luminance
+        picture.luminance[:] = result[..., 0] + result[..., 1] * picture.luminance
         held = result[..., 2] >= 0
-        object_index[held], depth[held] = result[..., 2][held], result[..., 3][held]
+        picture.object_index[held], picture.depth[held] = result[..., 2][held], result[..., 3][held]
 
     def _draw_tiles(self, tiles: moderngl.Framebuffer, region: Region, numbers: Sequence[int], size: tuple[int, int]) -> None:
         fx, fy, cx, cy = self._intrinsics

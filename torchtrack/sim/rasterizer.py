@@ -9,6 +9,8 @@ Samples of a pixel lie beside one another in memory, sample ``s`` at ``offsets[s
 few cache lines, and a pixel's samples are tested in one go. Coordinates are float64 up to the pixel's centre, float32 from there.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from torchtrack.backends.numba.compiler import Array, kernel
@@ -17,10 +19,50 @@ from torchtrack.backends.numba.compiler import Array, kernel
 _SLIVER = 1e-13
 
 
+class Faces(NamedTuple):
+    """All faces in the camera frame.
+
+    Args:
+        corners: ``[f, 3, 3]`` (m).
+        normals: ``[f, 3, 3]`` unit normals of the corners, float32.
+        is_seen: ``[f]`` whether it is no back of a closed surface.
+        planes: ``[f, 3, 3]`` coefficients of the barycentric coordinates over the inverse depth, affine in the pixel of a region.
+    """
+
+    corners: Array
+    normals: Array
+    is_seen: Array
+    planes: Array
+
+
+class View(NamedTuple):
+    """The region of the image that is drawn.
+
+    Args:
+        intrinsics: ``fx, fy, cx, cy`` (px), and the depth that nothing is drawn before (m).
+        origin: ``[2]`` its first column and row.
+        offsets: ``[s, 2]`` of the samples from the centre of their pixel (px).
+    """
+
+    intrinsics: Array
+    origin: Array
+    offsets: Array
+
+
+class Samples(NamedTuple):
+    """What the samples of a region show.
+
+    Args:
+        inverse_depth: ``[h, w, s]`` (1/m), float32.
+        face_index: ``[h, w, s]``; -1 where there is none.
+    """
+
+    inverse_depth: Array
+    face_index: Array
+
+
 @kernel()
-def place(
-    corners_obj: Array, normals_obj: Array, face_object: Array, pose: Array, is_closed: Array, corners: Array, normals: Array, is_seen: Array
-) -> None:
+def place(corners_obj: Array, normals_obj: Array, face_object: Array, pose: Array, is_closed: Array, faces: Faces) -> None:
     """Move all faces to the camera frame; normals are turned towards the camera, and backs of closed surfaces marked as unseen.
 
     Args:
@@ -28,8 +70,9 @@ def place(
         face_object: ``[f]`` number of the object.
         pose: ``[o, 4, 4]``.
         is_closed: ``[o]``.
-        corners, normals, is_seen: filled.
+        faces: all but its planes are filled.
     """
+    corners, normals, is_seen, _ = faces
     for f in range(len(corners_obj)):
         T = pose[face_object[f]]
         for k in range(3):
@@ -134,18 +177,18 @@ def _test(f: int, centre: tuple[float, float, float], limits: tuple[float, float
 
 
 @kernel()
-def _draw_face(
-    f: int, corners: Array, intrinsics: Array, origin: Array, offsets: Array, plane: Array, work: Array, inverse_depth: Array, face_index: Array
-) -> None:
+def _draw_face(f: int, corners: Array, plane: Array, view: View, work: Array, samples: Samples) -> None:
     """Put one face wherever it is nearer than what was drawn before; ``work [4, s]`` is room for the steps."""
+    inverse_depth, face_index = samples
     height, width, _ = inverse_depth.shape
-    farthest, nearest = corners[f, :, 2].max(), corners[f, :, 2].min()
+    intrinsics, origin, offsets = view
+    farthest, nearest = corners[:, 2].max(), corners[:, 2].min()
     highest = 1.0 / max(nearest, intrinsics[4])
     # What lies before the near plane is cut off.
     limits = (1.0 / farthest, highest, highest if nearest < intrinsics[4] else np.inf)
     reach = np.empty(3)
     _steps(plane, offsets, work, reach)
-    first_row, end_row = _row_range(corners[f], intrinsics, origin, height)
+    first_row, end_row = _row_range(corners, intrinsics, origin, height)
     for row in range(first_row, end_row):
         first, last = _span(plane, reach, row, width)
         for col in range(first, last + 1):
@@ -156,25 +199,14 @@ def _draw_face(
 
 
 @kernel()
-def draw(
-    corners: Array,
-    ranges: Array,
-    is_seen: Array,
-    intrinsics: Array,
-    origin: Array,
-    offsets: Array,
-    planes: Array,
-    inverse_depth: Array,
-    face_index: Array,
-) -> None:
-    """Find the nearest face at every sample, among those faces in ``ranges [r, 2]`` (first, end) that are ``is_seen [f]``.
-
-    Fills ``planes [f, 3, 3]`` for those faces, ``inverse_depth`` and ``face_index [h, w, s]`` (-1 where there is none).
-    """
-    inverse_depth[:] = 0
-    face_index[:] = -1
+def draw(faces: Faces, ranges: Array, view: View, samples: Samples) -> None:
+    """Find the nearest face at every sample, among those seen in ``ranges [r, 2]`` (first, end); fills their planes, and ``samples``."""
+    corners, _, is_seen, planes = faces
+    intrinsics, origin, offsets = view
+    samples.inverse_depth[:] = 0
+    samples.face_index[:] = -1
     work = np.empty((4, len(offsets)), dtype=np.float32)
     for r in range(len(ranges)):
         for f in range(ranges[r, 0], ranges[r, 1]):
             if is_seen[f] and _setup(corners[f], intrinsics, origin, planes[f]):
-                _draw_face(f, corners, intrinsics, origin, offsets, planes[f], work, inverse_depth, face_index)
+                _draw_face(f, corners[f], planes[f], view, work, samples)

@@ -28,7 +28,7 @@ from torch import Tensor
 from torchtrack.config.settings import Settings
 from torchtrack.core.camera import Camera
 from torchtrack.errors import CalibrationError, MissingExtraError, ModelError, PoseError
-from torchtrack.sim.drawing import Drawer, Light, Region, merge_regions
+from torchtrack.sim.drawing import Drawer, Light, Picture, Region, merge_regions
 from torchtrack.sim.surface import Parts, merge_objects
 
 # The blur's weights beyond this many standard deviations are below 1e-4.
@@ -145,7 +145,7 @@ class Renderer:
         for region in regions:
             inside = [number for number, box in enumerate(boxes) if box is not None and box.overlaps(region)]
             sharp = self._sharp_background[region.slices].copy()
-            self._drawer.draw(region, inside, sharp, depth[region.slices], object_index[region.slices])
+            self._drawer.draw(region, inside, Picture(sharp, depth[region.slices], object_index[region.slices]))
             luminance[region.slices] = self._blurred_region(sharp, region)
         if scenery.brightness != 1:
             luminance *= np.float32(scenery.brightness)

@@ -5,19 +5,23 @@ from typing import NamedTuple
 import numpy as np
 
 from torchtrack.backends.numba.compiler import Array, kernel
+from torchtrack.sim.drawing import Picture
+from torchtrack.sim.rasterizer import Faces, Samples, View
 
 Triple = tuple[float, float, float]
 
 # No "nnan" and no "ninf": comparisons must keep their meaning for numbers that are not finite.
 _FAST = {"contract", "arcp", "nsz", "reassoc"}
 
+# What is called for every pixel takes arrays out of a tuple where it reads them: references to those kept under a name are counted each time.
+
 
 class Surface(NamedTuple):
-    """Look of ``f`` faces, camera frame; everything float32 but for the indices."""
+    """Faces, and the look of each; everything float32 but for the indices."""
 
+    faces: Faces
     uv: Array  # [f, 3, 2] texture coordinates of the corners, v downwards
     albedo: Array  # [f, 3] reflectance of the corners, which multiplies the texture
-    normals: Array  # [f, 3, 3] unit normals of the corners
     is_flat: Array  # [f] bool: the three normals are the same
     texture: Array  # [f, 3] int64: where its texture starts in ``texels``, its width and height
     texels: Array  # [n] reflectances of all textures, row by row
@@ -31,6 +35,14 @@ class Lighting(NamedTuple):
     ambient: float
     diffuse: float
     direction: Array  # [3] unit vector towards the light, camera frame
+
+
+class Pixel(NamedTuple):
+    """A pixel of the region, and the unit vector halfway between its directions to the light and to the camera."""
+
+    row: int
+    col: int
+    half: Triple
 
 
 @kernel(fastmath=_FAST)
@@ -113,8 +125,11 @@ def _half_vector(u: float, v: float, intrinsics: Array, light: Array) -> Triple:
 
 
 @kernel()
-def _vote(faces: Array, inverse_depth: Array, face_object: Array, depth: Array, object_index: Array, row: int, col: int) -> None:
-    """Give the pixel to whoever holds most of its samples; inverse depth is affine, so its mean is that of the centre."""
+def _vote(faces: Array, inverse_depth: Array, face_object: Array) -> tuple[int, float]:
+    """Number of the object that holds most samples of a pixel, and its depth; -1 and infinite for the background.
+
+    Inverse depth is affine, so its mean is that of the centre.
+    """
     best, most, inverse = -1, 0, 0.0
     for s in range(len(faces)):
         # Who comes after this many others cannot hold more.
@@ -128,15 +143,13 @@ def _vote(faces: Array, inverse_depth: Array, face_object: Array, depth: Array, 
                 total += inverse_depth[q]
         if count > most:
             best, most, inverse = owner, count, total
-    if best >= 0:
-        object_index[row, col] = best
-        depth[row, col] = most / inverse
+    return best, most / inverse
 
 
 @kernel(fastmath=_FAST)
 def _light(f: int, weights: Triple, half: Triple, surface: Surface, lighting: Lighting) -> tuple[float, float]:
     """Diffuse light and highlight on a face at barycentric ``weights`` (Blinn 1977)."""
-    nx, ny, nz = _normal(f, weights, surface.normals, surface.is_flat)
+    nx, ny, nz = _normal(f, weights, surface.faces.normals, surface.is_flat)
     light = lighting.direction
     lambert = max(nx * light[0] + ny * light[1] + nz * light[2], 0.0)
     shine = max(nx * half[0] + ny * half[1] + nz * half[2], 0.0)
@@ -146,17 +159,18 @@ def _light(f: int, weights: Triple, half: Triple, surface: Surface, lighting: Li
 
 
 @kernel(fastmath=_FAST)
-def _one_face(f: int, row: int, col: int, planes: Array, offsets: Array, half: Triple, surface: Surface, lighting: Lighting) -> float:
+def _one_face(f: int, pixel: Pixel, offsets: Array, surface: Surface, lighting: Lighting) -> float:
     """Luminance of a pixel that one face fills: light and corner values are taken at the centre, texture at every sample."""
-    centre = _weights(planes, f, col, row)
-    diffuse, highlight = _light(f, centre, half, surface, lighting)
+    row, col = pixel.row, pixel.col
+    centre = _weights(surface.faces.planes, f, col, row)
+    diffuse, highlight = _light(f, centre, pixel.half, surface, lighting)
     offset, width, height = surface.texture[f, 0], surface.texture[f, 1], surface.texture[f, 2]
     if width * height == 1:
         return _reflectance(f, centre, surface) * diffuse + highlight
     # Inside a pixel the texture coordinates are as good as affine.
     u, v = _coordinates(f, centre, surface.uv)
-    u_right, v_right = _coordinates(f, _weights(planes, f, col + 0.25, row), surface.uv)
-    u_below, v_below = _coordinates(f, _weights(planes, f, col, row + 0.25), surface.uv)
+    u_right, v_right = _coordinates(f, _weights(surface.faces.planes, f, col + 0.25, row), surface.uv)
+    u_below, v_below = _coordinates(f, _weights(surface.faces.planes, f, col, row + 0.25), surface.uv)
     total = 0.0
     for s in range(len(offsets)):
         dx, dy = 4 * offsets[s, 0], 4 * offsets[s, 1]
@@ -177,13 +191,12 @@ def _common_face(faces: Array) -> int:
 
 
 @kernel(fastmath=_FAST)
-def _some_faces(
-    faces: Array, row: int, col: int, planes: Array, offsets: Array, half: Triple, surface: Surface, lighting: Lighting
-) -> tuple[float, int]:
+def _some_faces(faces: Array, pixel: Pixel, offsets: Array, surface: Surface, lighting: Lighting) -> tuple[float, int]:
     """Sum of the luminances of the samples that show a face, and how many there are.
 
     Light is taken once per face, in the middle of its samples; texture at every sample.
     """
+    row, col = pixel.row, pixel.col
     total, covered = 0.0, 0
     done = np.uint64(0)
     for s in range(len(faces)):
@@ -197,8 +210,8 @@ def _some_faces(
                 count += 1
                 x += offsets[q, 0]
                 y += offsets[q, 1]
-        weights = _weights(planes, f, col + x / count, row + y / count)
-        diffuse, highlight = _light(f, weights, half, surface, lighting)
+        weights = _weights(surface.faces.planes, f, col + x / count, row + y / count)
+        diffuse, highlight = _light(f, weights, pixel.half, surface, lighting)
         covered += count
         total += count * highlight
         if surface.texture[f, 1] * surface.texture[f, 2] == 1:
@@ -206,38 +219,29 @@ def _some_faces(
             continue
         for q in range(s, len(faces)):
             if faces[q] == f:
-                total += diffuse * _reflectance(f, _weights(planes, f, col + offsets[q, 0], row + offsets[q, 1]), surface)
+                total += diffuse * _reflectance(f, _weights(surface.faces.planes, f, col + offsets[q, 0], row + offsets[q, 1]), surface)
     return total, covered
 
 
 @kernel(fastmath=_FAST)
-def shade(
-    face_index: Array,
-    inverse_depth: Array,
-    planes: Array,
-    offsets: Array,
-    surface: Surface,
-    lighting: Lighting,
-    intrinsics: Array,
-    origin: Array,
-    luminance: Array,
-    depth: Array,
-    object_index: Array,
-) -> None:
-    """Average the samples of every pixel into ``luminance`` (which holds the background), ``depth`` and ``object_index [h, w]``."""
-    height, width, samples = face_index.shape
+def shade(samples: Samples, surface: Surface, lighting: Lighting, view: View, picture: Picture) -> None:
+    """Average the samples of every pixel into the picture, which holds the background."""
+    inverse_depth, face_index = samples
+    intrinsics, origin, offsets = view
+    luminance, depth, object_index = picture
+    height, width, count = face_index.shape
     for row in range(height):
         for col in range(width):
             faces = face_index[row, col]
             common = _common_face(faces)
             if common == -1:
                 continue
-            half = _half_vector(origin[0] + col, origin[1] + row, intrinsics, lighting.direction)
+            pixel = Pixel(row, col, _half_vector(origin[0] + col, origin[1] + row, intrinsics, lighting.direction))
             if common >= 0:
-                luminance[row, col] = _one_face(common, row, col, planes, offsets, half, surface, lighting)
+                luminance[row, col] = _one_face(common, pixel, offsets, surface, lighting)
                 object_index[row, col] = surface.face_object[common]
-                depth[row, col] = samples / inverse_depth[row, col].sum()
+                depth[row, col] = count / inverse_depth[row, col].sum()
                 continue
-            total, covered = _some_faces(faces, row, col, planes, offsets, half, surface, lighting)
-            luminance[row, col] = (total + (samples - covered) * luminance[row, col]) / samples
-            _vote(faces, inverse_depth[row, col], surface.face_object, depth, object_index, row, col)
+            total, covered = _some_faces(faces, pixel, offsets, surface, lighting)
+            luminance[row, col] = (total + (count - covered) * luminance[row, col]) / count
+            object_index[row, col], depth[row, col] = _vote(faces, inverse_depth[row, col], surface.face_object)
