@@ -75,9 +75,6 @@ class MeshEdges:
     is_crease: np.ndarray
 
 
-NO_EDGES = MeshEdges(np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), np.zeros(0, dtype=bool))
-
-
 def contour_edges(surface: Surface, table: EdgeTable, crease_angle_deg: float, drop_concave: bool) -> MeshEdges:
     """The edges of ``table`` that can be a contour or are a crease.
 

@@ -1,7 +1,7 @@
 """The object model that the tracker works with."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +13,11 @@ from torch import Tensor
 from torchtrack.errors import ModelError
 from torchtrack.object_model.colour_edges import colour_edges
 from torchtrack.object_model.loading import MESH_SUFFIXES, check_file, join_parts, load_parts, mesh_parts, place_part
-from torchtrack.object_model.mesh_edges import NO_EDGES, EdgeTable, MeshEdges, contour_edges
+from torchtrack.object_model.mesh_edges import EdgeTable, contour_edges
 from torchtrack.object_model.notices import tell
 from torchtrack.object_model.placement import Placement
 from torchtrack.object_model.polylines import POLYLINE_SUFFIXES, as_polylines, has_obj_lines, read_polylines, segments_of
-from torchtrack.object_model.sampling import NO_SAMPLES, sample_surface
+from torchtrack.object_model.sampling import sample_surface
 from torchtrack.object_model.settings import ModelSettings, Unit
 from torchtrack.object_model.surface import Surface, surface_from_parts
 from torchtrack.object_model.surface_points import NO_POINTS, SurfacePoints, join_points, thin_out
@@ -27,7 +27,6 @@ from torchtrack.object_model.winding import turn_outwards
 # Points on texture edges nearer than this fraction of the diameter see the same pixels.
 _SPACING_FRACTION = 0.0025
 _COLOUR_PIXELS = 4
-NO_TRIANGLES = np.zeros((0, 3, 3))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -138,13 +137,20 @@ class ObjectModel:
         for part in parts:
             place_part(part, factor, origin)
         surface, table, outwards = turn_outwards(surface_from_parts(parts), name)
-        return cls._assemble(
-            name,
-            surface.vertices[np.unique(surface.faces)],
-            edges=contour_edges(surface, table, settings.crease_angle_deg, drop_concave=outwards),
-            printed=_print_edges(surface, table, settings, name),
-            samples=sample_surface(surface, settings.surface_point_count),
-            triangles=surface.corners,
+        edges = contour_edges(surface, table, settings.crease_angle_deg, drop_concave=outwards)
+        printed = _print_edges(surface, table, settings, name)
+        points, normals = sample_surface(surface, settings.surface_point_count)
+        return replace(
+            cls._bare(name, surface.vertices[np.unique(surface.faces)]),
+            edge_points=_tensor(edges.points),
+            edge_normals=_tensor(edges.normals),
+            edge_is_crease=torch.from_numpy(edges.is_crease),
+            texture_points=_tensor(printed.points),
+            texture_tangents=_tensor(printed.tangents),
+            texture_normals=_tensor(printed.normals),
+            surface_points=_tensor(points),
+            surface_normals=_tensor(normals),
+            triangles=_tensor(surface.corners),
             mesh=_drawable(parts, surface),
         )
 
@@ -181,39 +187,29 @@ class ObjectModel:
             raise ModelError(f"'{name}' has no line segments. Give at least one polyline of two different points.")
         factor, origin = Placement(stated or unit, scale, centre).metres(segments.reshape(-1, 3), name)
         points = segments.reshape(-1, 3) * factor - origin
-        return cls._assemble(name, points, segments=points.reshape(-1, 2, 3))
+        return replace(cls._bare(name, points), segments=_tensor(points.reshape(-1, 2, 3)))
 
     @classmethod
-    def _assemble(
-        cls,
-        name: str,
-        extent: np.ndarray,
-        *,
-        edges: MeshEdges = NO_EDGES,
-        printed: SurfacePoints = NO_POINTS,
-        segments: np.ndarray = NO_EDGES.points,
-        samples: tuple[np.ndarray, np.ndarray] = NO_SAMPLES,
-        triangles: np.ndarray = NO_TRIANGLES,
-        mesh: trimesh.Trimesh | None = None,
-    ) -> "ObjectModel":
-        """The model with the given parts, whose bounding box is that of ``extent [n, 3]``."""
+    def _bare(cls, name: str, extent: np.ndarray) -> "ObjectModel":
+        """A model with nothing on it yet, whose bounding box is that of ``extent [n, 3]``."""
         low, high = extent.min(0), extent.max(0)
+        points, pairs = _tensor(np.zeros((0, 3))), _tensor(np.zeros((0, 2, 3)))
         return cls(
             name=name,
             centre=_tensor((low + high) / 2),
             half_extent=_tensor((high - low) / 2),
             diameter_m=float(np.linalg.norm(high - low)),
-            edge_points=_tensor(edges.points),
-            edge_normals=_tensor(edges.normals),
-            edge_is_crease=torch.from_numpy(edges.is_crease),
-            texture_points=_tensor(printed.points),
-            texture_tangents=_tensor(printed.tangents),
-            texture_normals=_tensor(printed.normals),
-            segments=_tensor(segments),
-            surface_points=_tensor(samples[0]),
-            surface_normals=_tensor(samples[1]),
-            triangles=_tensor(triangles),
-            mesh=mesh,
+            edge_points=pairs,
+            edge_normals=pairs,
+            edge_is_crease=torch.zeros(0, dtype=torch.bool),
+            texture_points=points,
+            texture_tangents=points,
+            texture_normals=points,
+            segments=pairs,
+            surface_points=points,
+            surface_normals=points,
+            triangles=_tensor(np.zeros((0, 3, 3))),
+            mesh=None,
         )
 
 

@@ -4,8 +4,6 @@ import numpy as np
 
 from torchtrack.object_model.surface import Surface
 
-NO_SAMPLES = np.zeros((0, 3)), np.zeros((0, 3))
-
 
 def sample_surface(surface: Surface, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """``count`` points and their unit normals, each ``[N, 3]``: uniform over the area, the same every time.
