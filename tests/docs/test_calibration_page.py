@@ -13,6 +13,7 @@ from torchtrack.cli.main import main
 from torchtrack.core.camera import Camera, undistort
 from torchtrack.io import read_calibration
 from torchtrack.io.convert import convert
+from torchtrack.io.formats import Input
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "calibration.md"
 TRUE = Camera(331.0, 330.6, 170.2, 131.6, 346, 260, "plumb_bob", (-0.36, 0.14, 0.0005, -0.0008, 0.0))
@@ -62,7 +63,7 @@ def calibrated(tmp_path_factory):
         parts.append((x[mixed], y[mixed], 200_000 * number + np.sort(random.integers(1, 200_000, len(x)))))
     x, y, t_us = (np.concatenate(values) for values in zip(*parts, strict=True))
     np.savez(folder / "board.npz", x=x.astype(np.uint16), y=y.astype(np.uint16), t=t_us, p=np.arange(len(t_us)) % 2)
-    convert(folder / "board.npz", folder / "board.raw", width=TRUE.width, height=TRUE.height)
+    convert(Input(folder / "board.npz", TRUE.width, TRUE.height), folder / "board.raw")
     (code,) = re.findall(r"^```python file calibrate.py\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     (folder / "calibrate.py").write_text(code, encoding="utf-8")
     done = subprocess.run([sys.executable, "calibrate.py"], cwd=folder, capture_output=True, text=True, check=False)

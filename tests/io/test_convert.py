@@ -17,6 +17,7 @@ from torchtrack.core.events import EventBatch
 from torchtrack.errors import EventDataError, UnknownFormatError
 from torchtrack.io import open_events, read_sequence
 from torchtrack.io.convert import WRITERS, convert
+from torchtrack.io.formats import Input
 from torchtrack.io.writers.base import EventWriter
 
 LIBRARIES = {"aedat4": ("dv_processing", "lz4.frame")}
@@ -174,7 +175,7 @@ def test_an_unknown_suffix_lists_the_known_ones(tmp_path, data_dir):
 def test_nothing_is_left_where_a_conversion_fails(tmp_path):
     (tmp_path / "bad.txt").write_text("0.1 1 1 1\n0.2 1 2\n")
     with pytest.raises(EventDataError, match="line 2"):
-        convert(tmp_path / "bad.txt", tmp_path / "out.npz", strict=True)
+        convert(Input(tmp_path / "bad.txt", strict=True), tmp_path / "out.npz")
     assert [path.name for path in tmp_path.iterdir()] == ["bad.txt"]
 
 

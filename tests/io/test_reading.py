@@ -8,6 +8,7 @@ from helpers import random_events
 from torchtrack.io import open_events
 from torchtrack.io.columns import Columns
 from torchtrack.io.convert import WRITERS, convert
+from torchtrack.io.formats import Input
 from torchtrack.io.reading import Reading
 
 SUFFIX = {"evt2": ".raw", "evt3": ".raw", "aedat4": ".aedat4", "dsec": ".h5", "npz": ".npz", "csv": ".csv"}
@@ -76,7 +77,7 @@ def test_facts_and_conversions_say_how_far_they_are(events, tmp_path):
     open_events(tmp_path / "events.raw", 64, 48).info(max_events=1000, progress=shares.append)
     assert shares == [1.0]
     shares.clear()
-    convert(tmp_path / "events.raw", tmp_path / "events.npz", width=64, height=48, progress=shares.append)
+    convert(Input(tmp_path / "events.raw", 64, 48), tmp_path / "events.npz", progress=shares.append)
     assert shares[-1] > 0.95 and shares == sorted(shares)
 
 

@@ -84,7 +84,7 @@ def measure(setup: Setup) -> Report:
     for count, columns, streams in SCENES[setup.device.type]:
         name = f"{count * streams} objects"
         setup.show(name)
-        run = started(simulated(SHAPES[:1] if count == 1 else shapes_of(count), columns), setup.device, streams)
+        run = started([simulated(SHAPES[:1] if count == 1 else shapes_of(count), columns)] * streams, setup.device)
         results += [Result(f"{name}: windows in which there is any {what}", "%", (100 * share,)) for what, share in _failures(run).items()]
         stages, kernels, launched = _profiled(setup, run)
         results += [time_result(f"{name}: {stage}", [seconds]) for stage, seconds in stages]

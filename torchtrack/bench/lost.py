@@ -6,6 +6,7 @@ stream, so that none is found where another one is.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,7 +14,6 @@ import torch
 from torchtrack.bench.results import Report, Result, time_result
 from torchtrack.bench.scene import Run, Scene, simulated, started
 from torchtrack.bench.setup import Setup
-from torchtrack.core.events import EventBatch
 from torchtrack.tracking.validation.status import Status
 
 SHAPES = ("lbracket", "cube", "satellite", "robot", "book", "wedge", "mug", "animal")
@@ -48,8 +48,8 @@ def _case(setup: Setup, scene: Scene, shape: str) -> tuple[list[Result], str]:
     name = f"{count} objects, {shape} lost" + (f" in {lost_in} of {streams} streams" if streams > 1 else "")
     setup.show(name)
     number = SHAPES.index(shape)
-    hidden = [_without(scene, number)] * lost_in
-    runs = [started(scene, setup.device, streams, first_streams=events).after(KNOWN_AFTER) for events in ([], hidden)]
+    with_lost = [_without(scene, number)] * lost_in + [scene] * (streams - lost_in)
+    runs = [started(scenes, setup.device).after(KNOWN_AFTER) for scenes in ([scene] * streams, with_lost)]
     times = np.array([[run.latencies(setup.clock) for run in runs] for _ in range(setup.repeats)])
     parts = {"in the first second": times[..., :SOON], "later": times[..., SOON:]}
     results = [result for when, part in parts.items() for result in _results(f"{count} objects, none lost (beside {shape})", name, when, part)]
@@ -66,11 +66,12 @@ def _results(none: str, lost: str, when: str, times: np.ndarray) -> Iterator[Res
         yield Result(f"{lost}, {when}, {what} over none lost", "times", ratios, most, lower_is_better=True)
 
 
-def _without(scene: Scene, number: int) -> EventBatch:
-    """The events of a scene, without those of an object from :data:`HIDDEN_FROM_US` on."""
+def _without(scene: Scene, number: int) -> Scene:
+    """The scene without the events of an object from :data:`HIDDEN_FROM_US` on."""
     if scene.source is None:
         raise ValueError("of a scene that was read, it is not known which object an event is of.")
-    return scene.events[(scene.source != number) | (scene.events.t_us <= HIDDEN_FROM_US)]
+    kept = (scene.source != number) | (scene.events.t_us <= HIDDEN_FROM_US)
+    return replace(scene, events=scene.events[kept], source=scene.source[kept])
 
 
 def _lost_ratio(run: Run, number: int) -> float:

@@ -95,7 +95,7 @@ def _latency(setup: Setup, case: _Case) -> _Part:
     """Median and 95 % of the time of a step, each once per repeat, and how well it tracked."""
     name = case.full_name
     setup.show(name)
-    run = started(case.scene, setup.device, case.streams, compiled=case.compiled, kernels=case.kernels, searches=case.searches)
+    run = started([case.scene] * case.streams, setup.device, compiled=case.compiled, kernels=case.kernels, searches=case.searches)
     quality = run.quality(setup.clock)
     repeats = [run.latencies(setup.clock) for _ in range(setup.repeats)]
     median, p95 = ([float(value) for value in np.quantile(repeats, share, axis=1)] for share in (0.5, 0.95))
@@ -118,7 +118,7 @@ def _outside(setup: Setup) -> _Part:
     """How many times longer a step takes with events that are near no object."""
     scene = simulated(SHAPES[:1])
     setup.show("events outside the object")
-    runs = [started(with_events_outside(scene, rate), setup.device) for rate in (0.0, *OUTSIDE_MEV_S)]
+    runs = [started([with_events_outside(scene, rate)], setup.device) for rate in (0.0, *OUTSIDE_MEV_S)]
     # Turn by turn, so that a machine that gets slower does so for all.
     medians = np.array([[np.median(run.latencies(setup.clock)) for run in runs] for _ in range(setup.repeats)])
     ratios = medians[:, 1:] / medians[:, :1]
@@ -133,7 +133,7 @@ def _real_time(setup: Setup, compiled: bool) -> _Part:
     setup.show(name)
     scene = simulated(SHAPES[:1], size=HD)
     scene = with_events_outside(scene, max(HD_MEV_S - scene.mev_per_s, 0))
-    run = started(scene, setup.device, compiled=compiled)
+    run = started([scene], setup.device, compiled=compiled)
     start_us = int(run.state.t_us[0])
     stream = scene.events.slice_time(start_us, scene.end_us)
     factors = []

@@ -36,7 +36,7 @@ def measure(setup: Setup) -> Report:
 def _of_run(setup: Setup, name: str, scene: Scene, streams: int) -> tuple[Result, str]:
     """Median time of a step, once per repeat, and how well it tracked."""
     setup.show(name)
-    run = started(scene, setup.device, streams)
+    run = started([scene] * streams, setup.device)
     run = replace(run, windows=run.windows[:_WINDOWS])
     quality = run.quality(setup.clock)
     medians = [float(np.median(run.latencies(setup.clock))) for _ in range(setup.repeats)]

@@ -249,45 +249,33 @@ class Run:
         return torch.stack([rotation_angle_deg(estimated[:, :3, :3], expected[:, :3, :3]), 1e3 * (estimated - expected)[:, :3, 3].norm(dim=-1)], -1)
 
 
-def started(
-    scene: Scene,
-    device: torch.device,
-    streams: int = 1,
-    *,
-    compiled: bool = False,
-    kernels: bool = True,
-    searches: bool = True,
-    first_streams: Sequence[EventBatch] = (),
-) -> Run:
-    """A tracker that follows the scene, after its first windows.
+def started(scenes: Sequence[Scene], device: torch.device, *, compiled: bool = False, kernels: bool = True, searches: bool = True) -> Run:
+    """A tracker that follows scenes of the same time, after its first windows.
 
     Args:
-        scene: the scene.
+        scenes: what the camera of each stream sees.
         device: where the tracker runs.
-        streams: how many cameras see the same scene, each in a stream of its own.
         compiled: whether steady windows are taken by compiled graphs.
         kernels: whether kernels of a backend are used where they apply.
         searches: whether lost objects are searched for.
-        first_streams: events of the first streams, where they are not those of the scene.
 
     Raises:
-        ConfigError: if the scene ends with its first windows.
+        ConfigError: if the scenes end with their first windows.
     """
-    count = len(scene.models)
-    index = [stream for stream in range(streams) for _ in range(count)]
+    first, models = scenes[0], [model for scene in scenes for model in scene.models]
+    index = [stream for stream, scene in enumerate(scenes) for _ in scene.models]
     config = TrackerConfig() if searches else TrackerConfig(relocalization=RelocalizationConfig(hypotheses=0))
-    tracker = Tracker(scene.models * streams, [scene.camera] * streams, config, index, compiled=compiled, kernels=kernels).to(device)
-    state = tracker.init(scene.T_cam_obj.repeat(streams, 1, 1), scene.start_us)
+    tracker = Tracker(models, [scene.camera for scene in scenes], config, index, compiled=compiled, kernels=kernels).to(device)
+    state = tracker.init(torch.cat([scene.T_cam_obj for scene in scenes]), first.start_us)
     tracker.prepare(state)
-    seen = [*(replace(scene, events=events) for events in first_streams), *[scene] * (streams - len(first_streams))]
     windows = []
-    for together in zip(*(of_stream.windows(tracker.config.window.duration_us) for of_stream in seen), strict=True):
+    for together in zip(*(scene.windows(tracker.config.window.duration_us) for scene in scenes), strict=True):
         events = concatenate([own.of_stream(stream) for stream, (own, _) in enumerate(together)])
         windows.append((events.to(device), together[0][1]))
     if len(windows) <= WARM_UP_WINDOWS:
         needed = f"more than {WARM_UP_WINDOWS} windows of {tracker.config.window.duration_us} µs"
-        raise ConfigError(f"there is nothing to measure: {needed} are needed, and the scene lasts {scene.end_us - scene.start_us} µs.")
+        raise ConfigError(f"there is nothing to measure: {needed} are needed, and the scene lasts {first.end_us - first.start_us} µs.")
     with torch.inference_mode():
         for events, end_us in windows[:WARM_UP_WINDOWS]:
             state, _ = tracker.step(state, events, end_us)
-    return Run(tracker, state, windows[WARM_UP_WINDOWS:], scene.truth)
+    return Run(tracker, state, windows[WARM_UP_WINDOWS:], first.truth)

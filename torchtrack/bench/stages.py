@@ -30,12 +30,12 @@ def measure(setup: Setup) -> Report:
 
 def _runs(setup: Setup) -> Iterator[tuple[str, Run]]:
     if setup.sequence is not None:
-        yield setup.sequence.stem, started(read(setup.sequence), setup.device)
+        yield setup.sequence.stem, started([read(setup.sequence)], setup.device)
         return
     for shape in SHAPES:
-        yield f"1 object ({shape})", started(simulated((shape,)), setup.device)
+        yield f"1 object ({shape})", started([simulated((shape,))], setup.device)
     for count, columns in MANY:
-        yield f"{count} objects", started(simulated(shapes_of(count), columns), setup.device)
+        yield f"{count} objects", started([simulated(shapes_of(count), columns)], setup.device)
 
 
 def _of_run(setup: Setup, name: str, run: Run) -> list[Result]:

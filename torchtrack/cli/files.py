@@ -12,7 +12,6 @@ from torchtrack.cli.console import OutputConsole, output_console
 from torchtrack.cli.exit_codes import ExitCode
 from torchtrack.cli.picture import check_picture, write_picture
 from torchtrack.cli.progress import progress_shown, share_of
-from torchtrack.config.events import ReadingConfig
 from torchtrack.config.formats import OutputFormat
 from torchtrack.core.atomic import check_other_file
 from torchtrack.core.camera import undistortion_table
@@ -21,24 +20,13 @@ from torchtrack.core.windows import clipped
 from torchtrack.errors import EventDataError, TorchtrackWarning
 from torchtrack.io.calibration import read_calibration
 from torchtrack.io.convert import convert
-from torchtrack.io.event_file import DEFAULT_CHOICES, EventFile
-from torchtrack.io.formats import FORMAT_NAMES, open_events
+from torchtrack.io.event_file import EventFile
+from torchtrack.io.formats import FORMAT_NAMES, Input
 from torchtrack.io.info import EventInfo, as_plain
 from torchtrack.io.raw_file import RawFile
 from torchtrack.viz.event_picture import SHOWN_US, draw_events, soonest_event
 
 _ONE_POLARITY = " (all alike: polarity may be coded in another way, --polarity)"
-
-
-@dataclass(frozen=True)
-class Input:
-    """A file of events, and how it is read; see :func:`torchtrack.io.open_events`."""
-
-    path: Path
-    width: int | None = None
-    height: int | None = None
-    strict: bool = False
-    choices: ReadingConfig = DEFAULT_CHOICES
 
 
 @dataclass(frozen=True)
@@ -61,7 +49,7 @@ def info(file: Input, max_events: int | None, picture: EventPicture | None = Non
     if picture is not None:
         check_other_file(file.path, picture.path)
         check_picture(picture.path)
-    source = open_events(file.path, file.width, file.height, file.strict, file.choices)
+    source = file.open()
     with warnings.catch_warnings(), progress_shown(quiet=quiet, kernels=False) as progress:
         # What is wrong is part of the facts.
         warnings.simplefilter("ignore", TorchtrackWarning)
@@ -140,7 +128,7 @@ def convert_file(source: Input, target: str, format: OutputFormat | None, *, qui
         # Said below, with the counts.
         warnings.filterwarnings("ignore", ".*(some of it was left out|it was mended)", TorchtrackWarning)
         shown = share_of(progress, f"converting {source.path.name}")
-        done = convert(source.path, target, format, source.width, source.height, source.strict, source.choices, shown)
+        done = convert(source, target, format, shown)
     console = output_console()
     console.print(f"{done.count:,} events are in {target} ({done.format})")
     if done.problems is not None and done.problems.counts:

@@ -53,7 +53,8 @@ class Info:
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
         with starting(quiet=self.quiet):
-            from torchtrack.cli.files import EventPicture, Input, info
+            from torchtrack.cli.files import EventPicture, info
+            from torchtrack.io.formats import Input
 
         refuse_settings(overrides)
         if self.picture is None and (self.at_us is not None or self.calibration is not None):
@@ -93,7 +94,8 @@ class Convert:
     def run(self, overrides: dict[str, Any]) -> int:
         """Carry the command out; returns the exit code."""
         with starting(quiet=self.quiet):
-            from torchtrack.cli.files import Input, convert_file
+            from torchtrack.cli.files import convert_file
+            from torchtrack.io.formats import Input
 
         refuse_settings(overrides)
         choices = _choices(self.time_unit, self.polarity, self.topic)

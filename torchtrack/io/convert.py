@@ -10,15 +10,13 @@ from typing import Any, get_args
 
 import numpy as np
 
-from torchtrack.config.events import ReadingConfig
 from torchtrack.config.formats import OutputFormat
 from torchtrack.core.atomic import check_other_file, temporary_folder, writing
 from torchtrack.core.events import EventBatch
 from torchtrack.errors import UnknownFormatError
 from torchtrack.io.container import ContainerWriter, is_container, read_source
-from torchtrack.io.event_file import DEFAULT_CHOICES
 from torchtrack.io.event_source import DEFAULT_CHUNK_EVENTS, EventSource
-from torchtrack.io.formats import open_events
+from torchtrack.io.formats import Input
 from torchtrack.io.npz import keys_of, open_archive, stream_array
 from torchtrack.io.problems import Problems
 from torchtrack.io.reading import Progress, Reading
@@ -55,13 +53,9 @@ class Conversion:
 
 
 def convert(
-    source: str | os.PathLike[str],
+    source: str | os.PathLike[str] | Input,
     target: str | os.PathLike[str],
     format: OutputFormat | None = None,
-    width: int | None = None,
-    height: int | None = None,
-    strict: bool = False,
-    choices: ReadingConfig = DEFAULT_CHOICES,
     progress: Progress | None = None,
 ) -> Conversion:
     """Write the events of one file into another, and all else of a sequence where both are sequences.
@@ -70,11 +64,10 @@ def convert(
     HDF5; other formats take its events alone.
 
     Args:
-        source: the file to read; see :func:`torchtrack.io.open_events`.
+        source: the file to read; an :class:`~torchtrack.io.formats.Input` also says how.
         target: the file to write.
         format: its format; by default as its suffix says: ``.raw`` is EVT3, ``.h5`` a sequence if the source is one, else
             the layout of DSEC.
-        width, height, strict, choices: as :func:`torchtrack.io.open_events` takes them.
         progress: called with the share of the input that is done.
 
     Raises:
@@ -82,23 +75,23 @@ def convert(
         OutputError: if the target is the source, or cannot be written.
         TorchtrackError: what reading or writing raises.
     """
-    source, target = Path(source), Path(target)
-    check_other_file(source, target)
+    file, target = source if isinstance(source, Input) else Input(Path(source)), Path(target)
+    check_other_file(file.path, target)
     # Where its events are from is copied beside them: none may be left out, nor change places.
-    sequence = read_sequence(source, strict=True, choices=choices) if is_sequence(source) else None
+    sequence = read_sequence(file.path, strict=True, choices=file.choices) if is_sequence(file.path) else None
     chosen = _format(target, format, sequence is not None)
-    events: EventSource = sequence.events if sequence else open_events(source, width, height, strict, choices)
+    events: EventSource = sequence.events if sequence else file.open()
     chunks = _shown(events, progress)
     with temporary_folder(target) as folder, writing(target):
         written = folder / target.name
         if sequence is not None and chosen in ("npz", "sequence"):
-            count = _write_sequence(sequence, chunks, source, written, chosen)
+            count = _write_sequence(sequence, chunks, file.path, written, chosen)
         else:
             with closing(WRITERS[chosen](written, events.width, events.height)) as writer:
                 count = _copy(chunks, writer.write)
         # The file that names the others comes last: whoever sees it finds them.
-        for file in sorted((file for file in written.parent.iterdir() if file.is_file()), key=lambda file: file == written):
-            file.replace(target.parent / file.name)
+        for made in sorted((path for path in written.parent.iterdir() if path.is_file()), key=lambda path: path == written):
+            made.replace(target.parent / made.name)
     return Conversion(chosen, count, getattr(events, "problems", None))
 
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
 from typing import cast
@@ -75,6 +76,21 @@ def open_events(
     """
     path = Path(path)
     return reader_of(path)(path, width or 0, height or 0, strict, choices=choices)
+
+
+@dataclass(frozen=True)
+class Input:
+    """A file of events, and how it is read; see :func:`open_events`."""
+
+    path: Path
+    width: int | None = None
+    height: int | None = None
+    strict: bool = False
+    choices: ReadingConfig = DEFAULT_CHOICES
+
+    def open(self) -> EventFile:
+        """The file, as :func:`open_events` opens it."""
+        return open_events(self.path, self.width, self.height, self.strict, self.choices)
 
 
 def reader_of(path: Path) -> Callable[..., EventFile]:

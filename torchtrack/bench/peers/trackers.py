@@ -36,7 +36,7 @@ def compare(comparison: Comparison) -> None:
     if rapid is None:
         return
     scene = simulated((SHAPE,))
-    run = started(scene, setup.device)
+    run = started([scene], setup.device)
     setup.show(f"{name}torchtrack")
     ours = time_result(f"{name}torchtrack", [float(np.median(run.latencies(setup.clock))) for _ in range(setup.repeats)])
     comparison.results.append(ours)
