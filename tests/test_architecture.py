@@ -38,8 +38,9 @@ ORDER = (
     ("cli",),
     ("__main__",),
 )
-# A function that needs more is two, or its arguments are one thing without a name. A tracker's are a user's options, most of them left out.
-MOST_ARGUMENTS, OF_USERS = 7, {"tracking.tracker.__init__"}
+# A function that needs more is two, or its arguments are one thing without a name. These have a user's options, most of them left out.
+MOST_ARGUMENTS = 6
+OF_USERS = {"tracking.tracker.__init__", "viz.overlay.overlay_objects", "viz.overlay.draw_overlay", "cli.simulate.simulate", "cli.track.track_many"}
 PLACES = {name: place for place, names in enumerate(ORDER) for name in names}
 
 
@@ -95,9 +96,10 @@ def functions(module: str) -> Iterator[tuple[str, int]]:
             yield f"{module}.{node.name}", len(names) - (names[:1] in (["self"], ["cls"]))
 
 
-def test_no_function_of_tracking_takes_too_many_arguments():
-    taken = {name: count for module in MODULES if module.startswith("tracking") for name, count in functions(module)}
-    assert len(taken) > 300
+def test_no_function_takes_too_many_arguments():
+    # A launch of Triton's takes pointers and sizes, each by itself.
+    taken = {name: count for module in MODULES if not module.startswith("backends.triton.") for name, count in functions(module)}
+    assert len(taken) > 2000
     assert {name for name, count in taken.items() if count > MOST_ARGUMENTS} == OF_USERS
 
 

@@ -19,6 +19,7 @@ from torchtrack.tracking.frontend.corners import no_corners
 from torchtrack.tracking.motion.predict import forecast
 from torchtrack.tracking.relocalization.lost_objects import Relocalized
 from torchtrack.tracking.update import conclude
+from torchtrack.tracking.validation.measures import visible_ratio
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import Status
 
@@ -141,7 +142,8 @@ def random_find(tracker, prediction, dtype):
     measured[0], measured[1], measured[5], inlier_ratio[2] = 0.05, 0.3, torch.nan, torch.nan
     elsewhere = torch.arange(OBJECTS) % 3 == 0
     reference_inlier_ratio, apart, agreement, required_spread = (uniform(OBJECTS, seed=seed).to(dtype) for seed in (26, 30, 32, 31))
-    stated = measured, torch.ones_like(measured), count, inlier_ratio, reference_inlier_ratio, apart, agreement, required_spread
+    visible = visible_ratio(contours, tracker.objects.image_sizes).to(dtype)
+    stated = measured, torch.ones_like(measured), count, inlier_ratio, reference_inlier_ratio, apart, agreement, visible, required_spread
     return ScoredFit(Fit(solution, contours, matches), *stated, elsewhere)
 
 

@@ -22,7 +22,6 @@ from torchtrack.tracking.motion.prediction import Prediction
 from torchtrack.tracking.relocalization.lost_objects import Relocalized
 from torchtrack.tracking.state import StepResult, TrackerState
 from torchtrack.tracking.validation.health import TrackHealth
-from torchtrack.tracking.validation.measures import visible_ratio
 from torchtrack.tracking.validation.scored_fit import ScoredFit
 from torchtrack.tracking.validation.status import Status
 from torchtrack.tracking.validation.verdict import Limits, Measured, Verdict, remembered, seen_well, verdict
@@ -83,7 +82,7 @@ def measured_of(located: Relocalized) -> Measured:
         inlier_ratio=scored.inlier_ratio,
         reference_inlier_ratio=scored.reference_inlier_ratio,
         texture_agreement=scored.texture_agreement,
-        in_view=visible_ratio(scored.fit.contours, prediction.objects.image_sizes),
+        in_view=scored.visible_ratio,
         gate_scale=located.gate_scale,
         rotated_rad=rotated_rad,
         moved_diameters=moved_m / prediction.objects.diameter_m,

@@ -1,5 +1,7 @@
 """Arrival flow pixel by pixel: :func:`torchtrack.tracking.frontend.arrival_flow.arrival_flow`."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -25,30 +27,59 @@ _TOTAL, _X, _Y, _T, _XX, _XY, _YY, _XT, _YT, _A, _B, _C, _DETERMINANT, _SPREAD, 
 )
 
 
+class PointArrays(NamedTuple):
+    """Pixels that flow is asked for at, ``[b, n, 2]``; polarities, where known, and which exist: ``[b, n]``."""
+
+    pixels: Array
+    polarity: Array
+    mask: Array
+
+
+class SensorArrays(NamedTuple):
+    """What sensors of a size know: ages of bursts ``[s, 2, h*w]``, pixels without distortion ``[s, h*w*2]``; and the stream of each object."""
+
+    size: tuple[int, int]
+    ages_us: Array
+    ideal_pixels: Array
+    stream_index: Array
+
+
+class Fitted(NamedTuple):
+    """What planes are fitted to, in rows of :data:`LANES`: offsets (px), times (s), 1 for those that take part, and weights."""
+
+    x: Array
+    y: Array
+    times_s: Array
+    counts: Array
+    weights: Array
+
+
+class Around(NamedTuple):
+    """The pixels around another one: how far each is from it, ``[k]``, and which of them are on the sensor."""
+
+    steps: Array
+    inside: Array
+
+
+class Offsets(NamedTuple):
+    """Where offsets of pixels, and how much later the edge came there (µs), are written, every :data:`LANES`-th place."""
+
+    x: Array
+    y: Array
+    later_us: Array
+
+
 @kernel(fastmath=FAST)
-def flow_at(
-    pixels: Array,
-    polarity: Array,
-    mask: Array,
-    ages_us: Array,
-    stream_index: Array,
-    ideal_pixels: Array,
-    size: tuple[int, int],
-    around: Array,
-    settings: ArrivalSettings,
-    flow: Array,
-    valid: Array,
-) -> None:
+def flow_at(points: PointArrays, sensors: SensorArrays, around: Array, settings: ArrivalSettings, flow: Array, valid: Array) -> None:
     """Fill ``flow [b, n, 2]`` and ``valid [b, n]``, which are zero so far.
 
     Args:
-        ages_us, ideal_pixels: ``[s, 2, h*w]`` and ``[s, h*w*2]`` of sensors of ``size``.
         around: ``[2, k]``, offsets of the pixels that take part.
     """
-    (height, width), count = size, around.shape[1]
+    (pixels, polarity, mask), ((height, width), ages_us, ideal_pixels, stream_index), count = points, sensors, around.shape[1]
     places = -(-count // int(AT_ONCE)) * int(AT_ONCE * LANES)
-    x, y, later_us = np.zeros(places, ideal_pixels.dtype), np.zeros(places, ideal_pixels.dtype), np.full(places, settings.long_ago_us, np.int32)
-    times_s, counts, weights = np.empty(places), np.empty(places), np.empty(places)
+    dtype, later_us = ideal_pixels.dtype, np.full(places, settings.long_ago_us, np.int32)
+    fitted = Fitted(np.zeros(places, dtype), np.zeros(places, dtype), np.empty(places), np.empty(places), np.empty(places))
     number, fits, reach, steps = np.empty(LANES, np.int64), np.empty(_ROWS * LANES), around.max(), around[1] * width + around[0]
     everywhere, inside = np.ones(count, np.int64), np.empty(count, np.int64)
     for b in range(len(pixels)):
@@ -61,30 +92,26 @@ def flow_at(
                     for k in range(count):
                         inside[k] = 0 <= u + around[0, k] < width and 0 <= v + around[1, k] < height
                 is_on = ages[1, own] < ages[0, own] if polarity[b, i] == 0 else polarity[b, i] > 0
-                _look_around(
-                    own, steps, everywhere if is_within else inside, ages[1 if is_on else 0], ideal, settings, x[lanes:], y[lanes:], later_us[lanes:]
-                )
+                offsets = Offsets(fitted.x[lanes:], fitted.y[lanes:], later_us[lanes:])
+                _look_around(own, Around(steps, everywhere if is_within else inside), ages[1 if is_on else 0], ideal, settings, offsets)
                 number[lanes], lanes = i, lanes + 1
             if lanes == LANES or (lanes > 0 and i == pixels.shape[1] - 1):
                 for k in range(places):
-                    times_s[k], counts[k] = later_us[k] * 1e-6, abs(later_us[k]) <= settings.span_us
-                _fit(x, y, times_s, counts, weights, fits, settings)
+                    fitted.times_s[k], fitted.counts[k] = later_us[k] * 1e-6, abs(later_us[k]) <= settings.span_us
+                _fit(fitted, fits, settings)
                 for lane in range(lanes):
                     flow[b, number[lane], 0], flow[b, number[lane], 1], valid[b, number[lane]] = _normal_flow(fits[lane:], settings)
                 lanes = 0
 
 
 @kernel(fastmath=FAST)
-def _look_around(
-    own: int, steps: Array, inside: Array, ages_us: Array, ideal: Array, settings: ArrivalSettings, x: Array, y: Array, later_us: Array
-) -> None:
+def _look_around(own: int, around: Around, ages_us: Array, ideal: Array, settings: ArrivalSettings, offsets: Offsets) -> None:
     """Offsets of the pixels around one, and how much later the edge came to it than to them; longer than any that counts where it did not.
 
     Args:
-        steps, inside: ``[k]``, to those pixels, and which of them are on the sensor.
         ages_us, ideal: ``[h*w]`` and ``[h*w*2]``.
-        x, y, later_us: filled, every :data:`LANES`-th place.
     """
+    (steps, inside), (x, y, later_us) = around, offsets
     known_us, own_us, own_x, own_y = settings.long_ago_us - settings.cut_off_us, np.int32(ages_us[own]), ideal[2 * own], ideal[2 * own + 1]
     for k in range(np.uint64(len(steps))):
         place, at = np.uint64(own + steps[k] * inside[k]), k * LANES
@@ -94,26 +121,26 @@ def _look_around(
 
 
 @kernel(fastmath=FAST)
-def _fit(x: Array, y: Array, times_s: Array, counts: Array, weights: Array, fits: Array, settings: ArrivalSettings) -> None:
+def _fit(fitted: Fitted, fits: Array, settings: ArrivalSettings) -> None:
     """Planes fitted to times: :func:`torchtrack.tracking.frontend.arrival_flow.plane_flow`.
 
     Args:
-        x, y, times_s, counts: offsets (px), times (s), and 1 for those that take part, in rows of :data:`LANES`.
-        weights: of each, filled.
+        fitted: its weights are filled.
         fits: what is known of each fit, filled.
     """
-    weights[:] = counts
+    fitted.weights[:] = fitted.counts
     for iteration in range(settings.iterations + 1):
-        _sum(x, y, times_s, weights, fits)
+        _sum(fitted, fits)
         _solve(fits)
-        _sum_residuals(x, y, times_s, weights, fits)
+        _sum_residuals(fitted, fits)
         if iteration < settings.iterations:
-            _weigh(x, y, times_s, counts, fits, settings.bound, settings.least_scale_s, settings.plane_s, weights)
+            _weigh(fitted, fits, settings)
 
 
 @kernel(fastmath=FAST)
-def _sum(x: Array, y: Array, times_s: Array, weights: Array, fits: Array) -> None:
+def _sum(fitted: Fitted, fits: Array) -> None:
     """Weighted sums of all that a plane is solved from."""
+    x, y, times_s, _, weights = fitted
     fits[: _YT + LANES] = 0.0
     for first in range(np.uint64(0), np.uint64(len(x)), AT_ONCE * LANES):
         for lane in range(LANES):
@@ -146,8 +173,9 @@ def _solve(fits: Array) -> None:
 
 
 @kernel(fastmath=FAST)
-def _sum_residuals(x: Array, y: Array, times_s: Array, weights: Array, fits: Array) -> None:
+def _sum_residuals(fitted: Fitted, fits: Array) -> None:
     """Weighted sums of residuals and of their squares, and how many points have a weight."""
+    x, y, times_s, _, weights = fitted
     fits[_ABSOLUTE:] = 0.0
     for first in range(np.uint64(0), np.uint64(len(x)), AT_ONCE * LANES):
         for lane in range(LANES):
@@ -162,10 +190,9 @@ def _sum_residuals(x: Array, y: Array, times_s: Array, weights: Array, fits: Arr
 
 
 @kernel(fastmath=FAST)
-def _weigh(
-    x: Array, y: Array, times_s: Array, counts: Array, fits: Array, bound: float, least_scale_s: float, plane_s: float, weights: Array
-) -> None:
+def _weigh(fitted: Fitted, fits: Array, settings: ArrivalSettings) -> None:
     """Bisquare weights of the residuals, zero for what the plane passes too early or too late."""
+    (x, y, times_s, counts, weights), bound, least_scale_s, plane_s = fitted, settings.bound, settings.least_scale_s, settings.plane_s
     for first in range(np.uint64(0), np.uint64(len(x)), AT_ONCE * LANES):
         for lane in range(LANES):
             a, b, c = fits[_A + lane], fits[_B + lane], fits[_C + lane]
@@ -195,9 +222,10 @@ def arrival_flow_numba(points: SensorPoints, view: SensorView, config: FlowConfi
     mask, burst_age_us = points.mask, view.maps.burst_age_us
     flow, valid = torch.zeros(*mask.shape, 2, dtype=view.ideal_pixels.dtype), torch.zeros_like(mask)
     around = disc(config.radius_px, torch.int64, mask.device)
+    size, of_sensors = burst_age_us.shape[2:], as_arrays(burst_age_us.flatten(2), view.ideal_pixels.flatten(1), view.stream_index)
     flow_at(
-        *as_arrays(points.sensor_pixels, points.polarity, mask, burst_age_us.flatten(2), view.stream_index, view.ideal_pixels.flatten(1)),
-        (burst_age_us.shape[2], burst_age_us.shape[3]),
+        as_arrays(points.sensor_pixels, points.polarity, mask),
+        (tuple(size), *of_sensors),
         around.numpy(),
         filled(ArrivalSettings, arrival_flow, bursts, config),
         *as_arrays(flow, valid),

@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import PaddedArrays, as_arrays, padded_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.core.dispatch import accelerates
 from torchtrack.core.events import PaddedEvents
@@ -14,27 +14,15 @@ from torchtrack.tracking.frontend.bursts import LONG_AGO_US, LONGEST_US
 
 
 @kernel()
-def update_bursts(
-    x: Array,
-    y: Array,
-    age_us: Array,
-    polarity: Array,
-    mask: Array,
-    elapsed_us: Array,
-    longest_us: int,
-    long_ago_us: int,
-    before: Array,
-    ages: Array,
-) -> None:
+def update_bursts(events: PaddedArrays, elapsed_us: Array, longest_us: int, long_ago_us: int, before: Array, ages: Array) -> None:
     """Bring a map of bursts up to a window's end.
 
     Args:
-        x, y, age_us, polarity, mask: ``[s, e]``.
         elapsed_us: ``[s]``.
         before: ``[s, 2, h, w]``, where the window began.
         ages: at its end; filled.
     """
-    height, width = np.uint64(before.shape[2]), np.uint64(before.shape[3])
+    (x, y, age_us, polarity, mask), height, width = events, np.uint64(before.shape[2]), np.uint64(before.shape[3])
     for s in range(len(mask)):
         elapsed, aged = elapsed_us[s], ages[s].ravel()
         age_all(before[s].ravel(), np.int16(elapsed), np.int16(long_ago_us - elapsed), aged)
@@ -71,5 +59,5 @@ def _ages_tell(burst_age_us: Tensor, elapsed_us: Tensor, events: PaddedEvents) -
 def update_bursts_numba(burst_age_us: Int[Tensor, "s 2 h w"], elapsed_us: Int[Tensor, "s"], events: PaddedEvents) -> Int[Tensor, "s 2 h w"]:
     """One event after the other."""
     ages = torch.empty(burst_age_us.shape, dtype=torch.int16)
-    update_bursts(*as_arrays(*vars(events).values(), elapsed_us), LONGEST_US, LONG_AGO_US, *as_arrays(burst_age_us, ages))
+    update_bursts(padded_arrays(events), elapsed_us.numpy(), LONGEST_US, LONG_AGO_US, *as_arrays(burst_age_us, ages))
     return ages

@@ -1,6 +1,7 @@
 """Pixels that contours pass in a window, point by point: :func:`torchtrack.tracking.association.claimed_events.claimed_pixels`."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,26 +18,32 @@ from torchtrack.tracking.frontend.window_events import SharedEvents
 from torchtrack.tracking.motion.prediction import Prediction
 
 
+class PassingPoints(NamedTuple):
+    """Contour points that move in the image: ``[b, m, 2]``, and which exist, ``[b, m]``."""
+
+    pixels: Array
+    velocity: Array
+    exists: Array
+
+
+class Claimants(NamedTuple):
+    """Objects that may claim events: their windows (s), streams, and which are seen well, ``[b]``."""
+
+    window_s: Array
+    stream_index: Array
+    is_seen_well: Array
+
+
 # Without liberties of arithmetic: which pixel is the nearest may hang on the last digit.
 @kernel()
-def claim(
-    pixels: Array,
-    velocity: Array,
-    exists: Array,
-    window_s: Array,
-    stream_index: Array,
-    is_seen_well: Array,
-    places: int,
-    within_px: int,
-    claimed: Array,
-) -> None:
+def claim(points: PassingPoints, objects: Claimants, places: int, within_px: int, claimed: Array) -> None:
     """Mark the pixels around where contour points come by.
 
     Args:
-        pixels, velocity, exists: ``[b, m, 2]`` and ``[b, m]`` of contour points.
+        places: in a window that points are looked at in.
         claimed: ``[s, h, w]``, nothing so far; filled.
     """
-    _, height, width = claimed.shape
+    (pixels, velocity, exists), (window_s, stream_index, is_seen_well), (_, height, width) = points, objects, claimed.shape
     # Where a point came by already: neighbours along a contour share most of their pixels.
     been = np.zeros_like(claimed)
     for b in range(len(pixels)):
@@ -85,8 +92,9 @@ def claimed_pixels_numba(
 ) -> Bool[Tensor, "s h w"]:
     """Point by point."""
     claimed = torch.zeros(prediction.objects.image_shape, dtype=torch.bool)
-    points = contours.pixels, prediction.contour_velocity(contours), contours.mask
-    claim(*as_arrays(*points, window_s, prediction.objects.stream_index, is_seen_well), PLACES, CLAIMED_WITHIN_PX, *as_arrays(claimed))
+    points = as_arrays(contours.pixels, prediction.contour_velocity(contours), contours.mask)
+    objects = as_arrays(window_s, prediction.objects.stream_index, is_seen_well)
+    claim(points, objects, PLACES, CLAIMED_WITHIN_PX, claimed.numpy())
     return claimed
 
 

@@ -1,6 +1,7 @@
 """What each object's pose is worth, and where it goes on from there: :mod:`torchtrack.tracking.update`, object by object."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -8,11 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.backends.filling import filled
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import SolutionArrays, as_arrays
 from torchtrack.backends.numba.compiler import Array, for_numbers, kernel
 from torchtrack.backends.numba.filtering import inverse
 from torchtrack.backends.numba.geometry import centre_of, is_finite
-from torchtrack.backends.numba.parameters import CorrectionSettings
+from torchtrack.backends.numba.parameters import ConclusionSettings
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking import update
@@ -21,8 +22,7 @@ from torchtrack.tracking.motion.model import MotionState
 from torchtrack.tracking.relocalization.lost_objects import Relocalized
 from torchtrack.tracking.state import TrackerState
 from torchtrack.tracking.validation import verdict
-from torchtrack.tracking.validation.measures import visible_ratio
-from torchtrack.tracking.validation.verdict import Limits, Measured, References
+from torchtrack.tracking.validation.verdict import Limits, Measured, References, Verdict
 
 _UNKNOWNS = 12
 # The rules, for one object: the same source as PyTorch runs.
@@ -34,61 +34,74 @@ _RULES = for_numbers(
 _verdict, _remembered = _RULES["verdict"], _RULES["remembered"]
 
 
-@kernel()
-def conclude(
-    T_before: Array,
-    T_prior: Array,
-    usable: Array,
-    velocity: Array,
-    covariance: Array,
-    T_estimated: Array,
-    offset: Array,
-    hessian: Array,
-    counts: Array,
-    flags: Array,
-    measured: Array,
-    dt_s: Array,
-    centre_obj: Array,
-    diameter_m: Array,
-    limits: Limits,
-    settings: CorrectionSettings,
-    remembered: Array,
-    T_last_validated: Array,
-    T_cam_obj: Array,
-    new_velocity: Array,
-    posterior: Array,
-    left: Array,
-    status: Array,
-) -> None:
-    """Judge every object, and go on as predicted where it failed.
+class Before(NamedTuple):
+    """Objects before the window: poses ``[b, 4, 4]``, how long it is, centres, and diameters."""
+
+    T_cam_obj: Array
+    dt_s: Array
+    centre_obj: Array
+    diameter_m: Array
+
+
+class Predicted(NamedTuple):
+    """The prediction: ``[b, 4, 4]``, ``[b]``, ``[b, 6]``, and ``[b, 12, 12]``."""
+
+    T_cam_obj: Array
+    usable: Array
+    velocity: Array
+    covariance: Array
+
+
+class Fits(NamedTuple):
+    """What is known of the fits, in the order of :class:`Measured`: numbers ``[7, b]``, counts ``[2, b]``, and flags ``[2, b]``."""
+
+    measured: Array
+    counts: Array
+    flags: Array
+
+
+class After(NamedTuple):
+    """Objects after the window.
 
     Args:
-        T_before: poses before the window, ``[b, 4, 4]``.
-        T_prior, usable, velocity, covariance: of the prediction.
-        T_estimated, offset, hessian: of the solution: ``[b, 4, 4]``, ``[b, 12]``, ``[b, 12, 12]``.
-        counts, flags, measured: ``[2, b]``, ``[2, b]`` and ``[7, b]``: what is known of the fits, in the order of :class:`Measured`.
-        remembered, T_last_validated: ``[6, b]``, in the order of :class:`References`, and ``[b, 4, 4]`` before the window; changed to those after it.
-        T_cam_obj, new_velocity, posterior, left, status: after the window, ``left`` being the covariance of poses; filled.
+        T_cam_obj, velocity, covariance: ``[b, 4, 4]``, ``[b, 6]``, and ``[b, 12, 12]``.
+        left, status: the covariance of poses, ``[b, 6, 6]``, and ``[b]``.
+        references, T_last_validated: ``[6, b]``, in the order of :class:`References`, and ``[b, 4, 4]``; when given, those before the window.
     """
-    inverses, centre = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(3)
-    for b in range(len(usable)):
-        m, r = measured[:, b], remembered[:, b]
-        rotated, moved = _length(offset[b, :3]), _length(offset[b, 3:6]) / diameter_m[b]
-        of_fit = Measured(m[0], m[1], m[2], m[3], m[4], m[5], m[6], rotated, moved, counts[0, b], counts[1, b], flags[0, b], usable[b], flags[1, b])
+
+    T_cam_obj: Array
+    velocity: Array
+    covariance: Array
+    left: Array
+    status: Array
+    references: Array
+    T_last_validated: Array
+
+
+@kernel()
+def conclude(before: Before, predicted: Predicted, solved: SolutionArrays, fits: Fits, settings: ConclusionSettings, after: After) -> None:
+    """Judge every object, and go on as predicted where it failed; what is known after the window is filled."""
+    before, predicted, solved, after = Before(*before), Predicted(*predicted), SolutionArrays(*solved), After(*after)
+    estimated, centre, limits, (all_measured, counts, flags) = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(3), settings.limits, fits
+    for b in range(len(predicted.usable)):
+        m, r, dt, offset = all_measured[:, b], after.references[:, b], before.dt_s[b], solved.offset[b]
+        rotated, moved, usable = _length(offset[:3]), _length(offset[3:6]) / before.diameter_m[b], predicted.usable[b]
+        of_fit = Measured(m[0], m[1], m[2], m[3], m[4], m[5], m[6], rotated, moved, counts[0, b], counts[1, b], flags[0, b], usable, flags[1, b])
         known = References(r[0], r[1], r[2], r[3], r[4], r[5])
         judged = _verdict(of_fit, known, limits)
-        status[b] = judged.status
-        _orthonormalise(T_prior[b] if judged.failed else T_estimated[b], T_cam_obj[b])
-        if judged.held or (judged.failed and not usable[b]):
-            T_cam_obj[b] = T_before[b]
-        inverse(hessian[b], inverses)
-        of_prediction = velocity[b], covariance[b]
-        _update(judged.trusted, judged.failed, judged.held, dt_s[b], of_prediction, offset[b], inverses, settings, new_velocity[b], posterior[b])
-        centre_of(T_cam_obj[b], centre_obj[b], centre)
-        _to_left(posterior[b], centre, left[b])
-        r[0], r[1], r[2], r[3], r[4], r[5] = _remembered(known, of_fit, judged, dt_s[b], limits)
+        after.status[b], T_cam_obj = judged.status, after.T_cam_obj[b]
+        _orthonormalise(predicted.T_cam_obj[b] if judged.failed else solved.T_cam_obj[b], T_cam_obj)
+        if judged.held or (judged.failed and not usable):
+            T_cam_obj[:] = before.T_cam_obj[b]
+        inverse(solved.hessian[b], estimated)
+        estimated *= settings.observation_px**2
+        after.covariance[b], after.velocity[b] = predicted.covariance[b], predicted.velocity[b]
+        _update(judged, np.exp(-dt / settings.coast_s), offset, estimated, after.velocity[b], after.covariance[b])
+        centre_of(T_cam_obj, before.centre_obj[b], centre)
+        _to_left(after.covariance[b], centre, after.left[b])
+        r[0], r[1], r[2], r[3], r[4], r[5] = _remembered(known, of_fit, judged, dt, limits)
         if judged.is_certain:
-            T_last_validated[b] = T_cam_obj[b]
+            after.T_last_validated[b] = T_cam_obj
 
 
 @kernel()
@@ -112,39 +125,26 @@ def _orthonormalise(T: Array, exact: Array) -> None:
 
 
 @kernel()
-def _update(
-    trusted: float,
-    failed: bool,
-    held: bool,
-    dt: float,
-    of_prediction: tuple[Array, Array],
-    offset: Array,
-    inverses: Array,
-    settings: CorrectionSettings,
-    new_velocity: Array,
-    posterior: Array,
-) -> None:
-    """Velocity and covariance after a window: as estimated, as far as that is to be trusted; none where an object is ``held``."""
-    velocity, predicted = of_prediction
-    variance, total = settings.observation_px**2, 0.0
-    for j in range(12):
-        for k in range(12):
-            total += variance * inverses[j, k]
-    trusted *= np.isfinite(total)
-    for j in range(12):
-        for k in range(12):
-            estimated = variance * inverses[j, k]
-            posterior[j, k] = estimated + (1.0 - trusted) * (predicted[j, k] - estimated) if trusted > 0 else predicted[j, k]
-    kept = np.exp(-dt / settings.coast_s) if failed else 1.0
-    dropped = np.empty(6)
+def _update(judged: Verdict, coasting: float, offset: Array, estimated: Array, velocity: Array, covariance: Array) -> None:
+    """Bring velocity and covariance up from what was predicted: as estimated, as far as that is to be trusted; none where an object is held.
+
+    Args:
+        coasting: how much of its velocity an object keeps that failed.
+    """
+    trusted = judged.trusted * np.isfinite(estimated.sum())
+    if trusted > 0:
+        for j in range(12):
+            for k in range(12):
+                covariance[j, k] = estimated[j, k] + (1.0 - trusted) * (covariance[j, k] - estimated[j, k])
+    kept, dropped = coasting if judged.failed else 1.0, np.empty(6)
     for k in range(6):
         moving = velocity[k] + trusted * offset[6 + k]
-        new_velocity[k] = 0.0 if held else kept * moving
-        dropped[k] = moving - new_velocity[k]
-    if held:
+        velocity[k] = 0.0 if judged.held else kept * moving
+        dropped[k] = moving - velocity[k]
+    if judged.held:
         for j in range(6):
             for k in range(6):
-                posterior[6 + j, 6 + k] += dropped[j] * dropped[k]
+                covariance[6 + j, 6 + k] += dropped[j] * dropped[k]
 
 
 @kernel()
@@ -172,9 +172,8 @@ def judged_objects_numba(state: TrackerState, located: Relocalized, dt_s: Float[
     """Object by object."""
     prediction, scored = located.prediction, located.scored
     objects, solution, batch, health = prediction.objects, scored.fit.solution, len(dt_s), state.health
-    in_view = visible_ratio(scored.fit.contours, objects.image_sizes)
-    ratios = scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, scored.texture_agreement, in_view
-    measured = torch.stack([*ratios, located.gate_scale])
+    ratios = scored.explained_ratio, scored.score, scored.inlier_ratio, scored.reference_inlier_ratio, scored.texture_agreement
+    measured = torch.stack([*ratios, scored.visible_ratio, located.gate_scale])
     counts = torch.stack([scored.count, scored.fit.matches.near.sum(-1)])
     flags = torch.stack([~scored.measured_ratio.isnan(), scored.is_relocalized])
     remembered = torch.stack(health.references)
@@ -182,12 +181,12 @@ def judged_objects_numba(state: TrackerState, located: Relocalized, dt_s: Float[
     T_cam_obj, covariance, left = (T_last_validated.new_empty(batch, size, size) for size in (4, 12, 6))
     velocity, status = dt_s.new_empty(batch, 6), scored.count.new_empty(batch)
     conclude(
-        *as_arrays(state.T_cam_obj, prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance),
-        *as_arrays(solution.T_cam_obj, solution.from_prior, solution.hessian),
-        *as_arrays(counts, flags, measured, dt_s, objects.centre_obj, objects.diameter_m),
-        Limits.from_config(config),
-        filled(CorrectionSettings, config.solver, model),
-        *as_arrays(remembered, T_last_validated, T_cam_obj, velocity, covariance, left, status),
+        as_arrays(state.T_cam_obj, dt_s, objects.centre_obj, objects.diameter_m),
+        as_arrays(prediction.T_cam_obj, prediction.usable, prediction.velocity, prediction.covariance),
+        as_arrays(solution.T_cam_obj, solution.from_prior, solution.gradient, solution.hessian),
+        as_arrays(measured, counts, flags),
+        filled(ConclusionSettings, config.solver, model, limits=Limits.from_config(config)),
+        as_arrays(T_cam_obj, velocity, covariance, left, status, remembered, T_last_validated),
     )
     health = replace(health, **References(*remembered.unbind())._asdict(), T_last_validated=T_last_validated)
     return MotionState(T_cam_obj, velocity, covariance), health, left, status

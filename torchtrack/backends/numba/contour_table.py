@@ -1,5 +1,7 @@
 """The table of what observations take from contour points: :meth:`torchtrack.tracking.association.nearest.contour_table`, point by point."""
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,43 +21,34 @@ from torchtrack.tracking.contours.points import Contours
 __all__ = ["COLUMNS", "fill"]
 
 
+class TablePoints(NamedTuple):
+    """Contour points: ``[b, 3, m]``, ``[b, 2, m]``, and ``[b, m]``; and their pixels when indexed, ``[b, 2, m]``; or of one object."""
+
+    points_obj: Array
+    normals: Array
+    kind: Array
+    mask: Array
+    indexed: Array
+
+
 @kernel()
-def fill(
-    points_obj: Array,
-    normals: Array,
-    kind: Array,
-    mask: Array,
-    indexed: Array,
-    polarity: Array,
-    settings: TableSettings,
-    table: Array,
-    not_plain: Array,
-) -> None:
+def fill(points: TablePoints, polarity: Array, settings: TableSettings, table: Array, not_plain: Array) -> None:
     """Fill ``table [b, m, COLUMNS]``, with zeros for points that do not count, and ``not_plain [b]``: which objects show texture or silhouettes.
 
     Args:
-        points_obj, normals, kind, mask: of contours; ``normals`` as ``[b, 2, m]``, ``points_obj`` as ``[b, 3, m]``.
-        indexed: ``[b, 2, m]``, pixels when indexed.
         polarity: ``[b, 8]``, expected by octant; ``[b, 0]`` where nothing is.
     """
+    points = TablePoints(*points)
     table[:] = 0.0
     for b in range(len(table)):
-        expected = polarity[b] if polarity.shape[1] else polarity.ravel()
-        not_plain[b] = _fill_one(points_obj[b], normals[b], kind[b], mask[b], indexed[b], expected, settings, table[b])
+        own = TablePoints(points.points_obj[b], points.normals[b], points.kind[b], points.mask[b], points.indexed[b])
+        not_plain[b] = _fill_one(own, polarity[b] if polarity.shape[1] else polarity.ravel(), settings, table[b])
 
 
 @kernel()
-def _fill_one(
-    points_obj: Array,
-    normals: Array,
-    kind: Array,
-    mask: Array,
-    indexed: Array,
-    polarity: Array,
-    settings: TableSettings,
-    table: Array,
-) -> bool:
+def _fill_one(points: TablePoints, polarity: Array, settings: TableSettings, table: Array) -> bool:
     """Fill the table of one object; whether it shows texture or silhouettes."""
+    points_obj, normals, kind, mask, indexed = points
     not_plain = False
     for i in range(len(mask)):
         if not mask[i]:
@@ -82,5 +75,6 @@ def contour_table_numba(
     table, not_plain = contours.points_obj.new_empty(*contours.mask.shape, COLUMNS), torch.empty_like(contours.mask[:, 0])
     points, normals, indexed = (value.transpose(1, 2) for value in (contours.points_obj, contours.normals, index.pixels))
     expected = normals.new_empty(len(table), 0) if polarity is None else polarity
-    fill(*as_arrays(points, normals, contours.kind, contours.mask, indexed, expected), settings, table.numpy(), not_plain.numpy())
+    given = as_arrays(points, normals, contours.kind, contours.mask, indexed)
+    fill(given, *as_arrays(expected), settings, table.numpy(), not_plain.numpy())
     return ContourTable(table.transpose(1, 2), index, not_plain)

@@ -1,12 +1,14 @@
 """Corners cell by cell: :func:`torchtrack.tracking.frontend.corners.detect_corners`."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.backends.filling import filled
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import RegionArrays, as_arrays, region_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.backends.numba.corner_response import corner_responses
 from torchtrack.backends.numba.parameters import CornerSettings
@@ -19,31 +21,47 @@ from torchtrack.tracking.frontend.sensor_view import SensorView
 from torchtrack.tracking.frontend.time_surface import Regions
 
 
+class Surfaces(NamedTuple):
+    """Surfaces and their responses, ``[b, h, w]``, and what a surface is above at pixels that may be corners, ``[s]``."""
+
+    values: Array
+    responses: Array
+    least: Array
+
+
+class Maps(NamedTuple):
+    """Ends of the windows ``[s]``, newest events ``[s, h, w]``, bursts ``[s, 2, h, w]``, and tables of undistortion ``[s, h, w, 2]``."""
+
+    t_us: Array
+    newest_us: Array
+    bursts: Array
+    ideal_pixels: Array
+
+
+class CornerArrays(NamedTuple):
+    """Corners: pixels on the sensor and ideal ones ``[b, n, 2]``, ages (s), mask and polarity ``[b, n]``."""
+
+    pixels: Array
+    ideal: Array
+    age_s: Array
+    mask: Array
+    polarity: Array
+
+
 @kernel()
-def choose(
-    responses: Array,
-    surfaces: Array,
-    least: Array,
-    regions: tuple[Array, Array, Array],
-    maps: tuple[Array, Array, Array, Array],
-    settings: CornerSettings,
-    corners: tuple[Array, Array, Array, Array, Array],
-) -> None:
+def choose(surfaces: Surfaces, regions: RegionArrays, maps: Maps, settings: CornerSettings, corners: CornerArrays) -> None:
     """Choose the corners of each object, in the order of their cells.
 
     Args:
-        least: ``[s]``, what the surface is above at pixels that may be corners.
-        regions: origin ``[b, 2]``, extent ``[b, 2]`` and stream ``[b]``.
-        maps: ends of the windows ``[s]``, newest events ``[s, h, w]``, bursts ``[s, 2, h, w]`` and undistortion tables ``[s, h, w, 2]``.
-        corners: pixels on the sensor and ideal ones ``[b, n, 2]``, ages (s), mask and polarity ``[b, n]``, zero so far; filled from the front.
+        corners: zero so far; filled from the front.
     """
-    (origin, extent, stream_index), (now_us, newest, bursts, ideal_pixels) = regions, maps
+    (values, responses, least), (origin, extent, stream_index), (now_us, newest, bursts, ideal_pixels) = surfaces, regions, maps
     pixels, ideal, ages_s, mask, polarity = corners
     cells = (responses.shape[1] // settings.cell_px) * (responses.shape[2] // settings.cell_px)
     best, places = np.empty(cells, responses.dtype), np.empty((cells, 2), np.int32)
     for b in range(len(responses)):
         response, stream = responses[b], stream_index[b]
-        _keep_own(response, surfaces[b], least[stream], extent[b], settings.reach_px)
+        _keep_own(response, values[b], least[stream], extent[b], settings.reach_px)
         count = _best_of_cells(response, settings, best, places)
         chosen, newest_us = 0, newest[stream]
         for i in range(count):
@@ -139,8 +157,7 @@ def detect_corners_numba(
     corner_responses(*as_arrays(values, responses))
     pixels, ideal = torch.zeros(batch, count, 2, dtype=torch.int64), view.ideal_pixels.new_zeros(batch, count, 2)
     age_s, polarity, mask = surface.new_zeros(batch, count), surface.new_zeros(batch, count), torch.zeros(batch, count, dtype=torch.bool)
-    of_regions = as_arrays(regions.origin, regions.extent, regions.stream_index)
     of_maps = as_arrays(view.t_us, maps.last_event_us, maps.burst_age_us, view.ideal_pixels)
     filled_in = as_arrays(pixels, ideal, age_s, mask, polarity)
-    choose(*as_arrays(responses, values, oldest), tuple(of_regions), tuple(of_maps), settings, tuple(filled_in))
+    choose(as_arrays(values, responses, oldest), region_arrays(regions), of_maps, settings, filled_in)
     return Corners(pixels, ideal, age_s, mask, torch.zeros_like(ideal), torch.zeros_like(mask), polarity)

@@ -1,11 +1,13 @@
 """Contour points behind what is drawn in a depth buffer: :func:`torchtrack.tracking.contours.depth_buffer.hidden_in_buffer`, sample by sample."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import ContourArrays, as_arrays, contour_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, entries, inverse_depth, lens, placed
 from torchtrack.backends.numba.models import arrays_of
@@ -17,24 +19,78 @@ from torchtrack.tracking.contours.depth_buffer import Scene
 from torchtrack.tracking.contours.points import Contours
 
 
-@kernel(fastmath=FAST)
-def _cell(u: float, v: float, first: Numbers, rows_before: int, grid: GridSettings) -> int:
-    """The cell of a depth buffer that a pixel falls into; what lies outside falls into the outermost, what is not a number into the first."""
-    column, row = np.rint(u / grid.side_px) - first[0], np.rint(v / grid.side_px) - first[1]
-    # Written so that what is not a number finds a cell, too.
-    column, row = min(column if column > 0 else 0.0, grid.columns - 1.0), min(row if row > 0 else 0.0, grid.rows - 1.0)
-    return int((row + rows_before) * grid.columns + column)
+class Views(NamedTuple):
+    """Objects as cameras see them.
+
+    Args:
+        first: ``[s, 2]``, the first cell (column, row) of each stream's buffer.
+        T_cam_obj, intrinsics, diameters_m, stream_index: ``[b, 4, 4]``, ``[b, 4]``, and ``[b]``.
+        drawn, exact: ``[b]``, which are drawn, and whose own surface does not count for them.
+        margin_m: ``[b]``, how far behind a surface their points are hidden.
+    """
+
+    first: Array
+    T_cam_obj: Array
+    intrinsics: Array
+    diameters_m: Array
+    stream_index: Array
+    drawn: Array
+    exact: Array
+    margin_m: Array
+
+
+class Buffers(NamedTuple):
+    """Depth buffers of all streams, one for each size of holes.
+
+    Args:
+        nearest: ``[k, p]``, depths in whole steps with the object in the low bits.
+        used: ``[k]``, whether anything was drawn there.
+    """
+
+    nearest: Array
+    used: Array
+
+
+class Part(NamedTuple):
+    """The part of a buffer that is a stream's: its first cell, and how many rows are before it."""
+
+    column: float
+    row: float
+    rows_before: int
+
+
+class Samples(NamedTuple):
+    """Where surface samples are drawn, and what: cells, and depths in whole steps above the bits for an object."""
+
+    cells: Array
+    keys: Array
 
 
 @kernel()
-def around(pixels: Array, mask: Array, stream_index: Array, cell_px: float, height: int, width: int, first: Array) -> tuple[int, int]:
+def _part_of(views: Views, b: int, grid: GridSettings) -> Part:
+    """The part of a buffer that an object is drawn into."""
+    stream = views.stream_index[b]
+    return Part(views.first[stream, 0], views.first[stream, 1], stream * grid.rows)
+
+
+@kernel(fastmath=FAST)
+def _cell(u: float, v: float, part: Part, grid: GridSettings) -> int:
+    """The cell of a depth buffer that a pixel falls into; what lies outside falls into the outermost, what is not a number into the first."""
+    column, row = np.rint(u / grid.side_px) - part.column, np.rint(v / grid.side_px) - part.row
+    # Written so that what is not a number finds a cell, too.
+    column, row = min(column if column > 0 else 0.0, grid.columns - 1.0), min(row if row > 0 else 0.0, grid.rows - 1.0)
+    return int((row + part.rows_before) * grid.columns + column)
+
+
+@kernel()
+def around(contours: ContourArrays, stream_index: Array, cell_px: float, size: tuple[int, int], first: Array) -> tuple[int, int]:
     """Rows and columns of depth buffers that hold what is asked for: :meth:`torchtrack.tracking.contours.depth_buffer.DepthGrid.around`.
 
     Args:
-        pixels, mask: ``[b, 2, m]`` and ``[b, m]``.
-        height, width: of the image (px); pixels outside it are not asked for.
+        size: height and width of the image (px); pixels outside it are not asked for.
         first: ``[s, 2]``, filled: first cell (column, row) of each stream's buffer.
     """
+    (_, pixels, _, mask, _), (height, width) = contours, size
     last = np.full(first.shape, -np.inf)
     first[:] = np.inf
     for b in range(len(mask)):
@@ -71,39 +127,25 @@ def _density(samples: int, T_cam_obj: Array, intrinsics: Array, diameter_m: floa
 
 
 @kernel(fastmath=FAST)
-def draw(
-    members: Array,
-    drawn: Array,
-    samples: Array,
-    T_cam_obj: Array,
-    intrinsics: Array,
-    diameters_m: Array,
-    stream_index: Array,
-    first: Array,
-    grid: GridSettings,
-    nearest: Array,
-    used: Array,
-) -> None:
+def draw(members: Array, samples: Array, views: Views, grid: GridSettings, buffers: Buffers) -> None:
     """Draw surface samples of objects of one model into depth buffers; of objects as near, the first stays.
 
     Args:
-        members: numbers of the objects, and which of all are ``drawn [b]``.
+        members: numbers of the objects.
         samples: ``[3, n]``, in the object's frame.
-        first: ``[s, 2]``, first cell of each stream's buffer.
-        nearest: ``[k, p]``, depths in whole steps with the object in the low bits; a row for each size of holes; changed.
-        used: ``[k]``, whether anything was drawn there; changed.
     """
-    cells, keys = np.empty(samples.shape[1], np.int32), np.empty(samples.shape[1], np.int64)
+    views, buffers = Views(*views), Buffers(*buffers)
+    room = Samples(np.empty(samples.shape[1], np.int32), np.empty(samples.shape[1], np.int64))
     for b in members:
-        if not drawn[b]:
+        if not views.drawn[b]:
             continue
-        every, side = _density(samples.shape[1], T_cam_obj[b], intrinsics[b], diameters_m[b], grid)
-        taken, stream, own = samples if every == 1 else samples[:, ::every].copy(), stream_index[b], nearest[side - 1]
-        used[side - 1] = True
-        _place(taken, entries(T_cam_obj[b]), lens(intrinsics[b]), (first[stream, 0], first[stream, 1]), stream * grid.rows, grid, cells, keys)
+        every, side = _density(samples.shape[1], views.T_cam_obj[b], views.intrinsics[b], views.diameters_m[b], grid)
+        taken, own = samples if every == 1 else samples[:, ::every].copy(), buffers.nearest[side - 1]
+        buffers.used[side - 1] = True
+        _place(taken, entries(views.T_cam_obj[b]), lens(views.intrinsics[b]), _part_of(views, b, grid), grid, room)
         for i in range(taken.shape[1]):
-            cell = np.uint64(cells[i])
-            own[cell] = min(own[cell], keys[i] + b)
+            cell = np.uint64(room.cells[i])
+            own[cell] = min(own[cell], room.keys[i] + b)
 
 
 @kernel()
@@ -142,85 +184,58 @@ def _put_least(values: Array, side: int, forward: bool) -> None:
 
 
 @kernel(fastmath=FAST)
-def _place(
-    samples: Array,
-    pose: Numbers,
-    intrinsics: Numbers,
-    first: Numbers,
-    rows_before: int,
-    grid: GridSettings,
-    cells: Array,
-    keys: Array,
-) -> None:
-    """Cells of surface samples, and their depths in whole steps above the bits for an object, several at once; nothing behind the camera."""
-    points_x, points_y, points_z = samples[0], samples[1], samples[2]
+def _place(samples: Array, pose: Numbers, intrinsics: Numbers, part: Part, grid: GridSettings, placed_at: Samples) -> None:
+    """Cells of surface samples, and their depths, several at once; nothing behind the camera."""
+    (points_x, points_y, points_z), (cells, keys) = (samples[0], samples[1], samples[2]), placed_at
     for i in range(samples.shape[1]):
         x, y, z = placed(pose, points_x[i], points_y[i], points_z[i])
         inverse = inverse_depth(z)
-        cells[i] = _cell(x * inverse * intrinsics[0] + intrinsics[2], y * inverse * intrinsics[1] + intrinsics[3], first, rows_before, grid)
+        cells[i] = _cell(x * inverse * intrinsics[0] + intrinsics[2], y * inverse * intrinsics[1] + intrinsics[3], part, grid)
         keys[i] = np.int64(z * grid.steps_per_m) << grid.object_bits if z > grid.least_depth_m else grid.nothing
 
 
 @kernel(fastmath=FAST)
-def hide_in_buffer(
-    points_cam: Array,
-    pixels: Array,
-    normals: Array,
-    mask: Array,
-    exact: Array,
-    margin_m: Array,
-    stream_index: Array,
-    first: Array,
-    grid: GridSettings,
-    nearest: Array,
-    hidden: Array,
-) -> None:
+def hide_in_buffer(contours: ContourArrays, views: Views, grid: GridSettings, nearest: Array, hidden: Array) -> None:
     """Mark points in the image behind a surface in the depth buffer, there and a cell to each side of their contour.
 
     Args:
-        points_cam, pixels, normals: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``; ``mask [b, m]``.
-        exact: ``[b]``, objects that their own surface does not count for.
-        margin_m: ``[b]``, how far behind it is hidden.
         nearest: ``[p]``, as :func:`draw` has them.
         hidden: ``[b, m]``, changed.
     """
+    (points_cam, pixels, normals, mask, _), views = contours, Views(*views)
     for b in range(len(mask)):
-        stream = stream_index[b]
-        own_first, rows_before = (first[stream, 0], first[stream, 1]), stream * grid.rows
+        part, is_exact = _part_of(views, b, grid), views.exact[b]
         for i in range(mask.shape[1]):
             u, v = pixels[b, 0, i], pixels[b, 1, i]
             if not mask[b, i] or not (u >= 0 and v >= 0 and u <= grid.width - 1 and v <= grid.height - 1):
                 continue
-            behind, farthest_m = True, points_cam[b, 2, i] - margin_m[b]
+            behind, farthest_m = True, points_cam[b, 2, i] - views.margin_m[b]
             for side in (0.0, -grid.side_px, grid.side_px):
-                cell = _cell(u + side * normals[b, 0, i], v + side * normals[b, 1, i], own_first, rows_before, grid)
+                cell = _cell(u + side * normals[b, 0, i], v + side * normals[b, 1, i], part, grid)
                 owner, steps = nearest[cell] & ((1 << grid.object_bits) - 1), nearest[cell] >> grid.object_bits
-                behind = behind and (not exact[b] or owner != b) and farthest_m > steps / grid.steps_per_m
+                behind = behind and (not is_exact or owner != b) and farthest_m > steps / grid.steps_per_m
             hidden[b, i] = hidden[b, i] or behind
 
 
 @accelerates(depth_buffer.hidden_in_buffer)
 def hidden_in_buffer_numba(scene: Scene, contours: Contours, drawn: Bool[Tensor, "b"], exact: Bool[Tensor, "b 1"]) -> Bool[Tensor, "b m"]:
     """Sample by sample and point by point."""
-    streams, height, width = scene.image_shape
-    hidden, margin_m, first = torch.zeros_like(contours.mask), depth_buffer.DEPTH_MARGIN * scene.diameters_m, np.empty((streams, 2))
-    points_cam, pixels, normals, mask = as_arrays(
-        *(value.transpose(1, 2) for value in (contours.points_cam, contours.pixels, contours.normals)), contours.mask
-    )
-    T_cam_obj, intrinsics, stream_index, diameters_m = as_arrays(scene.T_cam_obj, scene.intrinsics, scene.stream_index, scene.diameters_m)
-    cell_px = float(depth_buffer.DEPTH_CELL_PX)
-    rows, columns = around(pixels, mask, stream_index, cell_px, height, width, first)
+    (streams, height, width), first = scene.image_shape, np.empty((scene.image_shape[0], 2))
+    hidden, margin_m, points = torch.zeros_like(contours.mask), depth_buffer.DEPTH_MARGIN * scene.diameters_m, contour_arrays(contours)
+    seen = as_arrays(scene.T_cam_obj, scene.intrinsics, scene.diameters_m, scene.stream_index, drawn, exact[:, 0], margin_m)
+    views, cell_px = (first, *seen), float(depth_buffer.DEPTH_CELL_PX)
+    rows, columns = around(points, seen[3], cell_px, (height, width), first)
     depths = depth_buffer.DEPTH_STEPS_PER_M, MIN_DEPTH_M, depth_buffer.OBJECT_BITS, depth_buffer.NOTHING
     squares = depth_buffer.SAMPLES_PER_CELL, depth_buffer.SAMPLES_PER_SQUARE, depth_buffer.MOST_CELLS
     settings = GridSettings(rows, columns, cell_px, height, width, *depths, *squares)
     of_each = np.full((depth_buffer.MOST_CELLS, streams * rows * columns), depth_buffer.NOTHING)
-    used, is_drawn = np.zeros(len(of_each), np.bool_), drawn.numpy()
+    used = np.zeros(len(of_each), np.bool_)
     for model in scene.models:
         of_model = arrays_of(model)
-        draw(of_model.members, is_drawn, of_model.surface, T_cam_obj, intrinsics, diameters_m, stream_index, first, settings, of_each, used)
+        draw(of_model.members, of_model.surface, views, settings, (of_each, used))
     nearest = of_each[0]
     for row in used[1:].nonzero()[0] + 1:
         close(of_each[row].reshape(streams, rows, columns), row + 1)
         np.minimum(nearest, of_each[row], out=nearest)
-    hide_in_buffer(points_cam, pixels, normals, mask, *as_arrays(exact[:, 0], margin_m), stream_index, first, settings, nearest, hidden.numpy())
+    hide_in_buffer(points, views, settings, nearest, hidden.numpy())
     return hidden

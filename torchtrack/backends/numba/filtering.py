@@ -1,5 +1,7 @@
 """Small matrices of the filter: functions of :mod:`torchtrack.tracking.motion.model`, object by object."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -47,27 +49,27 @@ def inverse(matrix: Array, into: Array) -> None:
             into[k, j] = column[k] * scale[k] * scale[j] if good else (np.inf if k == j else 0.0)
 
 
+class Moving(NamedTuple):
+    """Objects of which it is asked how far they move, and the stream of each."""
+
+    covariance: Array
+    T_cam_obj: Array
+    centre_obj: Array
+    focal_px: Array
+    diameter_m: Array
+    stream_index: Array
+
+
 @kernel()
-def find_unknown_motion(
-    covariance: Array,
-    T_cam_obj: Array,
-    centre_obj: Array,
-    focal_px: Array,
-    diameter_m: Array,
-    stream_index: Array,
-    elapsed_us: Array,
-    max_unknown_px: float,
-    most_sigma_px: float,
-    is_unknown: Array,
-) -> None:
+def find_unknown_motion(objects: Moving, elapsed_us: Array, max_unknown_px: float, most_sigma_px: float, is_unknown: Array) -> None:
     """Objects that may move far in a window beside what is known: :func:`torchtrack.tracking.initialization.of_unknown_motion`.
 
     Args:
-        covariance, T_cam_obj, centre_obj, focal_px, diameter_m, stream_index: of each object.
         elapsed_us: ``[s]``, the window's length.
         max_unknown_px, most_sigma_px: farther than that, and of those that are not known to be anywhere.
         is_unknown: ``[b]``, filled.
     """
+    covariance, T_cam_obj, centre_obj, focal_px, diameter_m, stream_index = objects
     for b in range(len(covariance)):
         turning = moving = 0.0
         for k in range(3):
@@ -91,7 +93,7 @@ def inverse_numba(matrices: Float[Tensor, "b k k"]) -> Float[Tensor, "b k k"]:
 def moves_unknown_numba(state: TrackerState, t_us: Int[Tensor, "s"], objects: ObjectBatch, config: TrackerConfig) -> Bool[Tensor, "b"]:
     """Object by object."""
     is_unknown = torch.empty_like(objects.stream_index, dtype=torch.bool)
-    own = as_arrays(objects.centre_obj, objects.intrinsics[:, 0], objects.diameter_m, objects.stream_index, t_us - state.t_us)
-    limits = initialization.MAX_UNKNOWN_PX, config.relocalization.wide_sigma_px
-    find_unknown_motion(*as_arrays(state.motion.covariance, state.T_cam_obj), *own, *limits, is_unknown.numpy())
+    own = objects.centre_obj, objects.intrinsics[:, 0], objects.diameter_m, objects.stream_index
+    moving, elapsed_us = as_arrays(state.motion.covariance, state.T_cam_obj, *own), (t_us - state.t_us).numpy()
+    find_unknown_motion(moving, elapsed_us, initialization.MAX_UNKNOWN_PX, config.relocalization.wide_sigma_px, is_unknown.numpy())
     return is_unknown

@@ -1,5 +1,7 @@
 """Where objects are expected at a window's end: :mod:`torchtrack.tracking.motion.predict`, object by object."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -20,40 +22,42 @@ from torchtrack.tracking.motion.model import MotionState
 from torchtrack.tracking.motion.prediction import MAX_DEPTH_M, Prediction
 
 
+class Motion(NamedTuple):
+    """Poses, velocities and covariances: ``[b, 4, 4]``, ``[b, 6]``, and ``[b, 12, 12]``."""
+
+    T_cam_obj: Array
+    velocity: Array
+    covariance: Array
+
+
+class Extents(NamedTuple):
+    """Centres and diameters of objects, and poses in the place of those that are not usable, ``[b, 4, 4]``."""
+
+    centre_obj: Array
+    diameter_m: Array
+    far_pose: Array
+
+
 @kernel()
-def forecast(
-    T_cam_obj: Array,
-    velocity: Array,
-    covariance: Array,
-    dt_s: Array,
-    centre_obj: Array,
-    diameter_m: Array,
-    far_pose: Array,
-    settings: ForecastSettings,
-    T_prior: Array,
-    usable: Array,
-    new_velocity: Array,
-    predicted: Array,
-) -> None:
+def forecast(before: Motion, dt_s: Array, objects: Extents, settings: ForecastSettings, after: Motion, usable: Array) -> None:
     """Predict each object's pose, velocity and covariance.
 
     Args:
-        T_cam_obj, velocity, covariance: of the state: ``[b, 4, 4]``, ``[b, 6]``, ``[b, 12, 12]``.
-        far_pose: ``[b, 4, 4]``, in the place of a pose that is not usable.
-        T_prior, usable, new_velocity, predicted: ``[b, 4, 4]``, ``[b]``, ``[b, 6]`` and ``[b, 12, 12]``; filled.
+        after, usable: filled; ``[b]``.
     """
-    before, moved, start = np.empty(6), np.empty(6), np.empty((12, 12))
-    for b in range(len(T_cam_obj)):
-        dt = np.float64(dt_s[b])
-        start[:] = covariance[b]
-        _expected_velocity(velocity[b], dt, settings, before, start)
-        rotation_sigma, move_sigma = _acceleration_sigma(before, diameter_m[b], settings)
-        _predict(start, rotation_sigma, move_sigma, dt, diameter_m[b], settings.most_uncertain, predicted[b])
+    before, after, objects = Motion(*before), Motion(*after), Extents(*objects)
+    velocity, moved, start = np.empty(6), np.empty(6), np.empty((12, 12))
+    for b in range(len(usable)):
+        dt, diameter_m = np.float64(dt_s[b]), objects.diameter_m[b]
+        start[:] = before.covariance[b]
+        _expected_velocity(before.velocity[b], dt, settings, velocity, start)
+        sigmas = _acceleration_sigma(velocity, diameter_m, settings)
+        _predict(start, sigmas, dt, (settings.most_uncertain, settings.most_uncertain * diameter_m), after.covariance[b])
         for k in range(6):
-            new_velocity[b, k], moved[k] = before[k], before[k] * dt
-        usable[b] = _step(T_cam_obj[b], centre_obj[b], moved, settings.least_depth_m, settings.most_depth_m, T_prior[b])
+            after.velocity[b, k], moved[k] = velocity[k], velocity[k] * dt
+        usable[b] = _step(before.T_cam_obj[b], objects.centre_obj[b], moved, settings.least_depth_m, settings.most_depth_m, after.T_cam_obj[b])
         if not usable[b]:
-            T_prior[b], new_velocity[b] = far_pose[b], 0.0
+            after.T_cam_obj[b], after.velocity[b] = objects.far_pose[b], 0.0
 
 
 @kernel()
@@ -79,15 +83,13 @@ def _acceleration_sigma(velocity: Array, diameter_m: float, settings: ForecastSe
 
 
 @kernel()
-def _predict(
-    covariance: Array, rotation_sigma: float, move_sigma: float, dt: float, diameter_m: float, most_uncertain: float, predicted: Array
-) -> None:
+def _predict(covariance: Array, sigmas: tuple[float, float], dt: float, most: tuple[float, float], predicted: Array) -> None:
     """Covariance of pose and velocity after a while: :func:`torchtrack.tracking.motion.model.predict_covariance`.
 
     Args:
         covariance: ``[12, 12]``.
-        rotation_sigma, move_sigma: standard deviations of the acceleration.
-        most_uncertain: what would be less certain than this (rad, and diameters) is left as it is.
+        sigmas: standard deviations of the acceleration, in rotation and in translation.
+        most: what would be less certain than this (rad, m) is left as it is.
         predicted: filled.
     """
     P, new = covariance, predicted
@@ -98,14 +100,14 @@ def _predict(
             new[j, 6 + k], new[6 + j, k] = both, P[6 + j, k] + dt * P[6 + j, 6 + k]
             new[6 + j, 6 + k] = P[6 + j, 6 + k]
         # An acceleration adds half its square of the time to the pose, and its time to the velocity.
-        sigma = rotation_sigma if j < 3 else move_sigma
+        sigma = sigmas[0] if j < 3 else sigmas[1]
         way, gain = 0.5 * dt * dt * sigma, dt * sigma
         new[j, j] += way * way
         new[j, 6 + j] += way * gain
         new[6 + j, j] += way * gain
         new[6 + j, 6 + j] += gain * gain
     for j in range(6):
-        if np.sqrt(new[j, j]) > most_uncertain * (1.0 if j < 3 else diameter_m):
+        if np.sqrt(new[j, j]) > (most[0] if j < 3 else most[1]):
             new[:] = P
             break
 
@@ -136,8 +138,7 @@ def forecast_numba(
     batch = len(dt_s)
     T_prior, usable = far_pose.new_empty(batch, 4, 4), torch.empty(batch, dtype=torch.bool)
     velocity, covariance = far_pose.new_empty(batch, 6), state.covariance.new_empty(batch, 12, 12)
-    known = as_arrays(state.T_cam_obj, state.velocity, state.covariance, dt_s)
-    of_objects = as_arrays(objects.centre_obj, objects.diameter_m, far_pose)
+    before, extents = as_arrays(state.T_cam_obj, state.velocity, state.covariance), (objects.centre_obj, objects.diameter_m, far_pose)
     settings = filled(
         ForecastSettings,
         config.motion,
@@ -147,5 +148,6 @@ def forecast_numba(
         least_depth_m=MIN_DEPTH_M,
         most_depth_m=MAX_DEPTH_M,
     )
-    forecast(*known, *of_objects, settings, *as_arrays(T_prior, usable, velocity, covariance))
+    after = as_arrays(T_prior, velocity, covariance)
+    forecast(before, *as_arrays(dt_s), as_arrays(*extents), settings, after, usable.numpy())
     return Prediction(objects, T_prior, usable, velocity, covariance)

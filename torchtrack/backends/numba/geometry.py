@@ -1,7 +1,10 @@
 """Points of a moving object in the image: :class:`torchtrack.core.image_velocity.MovingObjects`, one point at a time."""
 
+from typing import NamedTuple
+
 import numpy as np
 
+from torchtrack.backends.numba.arrays import MovingArrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 
 Numbers = tuple[float, ...]
@@ -67,14 +70,39 @@ def across(motion: Numbers, x: float, y: float, z: float, inverse: float, intrin
     return (moving_x - x * inverse * moving_z) * intrinsics[0], (moving_y - y * inverse * moving_z) * intrinsics[1]
 
 
+class Plane(NamedTuple):
+    """The plane through an object's centre, parallel to the image, as it moves: :func:`drift`, depth (m), and :func:`lens`."""
+
+    motion: Numbers
+    depth_m: float
+    lens: Numbers
+
+
 @kernel(fastmath=FAST)
-def at_depth(motion: Numbers, depth_m: float, u: float, v: float, intrinsics: Numbers) -> tuple[float, float]:
-    """Image velocity (px/s) that a pixel would have at a depth: :func:`torchtrack.core.image_velocity.object_plane_velocity`."""
-    x, y, inverse = (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], inverse_depth(depth_m)
+def plane_of(moving: MovingArrays, b: int) -> Plane:
+    """The plane of one object."""
+    return Plane(drift(moving.velocity[b], moving.centre_cam[b]), moving.centre_cam[b, 2], lens(moving.intrinsics[b]))
+
+
+@kernel(fastmath=FAST)
+def carried(plane: Plane, u: float, v: float, age_s: float) -> tuple[float, float]:
+    """Where a pixel comes in some time with an object's plane: :meth:`torchtrack.core.image_velocity.MovingObjects.plane_velocity`."""
+    motion, depth_m, (fx, fy, cx, cy) = plane
+    x, y, inverse = (u - cx) / fx, (v - cy) / fy, inverse_depth(depth_m)
     moving_z = motion[0] * y - motion[1] * x + motion[5] * inverse
     moving_x = motion[1] - motion[2] * y + motion[3] * inverse
     moving_y = motion[2] * x - motion[0] + motion[4] * inverse
-    return (moving_x - x * moving_z) * intrinsics[0], (moving_y - y * moving_z) * intrinsics[1]
+    return u + (moving_x - x * moving_z) * fx * age_s, v + (moving_y - y * moving_z) * fy * age_s
+
+
+@kernel(fastmath=FAST)
+def slope_of(point: Numbers, normal: Numbers, centre: Array, focal_px: Numbers) -> Numbers:
+    """How a point moves along its normal in the image with the pose: :func:`torchtrack.core.image_velocity.pose_jacobian`."""
+    inverse = inverse_depth(point[2])
+    gx, gy = normal[0] * focal_px[0] * inverse, normal[1] * focal_px[1] * inverse
+    gz = -(gx * point[0] + gy * point[1]) * inverse
+    ax, ay, az = point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]
+    return ay * gz - az * gy, az * gx - ax * gz, ax * gy - ay * gx, gx, gy, gz
 
 
 @kernel(fastmath=FAST)

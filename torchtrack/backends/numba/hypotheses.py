@@ -1,10 +1,12 @@
 """Where contour points have most events along their normals: :func:`torchtrack.tracking.relocalization.edge_search.strongest_along_normals`."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import ContourArrays, contour_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.outlines import at
 from torchtrack.core.dispatch import accelerates
@@ -13,18 +15,24 @@ from torchtrack.tracking.relocalization import edge_search
 from torchtrack.tracking.relocalization.event_image import BORDER_PX
 
 
+class Looking(NamedTuple):
+    """How far each contour point looks, at so many places, in images with a border so wide (px)."""
+
+    reach_px: float
+    looks: int
+    border_px: int
+
+
 @kernel(fastmath=FAST)
-def look_along_normals(
-    pixels: Array, normals: Array, mask: Array, images: Array, border_px: int, reach_px: float, looks: int, targets: Array, weights: Array
-) -> None:
+def look_along_normals(contours: ContourArrays, images: Array, looking: Looking, targets: Array, weights: Array) -> None:
     """The place with most events along the normal of each contour point, rather near by, and how much that counts.
 
     Args:
-        pixels, normals, mask: ``[n, 2, m]`` and ``[n, m]``, as many in turn of each image.
-        images: ``[k, h, w]``, with a border of ``border_px``.
-        reach_px: how far each looks, at so many ``looks``.
+        contours: as many in turn of each image.
+        images: ``[k, h, w]``, with a border.
         targets, weights: ``[n, m, 2]`` and ``[n, m]``, filled.
     """
+    (_, pixels, normals, mask, _), (reach_px, looks, border_px) = contours, looking
     height, width = float(images.shape[1]), float(images.shape[2])
     step_px = np.linspace(-reach_px, reach_px, looks)
     near = 1.0 - np.abs(step_px) / (reach_px + 1.0)
@@ -47,6 +55,6 @@ def strongest_along_normals_numba(
 ) -> tuple[Float[Tensor, "n m 2"], Float[Tensor, "n m"]]:
     """Point by point."""
     targets, weights = images.new_empty(*outlines.mask.shape, 2), images.new_empty(outlines.mask.shape)
-    points = as_arrays(outlines.pixels.transpose(1, 2), outlines.normals.transpose(1, 2), outlines.mask)
-    look_along_normals(*points, *as_arrays(images), BORDER_PX, reach_px, edge_search.LOOKS, *as_arrays(targets, weights))
+    looking = reach_px, edge_search.LOOKS, BORDER_PX
+    look_along_normals(contour_arrays(outlines), images.contiguous().numpy(), looking, targets.numpy(), weights.numpy())
     return targets, weights

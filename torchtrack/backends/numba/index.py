@@ -1,5 +1,7 @@
 """Making an index of nearest contour points: :func:`torchtrack.tracking.contours.index.index_contours`, point by point."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Int
@@ -7,11 +9,26 @@ from torch import Tensor
 
 from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.parameters import Cells, IndexSettings
+from torchtrack.backends.numba.parameters import IndexSettings
 from torchtrack.core import host_sync
 from torchtrack.core.dispatch import accelerates
-from torchtrack.tracking.contours.index import DISTANCE_STEPS, FAR_CELLS, HALF_DIAGONAL, OFF_BORDER_PX, ContourIndex, index_contours, radii, reach
+from torchtrack.tracking.contours.index import DISTANCE_STEPS, FAR_CELLS, HALF_DIAGONAL, ContourIndex, index_contours, radii, reach
 from torchtrack.tracking.contours.points import Contours
+
+
+class _Region(NamedTuple):
+    """Where regions begin, ``[b, 2]`` (column, row), and how many columns each has."""
+
+    first: Array
+    columns: int
+
+
+class _Room(NamedTuple):
+    """Where cells are written: parts of squared distances along a row, the least in each cell, and the number of the point that it is of."""
+
+    across: Array
+    steps: Array
+    number: Array
 
 
 @kernel()
@@ -47,13 +64,13 @@ def extents(pixels: Array, mask: Array, radius_px: Array, settings: IndexSetting
 
 
 @kernel()
-def write(pixels: Array, is_inside: Array, radius_px: Array, first: Array, columns: int, settings: IndexSettings, nearest: Array) -> None:
+def write(pixels: Array, is_inside: Array, radius_px: Array, region: _Region, settings: IndexSettings, nearest: Array) -> None:
     """Number of the point nearest to each cell, of those within the radius of its middle; -1 for none.
 
     Args:
         nearest: ``[b, p]``, filled.
     """
-    cells = nearest.shape[1]
+    (firsts, columns), cells = region, nearest.shape[1]
     steps, number = np.empty(cells, np.float32), np.empty(cells, np.int32)
     for b in range(len(pixels)):
         # Of an object that nothing is known of, this is no number to go by.
@@ -64,19 +81,19 @@ def write(pixels: Array, is_inside: Array, radius_px: Array, first: Array, colum
         farthest = np.floor(settings.distance_steps * radius_px[b] ** 2)
         # A square of cells that may lie within the radius: what is farther is no match.
         reach = int(radius_px[b] / settings.side_px + settings.half_diagonal)
-        across = np.empty(2 * reach + 1, np.float32)
+        of_object, room = _Region(firsts[b], columns), _Room(np.empty(2 * reach + 1, np.float32), steps, number)
         for i in range(pixels.shape[1]):
             if is_inside[b, i]:
-                _write_point(np.int32(i), pixels[b, i, 0], pixels[b, i, 1], reach, first[b], columns, settings, across, steps, number)
+                _write_point(np.int32(i), pixels[b, i, 0], pixels[b, i, 1], of_object, settings, room)
         for cell in range(cells):
             nearest[b, cell] = number[cell] if steps[cell] <= farthest else -1
 
 
 @kernel(fastmath=FAST)
-def _write_point(
-    own: int, u: float, v: float, reach: int, first: Array, columns: int, settings: IndexSettings, across: Array, steps: Array, number: Array
-) -> None:
+def _write_point(own: int, u: float, v: float, region: _Region, settings: IndexSettings, room: _Room) -> None:
     """Write one point into the cells around it that none is nearer to; of points as near, the first stays."""
+    (first, columns), (across, steps, number) = region, room
+    reach = len(across) // 2
     column, row = np.rint(u / settings.side_px), np.rint(v / settings.side_px)
     away_u, away_v = settings.side_px * column - u, settings.side_px * row - v
     for k in range(len(across)):
@@ -107,10 +124,5 @@ def index_contours_numba(
     rows, columns = extents(pixels, mask, radius, settings, is_inside, first.numpy())
     # Narrow numbers: half as much of the memory that a processor has near.
     nearest = torch.empty(len(pixels), rows * columns, dtype=torch.int32)
-    write(pixels, is_inside, radius, first.numpy(), columns, settings, nearest.numpy())
+    write(pixels, is_inside, radius, (first.numpy(), columns), settings, nearest.numpy())
     return ContourIndex(first, (rows, columns), cell_px, nearest, contours.pixels, answer)
-
-
-def cells_of(index: ContourIndex) -> Cells:
-    """The layout of an index as kernels know it."""
-    return Cells(*index.size, float(index.cell_px), OFF_BORDER_PX)

@@ -2,20 +2,23 @@
 
 import numpy as np
 
+from torchtrack.backends.numba.arrays import IndexArrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.parameters import Cells
 
 _NOWHERE = 1e30
 
 
-@kernel(fastmath=FAST)
-def nearest(nearest_of_cell: Array, first: Array, u: float, v: float, cells: Cells) -> int:
-    """The contour point that the cell around a place knows, -1 for none.
+@kernel()
+def index_of(index: IndexArrays, b: int) -> IndexArrays:
+    """The index of one object: ``nearest [p]``, and ``first [2]``."""
+    nearest_of_cell, first, cells = index
+    return IndexArrays(nearest_of_cell[b], first[b], cells)
 
-    Args:
-        nearest_of_cell: ``[p]`` of the object.
-        first: its first cell (column, row).
-    """
+
+@kernel(fastmath=FAST)
+def nearest(index: IndexArrays, u: float, v: float) -> int:
+    """The contour point that the cell around a place knows, by an object's index; -1 for none."""
+    first, cells = index.first, index.cells
     half = 0.5 * cells.side_px + cells.aside_px
     column = np.floor((u + half) / cells.side_px) - first[0]
     row = np.floor((v + half) / cells.side_px) - first[1]
@@ -23,17 +26,18 @@ def nearest(nearest_of_cell: Array, first: Array, u: float, v: float, cells: Cel
     # processor would guess many wrong: twice as fast.
     column = min(column if column >= 0 else 0.0, cells.columns - 1.0)
     row = min(row if row >= 0 else 0.0, cells.rows - 1.0)
-    return nearest_of_cell[np.uint64(row) * np.uint64(cells.columns) + np.uint64(column)]
+    return index.nearest[np.uint64(row) * np.uint64(cells.columns) + np.uint64(column)]
 
 
 # Called for each observation: a twentieth of all rounds' time.
 @kernel(fastmath=FAST, forceinline=True)
-def nearest_of_four(nearest_of_cell: Array, first: Array, pixels: Array, u: float, v: float, cells: Cells) -> int:
+def nearest_of_four(index: IndexArrays, pixels: Array, u: float, v: float) -> int:
     """Of the contour points that the four cells around a place know, the one nearest to it; -1 for none.
 
     Args:
-        pixels: ``[m, k]``, the last two of each row the place of a contour point when it was indexed.
+        pixels: ``[m, 2]``, the places of contour points when they were indexed.
     """
+    first, cells = index.first, index.cells
     column = np.floor((u + cells.aside_px) / cells.side_px) - first[0]
     row = np.floor((v + cells.aside_px) / cells.side_px) - first[1]
     if not (column >= 0 and row >= 0 and column < cells.columns - 1 and row < cells.rows - 1):
@@ -41,7 +45,7 @@ def nearest_of_four(nearest_of_cell: Array, first: Array, pixels: Array, u: floa
     begin = int(row) * cells.columns + int(column)
     best, least = -1, _NOWHERE
     for step in (0, 1, cells.columns, cells.columns + 1):
-        known = nearest_of_cell[begin + step]
+        known = index.nearest[begin + step]
         if known >= 0:
             du, dv = pixels[known, 0] - u, pixels[known, 1] - v
             away = du * du + dv * dv

@@ -1,5 +1,7 @@
 """Matching one object's observations with its contours: :func:`tracking.association.nearest.match_nearest`, and what its matches come to weigh."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from torchtrack.backends.alignment import (
@@ -32,10 +34,10 @@ from torchtrack.backends.alignment import (
     Y,
     Z,
 )
+from torchtrack.backends.numba.arrays import IndexArrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, across, inverse_depth, placed
 from torchtrack.backends.numba.look_up import nearest, nearest_of_four
-from torchtrack.backends.numba.parameters import Cells
 
 # Patches of the image: votes of the observations in each.
 _ON, _NEAR, _VOTES = range(3)
@@ -47,6 +49,70 @@ _GIVEN_U, _GIVEN_V, _GIVEN_AGE, _GIVEN_POLARITY = range(COLUMNS, COLUMNS + 4)
 _PLACE_U, _PLACE_V, _IS_NEAR, _IS_MATCHED = range(ROWS, ROWS + 4)
 # What weights hang on is known after each round, the rest after the last.
 _TO_WEIGH, _THE_REST = (TARGET_U, TARGET_V, DARK, AS_EXPECTED, EFFECTIVE), (MATCH_AGE, POINT_X, POINT_Y, POINT_Z, DIRECTION_U, DIRECTION_V, OFFSET)
+
+
+class Observed(NamedTuple):
+    """What was observed: ``rows [b, 5, n]``, and which of them exist, ``[b, n]``; or of one object."""
+
+    rows: Array
+    exists: Array
+
+
+class Table(NamedTuple):
+    """Contour points to match with, of all objects or of one.
+
+    Args:
+        rows: ``[b, m, COLUMNS]``.
+        nearest: their index.
+        subcell_lookup: ``[b]``, whether they are looked up between the cells of the index.
+    """
+
+    rows: Array
+    nearest: IndexArrays
+    subcell_lookup: Array
+
+
+class MatchArrays(NamedTuple):
+    """Matches: contour points ``[b, n]``, which observations are near any and which are matched, and rows ``[b, ROWS, n]``; or of one object."""
+
+    contour: Array
+    is_near: Array
+    is_matched: Array
+    rows: Array
+
+
+class Round(NamedTuple):
+    """One round of matching and solving.
+
+    Args:
+        pose, motion, lens: of the object, from :mod:`torchtrack.backends.numba.geometry`.
+        gate_px, wider: how far observations are matched, and by how much that, and all that is measured against contours, is wider.
+        is_last: whether all rows of matches are asked for, and not only what a weight and a residual hang on.
+    """
+
+    pose: Numbers
+    motion: Numbers
+    lens: Numbers
+    gate_px: float
+    wider: float
+    is_last: bool
+
+
+class Room(NamedTuple):
+    """Where :func:`match` works.
+
+    Args:
+        place: ``[2, n]``, where each observation is looked for.
+        given, derived: rows of a block of observations.
+        patch: of each of the block.
+        votes: ``[patches², 3]``.
+    """
+
+    place: Array
+    given: Array
+    derived: Array
+    patch: Array
+    votes: Array
 
 
 @kernel()
@@ -62,61 +128,33 @@ def patch(u: float, v: float, bits: int, patches: int) -> int:
 
 
 @kernel()
-def room_for(seen: Array, patches: int) -> tuple[Array, ...]:
-    """Where :func:`match` works: what is given and derived of a block of observations, their patches, and votes ``[patches², 3]``."""
+def room_for(seen: Array, patches: int) -> Room:
+    """Where :func:`match` works, for observations ``[b, 5, n]``."""
     given, derived = np.zeros((COLUMNS + 4) * BLOCK, seen.dtype), np.zeros((ROWS + 4) * BLOCK)
-    return given, derived, np.zeros(BLOCK, np.int64), np.empty((patches**2, 3))
+    return Room(np.empty((2, seen.shape[2])), given, derived, np.zeros(BLOCK, np.int64), np.empty((patches**2, 3)))
 
 
 @kernel(fastmath=FAST)
-def match(
-    seen: Array,
-    exists: Array,
-    place: Array,
-    table: Array,
-    nearest_of_cell: Array,
-    first: Array,
-    cells: Cells,
-    pose: Numbers,
-    motion: Numbers,
-    intrinsics: Numbers,
-    gate_px: float,
-    wider: float,
-    subcell_lookup: bool,
-    is_last: bool,
-    settings: MatchingSettings,
-    contour: Array,
-    is_near: Array,
-    is_matched: Array,
-    matches: Array,
-    room: tuple[Array, ...],
-) -> None:
-    """Match each observation with the contour point that is nearest to its place; ``place`` is moved on.
+def match(observed: Observed, table: Table, current: Round, settings: MatchingSettings, matches: MatchArrays, room: Room) -> None:
+    """Match each observation of an object with the contour point that is nearest to its place, which is moved on.
 
     Args:
-        seen: ``[5, n]``, and which of them exist.
-        place: ``[2, n]``.
-        table: ``[m, COLUMNS]``.
-        pose, intrinsics: of the object, from :mod:`torchtrack.backends.numba.geometry`; so is its ``motion``.
-        is_last: whether all rows of matches are asked for, and not only what a weight and a residual hang on.
-        contour, is_near, is_matched, matches: filled; ``[n]``, and ``[ROWS, n]``. Weights are those of ``match_nearest``.
-        room: from :func:`room_for`.
+        matches: filled; their weights are those of ``match_nearest``.
     """
-    given, derived, cell, votes = room
-    votes[:] = 0.0
-    count = _places_in_use(exists)
+    room.votes[:] = 0.0
+    count = _places_in_use(observed.exists)
     # Of many objects, most have far fewer observations than places.
-    contour[count:], is_near[count:], is_matched[count:], matches[:, count:] = 0, False, False, 0.0
+    matches.contour[count:], matches.is_near[count:], matches.is_matched[count:], matches.rows[:, count:] = 0, False, False, 0.0
     for begin in range(0, count, BLOCK):
         end = min(begin + BLOCK, count)
-        _look_up(begin, end, seen, exists, place, table, nearest_of_cell, first, cells, subcell_lookup, contour, is_near, given, derived)
-        _compare(given, pose, motion, intrinsics, gate_px, wider, settings, derived, cell)
-        _vote(end - begin, derived, cell, settings, votes)
-        _take_over(begin, end, derived, place, is_matched)
-        _write(begin, end, derived, _TO_WEIGH, matches)
-        if is_last:
-            _write(begin, end, derived, _THE_REST, matches)
-    _weigh(count, matches, votes, settings)
+        _look_up(begin, end, observed, table, matches, room)
+        _compare(current, settings, room.given, room.derived, room.patch)
+        _vote(end - begin, settings, room)
+        _take_over(begin, end, room, matches.is_matched)
+        _write(begin, end, room.derived, _TO_WEIGH, matches.rows)
+        if current.is_last:
+            _write(begin, end, room.derived, _THE_REST, matches.rows)
+    _weigh(count, matches.rows, room.votes, settings)
 
 
 @kernel()
@@ -129,34 +167,17 @@ def _places_in_use(exists: Array) -> int:
 
 
 @kernel(fastmath=FAST)
-def _look_up(
-    begin: int,
-    end: int,
-    seen: Array,
-    exists: Array,
-    place: Array,
-    table: Array,
-    nearest_of_cell: Array,
-    first: Array,
-    cells: Cells,
-    subcell_lookup: bool,
-    contour: Array,
-    is_near: Array,
-    given: Array,
-    derived: Array,
-) -> None:
+def _look_up(begin: int, end: int, observed: Observed, table: Table, matches: MatchArrays, room: Room) -> None:
     """Lay out a block of observations, each with the contour point nearest to its place; with the first one where there is none."""
-    indexed = table[:, INDEXED_U : INDEXED_V + 1]
+    (seen, exists), (place, given, derived, _, _), contour, is_near = observed, room, matches.contour, matches.is_near
+    indexed = table.rows[:, INDEXED_U : INDEXED_V + 1]
     for i in range(end - begin):
         at = begin + i
         u, v, nearest_index = place[0, at], place[1, at], -1
         if exists[at]:
-            if subcell_lookup:
-                nearest_index = nearest_of_four(nearest_of_cell, first, indexed, u, v, cells)
-            else:
-                nearest_index = nearest(nearest_of_cell, first, u, v, cells)
+            nearest_index = nearest_of_four(table.nearest, indexed, u, v) if table.subcell_lookup else nearest(table.nearest, u, v)
         contour[at], is_near[at], derived[_IS_NEAR * BLOCK + i] = max(nearest_index, 0), nearest_index >= 0, nearest_index >= 0
-        point = table[np.uint64(max(nearest_index, 0))]
+        point = table.rows[np.uint64(max(nearest_index, 0))]
         for k in range(COLUMNS):
             given[k * BLOCK + i] = point[k]
     for k in range(4):
@@ -168,18 +189,9 @@ def _look_up(
 
 
 @kernel(fastmath=FAST)
-def _compare(
-    given: Array,
-    pose: Numbers,
-    motion: Numbers,
-    intrinsics: Numbers,
-    gate_px: float,
-    wider: float,
-    settings: MatchingSettings,
-    derived: Array,
-    cell: Array,
-) -> None:
+def _compare(current: Round, settings: MatchingSettings, given: Array, derived: Array, patches: Array) -> None:
     """Fill the rows of matches of a block, and the patch that each lies in; places are moved on."""
+    pose, motion, intrinsics, gate_px, wider, _ = current
     for i in range(BLOCK):
         point_x, point_y, point_z = given[X * BLOCK + i], given[Y * BLOCK + i], given[Z * BLOCK + i]
         x, y, z = placed(pose, point_x, point_y, point_z)
@@ -209,14 +221,15 @@ def _compare(
         next_u, next_v = carried_u - (u - given[INDEXED_U * BLOCK + i]), carried_v - (v - given[INDEXED_V * BLOCK + i])
         place_u, place_v = derived[_PLACE_U * BLOCK + i], derived[_PLACE_V * BLOCK + i]
         derived[_PLACE_U * BLOCK + i], derived[_PLACE_V * BLOCK + i] = next_u if is_matched > 0 else place_u, next_v if is_matched > 0 else place_v
-        cell[i] = patch(target_u, target_v, settings.patch_bits, settings.patches)
+        patches[i] = patch(target_u, target_v, settings.patch_bits, settings.patches)
 
 
 @kernel(fastmath=FAST)
-def _vote(count: int, derived: Array, cell: Array, settings: MatchingSettings, votes: Array) -> None:
+def _vote(count: int, settings: MatchingSettings, room: Room) -> None:
     """Count the observations of a block in their patches."""
+    _, _, derived, patches, votes = room
     for i in range(count):
-        as_expected, away, patch_of = derived[AS_EXPECTED * BLOCK + i], abs(derived[OFFSET * BLOCK + i]), np.uint64(cell[i])
+        as_expected, away, patch_of = derived[AS_EXPECTED * BLOCK + i], abs(derived[OFFSET * BLOCK + i]), np.uint64(patches[i])
         # Products in the place of branches, of which a processor would guess half wrong.
         near, on = as_expected * (away < settings.smear_px), as_expected * (away < settings.on_contour_px)
         votes[patch_of, _NEAR] += near
@@ -225,14 +238,15 @@ def _vote(count: int, derived: Array, cell: Array, settings: MatchingSettings, v
 
 
 @kernel()
-def _take_over(begin: int, end: int, derived: Array, place: Array, is_matched: Array) -> None:
+def _take_over(begin: int, end: int, room: Room, is_matched: Array) -> None:
     """Keep where the observations of a block are looked for next, and which are matched."""
+    derived = room.derived
     matched, into = derived[_IS_MATCHED * BLOCK : (_IS_MATCHED + 1) * BLOCK], is_matched[begin:end]
     for i in range(len(into)):
         into[i] = matched[i] > 0
     for k in range(2):
         row = (_PLACE_U + k) * BLOCK
-        place[k, begin:end] = derived[row : row + end - begin]
+        room.place[k, begin:end] = derived[row : row + end - begin]
 
 
 @kernel(fastmath=FAST)
@@ -264,13 +278,13 @@ def _weigh(count: int, matches: Array, votes: Array, settings: MatchingSettings)
 
 
 @kernel(fastmath=FAST)
-def believe(seen: Array, is_matched: Array, matches: Array, settings: MatchingSettings) -> None:
+def believe(observed: Observed, matches: MatchArrays, settings: MatchingSettings) -> None:
     """Make weights what there is to be said of each match: none without one, or where an object has too few of them."""
-    total = 0.0
+    trust, is_matched, rows, total = observed.rows[TRUST], matches.is_matched, matches.rows, 0.0
     for i in range(len(is_matched)):
-        matches[WEIGHT, i] *= is_matched[i] * seen[TRUST, i]
-        total += matches[WEIGHT, i]
+        rows[WEIGHT, i] *= is_matched[i] * trust[i]
+        total += rows[WEIGHT, i]
     enough = total >= settings.min_observations
     for i in range(len(is_matched)):
         is_matched[i] = is_matched[i] and enough
-        matches[WEIGHT, i] *= enough * matches[EFFECTIVE, i]
+        rows[WEIGHT, i] *= enough * rows[EFFECTIVE, i]

@@ -5,9 +5,37 @@ from weakref import WeakKeyDictionary
 
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import Arrays, as_arrays
 from torchtrack.backends.numba.compiler import Array
 from torchtrack.object_model.contour_source import ContourModel
+
+
+class EdgeArrays(NamedTuple):
+    """A model's edges, as :class:`ContourModel` has them, but for those of faces: ``face_normals [2, 3, e]``, and ``face_offsets [2, e]``."""
+
+    ends: Array
+    face_normals: Array
+    face_offsets: Array
+    is_crease: Array
+    is_segment: Array
+    rows: Array
+
+
+class TextureArrays(NamedTuple):
+    """A model's points of texture, as :class:`ContourModel` has them."""
+
+    spacing_m: float
+    points: Array
+    tangents: Array
+    normals: Array
+    gaps_m: Array
+
+
+class FaceArrays(NamedTuple):
+    """A model's faces, ``[f, 3, 3]`` and ``[f, 3]``; none of dense meshes."""
+
+    triangles: Array
+    normals: Array
 
 
 class ModelArrays(NamedTuple):
@@ -15,14 +43,15 @@ class ModelArrays(NamedTuple):
 
     Args:
         members: numbers of the objects that have it.
-        sampled: what contour points are sampled from, in the order that :func:`torchtrack.backends.numba.sampling.sample` takes it.
-        faces: triangles and their normals; none of dense meshes.
+        edges, texture: :class:`EdgeArrays` and :class:`TextureArrays`, what contour points are sampled from.
+        faces: :class:`FaceArrays`, what hides them.
         surface: samples of the surface, ``[3, n]``.
     """
 
     members: Array
-    sampled: tuple[Array, ...]
-    faces: tuple[Array, Array]
+    edges: Arrays
+    texture: tuple[float, *Arrays]
+    faces: Arrays
     surface: Array
 
 
@@ -39,7 +68,7 @@ def arrays_of(model: ContourModel) -> ModelArrays:
 
 
 def _made(model: ContourModel) -> ModelArrays:
-    of_edges = model.edge_ends, model.face_normals.movedim(0, -1), model.face_offsets.T, model.is_crease, model.is_segment, model.edges
-    sampled = as_arrays(*of_edges, model.texture_points, model.texture_tangents, model.texture_normals, model.texture_gaps_m)
-    members, triangles, normals, surface = as_arrays(model.members, model.triangles, model.triangle_normals, model.surface_points.T)
-    return ModelArrays(members, tuple(sampled), (triangles, normals), surface)
+    edges = model.edge_ends, model.face_normals.movedim(0, -1), model.face_offsets.T, model.is_crease, model.is_segment, model.edges
+    texture = as_arrays(model.texture_points, model.texture_tangents, model.texture_normals, model.texture_gaps_m)
+    faces, (members, surface) = as_arrays(model.triangles, model.triangle_normals), as_arrays(model.members, model.surface_points.T)
+    return ModelArrays(members, as_arrays(*edges), (model.texture_spacing_m, *texture), faces, surface)

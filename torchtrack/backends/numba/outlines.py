@@ -1,5 +1,7 @@
 """How dense events are on outlines: :func:`torchtrack.tracking.relocalization.sampling.score_outlines`, point by point."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
@@ -8,35 +10,33 @@ from torchtrack.backends.numba.arrays import as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import entries, inverse_depth, lens, placed, turned
 from torchtrack.backends.numba.parameters import ShowingSettings
-from torchtrack.backends.numba.points import SHOWING, normal_of
+from torchtrack.backends.numba.points import SHOWING, ModelPoints, normal_of
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.relocalization import sampling
 from torchtrack.tracking.relocalization.event_image import BORDER_PX
 
 
+class Scoring(NamedTuple):
+    """How outlines are scored: where points show, how wide the border of images is (px), and how far beside a point it is less dense (px)."""
+
+    showing: ShowingSettings
+    border_px: int
+    beside_px: float
+
+
 @kernel(fastmath=FAST)
-def score_outlines(
-    points_obj: Array,
-    tangents_obj: Array,
-    mask: Array,
-    T_cam_obj: Array,
-    intrinsics: Array,
-    settings: ShowingSettings,
-    images: Array,
-    border_px: int,
-    beside_px: float,
-    scores: Array,
-) -> None:
+def score_outlines(points: ModelPoints, T_cam_obj: Array, intrinsics: Array, images: Array, scoring: Scoring, scores: Array) -> None:
     """How much denser events are on contours at some poses than beside them: :func:`torchtrack.tracking.relocalization.sampling.score_outlines`.
 
     Args:
-        points_obj, tangents_obj, mask: ``[n, 3, m]`` and ``[n, m]`` of each pose; or one row for all of an object.
+        points: of each pose ``[n, 3, m]``; or one row for all of an object.
         T_cam_obj: ``[n, 4, 4]``, as many in turn of each object.
         intrinsics: ``[k, 4]``.
         images: ``[k, h, w]``, with a border.
         scores: ``[n]``, filled.
     """
+    (points_obj, tangents_obj, mask), (settings, border_px, beside_px) = points, scoring
     height, width = float(images.shape[1]), float(images.shape[2])
     for n in range(len(scores)):
         k, row = n * len(images) // len(scores), n * len(mask) // len(scores)
@@ -71,6 +71,5 @@ def score_outlines_numba(
     """Point by point."""
     scores = images.new_empty(len(T_cam_obj))
     given = as_arrays(outlines.points_obj.transpose(1, 2), outlines.tangents_obj.transpose(1, 2), outlines.mask)
-    seen = as_arrays(T_cam_obj, intrinsics)
-    score_outlines(*given, *seen, SHOWING, *as_arrays(images), BORDER_PX, sampling.AROUND_PX, scores.numpy())
+    score_outlines(given, *as_arrays(T_cam_obj, intrinsics, images), (SHOWING, BORDER_PX, sampling.AROUND_PX), scores.numpy())
     return scores

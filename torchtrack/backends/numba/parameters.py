@@ -2,6 +2,9 @@
 
 from typing import NamedTuple
 
+from torchtrack.backends.alignment import DampingSettings, MatchingSettings
+from torchtrack.tracking.validation.verdict import Limits
+
 
 class Cells(NamedTuple):
     """The layout of an index.
@@ -59,8 +62,10 @@ class AgreementSettings(NamedTuple):
 
 
 class RoundSettings(NamedTuple):
-    """What :mod:`torchtrack.backends.numba.rounds` goes by beside that: settings, and constants of :mod:`estimation.levenberg_marquardt`."""
+    """What :mod:`torchtrack.backends.numba.rounds` goes by: settings, and constants of :mod:`estimation.levenberg_marquardt`."""
 
+    matching: MatchingSettings
+    damping: DampingSettings
     compensated: bool
     velocity_in_window: bool
 
@@ -229,13 +234,15 @@ class ForecastSettings(NamedTuple):
     most_depth_m: float
 
 
-class CorrectionSettings(NamedTuple):
-    """How :mod:`torchtrack.backends.numba.conclusion` goes on from a verdict.
+class ConclusionSettings(NamedTuple):
+    """What :mod:`torchtrack.backends.numba.conclusion` goes by.
 
     Args:
+        limits: of verdicts.
         coast_s: time in which the velocity of what failed fades.
     """
 
+    limits: Limits
     observation_px: float
     coast_s: float
 

@@ -1,5 +1,7 @@
 """Where contour points show at a pose: :mod:`torchtrack.tracking.contours.points`, point by point."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,25 +20,27 @@ SHOWING = ShowingSettings(MIN_DEPTH_M, MIN_PX_PER_M)
 _LEAST_LENGTH2 = 1e-18
 
 
-@kernel(fastmath=FAST)
-def show(
-    points_obj: Array,
-    tangents_obj: Array,
-    mask: Array,
-    T_cam_obj: Array,
-    intrinsics: Array,
-    settings: ShowingSettings,
-    points_cam: Array,
-    pixels: Array,
-    normals: Array,
-    shown: Array,
-) -> None:
-    """Contour points at a pose, with their normals in the image; those behind the camera or without a normal are not ``shown [b, m]``.
+class ModelPoints(NamedTuple):
+    """Contour points in their objects' frames, with the contour's direction: ``[b, 3, m]``, of which ``mask [b, m]`` count."""
 
-    Args:
-        points_obj, tangents_obj: ``[b, 3, m]``, of which ``mask [b, m]`` count.
-        points_cam, pixels, normals: ``[b, 3, m]``, ``[b, 2, m]``, ``[b, 2, m]``; filled.
-    """
+    points_obj: Array
+    tangents_obj: Array
+    mask: Array
+
+
+class Shown(NamedTuple):
+    """Contour points before the camera: ``[b, 3, m]``, ``[b, 2, m]`` with their normals, and which are shown, ``[b, m]``."""
+
+    points_cam: Array
+    pixels: Array
+    normals: Array
+    mask: Array
+
+
+@kernel(fastmath=FAST)
+def show(given: ModelPoints, T_cam_obj: Array, intrinsics: Array, settings: ShowingSettings, shown: Shown) -> None:
+    """Contour points at a pose, with their normals in the image; those behind the camera or without a normal are not shown."""
+    (points_obj, tangents_obj, mask), (points_cam, pixels, normals, is_shown) = given, shown
     for b in range(len(mask)):
         pose, of_lens = entries(T_cam_obj[b]), lens(intrinsics[b])
         fx, fy, cx, cy = of_lens
@@ -48,7 +52,7 @@ def show(
             ax, ay, az = turned(pose, tangents_obj[b, 0, i], tangents_obj[b, 1, i], tangents_obj[b, 2, i])
             u, v, length = normal_of(ax - x * inverse * az, ay - y * inverse * az, inverse, of_lens)
             normals[b, 0, i], normals[b, 1, i] = u, v
-            shown[b, i] = mask[b, i] and length > settings.least_px_per_m and z > settings.least_depth_m
+            is_shown[b, i] = mask[b, i] and length > settings.least_px_per_m and z > settings.least_depth_m
 
 
 @kernel(fastmath=FAST)
@@ -99,6 +103,7 @@ def assemble_numba(
     """Point by point."""
     rows, tangents = points_obj.transpose(1, 2), tangents_obj.transpose(1, 2)
     points_cam, pixels, normals, is_shown = rows.new_empty(rows.shape), *rows.new_empty(2, len(mask), 2, mask.shape[1]), torch.empty_like(mask)
-    show(*as_arrays(rows, tangents, mask, T_cam_obj, intrinsics), SHOWING, *as_arrays(points_cam, pixels, normals, is_shown))
+    shown = as_arrays(points_cam, pixels, normals, is_shown)
+    show(as_arrays(rows, tangents, mask), *as_arrays(T_cam_obj, intrinsics), SHOWING, shown)
     points_cam, pixels, normals = (value.transpose(1, 2) for value in (points_cam, pixels, normals))
     return Contours(points_obj, tangents_obj, kind, is_shown, points_cam, pixels, normals, torch.ones_like(mask, dtype=points_obj.dtype))

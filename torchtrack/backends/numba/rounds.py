@@ -3,6 +3,8 @@
 One Gauss-Newton step a round, as :func:`tracking.estimation.levenberg_marquardt.solve_pose` takes with one iteration, Tukey's loss and a prior.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 
@@ -15,8 +17,6 @@ from torchtrack.backends.alignment import (
     TARGET_V,
     UNKNOWNS,
     WEIGHT,
-    DampingSettings,
-    MatchingSettings,
     U,
     V,
     X,
@@ -28,13 +28,13 @@ from torchtrack.backends.alignment import (
     matching_settings,
     observed_rows,
 )
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import IndexArrays, SolutionArrays, as_arrays, index_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.geometry import Numbers, at_depth, centre_of, drift, entries, lens
-from torchtrack.backends.numba.index import cells_of
-from torchtrack.backends.numba.matching import BLOCK, believe, match, room_for
-from torchtrack.backends.numba.parameters import Cells, RoundSettings
-from torchtrack.backends.numba.solving import damped_step, move, normal_equations, row_of
+from torchtrack.backends.numba.geometry import Plane, carried, centre_of, drift, entries, lens
+from torchtrack.backends.numba.look_up import index_of
+from torchtrack.backends.numba.matching import BLOCK, MatchArrays, Observed, Round, Table, believe, match, room_for
+from torchtrack.backends.numba.parameters import RoundSettings
+from torchtrack.backends.numba.solving import damped_step, move, normal_equations, row_of, solution_of
 from torchtrack.config.components import Component
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core.constants import constant
@@ -54,83 +54,75 @@ _X, _Y, _Z, _NU, _NV, _TO_U, _TO_V, _AGE, _BELIEVED = range(9)
 _GIVEN = 9
 
 
-@kernel()
-def align(
-    seen: Array,
-    exists: Array,
-    table: Array,
-    nearest_of_cell: Array,
-    first: Array,
-    cells: Cells,
-    velocity: Array,
-    information: Array,
-    intrinsics: Array,
-    centre_obj: Array,
-    gates_px: Array,
-    wider: Array,
-    subcell_lookup: Array,
-    matching: MatchingSettings,
-    rounds: RoundSettings,
-    damping: DampingSettings,
-    T_cam_obj: Array,
-    offset: Array,
-    gradient: Array,
-    hessian: Array,
-    contour: Array,
-    is_near: Array,
-    is_matched: Array,
-    matches: Array,
-) -> None:
-    """Match and solve, one round per gate, for each object.
+class Objects(NamedTuple):
+    """What each object begins with: velocity ``[b, 6]`` as predicted, information ``[b, 12, 12]`` of the prior, camera and centre."""
 
-    Args:
-        seen: ``[b, 5, n]``, and which of them exist.
-        table: ``[b, m, COLUMNS]`` of contour points; ``nearest_of_cell [b, p]`` and ``first [b, 2]`` are their index.
-        velocity: ``[b, 6]`` as predicted.
-        information: ``[b, 12, 12]`` of the prior.
-        gates_px: ``[r]``, and by how much each is ``wider [r, b]``.
-        subcell_lookup: ``[b]``, whether contours are looked up between the cells of the index.
-        T_cam_obj, offset: ``[b, 4, 4]`` and ``[b, 12]`` from the prior, where the rounds begin; changed to where they end.
-        gradient, hessian, contour, is_near, is_matched, matches: of the last round; filled.
-    """
-    count = seen.shape[2]
-    place, rows, weights = np.empty((2, count)), np.empty((UNKNOWNS + 1, count), seen.dtype), np.empty(count, seen.dtype)
-    room, centre, step, used = room_for(seen, matching.patches), np.empty(3), np.empty(UNKNOWNS), np.empty(count + 1, np.int64)
-    given, derived = np.zeros(_GIVEN * BLOCK, seen.dtype), np.empty((UNKNOWNS + 2) * BLOCK, seen.dtype)
-    for b in range(len(seen)):
-        centre_of(T_cam_obj[b], centre_obj[b], centre)
-        moving, of_lens = drift(rounds.compensated * (velocity[b] + offset[b, 6:]), centre), lens(intrinsics[b])
-        _first_place(seen[b], moving, centre, of_lens, place)
-        for r in range(len(gates_px)):
-            centre_of(T_cam_obj[b], centre_obj[b], centre)
-            moving = drift(rounds.compensated * (velocity[b] + offset[b, 6:]), centre)
-            match(
-                seen[b], exists[b], place, table[b], nearest_of_cell[b], first[b], cells, entries(T_cam_obj[b]), moving, of_lens, gates_px[r],
-                wider[r, b], subcell_lookup[b], r == len(gates_px) - 1, matching, contour[b], is_near[b], is_matched[b], matches[b], room,
-            )  # fmt: skip
-            believe(seen[b], is_matched[b], matches[b], matching)
-            pose, scale_px = entries(T_cam_obj[b]), gates_px[r] * wider[r, b]
-            total = _that_count(matches[b, WEIGHT], used)
+    velocity: Array
+    information: Array
+    intrinsics: Array
+    centre_obj: Array
+
+
+class GateArrays(NamedTuple):
+    """Gates of the rounds: ``px [r]``, and by how much each is ``wider [r, b]``."""
+
+    px: Array
+    wider: Array
+
+
+class Aligned(NamedTuple):
+    """Where the rounds begin, changed to where they end, and the matches of the last one."""
+
+    solutions: SolutionArrays
+    matches: MatchArrays
+
+
+@kernel()
+def align(observed: Observed, table: Table, objects: Objects, gates: GateArrays, settings: RoundSettings, aligned: Aligned) -> None:
+    """Match and solve, one round per gate, for each object."""
+    observed, objects, gates = Observed(*observed), Objects(*objects), GateArrays(*gates)
+    table, aligned = Table(table[0], IndexArrays(*table[1]), table[2]), Aligned(SolutionArrays(*aligned[0]), MatchArrays(*aligned[1]))
+    dtype, count, last = observed.rows.dtype, observed.rows.shape[2], len(gates.px) - 1
+    rows, weights, used = np.empty((UNKNOWNS + 1, count), dtype), np.empty(count, dtype), np.empty(count + 1, np.int64)
+    room, centre, step = room_for(observed.rows, settings.matching.patches), np.empty(3), np.empty(UNKNOWNS)
+    given, derived = np.zeros(_GIVEN * BLOCK, dtype), np.empty((UNKNOWNS + 2) * BLOCK, dtype)
+    for b in range(len(observed.rows)):
+        seen, solution, matches = Observed(observed.rows[b], observed.exists[b]), solution_of(aligned.solutions, b), _matches_of(aligned.matches, b)
+        of_object, centre_obj = Table(table.rows[b], index_of(table.nearest, b), table.subcell_lookup[b]), objects.centre_obj[b]
+        T_cam_obj, offset, of_lens = solution.T_cam_obj, solution.offset, lens(objects.intrinsics[b])
+        for r in range(len(gates.px)):
+            centre_of(T_cam_obj, centre_obj, centre)
+            moving = drift(settings.compensated * (objects.velocity[b] + offset[6:]), centre)
+            if r == 0:
+                _first_place(seen.rows, Plane(moving, centre[2], of_lens), room.place)
+            current = Round(entries(T_cam_obj), moving, of_lens, gates.px[r], gates.wider[r, b], r == last)
+            match(seen, of_object, current, settings.matching, matches, room)
+            believe(seen, matches, settings.matching)
+            total = _that_count(matches.rows[WEIGHT], used)
             for begin in range(0, total, BLOCK):
                 end = min(begin + BLOCK, total)
-                _lay_out(used[begin:end], seen[b], table[b], contour[b], matches[b], given)
-                _linearise(given, pose, centre_obj[b], centre, of_lens, scale_px, rounds.velocity_in_window, derived)
+                _lay_out(used[begin:end], seen.rows, of_object.rows, matches, given)
+                _linearise(given, current, centre_obj, centre, settings.velocity_in_window, derived)
                 for k in range(UNKNOWNS + 1):
                     rows[k, begin:end] = derived[k * BLOCK : k * BLOCK + end - begin]
                 weights[begin:end] = derived[_WEIGHT * BLOCK : _WEIGHT * BLOCK + end - begin]
-            normal_equations(rows, weights, total, information[b], offset[b], gradient[b], hessian[b])
-            damped_step(gradient[b], hessian[b], damping.damping, damping, step)
-            move(T_cam_obj[b], centre_obj[b], offset[b], step)
+            normal_equations(rows, weights, total, objects.information[b], solution)
+            damped_step(solution, settings.damping.damping, settings.damping, step)
+            move(T_cam_obj, centre_obj, offset, step)
+
+
+@kernel()
+def _matches_of(matches: MatchArrays, b: int) -> MatchArrays:
+    """The matches of one object."""
+    return MatchArrays(matches.contour[b], matches.is_near[b], matches.is_matched[b], matches.rows[b])
 
 
 @kernel(fastmath=FAST)
-def _first_place(seen: Array, moving: Numbers, centre: Array, intrinsics: Numbers, place: Array) -> None:
+def _first_place(seen: Array, plane: Plane, place: Array) -> None:
     """Where the first round looks for each observation: carried to the window's end at the depth of the object's centre."""
     place_u, place_v = place
     for i in range(len(place_u)):
-        u, v, age = seen[U, i], seen[V, i], seen[AGE, i]
-        speed_u, speed_v = at_depth(moving, centre[2], u, v, intrinsics)
-        place_u[i], place_v[i] = u + speed_u * age, v + speed_v * age
+        place_u[i], place_v[i] = carried(plane, seen[U, i], seen[V, i], seen[AGE, i])
 
 
 @kernel()
@@ -144,9 +136,9 @@ def _that_count(weights: Array, used: Array) -> np.int64:
 
 
 @kernel()
-def _lay_out(used: Array, seen: Array, table: Array, contour: Array, matches: Array, given: Array) -> None:
+def _lay_out(used: Array, seen: Array, table: Array, matches: MatchArrays, given: Array) -> None:
     """Lay out a block of matches in rows."""
-    ages, targets_u, targets_v, weights = seen[AGE], matches[TARGET_U], matches[TARGET_V], matches[WEIGHT]
+    ages, contour, targets_u, targets_v, weights = seen[AGE], matches.contour, matches.rows[TARGET_U], matches.rows[TARGET_V], matches.rows[WEIGHT]
     for k in range(len(used)):
         i = np.uint64(used[k])
         point = table[np.uint64(contour[i])]
@@ -157,16 +149,15 @@ def _lay_out(used: Array, seen: Array, table: Array, contour: Array, matches: Ar
 
 
 @kernel(fastmath=FAST)
-def _linearise(
-    given: Array, pose: Numbers, centre_obj: Array, centre: Array, intrinsics: Numbers, scale_px: float, velocity_in_window: bool, derived: Array
-) -> None:
+def _linearise(given: Array, current: Round, centre_obj: Array, centre: Array, velocity_in_window: bool, derived: Array) -> None:
     """Rows of the Jacobian of a block of matches, with residuals and weights."""
+    intrinsics, scale_px = current.lens, current.gate_px * current.wider
     middle, own = (centre[0], centre[1], centre[2]), (centre_obj[0], centre_obj[1], centre_obj[2])
     for i in range(BLOCK):
         px, py, pz = given[_X * BLOCK + i] - own[0], given[_Y * BLOCK + i] - own[1], given[_Z * BLOCK + i] - own[2]
         nu, nv = given[_NU * BLOCK + i], given[_NV * BLOCK + i]
         there = (given[_TO_U * BLOCK + i] - intrinsics[2]) * nu + (given[_TO_V * BLOCK + i] - intrinsics[3]) * nv
-        row, residual = row_of(pose, px, py, pz, middle, intrinsics, nu, nv, there)
+        row, residual = row_of(current.pose, (px, py, pz), middle, intrinsics, (nu, nv), there)
         relative = residual / scale_px
         robust = max(1.0 - relative * relative, 0.0)
         age = given[_AGE * BLOCK + i] * velocity_in_window
@@ -188,17 +179,16 @@ def align_rounds_numba(
     # What the kernel writes to lies row by row in memory: of anything else it would be given a copy.
     T_cam_obj, offset = (value.clone(memory_format=torch.contiguous_format) for value in (start.begin.T_cam_obj, start.from_prior(information)))
     gradient, hessian = offset.new_empty(offset.shape), offset.new_empty(information.shape)
-    contour = torch.empty(batch, count, dtype=torch.int64)
+    contour, matches = torch.empty(batch, count, dtype=torch.int64), torch.empty(batch, ROWS, count, dtype=offset.dtype)
     is_near, is_matched = torch.empty(2, batch, count, dtype=torch.bool)
-    matches = torch.empty(batch, ROWS, count, dtype=offset.dtype)
+    compensated, velocity_in_window = config.association.motion_compensation, config.uses(Component.VELOCITY_IN_WINDOW)
+    rows, subcell_lookup = as_arrays(table.rows.transpose(1, 2), gates.subcell_lookup)
     align(
-        *as_arrays(observed_rows(observations), observations.mask, table.rows.transpose(1, 2), table.index.nearest, table.index.first),
-        cells_of(table.index),
-        *as_arrays(prediction.velocity, information, objects.intrinsics, objects.centre_obj),
-        *as_arrays(constant(config.association.gates_px, offset.dtype, offset.device), gates.wider, gates.subcell_lookup),
-        matching_settings(config),
-        RoundSettings(config.association.motion_compensation, config.uses(Component.VELOCITY_IN_WINDOW)),
-        damping_settings(config.solver, information),
-        *as_arrays(T_cam_obj, offset, gradient, hessian, contour, is_near, is_matched, matches),
+        as_arrays(observed_rows(observations), observations.mask),
+        (rows, index_arrays(table.index), subcell_lookup),
+        as_arrays(prediction.velocity, information, objects.intrinsics, objects.centre_obj),
+        as_arrays(constant(config.association.gates_px, offset.dtype, offset.device), gates.wider),
+        RoundSettings(matching_settings(config), damping_settings(config.solver, information), compensated, velocity_in_window),
+        (as_arrays(T_cam_obj, offset, gradient, hessian), as_arrays(contour, is_near, is_matched, matches)),
     )
     return Linearisation(T_cam_obj, gradient, hessian, offset), matches_of(contour, is_near, is_matched, matches), start.contours

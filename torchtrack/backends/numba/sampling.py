@@ -1,15 +1,16 @@
 """Contour points of a mesh: :func:`torchtrack.tracking.contours.sampling.mesh_points`, object by object."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import Arrays, as_arrays
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, entries, inverse_depth, lens, placed, turned
-from torchtrack.backends.numba.models import arrays_of
+from torchtrack.backends.numba.models import EdgeArrays, TextureArrays, arrays_of
 from torchtrack.backends.numba.parameters import SamplingSettings
 from torchtrack.config.tracker import ContourConfig
 from torchtrack.core.camera import MIN_DEPTH_M
@@ -23,59 +24,62 @@ _POINT, _TANGENT, _RESOLVED = 0, 3, 6
 _SAMPLED = 7
 
 
+class Sampled(NamedTuple):
+    """What is sampled, with room enough: ``[b, _SAMPLED, n]`` and ``[b, n]``, of which there are as many as ``counts [b]`` says; or of one object."""
+
+    rows: Array
+    kind: Array
+    counts: Array
+
+
+class ActiveEdges(NamedTuple):
+    """Edges that are contours: their numbers, lengths in the image, and depths of their ends."""
+
+    numbers: Array
+    length: Array
+    depths: Array
+
+
+class Points(NamedTuple):
+    """Contour points of each object: ``[b, 3, m]``, and ``[b, m]``."""
+
+    points_obj: Array
+    tangents_obj: Array
+    kind: Array
+    mask: Array
+    resolved: Array
+
+
 @kernel(fastmath=FAST)
-def sample(
-    members: Array,
-    edge_ends: Array,
-    face_normals: Array,
-    face_offsets: Array,
-    is_crease: Array,
-    is_segment: Array,
-    edges: Array,
-    texture_points: Array,
-    texture_tangents: Array,
-    texture_normals: Array,
-    texture_gaps_m: Array,
-    texture_spacing_m: float,
-    T_cam_obj: Array,
-    intrinsics: Array,
-    settings: SamplingSettings,
-    sampled: Array,
-    kind: Array,
-    counts: Array,
-) -> None:
+def sample(members: Array, edges: EdgeArrays, texture: TextureArrays, views: Arrays, settings: SamplingSettings, sampled: Sampled) -> None:
     """Points of objects of one model: on its edges, spread evenly in the image, and of its texture.
 
     Args:
         members: numbers of the objects.
-        edge_ends, face_normals, face_offsets, is_crease, is_segment, edges: of the model's edges, as :class:`contour_source.ContourModel`
-            has them, but for those of faces, ``[2, 3, e]`` and ``[2, e]``; so are those of texture.
-        sampled, kind: ``[b, _SAMPLED, n]`` and ``[b, n]``, with room enough; filled as far as ``counts [b]`` says.
+        views: poses ``[b, 4, 4]``, and intrinsics ``[b, 4]``, of all objects.
     """
-    active, length, depths = np.empty(len(edge_ends), np.int64), np.empty(len(edge_ends)), np.empty((len(edge_ends), 2))
-    camera_obj = np.empty(3)
+    sampled, edges, texture, (T_cam_obj, intrinsics) = Sampled(*sampled), EdgeArrays(*edges), TextureArrays(*texture), views
+    total = len(edges.ends)
+    active, camera_obj = ActiveEdges(np.empty(total, np.int64), np.empty(total), np.empty((total, 2))), np.empty(3)
     for b in members:
         T, pose, of_lens = T_cam_obj[b], entries(T_cam_obj[b]), lens(intrinsics[b])
         for k in range(3):
             camera_obj[k] = -(T[0, k] * T[0, 3] + T[1, k] * T[1, 3] + T[2, k] * T[2, 3])
-        used = _active_edges(camera_obj, face_normals, face_offsets, is_crease, is_segment, settings, active)
-        total = _measure(active, used, edge_ends, pose, of_lens, settings, length, depths)
-        count = _sample_edges(active, used, edges, camera_obj, length, depths, total, settings, sampled[b], kind[b])
-        counts[b] = count + _sample_texture(
-            count, texture_points, texture_tangents, texture_normals, texture_gaps_m, texture_spacing_m, pose, of_lens, settings, sampled[b], kind[b]
-        )
+        used, own = _find_active(edges, camera_obj, settings, active.numbers), Sampled(sampled.rows[b], sampled.kind[b], sampled.counts)
+        shown = ActiveEdges(active.numbers[:used], active.length[:used], active.depths[:used])
+        _measure(edges.ends, pose, of_lens, settings, shown)
+        count = _sample_edges(edges, shown, camera_obj, settings, own)
+        sampled.counts[b] = count + _sample_texture(count, texture, pose, of_lens, settings, own)
 
 
 @kernel(fastmath=FAST)
-def _active_edges(
-    camera_obj: Array, face_normals: Array, face_offsets: Array, is_crease: Array, is_segment: Array, settings: SamplingSettings, active: Array
-) -> int:
+def _find_active(edges: EdgeArrays, camera_obj: Array, settings: SamplingSettings, active: Array) -> int:
     """Which edges are contours, first in ``active``: how many; of too many, some, spread evenly."""
     front, back = np.empty(len(active), np.bool_), np.empty(len(active), np.bool_)
-    _facing(face_normals[0], face_offsets[0], camera_obj, front)
-    _facing(face_normals[1], face_offsets[1], camera_obj, back)
+    _facing(edges.face_normals[0], edges.face_offsets[0], camera_obj, front)
+    _facing(edges.face_normals[1], edges.face_offsets[1], camera_obj, back)
     # Of eight edges at a time, mostly none is one.
-    shows, used = np.zeros(-(-len(active) // 8) * 8, np.bool_), 0
+    shows, used, is_segment, is_crease = np.zeros(-(-len(active) // 8) * 8, np.bool_), 0, edges.is_segment, edges.is_crease
     for e in range(len(active)):
         shows[e] = is_segment[e] | (is_crease[e] & (front[e] | back[e])) | (front[e] != back[e])
     eight = shows.view(np.uint64)
@@ -102,37 +106,23 @@ def _facing(normals: Array, offsets: Array, camera_obj: Array, facing: Array) ->
 
 
 @kernel(fastmath=FAST)
-def _measure(
-    active: Array, used: int, edge_ends: Array, pose: Numbers, intrinsics: Numbers, settings: SamplingSettings, length: Array, depths: Array
-) -> float:
-    """Lengths of edges in the image, zero for those that reach behind the camera, and depths of their ends; the sum of lengths."""
-    total = 0.0
-    for j in range(used):
-        ends = edge_ends[active[j]]
+def _measure(edge_ends: Array, pose: Numbers, intrinsics: Numbers, settings: SamplingSettings, active: ActiveEdges) -> None:
+    """Lengths of edges in the image, zero for those that reach behind the camera, and depths of their ends."""
+    for j in range(len(active.numbers)):
+        ends = edge_ends[active.numbers[j]]
         x0, y0, z0 = placed(pose, ends[0, 0], ends[0, 1], ends[0, 2])
         x1, y1, z1 = placed(pose, ends[1, 0], ends[1, 1], ends[1, 2])
-        depths[j, 0], depths[j, 1], length[j] = z0, z1, 0.0
+        active.depths[j, 0], active.depths[j, 1], active.length[j] = z0, z1, 0.0
         if z0 > settings.least_depth_m and z1 > settings.least_depth_m:
             du, dv = (x1 / z1 - x0 / z0) * intrinsics[0], (y1 / z1 - y0 / z0) * intrinsics[1]
-            length[j] = np.sqrt(du * du + dv * dv)
-        total += length[j]
-    return total
+            active.length[j] = np.sqrt(du * du + dv * dv)
 
 
 @kernel(fastmath=FAST)
-def _sample_edges(
-    active: Array,
-    used: int,
-    edges: Array,
-    camera_obj: Array,
-    length: Array,
-    depths: Array,
-    total: float,
-    settings: SamplingSettings,
-    sampled: Array,
-    kind: Array,
-) -> int:
+def _sample_edges(edges: EdgeArrays, active: ActiveEdges, camera_obj: Array, settings: SamplingSettings, sampled: Sampled) -> int:
     """Points at even distances in the image along all edges, one after the other; how many."""
+    numbers, length, depths = active
+    total, rows = length.sum(), sampled.rows
     if not total > 0:
         return 0
     count = settings.max_edge_points
@@ -141,41 +131,30 @@ def _sample_edges(
     j, until = 0, length[0]
     for i in range(count):
         target = (i + 0.5) / count * total
-        while until < target and j < used - 1:
+        while until < target and j < len(numbers) - 1:
             j += 1
             until += length[j]
         along = 1.0 - (until - target) / max(length[j], 1e-9)
         # Even steps in the image are not even along the edge: undo the perspective.
         z0, z1 = depths[j, 0], depths[j, 1]
         along = min(max(along * z0 / max(z1 + along * (z0 - z1), settings.least_depth_m), 0.0), 1.0)
-        e, side = active[j], 0.0
+        e, side = numbers[j], 0.0
         for k in range(3):
-            sampled[_POINT + k, i] = edges[_START + k, e] + along * edges[_VECTOR + k, e]
-            side += edges[_TURNING + k, e] * (sampled[_POINT + k, i] - camera_obj[k])
+            rows[_POINT + k, i] = edges.rows[_START + k, e] + along * edges.rows[_VECTOR + k, e]
+            side += edges.rows[_TURNING + k, e] * (rows[_POINT + k, i] - camera_obj[k])
         # The normal in the image is to point out of the object: tangents turn with it on their right.
         sign = 1.0 if side > 0 else -1.0
         for k in range(3):
-            sampled[_TANGENT + k, i] = sign * edges[_DIRECTION + k, e]
-        sampled[_RESOLVED, i] = 1.0
-        kind[i] = int(edges[_KIND, e])
+            rows[_TANGENT + k, i] = sign * edges.rows[_DIRECTION + k, e]
+        rows[_RESOLVED, i] = 1.0
+        sampled.kind[i] = int(edges.rows[_KIND, e])
     return count
 
 
 @kernel(fastmath=FAST)
-def _sample_texture(
-    first: int,
-    points: Array,
-    tangents: Array,
-    normals: Array,
-    gaps_m: Array,
-    spacing_m: float,
-    pose: Numbers,
-    intrinsics: Numbers,
-    settings: SamplingSettings,
-    sampled: Array,
-    kind: Array,
-) -> int:
+def _sample_texture(first: int, texture: TextureArrays, pose: Numbers, intrinsics: Numbers, settings: SamplingSettings, sampled: Sampled) -> int:
     """Points of texture that looks at the camera, written from place ``first`` on; how many."""
+    (spacing_m, points, tangents, normals, gaps_m), (rows, kind, _) = texture, sampled
     if len(points) == 0:
         return 0
     spacing_px = spacing_m * intrinsics[0] * inverse_depth(pose[11])
@@ -190,10 +169,10 @@ def _sample_texture(
         towards = -(nx * x + ny * y + nz * z)
         if towards > settings.least_cosine * np.sqrt(x * x + y * y + z * z):
             for k in range(3):
-                sampled[_POINT + k, at], sampled[_TANGENT + k, at] = points[i, k], tangents[i, k]
+                rows[_POINT + k, at], rows[_TANGENT + k, at] = points[i, k], tangents[i, k]
             tangent, place = turned(pose, tangents[i, 0], tangents[i, 1], tangents[i, 2]), (x, y, z)
             gap_px = gaps_m[i] * _px_per_m_across(place, tangent, towards, intrinsics)
-            kind[at], sampled[_RESOLVED, at] = settings.texture, min(gap_px / settings.resolved_px, 1.0)
+            kind[at], rows[_RESOLVED, at] = settings.texture, min(gap_px / settings.resolved_px, 1.0)
             at += 1
     return at - first
 
@@ -207,16 +186,17 @@ def _px_per_m_across(place: Numbers, tangent: Numbers, towards: float, intrinsic
 
 
 @kernel(fastmath=FAST)
-def gather(sampled: Array, kind: Array, counts: Array, points_obj: Array, tangents_obj: Array, kinds: Array, mask: Array, resolved: Array) -> None:
-    """Lay out what was sampled in as many places as needed: ``[b, 3, m]`` and ``[b, m]``; zero where there is nothing."""
+def gather(sampled: Sampled, points: Points) -> None:
+    """Lay out what was sampled in as many places as needed; zero where there is nothing."""
+    (rows, kind, counts), (points_obj, tangents_obj, kinds, mask, resolved) = sampled, points
     for b in range(len(counts)):
         for i in range(mask.shape[1]):
             exists = i < counts[b]
             mask[b, i], kinds[b, i] = exists, kind[b, i] if exists else 0
-            resolved[b, i] = sampled[b, _RESOLVED, i] if exists else 0.0
+            resolved[b, i] = rows[b, _RESOLVED, i] if exists else 0.0
             for k in range(3):
-                points_obj[b, k, i] = sampled[b, _POINT + k, i] if exists else 0.0
-                tangents_obj[b, k, i] = sampled[b, _TANGENT + k, i] if exists else 0.0
+                points_obj[b, k, i] = rows[b, _POINT + k, i] if exists else 0.0
+                tangents_obj[b, k, i] = rows[b, _TANGENT + k, i] if exists else 0.0
 
 
 def sampling_settings(config: ContourConfig) -> SamplingSettings:
@@ -237,16 +217,16 @@ def mesh_points_numba(models: Sequence[ContourModel], T_cam_obj: Tensor, intrins
     """Edge by edge."""
     settings, batch = sampling_settings(config), len(T_cam_obj)
     room = settings.max_edge_points + max(len(model.texture_points) for model in models)
-    sampled = T_cam_obj.new_empty(batch, _SAMPLED, room).numpy()
-    kind, counts = np.empty((batch, room), np.int64), np.zeros(batch, np.int64)
+    counts = np.zeros(batch, np.int64)
+    sampled = T_cam_obj.new_empty(batch, _SAMPLED, room).numpy(), np.empty((batch, room), np.int64), counts
     seen = as_arrays(T_cam_obj, intrinsics)
     for model in models:
         of_model = arrays_of(model)
-        sample(of_model.members, *of_model.sampled, model.texture_spacing_m, *seen, settings, sampled, kind, counts)
+        sample(of_model.members, of_model.edges, of_model.texture, seen, settings, sampled)
     # One place at least: what selects from contours needs one to point at.
     width = max(int(counts.max()), 1)
     points_obj, tangents_obj = T_cam_obj.new_empty(2, batch, 3, width)
     kinds, mask = torch.empty(batch, width, dtype=torch.int64), torch.empty(batch, width, dtype=torch.bool)
     resolved = T_cam_obj.new_empty(batch, width)
-    gather(sampled, kind, counts, *as_arrays(points_obj, tangents_obj, kinds, mask, resolved))
+    gather(sampled, as_arrays(points_obj, tangents_obj, kinds, mask, resolved))
     return points_obj.transpose(1, 2), tangents_obj.transpose(1, 2), kinds, mask, resolved

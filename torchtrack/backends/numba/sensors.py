@@ -2,22 +2,23 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import PaddedArrays, as_arrays, padded_arrays
 from torchtrack.backends.numba.bursts import age_all, fire
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
-from torchtrack.backends.numba.tiles import divide, numbers_near
+from torchtrack.backends.numba.tiles import divide, grid_of, numbers_near, tiles_of
 from torchtrack.core.dispatch import accelerates
 from torchtrack.core.events import EventBatch, PaddedEvents, check_streams_in_order, of_streams, stream_bounds
 from torchtrack.tracking.frontend.bursts import LONG_AGO_US, LONGEST_US
 from torchtrack.tracking.frontend.history import BORDER_PX
 from torchtrack.tracking.frontend.sensors import Sensors
-from torchtrack.tracking.frontend.tiles import TILE_BITS, NearbyEvents
+from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.frontend.window_events import ObjectEvents, SharedEvents, WindowEvents
 
 # Rows of what an object sees of an event.
@@ -26,16 +27,15 @@ SEEN = 4
 
 
 @kernel(fastmath=FAST)
-def see(x: Array, y: Array, age_us: Array, polarity: Array, mask: Array, ideal_pixels: Array, stream_index: Array, seen: Array) -> None:
+def see(events: PaddedArrays, ideal_pixels: Array, stream_index: Array, seen: Array) -> None:
     """Events of several streams as each object's camera saw them.
 
     Args:
-        x, y, age_us, polarity, mask: ``[s, e]`` of a window.
         ideal_pixels: ``[s, h, w, 2]``.
         stream_index: ``[b]``; of one stream, ``[1]`` is enough for all that see it.
         seen: ``[SEEN, b, e]``, filled; zero where there is nothing.
     """
-    width = np.uint64(ideal_pixels.shape[2])
+    (x, y, age_us, polarity, mask), width = events, np.uint64(ideal_pixels.shape[2])
     for b in range(len(stream_index)):
         s = stream_index[b]
         ideal = ideal_pixels[s].reshape(-1, 2)
@@ -50,41 +50,58 @@ def see(x: Array, y: Array, age_us: Array, polarity: Array, mask: Array, ideal_p
             seen[POLARITY, b, i] = 1.0 if polarity[s, i] else -1.0
 
 
+class Kept(NamedTuple):
+    """Which events are kept: ``numbers [n]`` of those of all streams; a stream's own from ``first`` to ``last``, with places for them to ``end``."""
+
+    numbers: Array
+    first: int
+    last: int
+    end: int
+
+
+class StreamEvents(NamedTuple):
+    """Events of all streams, ``[e]``."""
+
+    x: Array
+    y: Array
+    t_us: Array
+    polarity: Array
+
+
+class Ages(NamedTuple):
+    """When a window ends, how long it is, and how long a burst and what was long ago (µs)."""
+
+    end_us: int
+    elapsed_us: int
+    longest_us: int
+    long_ago_us: int
+
+
+class StreamMaps(NamedTuple):
+    """A stream's pixels without the lens's distortion, ``[h, w, 2]``, and its map of bursts before the window and after it, ``[2, h, w]``."""
+
+    ideal_pixels: Array
+    before: Array
+    ages: Array
+
+
 @kernel(fastmath=FAST)
-def see_kept(
-    kept: Array,
-    places: tuple[int, int, int],
-    x: Array,
-    y: Array,
-    t_us: Array,
-    polarity: Array,
-    end_us: int,
-    elapsed_us: int,
-    longest_us: int,
-    long_ago_us: int,
-    ideal_pixels: Array,
-    before: Array,
-    ages: Array,
-    seen: Array,
-    exists: Array,
-) -> None:
+def see_kept(events: StreamEvents, kept: Kept, ages: Ages, maps: StreamMaps, seen: Array, exists: Array) -> None:
     """Some events of one stream as its camera saw them, and the map of bursts brought up to the window's end.
 
     As :func:`torchtrack.backends.numba.bursts.update_bursts` and :func:`see` one after the other, without anything written in between.
 
     Args:
-        kept: numbers of the events of all streams, ``[n]``.
-        places: the first of the stream's own among them; where these end, and where the places for them do.
-        ideal_pixels: ``[h, w, 2]``; ``before`` and ``ages [2, h, w]``.
-        seen, exists: ``[SEEN, n]`` and ``[n]``, filled there; where there are more places, with zeros.
+        seen, exists: ``[SEEN, n]`` and ``[n]``, filled where the stream's own are; where there are more places, with zeros.
     """
+    (x, y, t_us, polarity), (numbers, first, last, end), (end_us, elapsed_us, longest_us, long_ago_us) = events, kept, ages
+    ideal_pixels, before, aged = maps
     width, brighter = np.uint64(ideal_pixels.shape[1]), np.uint64(ideal_pixels.shape[0] * ideal_pixels.shape[1])
-    aged, ideal = ages.ravel(), ideal_pixels.reshape(-1, 2)
+    aged, ideal = aged.ravel(), ideal_pixels.reshape(-1, 2)
     u, v, age_s, sign = seen[PIXELS], seen[PIXELS + 1], seen[AGE], seen[POLARITY]
     age_all(before.ravel(), np.int16(elapsed_us), np.int16(long_ago_us - elapsed_us), aged)
-    first, last, end = places
     for j in range(first, last):
-        i = np.uint64(kept[j])
+        i = np.uint64(numbers[j])
         pixel, age = np.uint64(y[i]) * width + np.uint64(x[i]), end_us - t_us[i]
         fire(aged, pixel + np.uint64(polarity[i]) * brighter, min(age, long_ago_us), True, elapsed_us, longest_us)
         u[j], v[j], age_s[j] = ideal[pixel, 0], ideal[pixel, 1], age * 1e-6
@@ -118,8 +135,7 @@ def seen_numba(sensors: Sensors, window: PaddedEvents, number: Int[Tensor, "e"] 
     # What all see alike is written once.
     own = sensors.stream_index[:1] if len(sensors.ideal_pixels) == 1 else sensors.stream_index
     seen = sensors.ideal_pixels.new_empty(SEEN, len(own), window.mask.shape[1])
-    arrays = as_arrays(window.x, window.y, window.age_us, window.polarity, window.mask, sensors.ideal_pixels)
-    see(*arrays, *as_arrays(own), seen.numpy())
+    see(padded_arrays(window), *as_arrays(sensors.ideal_pixels, own), seen.numpy())
     return _of_rows(seen.expand(-1, batch, -1), window.mask[own].expand(batch, -1))
 
 
@@ -151,14 +167,15 @@ def window_events_numba(
     maps, filled = as_arrays(sensors.ideal_pixels, burst_age_us, ages_us), as_arrays(seen[:, 0], exists[0])
     for s, (end_us, elapsed) in enumerate(zip(t_us.tolist(), elapsed_us.tolist(), strict=True)):
         last = int(bounds[s + 1])
-        of_stream = int(bounds[s]), last, places if s + 1 == streams else last
-        see_kept(kept, of_stream, *of_events, end_us, elapsed, LONGEST_US, LONG_AGO_US, *(table[s] for table in maps), *filled)
+        of_stream = kept, int(bounds[s]), last, places if s + 1 == streams else last
+        see_kept(of_events, of_stream, (end_us, elapsed, LONGEST_US, LONG_AGO_US), tuple([table[s] for table in maps]), *filled)
     shared = replace(_of_rows(seen, exists), number=torch.from_numpy(number if len(kept) else np.zeros(1, np.int64))[None])
     if len(near) == 1 == streams:
         return shared, ages_us
     # Only what is written of this is ever looked at.
     own, counts = torch.empty(len(near), int(np.diff(bounds).max()) + 1, dtype=torch.int32), torch.empty(len(near), dtype=torch.int64)
-    divide(kept, bounds, *of_events[:2], *as_arrays(near, sensors.stream_index), TILE_BITS, sensors.tiles.columns, *as_arrays(own, counts))
+    tiles = tiles_of(*of_events[:2], kept, grid_of(sensors.tiles))
+    divide(tiles, bounds, *as_arrays(near, sensors.stream_index, own, counts))
     return SharedEvents(shared, own, counts), ages_us
 
 

@@ -1,12 +1,14 @@
 """Levenberg-Marquardt of :func:`tracking.estimation.levenberg_marquardt.solve_pose`, object by object, and the parts of a step that rounds share."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchtrack.backends.alignment import DampingSettings, damping_settings
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import SolutionArrays, as_arrays
 from torchtrack.backends.numba.cholesky import factorise, solve
 from torchtrack.backends.numba.compiler import FAST, Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, centre_of, entries, inverse_depth, is_finite, lens, turn, turned
@@ -23,74 +25,74 @@ _ALONG = FAST | {"reassoc"}
 _POSE = 6
 
 
-@kernel()
-def solve_poses(
-    points_obj: Array,
-    targets: Array,
-    directions: Array,
-    weights: Array,
-    age_s: Array,
-    velocity: Array,
-    intrinsics: Array,
-    centre_obj: Array,
-    scale_px: Array,
-    information: Array,
-    solving: SolvingSettings,
-    damping: DampingSettings,
-    T_cam_obj: Array,
-    offset: Array,
-    gradient: Array,
-    hessian: Array,
-) -> None:
-    """Solve each problem: :class:`torchtrack.tracking.estimation.terms.PoseProblem` by its fields.
+class ProblemArrays(NamedTuple):
+    """Problems to solve: :class:`torchtrack.tracking.estimation.terms.PoseProblem` by its fields.
 
     Args:
         age_s, velocity: of what is unknown beside the pose; not read where there is nothing.
-        T_cam_obj, offset: ``[b, 4, 4]`` and ``[b, k]`` from the prior, where the search starts; changed to where it ends.
-        gradient, hessian: ``[b, k]`` and ``[b, k, k]``, of the last linearisation; filled.
     """
-    count, unknowns = weights.shape[1], offset.shape[1]
-    rows, robust = np.empty((unknowns + 1, count), weights.dtype), np.empty(count, weights.dtype)
-    (pose, next_pose), (offset_of, next_offset) = np.empty((2, 4, 4)), np.empty((2, unknowns))
-    step, next_gradient, next_hessian = np.empty(unknowns), np.empty(unknowns), np.empty((unknowns, unknowns))
-    for b in range(len(offset)):
-        pose[:], offset_of[:] = T_cam_obj[b], offset[b]
-        problem = (points_obj[b], targets[b], directions[b], weights[b], age_s[b], velocity[b])
-        of_object = (lens(intrinsics[b]), centre_obj[b], scale_px[b], information[b])
-        cost = _look(problem, of_object, pose, offset_of, solving.loss, rows, robust, gradient[b], hessian[b])
-        damped = damping.damping
-        for _ in range(solving.iterations - 1):
-            next_pose[:], next_offset[:] = pose, offset_of
-            possible = damped_step(gradient[b], hessian[b], damped, damping, step)
-            move(next_pose, centre_obj[b], next_offset, step)
-            next_cost = _look(problem, of_object, next_pose, next_offset, solving.loss, rows, robust, next_gradient, next_hessian)
+
+    points_obj: Array
+    targets: Array
+    directions: Array
+    weights: Array
+    age_s: Array
+    velocity: Array
+    intrinsics: Array
+    centre_obj: Array
+    scale_px: Array
+    information: Array
+
+
+@kernel()
+def _problem_of(problems: ProblemArrays, b: int) -> ProblemArrays:
+    """The problem of one object."""
+    p = problems
+    observed = p.points_obj[b], p.targets[b], p.directions[b], p.weights[b], p.age_s[b], p.velocity[b]
+    return ProblemArrays(*observed, p.intrinsics[b], p.centre_obj[b], p.scale_px[b], p.information[b])
+
+
+@kernel()
+def solution_of(solutions: SolutionArrays, b: int) -> SolutionArrays:
+    """The solution of one object."""
+    return SolutionArrays(solutions.T_cam_obj[b], solutions.offset[b], solutions.gradient[b], solutions.hessian[b])
+
+
+@kernel()
+def solve_poses(problems: ProblemArrays, settings: SolvingSettings, damping: DampingSettings, solutions: SolutionArrays) -> None:
+    """Solve each problem, from where the search starts; the solutions are changed to where it ends."""
+    problems, solutions = ProblemArrays(*problems), SolutionArrays(*solutions)
+    count, unknowns, dtype = problems.weights.shape[1], solutions.offset.shape[1], problems.weights.dtype
+    rows, robust, step = np.empty((unknowns + 1, count), dtype), np.empty(count, dtype), np.empty(unknowns)
+    (pose, next_pose), (offset, next_offset) = np.empty((2, 4, 4)), np.empty((2, unknowns))
+    tried = SolutionArrays(next_pose, next_offset, np.empty(unknowns), np.empty((unknowns, unknowns)))
+    for b in range(len(problems.weights)):
+        problem, solution = _problem_of(problems, b), solution_of(solutions, b)
+        best = SolutionArrays(pose, offset, solution.gradient, solution.hessian)
+        pose[:], offset[:] = solution.T_cam_obj, solution.offset
+        cost, damped = _look(problem, best, settings.loss, rows, robust), damping.damping
+        for _ in range(settings.iterations - 1):
+            next_pose[:], next_offset[:] = pose, offset
+            possible = damped_step(best, damped, damping, step)
+            move(next_pose, problem.centre_obj, next_offset, step)
+            next_cost = _look(problem, tried, settings.loss, rows, robust)
             # Near the optimum, rounding must not decide.
-            if possible and next_cost <= cost * (1.0 + solving.rounding):
-                cost, damped = next_cost, damped * solving.decay
-                pose[:], offset_of[:], gradient[b], hessian[b] = next_pose, next_offset, next_gradient, next_hessian
+            if possible and next_cost <= cost * (1.0 + settings.rounding):
+                cost, damped = next_cost, damped * settings.decay
+                pose[:], offset[:], best.gradient[:], best.hessian[:] = next_pose, next_offset, tried.gradient, tried.hessian
             else:
-                damped = max(damped, solving.least_raised) * solving.growth
-        damped_step(gradient[b], hessian[b], damped, damping, step)
-        move(pose, centre_obj[b], offset_of, step)
-        T_cam_obj[b], offset[b] = pose, offset_of
+                damped = max(damped, settings.least_raised) * settings.growth
+        damped_step(best, damped, damping, step)
+        move(pose, problem.centre_obj, offset, step)
+        solution.T_cam_obj[:], solution.offset[:] = pose, offset
 
 
 @kernel(fastmath=FAST)
-def _look(
-    problem: tuple[Array, ...],
-    of_object: tuple[Numbers, Array, float, Array],
-    pose: Array,
-    offset: Array,
-    loss: int,
-    rows: Array,
-    robust: Array,
-    gradient: Array,
-    hessian: Array,
-) -> float:
-    """Gradient and Hessian at a pose and an offset from the prior, filled, and the cost there."""
-    points, targets, directions, weights, age_s, velocity = problem
-    intrinsics, centre_obj, scale_px, information = of_object
-    unknowns, centre, cost, used, velocity_offset = len(offset), np.empty(3), 0.0, 0, np.zeros(_POSE)
+def _look(problem: ProblemArrays, solution: SolutionArrays, loss: int, rows: Array, robust: Array) -> float:
+    """Gradient and Hessian at a solution's pose and offset from the prior, filled, and the cost there."""
+    points, targets, directions, weights, age_s, velocity, _, centre_obj, scale_px, information = problem
+    pose, offset, _, _ = solution
+    intrinsics, unknowns, centre, cost, used, velocity_offset = lens(problem.intrinsics), len(offset), np.empty(3), 0.0, 0, np.zeros(_POSE)
     centre_of(pose, centre_obj, centre)
     numbers, c, middle = entries(pose), (centre_obj[0], centre_obj[1], centre_obj[2]), (centre[0], centre[1], centre[2])
     if unknowns > _POSE:
@@ -100,7 +102,8 @@ def _look(
             continue
         nu, nv = directions[i, 0], directions[i, 1]
         there = (targets[i, 0] - intrinsics[2]) * nu + (targets[i, 1] - intrinsics[3]) * nv
-        row, residual = row_of(numbers, points[i, 0] - c[0], points[i, 1] - c[1], points[i, 2] - c[2], middle, intrinsics, nu, nv, there)
+        from_centre = points[i, 0] - c[0], points[i, 1] - c[1], points[i, 2] - c[2]
+        row, residual = row_of(numbers, from_centre, middle, intrinsics, (nu, nv), there)
         for k in range(_POSE):
             rows[k, used] = row[k]
         if unknowns > _POSE:
@@ -112,23 +115,21 @@ def _look(
         cost += weights[i] * lost
         rows[unknowns, used], robust[used] = residual, weights[i] * weight
         used += 1
-    return cost + 0.5 * normal_equations(rows, robust, used, information, offset, gradient, hessian)
+    return cost + 0.5 * normal_equations(rows, robust, used, information, solution)
 
 
 @kernel(fastmath=FAST)
-def row_of(
-    pose: Numbers, x: float, y: float, z: float, centre: Numbers, intrinsics: Numbers, nu: float, nv: float, there: float
-) -> tuple[Numbers, float]:
+def row_of(pose: Numbers, from_centre: Numbers, centre: Numbers, intrinsics: Numbers, direction: Numbers, there: float) -> tuple[Numbers, float]:
     """The Jacobian of a residual by the pose, and the residual: :func:`torchtrack.core.image_velocity.pose_jacobian`.
 
     Args:
-        x, y, z: the point from the object's centre, in the object's axes.
-        nu, nv: the direction along which the distance counts.
+        from_centre: the point from the object's centre, in the object's axes.
+        direction: along which the distance counts.
         there: where the target is along it, from the principal point.
     """
-    ax, ay, az = turned(pose, x, y, z)
+    ax, ay, az = turned(pose, from_centre[0], from_centre[1], from_centre[2])
     inverse = inverse_depth(az + centre[2])
-    gx, gy = nu * intrinsics[0] * inverse, nv * intrinsics[1] * inverse
+    gx, gy = direction[0] * intrinsics[0] * inverse, direction[1] * intrinsics[1] * inverse
     along = gx * (ax + centre[0]) + gy * (ay + centre[1])
     gz = -along * inverse
     return (ay * gz - az * gy, az * gx - ax * gz, ax * gy - ay * gx, gx, gy, gz), along - there
@@ -151,12 +152,13 @@ def robustly(residual: float, scale_px: float, loss: int) -> tuple[float, float]
 
 
 @kernel(fastmath=_ALONG)
-def normal_equations(rows: Array, weights: Array, used: int, information: Array, offset: Array, gradient: Array, hessian: Array) -> float:
-    """Gradient of the cost, and its Gauss-Newton Hessian, prior included, filled; and twice the prior's part of the cost.
+def normal_equations(rows: Array, weights: Array, used: int, information: Array, solution: SolutionArrays) -> float:
+    """Gradient of the cost at a solution, and its Gauss-Newton Hessian, prior included, filled; and twice the prior's part of the cost.
 
     Args:
         rows: ``[k + 1, n]`` of the Jacobian, and the residuals.
     """
+    _, offset, gradient, hessian = solution
     unknowns, weighted, priors = len(offset), np.empty(used, rows.dtype), 0.0
     for j in range(unknowns + 1):
         row = rows[j]
@@ -181,15 +183,15 @@ def normal_equations(rows: Array, weights: Array, used: int, information: Array,
 
 
 @kernel()
-def damped_step(gradient: Array, hessian: Array, damped: float, damping: DampingSettings, step: Array) -> bool:
-    """The damped step to the optimum, filled, and whether there is one; none where the Hessian is not positive definite."""
+def damped_step(solution: SolutionArrays, damped: float, damping: DampingSettings, step: Array) -> bool:
+    """The damped step from a solution to the optimum, filled, and whether there is one; none where the Hessian is not positive definite."""
     unknowns = len(step)
-    matrix, factor, largest = hessian.astype(np.float64), np.empty((unknowns, unknowns)), 0.0
+    matrix, factor, largest = solution.hessian.astype(np.float64), np.empty((unknowns, unknowns)), 0.0
     for k in range(_POSE):
         largest = max(largest, matrix[k, k])
     for k in range(unknowns):
         matrix[k, k] += damping.least_diagonal + damping.least_share * largest + damped * matrix[k, k]
-        step[k] = -gradient[k]
+        step[k] = -solution.gradient[k]
     if factorise(matrix, factor):
         solve(factor, step)
         if is_finite(step):
@@ -224,13 +226,10 @@ def solve_pose_numba(
     gradient, hessian = torch.empty_like(offset), torch.empty_like(problem.prior_information, memory_format=torch.contiguous_format)
     observed = problem.points_obj, problem.targets, problem.directions, problem.weights, window.age_s
     of_objects = window.velocity, problem.intrinsics, problem.centre_obj, problem.scale_px, problem.prior_information
+    problems = as_arrays(*(value.detach() for value in (*observed, *of_objects)))
     rounding = lm.ROUNDINGS * torch.finfo(T_start.dtype).eps
-    solve_poses(
-        *as_arrays(*(value.detach() for value in (*observed, *of_objects))),
-        SolvingSettings(config.iterations, LOSSES.index(config.loss), rounding, lm.DAMPING_START, lm.DAMPING_GROWTH, lm.DAMPING_DECAY),
-        damping_settings(config, hessian),
-        *as_arrays(T_cam_obj, offset, gradient, hessian),
-    )
+    settings = SolvingSettings(config.iterations, LOSSES.index(config.loss), rounding, lm.DAMPING_START, lm.DAMPING_GROWTH, lm.DAMPING_DECAY)
+    solve_poses(problems, settings, damping_settings(config, hessian), as_arrays(T_cam_obj, offset, gradient, hessian))
     return Linearisation(T_cam_obj, gradient, hessian, offset)
 
 

@@ -1,5 +1,7 @@
 """Which events can have to do with which object: :mod:`torchtrack.tracking.frontend.tiles`, tile by tile and event by event."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -20,40 +22,60 @@ from torchtrack.tracking.motion.prediction import Prediction
 _BLOCK = 1024
 
 
+class Tiles(NamedTuple):
+    """Tiles of each sensor: middles ``[s, t, 2]``, and how far anything in one reaches, ``[s, t]``."""
+
+    middle: Array
+    reach_px: Array
+
+
+class Motions(NamedTuple):
+    """How objects are expected to move: ``[b, 6]``, the variance of the pose ``[b, 6]``, ``[b, 4, 4]``, and the window ``[b]``."""
+
+    velocity: Array
+    variance: Array
+    T_cam_obj: Array
+    window_s: Array
+
+
+class Boxes(NamedTuple):
+    """Boxes around objects, in their frames, and what sees each."""
+
+    centre_obj: Array
+    half_extent: Array
+    diameter_m: Array
+    intrinsics: Array
+    stream_index: Array
+
+
+class TileGrid(NamedTuple):
+    """Tiles of a sensor: so many bits of a pixel's place lie within one; so many ``columns`` of them; and the sensor's size (px)."""
+
+    bits: int
+    columns: int
+    width: int
+    height: int
+
+
 @kernel(fastmath=FAST)
-def near_tiles(
-    middle: Array,
-    reach_px: Array,
-    velocity: Array,
-    variance: Array,
-    T_cam_obj: Array,
-    window_s: Array,
-    centre_obj: Array,
-    half_extent: Array,
-    diameter_m: Array,
-    intrinsics: Array,
-    stream_index: Array,
-    tiles: TileSettings,
-    near: Array,
-) -> None:
+def near_tiles(tiles: Tiles, motions: Motions, boxes: Boxes, settings: TileSettings, near: Array) -> None:
     """Tiles that anything can be seen in that is near an object: :meth:`torchtrack.tracking.frontend.tiles.SensorTiles.near`.
 
     Args:
-        middle, reach_px: ``[s, t, 2]`` and ``[s, t]``.
-        velocity, variance: ``[b, 6]``, and of the pose, ``[b, 6]``.
         near: ``[b, t]``, filled.
     """
+    (velocity, variance, T_cam_obj, window_s), boxes, tiles = motions, Boxes(*boxes), Tiles(*tiles)
     for b in range(len(near)):
-        rim_m = 0.5 * diameter_m[b]
+        rim_m = 0.5 * boxes.diameter_m[b]
         turning = np.sqrt((velocity[b, :3] ** 2).sum())
         speed_m_s = np.sqrt((velocity[b, 3:] ** 2).sum())
         turned, moved = np.sqrt(variance[b, :3].max()), np.sqrt(variance[b, 3:].max())
-        within_m = (speed_m_s + rim_m * turning) * window_s[b] + tiles.sigmas * (moved + rim_m * turned)
-        pose, of_lens = entries(T_cam_obj[b]), lens(intrinsics[b])
-        left, top, right, bottom = _around(pose, centre_obj[b], half_extent[b], of_lens, within_m, tiles.least_depth_m)
-        of_sensor, reach_of_sensor = middle[stream_index[b]], reach_px[stream_index[b]]
+        within_m = (speed_m_s + rim_m * turning) * window_s[b] + settings.sigmas * (moved + rim_m * turned)
+        pose, of_lens = entries(T_cam_obj[b]), lens(boxes.intrinsics[b])
+        left, top, right, bottom = _around(pose, boxes.centre_obj[b], boxes.half_extent[b], of_lens, within_m, settings.least_depth_m)
+        of_sensor, reach_of_sensor = tiles.middle[boxes.stream_index[b]], tiles.reach_px[boxes.stream_index[b]]
         for t in range(len(of_sensor)):
-            u, v, away_px = of_sensor[t, 0], of_sensor[t, 1], reach_of_sensor[t] + tiles.margin_px
+            u, v, away_px = of_sensor[t, 0], of_sensor[t, 1], reach_of_sensor[t] + settings.margin_px
             near[b, t] = u + away_px >= left and u - away_px <= right and v + away_px >= top and v - away_px <= bottom
 
 
@@ -84,7 +106,7 @@ def _around(
 
 
 @kernel()
-def keep(x: Array, y: Array, is_near: Array, tile_bits: int, columns: int, width: int, height: int, kept: Array) -> np.int64:
+def keep(x: Array, y: Array, is_near: Array, grid: TileGrid, kept: Array) -> np.int64:
     """Numbers of the events of one stream in tiles near any object: how many; -1 where any event is outside the sensor.
 
     Args:
@@ -93,7 +115,7 @@ def keep(x: Array, y: Array, is_near: Array, tile_bits: int, columns: int, width
     """
     count, tiles = np.uint64(0), np.empty(_BLOCK, np.uint32)
     for first in range(0, len(x), _BLOCK):
-        if not _tiles_of(x[first : first + _BLOCK], y[first : first + _BLOCK], tile_bits, columns, width, height, tiles):
+        if not _fill(x[first : first + _BLOCK], y[first : first + _BLOCK], grid, tiles):
             return np.int64(-1)
         for i in range(first, min(first + _BLOCK, len(x))):
             # Products in the place of branches, of which a processor would guess many wrong.
@@ -104,44 +126,48 @@ def keep(x: Array, y: Array, is_near: Array, tile_bits: int, columns: int, width
 
 
 @kernel()
-def _tiles_of(x: Array, y: Array, tile_bits: int, columns: int, width: int, height: int, tiles: Array) -> bool:
+def _fill(x: Array, y: Array, grid: TileGrid, tiles: Array) -> bool:
     """The tile of each event, several at once, and whether all are on the sensor."""
     right, bottom = np.uint32(0), np.uint32(0)
     for i in range(len(x)):
         # Unsigned, a negative number is a large one.
         u, v = np.uint32(x[i]), np.uint32(y[i])
         right, bottom = max(right, u), max(bottom, v)
-        tiles[i] = (u >> np.uint32(tile_bits)) + (v >> np.uint32(tile_bits)) * np.uint32(columns)
-    return bool(right < width and bottom < height)
+        tiles[i] = (u >> np.uint32(grid.bits)) + (v >> np.uint32(grid.bits)) * np.uint32(grid.columns)
+    return bool(right < grid.width and bottom < grid.height)
 
 
 @kernel()
-def divide(
-    kept: Array, bounds: Array, x: Array, y: Array, near: Array, stream_index: Array, tile_bits: int, columns: int, own: Array, counts: Array
-) -> None:
+def tiles_of(x: Array, y: Array, kept: Array, grid: TileGrid) -> Array:
+    """The tiles of the events that are kept, by their numbers ``[n]``."""
+    tiles = np.empty(len(kept), np.uint32)
+    for j in range(len(kept)):
+        # Unsigned, an index needs no look whether it is negative.
+        i = np.uint64(kept[j])
+        tiles[j] = np.uint64(x[i] >> grid.bits) + np.uint64(y[i] >> grid.bits) * np.uint64(grid.columns)
+    return tiles
+
+
+@kernel()
+def divide(tiles: Array, bounds: Array, near: Array, stream_index: Array, own: Array, counts: Array) -> None:
     """Which of the events that are kept are near each object.
 
     Args:
-        kept: numbers of the events, ``[n]``, stream by stream, as ``bounds [s + 1]`` says.
+        tiles: of the events, ``[n]``, stream by stream, as ``bounds [s + 1]`` says.
         near: ``[b, t]``, tiles near each object.
         own, counts: ``[b, n + 1]`` places among those that are kept, and how many of them there are: ``[b]``; filled.
     """
-    tile = np.empty(len(kept), np.uint32)
-    for j in range(len(kept)):
-        i = np.uint64(kept[j])
-        tile[j] = _tile(x[i], y[i], tile_bits, columns)
     for b in range(len(near)):
         of_object, places, count = near[b], own[b], np.uint64(0)
         for j in range(bounds[stream_index[b]], bounds[stream_index[b] + 1]):
             places[count] = j
-            count += np.uint64(of_object[np.uint64(tile[j])])
+            count += np.uint64(of_object[np.uint64(tiles[j])])
         counts[b] = count
 
 
-@kernel()
-def _tile(x: int, y: int, tile_bits: int, columns: int) -> np.uint64:
-    """The tile that a pixel lies in; unsigned, as an index needs no look then whether it is negative."""
-    return np.uint64(x >> tile_bits) + np.uint64(y >> tile_bits) * np.uint64(columns)
+def grid_of(sensor: SensorTiles) -> TileGrid:
+    """The tiles of a sensor."""
+    return TileGrid(TILE_BITS, sensor.columns, sensor.width, sensor.height)
 
 
 @accelerates(tiles.SensorTiles.near)
@@ -150,10 +176,10 @@ def near_numba(sensor: SensorTiles, prediction: Prediction, window_s: Float[Tens
     objects = prediction.objects
     near = torch.empty(len(window_s), sensor.middle.shape[1], dtype=torch.bool)
     variance = prediction.covariance.diagonal(dim1=-2, dim2=-1)[:, :6]
-    moving = as_arrays(prediction.velocity, variance, prediction.T_cam_obj, window_s)
-    own = as_arrays(objects.centre_obj, objects.half_extent, objects.diameter_m, objects.intrinsics, objects.stream_index)
+    motions = as_arrays(prediction.velocity, variance, prediction.T_cam_obj, window_s)
+    boxes = as_arrays(objects.centre_obj, objects.half_extent, objects.diameter_m, objects.intrinsics, objects.stream_index)
     settings = TileSettings(tiles.SIGMAS, margin_px + tiles.SLACK_PX, MIN_DEPTH_M)
-    near_tiles(*as_arrays(sensor.middle, sensor.reach_px), *moving, *own, settings, near.numpy())
+    near_tiles(as_arrays(sensor.middle, sensor.reach_px), motions, boxes, settings, near.numpy())
     return near
 
 
@@ -164,7 +190,7 @@ def numbers_near(sensor: SensorTiles, events: EventBatch, near: Bool[Tensor, "b 
         EventDataError: if an event is outside the sensor.
     """
     kept = np.empty(len(events) + 1, np.int64)
-    count = int(keep(*as_arrays(events.x, events.y, near.any(0)), TILE_BITS, sensor.columns, sensor.width, sensor.height, kept))
+    count = int(keep(*as_arrays(events.x, events.y, near.any(0)), grid_of(sensor), kept))
     if count < 0:
         check_on_sensor(events, sensor.width, sensor.height)
     return kept[:count]

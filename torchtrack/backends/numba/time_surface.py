@@ -1,11 +1,13 @@
 """Newest times event by event, regions of objects contour by contour, and their surfaces pixel by pixel: :mod:`tracking.frontend.time_surface`."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import RegionArrays, as_arrays, region_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.core.dispatch import accelerates
 from torchtrack.core.events import EventBatch, check_on_sensor, stream_bounds
@@ -16,17 +18,26 @@ from torchtrack.tracking.frontend.sensors import Sensors
 from torchtrack.tracking.frontend.time_surface import GRID_PX, Regions, regions_of
 
 
+class Frame(NamedTuple):
+    """How rectangles are laid: on a sensor of that size, whose table of pixels has a border, with a margin, and in whole steps of a grid (px)."""
+
+    height: int
+    width: int
+    border_px: int
+    margin_px: int
+    grid_px: int
+
+
 @kernel()
-def around(
-    pixels: Array, mask: Array, stream_index: Array, sensor_pixels: Array, size: tuple[int, int, int, int, int], origin: Array, extent: Array
-) -> None:
+def around(pixels: Array, mask: Array, sensor_pixels: Array, frame: Frame, regions: RegionArrays) -> None:
     """Rectangles around contours: :func:`torchtrack.tracking.frontend.time_surface.object_regions`.
 
     Args:
-        size: height and width of the sensor, border of the table ``sensor_pixels [s, bh, bw, 2]``, margin, and grid of the rectangles (px).
-        origin, extent: ``[b, 2]``, filled.
+        pixels, mask: ``[b, m, 2]`` and ``[b, m]``.
+        sensor_pixels: ``[s, bh, bw, 2]``.
+        regions: origin and extent are filled.
     """
-    height, width, border_px, margin_px, grid_px = size
+    (origin, extent, stream_index), (height, width, border_px, margin_px, grid_px) = regions, frame
     last_row, last_column = sensor_pixels.shape[1] - 1, sensor_pixels.shape[2] - 1
     border = pixels.dtype.type(border_px)
     for b in range(len(pixels)):
@@ -50,8 +61,8 @@ def around(
 def regions_numba(sensors: Sensors, contours: Contours, margin_px: int) -> Regions:
     """Contour by contour."""
     origin, extent = torch.empty(len(contours.mask), 2, dtype=torch.int64), torch.empty(len(contours.mask), 2, dtype=torch.int64)
-    of_contours = as_arrays(contours.pixels, contours.mask, sensors.stream_index, sensors.sensor_pixels)
-    around(*of_contours, (*sensors.image_size, BORDER_PX, margin_px, GRID_PX), *as_arrays(origin, extent))
+    regions = as_arrays(origin, extent, sensors.stream_index)
+    around(*as_arrays(contours.pixels, contours.mask, sensors.sensor_pixels), (*sensors.image_size, BORDER_PX, margin_px, GRID_PX), regions)
     return regions_of(origin, extent, sensors.stream_index)
 
 
@@ -88,9 +99,9 @@ def update_last_event_numba(last_event_us: Int[Tensor, "s h w"], events: EventBa
 
 
 @kernel()
-def decays(times_us: Array, t_us: Array, origin: Array, stream_index: Array, oldest_us: int, per_us: float, powers: Array) -> None:
+def decays(times_us: Array, t_us: Array, regions: RegionArrays, oldest_us: int, per_us: float, powers: Array) -> None:
     """Fill ``powers [b, rh, rw]`` with what each pixel decays by, as a power of e: minus infinity outside the sensor, and from an age on."""
-    height, width = times_us.shape[1:]
+    (origin, _, stream_index), (height, width) = regions, times_us.shape[1:]
     for b in range(len(powers)):
         power, times, now_us, (left, top) = powers[b], times_us[stream_index[b]], t_us[stream_index[b]], (origin[b, 0], origin[b, 1])
         first, end = min(max(-left, 0), power.shape[1]), max(min(width - left, power.shape[1]), 0)
@@ -112,7 +123,6 @@ def time_surface_numba(
 ) -> Float[Tensor, "b rh rw"]:
     """Pixel by pixel; the exponential of all at once, by NumPy, which takes a third of the time where many pixels never fired."""
     powers = torch.empty(len(regions.origin), *regions.size, dtype=dtype)
-    arrays = as_arrays(last_event_us, t_us, regions.origin, regions.stream_index)
-    decays(*arrays, int(time_surface.MAX_DECAYS * tau_s * 1e6), -1e-6 / tau_s, powers.numpy())
+    decays(*as_arrays(last_event_us, t_us), region_arrays(regions), int(time_surface.MAX_DECAYS * tau_s * 1e6), -1e-6 / tau_s, powers.numpy())
     np.exp(powers.numpy(), out=powers.numpy())
     return powers

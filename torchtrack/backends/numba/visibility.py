@@ -5,10 +5,10 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from torchtrack.backends.numba.arrays import as_arrays
+from torchtrack.backends.numba.arrays import ContourArrays, as_arrays, contour_arrays
 from torchtrack.backends.numba.compiler import Array, kernel
 from torchtrack.backends.numba.geometry import Numbers, entries, placed, turned
-from torchtrack.backends.numba.models import arrays_of
+from torchtrack.backends.numba.models import FaceArrays, arrays_of
 from torchtrack.core.dispatch import accelerates
 from torchtrack.tracking.contours import visibility
 from torchtrack.tracking.contours.depth_buffer import Scene
@@ -19,19 +19,16 @@ _TESTS = 4
 
 
 @kernel()
-def hide_behind_faces(
-    members: Array, T_cam_obj: Array, triangles: Array, normals: Array, tolerance_m: Array, points_cam: Array, mask: Array, hidden: Array
-) -> None:
+def hide_behind_faces(members: Array, faces: FaceArrays, T_cam_obj: Array, tolerance_m: Array, contours: ContourArrays, hidden: Array) -> None:
     """Mark the points of objects of one model that lie behind one of its faces, as the camera sees them.
 
     Args:
         members: numbers of the objects.
         T_cam_obj: ``[b, 4, 4]``.
-        triangles, normals: ``[f, 3, 3]`` and ``[f, 3]``, in the object's frame.
         tolerance_m: ``[b]``.
-        points_cam, mask: ``[b, 3, m]``, and which of them count: ``[b, m]``.
         hidden: ``[b, m]``, changed.
     """
+    (triangles, normals), (points_cam, _, _, mask, _) = faces, contours
     count = points_cam.shape[2]
     tests = np.empty((len(triangles), _TESTS, 4), points_cam.dtype)
     points, place, deepest = np.empty((3, count), points_cam.dtype), np.empty(count, np.int64), np.empty(count, points_cam.dtype)
@@ -87,47 +84,13 @@ def _deepen(tests: Array, x: Array, y: Array, z: Array, deepest: Array) -> None:
         deepest[i] = least if least > deepest[i] else deepest[i]
 
 
-@kernel()
-def meet(pixels: Array, mask: Array, depth_m: Array, stream_index: Array, diameters_m: Array, beside_px: float, meets: Array) -> None:
-    """Which objects may be before another one of their stream: :func:`torchtrack.tracking.contours.visibility.may_overlap_others`.
-
-    Args:
-        pixels, mask, depth_m: of contours: ``[b, 2, m]``, ``[b, m]`` and ``[b, m]``.
-        meets: ``[b]``, filled.
-    """
-    low, high, close = np.full((len(mask), 2), np.inf, pixels.dtype), np.full((len(mask), 2), -np.inf, pixels.dtype), np.zeros(len(mask), np.bool_)
-    for b in range(len(mask)):
-        for i in range(mask.shape[1]):
-            if mask[b, i]:
-                close[b] |= depth_m[b, i] < diameters_m[b]
-                for k in range(2):
-                    low[b, k], high[b, k] = min(low[b, k], pixels[b, k, i]), max(high[b, k], pixels[b, k, i])
-        low[b] -= beside_px
-    for b in range(len(mask)):
-        meets[b] = False
-        for other in range(len(mask)):
-            apart = low[b, 0] > high[other, 0] or low[b, 1] > high[other, 1] or low[other, 0] > high[b, 0] or low[other, 1] > high[b, 1]
-            is_beside = close[b] or close[other] or not apart
-            meets[b] |= is_beside and other != b and stream_index[b] == stream_index[other]
-
-
-@accelerates(visibility.may_overlap_others)
-def may_overlap_others_numba(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tensor, "b"]:
-    """Point by point."""
-    meets = torch.empty_like(scene.stream_index, dtype=torch.bool)
-    seen = as_arrays(contours.pixels.transpose(1, 2), contours.mask, contours.points_cam[..., 2], scene.stream_index, scene.diameters_m)
-    meet(*seen, visibility.OVERLAP_CELLS * cell_px, meets.numpy())
-    return meets
-
-
 @accelerates(visibility.hidden_by_self)
 def hidden_by_self_numba(scene: Scene, contours: Contours) -> Bool[Tensor, "b m"]:
     """Object by object."""
     hidden = torch.zeros_like(contours.mask)
-    points = as_arrays(contours.points_cam.transpose(1, 2), contours.mask)
-    T_cam_obj, tolerance_m = as_arrays(scene.T_cam_obj, visibility.ON_FACE * scene.diameters_m)
+    points, T_cam_obj, tolerance_m = contour_arrays(contours), *as_arrays(scene.T_cam_obj, visibility.ON_FACE * scene.diameters_m)
     for model in scene.models:
         of_model = arrays_of(model)
         if len(of_model.faces[0]):
-            hide_behind_faces(of_model.members, T_cam_obj, *of_model.faces, tolerance_m, *points, hidden.numpy())
+            hide_behind_faces(of_model.members, of_model.faces, T_cam_obj, tolerance_m, points, hidden.numpy())
     return hidden

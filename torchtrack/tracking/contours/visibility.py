@@ -80,7 +80,6 @@ def _places_in_use(mask: Bool[Tensor, "b m"]) -> int:
     return int(used[-1]) + 1 if len(used) else 0
 
 
-@accelerable
 def may_overlap_others(scene: Scene, contours: Contours, cell_px: int) -> Bool[Tensor, "b"]:
     """Which objects may share a cell with another one of their stream: where the boxes around their outlines meet."""
     low, high = bounds(contours.pixels, contours.mask)

@@ -82,6 +82,7 @@ class FitMeasures(NamedTuple):
     inlier_ratio: Float[Tensor, "b"]
     normal_spread: Float[Tensor, "b"]
     texture_agreement: Float[Tensor, "b"]
+    visible_ratio: Float[Tensor, "b"]
 
 
 @accelerable
@@ -89,7 +90,8 @@ def fit_measures(contours: Contours, matches: Matches, objects: MovingObjects, i
     """What events say of poses whose contours move with their objects."""
     velocity = pixel_velocity(contours.points_cam, objects.velocity, objects.centre_cam, objects.intrinsics)
     measured, inliers = measured_ratio(contours, matches, velocity, image_sizes, config), inlier_ratio(matches, config.validation)
-    return FitMeasures(measured, inliers, normal_spread(matches), texture_agreement(contours, matches, config.validation))
+    agreement, visible = texture_agreement(contours, matches, config.validation), visible_ratio(contours, image_sizes)
+    return FitMeasures(measured, inliers, normal_spread(matches), agreement, visible.to(measured.dtype))
 
 
 def inlier_ratio(matches: Matches, config: ValidationConfig) -> Float[Tensor, "b"]:
@@ -162,7 +164,6 @@ def inside(pixels: Float[Tensor, "b m 2"], image_sizes: Int[Tensor, "b 2"]) -> B
     return ((pixels >= 0) & (pixels < image_sizes.flip(-1)[:, None])).all(-1)
 
 
-@accelerable
 def visible_ratio(contours: Contours, image_sizes: Int[Tensor, "b 2"]) -> Float[Tensor, "b"]:
     """Ratio of an object's contour points that lie in the image; zero without any."""
     seen = contours.mask & inside(contours.pixels, image_sizes)

@@ -31,6 +31,7 @@ class ScoredFit:
         reference_inlier_ratio: the same of when the object is seen well.
         normal_spread: how far the normals of the contours are spread that events lie on.
         texture_agreement: how far events on texture agree on its darker side; not a number where it does not tell.
+        visible_ratio: of the contour, what lies in the image.
         required_spread: how far normals have to be spread to count in full; zero for nothing required.
         is_relocalized: objects that a search took to another pose than the prediction led to.
     """
@@ -43,6 +44,7 @@ class ScoredFit:
     reference_inlier_ratio: Float[Tensor, "b"]
     normal_spread: Float[Tensor, "b"]
     texture_agreement: Float[Tensor, "b"]
+    visible_ratio: Float[Tensor, "b"]
     required_spread: Float[Tensor, "b"]
     is_relocalized: Bool[Tensor, "b"]
 
@@ -73,7 +75,7 @@ def score_fit(
         required_spread: how far normals have to be spread to count in full; zero, or none at all, for nothing required.
     """
     moving = prediction.at(fit.solution.T_cam_obj, fit.solution.from_prior).moving(compensated=True)
-    measured, inliers, spread, agreement = fit_measures(fit.contours, fit.matches, moving, prediction.objects.image_sizes, config)
+    measured, inliers, spread, agreement, visible = fit_measures(fit.contours, fit.matches, moving, prediction.objects.image_sizes, config)
     # Of what does not move, events are noise.
     inliers = torch.where(measured.isnan(), torch.nan, inliers) if config.uses(Component.INLIER_RATIO) else torch.full_like(measured, torch.nan)
     if required_spread is not None:
@@ -88,6 +90,7 @@ def score_fit(
         reference_inlier_ratio=nothing if reference_inlier_ratio is None else reference_inlier_ratio,
         normal_spread=spread,
         texture_agreement=agreement,
+        visible_ratio=visible,
         required_spread=nothing if required_spread is None else required_spread,
         is_relocalized=nothing.bool(),
     )
