@@ -50,7 +50,7 @@ class Allowed(NamedTuple):
     ends: Array
 
 
-class Cells(NamedTuple):
+class FilledCells(NamedTuple):
     """The cells of the square that an outline has points in, first of many, and the share of its points in each."""
 
     numbers: Array
@@ -69,7 +69,7 @@ def highest(outlines: Outlines, square: Square, denser: Array, shifts: Array, ap
     """
     (pixels, mask), peaks, square, allowed = outlines, Peaks(*peaks), Square(*square), _extent(shifts)
     points, fit = np.zeros(2 * square.side**2, np.int64), np.zeros(shifts.shape, denser.dtype)
-    cells = Cells(np.zeros(mask.shape[1] + _TOGETHER, np.int64), np.zeros(mask.shape[1] + _TOGETHER, denser.dtype))
+    cells = FilledCells(np.zeros(mask.shape[1] + _TOGETHER, np.int64), np.zeros(mask.shape[1] + _TOGETHER, denser.dtype))
     for n in range(len(mask)):
         used, total = _count(pixels[n], mask[n], square, points, cells.numbers)
         for k in range(used):
@@ -114,7 +114,7 @@ def _count(pixels: Array, mask: Array, square: Square, points: Array, cells: Arr
 
 
 @kernel(fastmath=FAST)
-def _add_up(used: int, cells: Cells, denser: Array, allowed: Allowed, fit: Array) -> None:
+def _add_up(used: int, cells: FilledCells, denser: Array, allowed: Allowed, fit: Array) -> None:
     """For each shift that may count, the sum over an outline's cells of how much denser events are there."""
     side, (numbers, shares), begins, ends = len(fit), cells, allowed.begins, allowed.ends
     for i in range(allowed.rows[0], allowed.rows[1]):

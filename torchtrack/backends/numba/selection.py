@@ -43,7 +43,7 @@ class Drawing(NamedTuple):
     golden_ratio: float
 
 
-class CornerArrays(NamedTuple):
+class ObservedCorners(NamedTuple):
     """Corners: pixels ``[b, k, 2]``, ages, polarities, and which exist: ``[b, k]``."""
 
     pixels: Array
@@ -60,13 +60,13 @@ class Chosen(NamedTuple):
 
 
 @kernel(fastmath=FAST)
-def select(events: EventArrays, moving: MovingArrays, index: IndexArrays, drawing: Drawing, corners: CornerArrays, chosen: Chosen) -> None:
+def select(events: EventArrays, moving: MovingArrays, index: IndexArrays, drawing: Drawing, corners: ObservedCorners, chosen: Chosen) -> None:
     """Take events near each object's contours once moved to the window's end, spread evenly in time, and corners, in their places.
 
     Args:
         chosen: filled as far as there are any, and else zero.
     """
-    events, corners, moving = EventArrays(*events), CornerArrays(*corners), MovingArrays(*moving)
+    events, corners, moving = EventArrays(*events), ObservedCorners(*corners), MovingArrays(*moving)
     (rows, exists), (number, count, _, golden_ratio), near = chosen, drawing, np.empty(events.mask.shape[1] + 1, np.int64)
     rows[:], exists[:] = 0.0, False
     for b in range(len(rows)):
