@@ -22,6 +22,12 @@ class RelocalizationConfig(Settings):
         ge=0,
         description="A very uncertain object is searched for once in this time (µs), half as often from 0.1, 0.2, 0.4 and 0.8 s on; 0: in all.",
     )
+    answer_after_us: int = Field(
+        0,
+        ge=0,
+        le=1_000_000,
+        description="A search goes on beside the windows, on another core, and its answer comes after so long (µs); 0: windows wait for it.",
+    )
     not_validated_below: float = Field(
         0.75,
         ge=0,

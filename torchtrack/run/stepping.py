@@ -100,6 +100,7 @@ def passed_over(tracker: Tracker, state: TrackerState, t_us: Int[Tensor, "s"]) -
         motion=state.motion.at_rest(objects, state.T_cam_obj, unknown),
         maps=replace(state.maps, burst_age_us=torch.where(passed[:, None, None, None], LONG_AGO_US, state.maps.burst_age_us)),
         t_us=torch.maximum(t_us, state.t_us),
+        search=None,
     )
 
 

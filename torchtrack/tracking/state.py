@@ -1,6 +1,6 @@
 """What the tracker remembers between windows, and what one window gives: both immutable."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchtrack.core.field_values import field_values
+from torchtrack.core.later import Later
 from torchtrack.tracking.adaptation.appearance import Appearance
 from torchtrack.tracking.contours.points import Contours
 from torchtrack.tracking.frontend.corners import Corners
@@ -31,6 +32,7 @@ class TrackerState:
         health: how well each object is seen.
         appearance: what was learned of how objects look.
         maps: what is remembered of every pixel of the sensors.
+        search: that goes on beside the windows, of all objects; none where searches are waited for. No part of the state has it.
     """
 
     t_us: Int[Tensor, "s"]
@@ -38,6 +40,7 @@ class TrackerState:
     health: TrackHealth
     appearance: Appearance
     maps: SensorMaps
+    search: "Search | None" = None
 
     def __repr__(self) -> str:
         return f"TrackerState({_times(self.t_us)}, positions {_positions(self.T_cam_obj)}, {self.T_cam_obj.device})"
@@ -64,7 +67,7 @@ class TrackerState:
         """The state without what is known of every pixel of the sensors, which is most of it: to be looked at, not to go on from."""
         streams, maps = len(self.t_us), self.maps
         empty = SensorMaps(maps.last_event_us.new_empty(streams, 0, 0), maps.burst_age_us.new_empty(streams, 2, 0, 0))
-        return replace(self, maps=empty)
+        return replace(self, maps=empty, search=None)
 
 
 @dataclass(frozen=True, repr=False)
@@ -97,6 +100,36 @@ class StepResult:
         return f"StepResult({_times(self.t_us)}, {statuses}{_more(self.status)}, positions {_positions(self.T_cam_obj)})"
 
 
+@dataclass(frozen=True)
+class Answer:
+    """What came of a search.
+
+    Args:
+        looked: objects that other poses were tried for.
+        is_unconfirmed: those of which no more was asked than whether another pose explains far more.
+        found: state and result of each object that was found, by its number, as a tracker of it alone has them.
+    """
+
+    looked: Bool[Tensor, "b"]
+    is_unconfirmed: Bool[Tensor, "b"]
+    found: Mapping[int, tuple[TrackerState, StepResult]]
+
+
+@dataclass(frozen=True)
+class Search:
+    """A search that goes on beside the windows.
+
+    Args:
+        since_us: end of the window that it is of, of each stream (µs).
+        triggers: what objects asked for that the search is not of.
+        answer: what came of it, followed through the windows since; none where no search goes on.
+    """
+
+    since_us: Int[Tensor, "s"]
+    triggers: Int[Tensor, "b"]
+    answer: Later[Answer] | None
+
+
 def _times(t_us: Int[Tensor, "s"]) -> str:
     return f"{', '.join(str(time) for time in t_us[:_MOST_SHOWN].tolist())}{_more(t_us)} µs"
 
@@ -114,6 +147,8 @@ S = TypeVar("S", TrackerState, StepResult)
 D = TypeVar("D")
 # What belongs to streams; everything else belongs to objects.
 _OF_STREAMS = ("t_us", "last_event_us", "burst_age_us")
+# What belongs to all objects together: no part has it, and nothing that is made of parts.
+_OF_ALL = ("search",)
 
 
 def choose_rows(
@@ -127,12 +162,15 @@ def choose_rows(
     def of_objects(first_rows: Tensor, second_rows: Tensor) -> Tensor:
         return torch.where(first.view(-1, *[1] * (first_rows.dim() - 1)), first_rows, second_rows)
 
-    results = (of_first[1], of_second[1])
-    places = max(result.contours.mask.shape[1] for result in results)
-    results_of_one_width = [replace(result, contours=result.contours.widened(places)) for result in results]
     state: TrackerState = _mapped(of_objects, lambda _, second: second, of_first[0], of_second[0])
-    result: StepResult = _mapped(of_objects, lambda _, second: second, *results_of_one_width)
+    result: StepResult = _mapped(of_objects, lambda _, second: second, *of_one_width(of_first[1], of_second[1]))
     return state, result
+
+
+def of_one_width(*results: StepResult) -> list[StepResult]:
+    """The results with as many places for contours in each."""
+    places = max(result.contours.mask.shape[1] for result in results)
+    return [replace(result, contours=result.contours.widened(places)) for result in results]
 
 
 def take_part(value: S, objects: slice, streams: slice) -> S:
@@ -145,6 +183,21 @@ def each_tensor(change: Callable[[Tensor], Tensor], value: D) -> D:
     """The state, the result or another dataclass with each of its tensors changed, in order; or a tensor changed."""
     changed: D = _mapped(change, change, value)
     return changed
+
+
+def with_object(number: int, of_all: tuple[TrackerState, StepResult], alone: tuple[TrackerState, StepResult]) -> tuple[TrackerState, StepResult]:
+    """State and result of all objects, with one of them as a tracker of it alone has it."""
+
+    def put(rows: Tensor, row: Tensor) -> Tensor:
+        changed = rows.clone()
+        changed[number] = row[0]
+        return changed
+
+    own_corners = take_part(of_all[1], slice(number, number + 1), slice(0)).corners
+    results = of_one_width(of_all[1], replace(alone[1], corners=own_corners))
+    state: TrackerState = _mapped(put, lambda rows, _: rows, of_all[0], alone[0])
+    result: StepResult = _mapped(put, lambda rows, _: rows, *results)
+    return replace(state, search=of_all[0].search), result
 
 
 def joined(states: Sequence[TrackerState]) -> TrackerState:
@@ -164,5 +217,7 @@ def _mapped(of_objects: Callable[..., Tensor], of_streams: Callable[..., Tensor]
     made = {}
     for name in field_values(values[0]):
         inner = [getattr(value, name) for value in values]
+        if name in _OF_ALL:
+            continue
         made[name] = of_streams(*inner) if name in _OF_STREAMS else _mapped(of_objects, of_streams, *inner)
     return kind(**made)

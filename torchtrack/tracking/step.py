@@ -1,6 +1,7 @@
 """One window of a tracker, from its events to poses: :func:`advance` calls the six stages in their order, and each is a function below."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,6 +10,7 @@ from torch import Tensor
 from torchtrack.config.components import Component
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch
+from torchtrack.core.later import Later
 from torchtrack.tracking.adapt import Lesson, learned_after
 from torchtrack.tracking.association.claimed_events import UNSEEN_FROM_S, claimed_pixels, without_claimed
 from torchtrack.tracking.association.flow_agreement import guided_by_flow
@@ -32,7 +34,7 @@ from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_objects import Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
 from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, has, triggered
-from torchtrack.tracking.state import StepResult, TrackerState, each_tensor
+from torchtrack.tracking.state import Answer, Search, StepResult, TrackerState, each_tensor, take_part
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.measures import required_spread
 from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, reference_where_known, score_fit
@@ -50,6 +52,7 @@ class StepInput:
         reads: asks for what has to be decided.
         learns: whether anything may be learned from the window.
         extra_terms: of the cost, beside contours and prediction.
+        asked: what objects asked for in earlier windows, where searches go on beside the windows; none where they are waited for.
     """
 
     events: NearbyEvents
@@ -58,6 +61,7 @@ class StepInput:
     reads: host_sync.HostReads = field(default_factory=host_sync.HostReads)
     learns: bool = True
     extra_terms: tuple[CostTerm, ...] = ()
+    asked: Int[Tensor, "b"] | None = None
 
 
 @dataclass(frozen=True)
@@ -114,9 +118,40 @@ def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> t
         given: the window.
     """
     window = steady_window(tracked, state, given)
+    if given.asked is not None:
+        return _searched_later(tracked, state, window, given, given.asked)
     # A GPU is waited for: a pose that begins to slip is farther off a window later.
     searches = given.reads.ask(has(window.evidence.triggers, SEARCHED), False).any()
     return update(tracked, state, window, relocalized(tracked, state, window) if searches else window.located, given)
+
+
+def _searched_later(
+    tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, given: StepInput, asked: Int[Tensor, "b"]
+) -> tuple[TrackerState, StepResult]:
+    """State and result of a window with nobody looked for, and with the search that objects ask for, by now or since they asked and are not well."""
+    evidence, limits = window.evidence, Limits.from_config(tracked.config)
+    is_well = (evidence.time_since_validated_s == 0) & (evidence.confirmations >= limits.confirmed_by)
+    triggers = evidence.triggers | torch.where(is_well, 0, asked)
+    next_state, result = update(tracked, state, window, window.located, given)
+    if host_sync.none_of(has(triggers, SEARCHED)):
+        return next_state, result
+    window = replace(window, evidence=replace(evidence, triggers=triggers))
+    answer = Later(partial(_answer, tracked, state, window, given))
+    return replace(next_state, search=Search(given.t_us, triggers, answer)), result
+
+
+@torch.no_grad()
+def _answer(tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, given: StepInput) -> Answer:
+    """What comes of the search that a window asks for, with each object that it finds as if it had been tracked alone."""
+    located = relocalized(tracked, state, window)
+    taken = update(tracked, state, window, located, given)
+    looked = torch.zeros_like(located.scored.is_relocalized) if located.looked is None else located.looked
+    found = {}
+    for number in (looked & located.scored.is_relocalized).nonzero()[:, 0].tolist():
+        stream = int(tracked.stream_index[number])
+        own = slice(number, number + 1), slice(stream, stream + 1)
+        found[number] = take_part(taken[0], *own), take_part(taken[1], *own)
+    return Answer(looked, has(window.evidence.triggers, Trigger.UNCONFIRMED), found)
 
 
 def steady_window(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> SteadyWindow:

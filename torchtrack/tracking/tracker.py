@@ -6,6 +6,7 @@ The only state is an immutable :class:`TrackerState`; ``step`` is pure: the same
 import copy
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import dispatch, host_sync
 from torchtrack.core.camera import Camera
 from torchtrack.core.events import EventBatch, ForeignEvents, as_batch
+from torchtrack.core.later import Ahead
 from torchtrack.core.pose_types import as_pose_matrices
 from torchtrack.errors import TorchtrackWarning
 from torchtrack.object_model import ObjectModel
@@ -26,6 +28,7 @@ from torchtrack.tracking.graphs import CompiledStep
 from torchtrack.tracking.initialization import PARTS, check_poses, first_state, to_be_parted
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.sampling import rehearse
+from torchtrack.tracking.search_beside import followed, may_search_later, with_search
 from torchtrack.tracking.start_check import check_in_view
 from torchtrack.tracking.state import StepResult, TrackerState, choose_rows
 from torchtrack.tracking.step import StepInput, advance, opened
@@ -67,6 +70,9 @@ class Tracker(TrackedObjects):
         super().__init__(objects, camera, config, stream_index, dtype, weighting_network)
         self.kernels = kernels
         self.graphs = CompiledStep(self, compiles=compiled)
+        self._ahead = Ahead()
+        # Those of objects that a search has found, by number.
+        self._alone: dict[int, Tracker] = {}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Tracker":
         """All of the tracker elsewhere, or in another type, and without the graphs of where it was."""
@@ -74,6 +80,7 @@ class Tracker(TrackedObjects):
         # While it is made, and brought to its type, there are none yet.
         if hasattr(self, "graphs"):
             self.graphs = copy.copy(self.graphs)
+            self._alone = {}
         return self
 
     def __repr__(self) -> str:
@@ -168,6 +175,30 @@ class Tracker(TrackedObjects):
         self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...]
     ) -> tuple[TrackerState, StepResult]:
         """The state and result after the window that ends at ``t_us``, whose events are checked."""
+        under_way = state.search
+        if under_way is None and not may_search_later(state, self.config):
+            return self._taken(state, events, t_us, extra_terms)
+        asked = torch.zeros_like(self.stream_index) if under_way is None else under_way.triggers
+        if under_way is not None:
+            under_way = followed(under_way, events, t_us, self._followed, self._ahead)
+        taken = self._taken(replace(state, search=None), events, t_us, extra_terms, asked)
+        return with_search(taken, under_way, self.config, self._ahead)
+
+    def _followed(self, number: int, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult]:
+        """A window of one of the objects alone, that is looked for by nobody."""
+        if number not in self._alone:
+            alone = self.alone(number)
+            search = self.config.relocalization.model_copy(update={"hypotheses": 0, "answer_after_us": 0})
+            alone.config = self.config.model_copy(update={"relocalization": search})
+            self._alone[number] = alone
+        stream = int(self.stream_index[number])
+        own = events if self.streams == 1 else events[events.stream_index == stream].of_stream(0)
+        return self._alone[number].step(state, own, t_us[stream : stream + 1])
+
+    def _taken(
+        self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...], asked: Tensor | None = None
+    ) -> tuple[TrackerState, StepResult]:
+        """The same without a search that goes on; what objects ``asked`` for earlier, where theirs need not be waited for."""
         steady = None if extra_terms else self._steady(state, events, t_us)
         if steady is not None:
             return _counted(steady)
@@ -175,9 +206,9 @@ class Tracker(TrackedObjects):
         parted = host_sync.AsyncValue.to(in_parts)
         if host_sync.read_at_once(in_parts) and bool(in_parts.all()):
             return _counted(self._advance_in_parts(state, events, t_us, in_parts, extra_terms))
-        done = self._advance(state, events, t_us, extra_terms=extra_terms)
         if not parted.any():
-            return _counted(done)
+            return _counted(self._advance(state, events, t_us, extra_terms=extra_terms, asked=asked))
+        done = self._advance(state, events, t_us, extra_terms=extra_terms)
         return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us, in_parts, extra_terms), done))
 
     def _steady(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult] | None:
@@ -196,10 +227,17 @@ class Tracker(TrackedObjects):
         return self._advance(state, events, t_us, starting, extra_terms)
 
     def _advance(
-        self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor | None = None, extra_terms: tuple[CostTerm, ...] = ()
+        self,
+        state: TrackerState,
+        events: EventBatch,
+        t_us: Tensor,
+        starting: Tensor | None = None,
+        extra_terms: tuple[CostTerm, ...] = (),
+        asked: Tensor | None = None,
     ) -> tuple[TrackerState, StepResult]:
         """One window, or one part of it."""
-        return advance(self, opened(self, state, events), StepInput(NearbyEvents(events), t_us, starting, extra_terms=extra_terms))
+        given = StepInput(NearbyEvents(events), t_us, starting, extra_terms=extra_terms, asked=asked)
+        return advance(self, opened(self, state, events), given)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""

@@ -26,12 +26,12 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
     def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         function = inspect.unwrap(function)  # a type checker's wrapper cannot be compiled
         try:
-            dispatcher: Any = numba.njit(function, cache=True, error_model="numpy", **options)
+            dispatcher: Any = numba.njit(function, cache=True, error_model="numpy", nogil=True, **options)
             # Numba looks whether the function's own file has changed, and not those of the kernels that were compiled into it.
             dispatcher._cache._cache_file._source_stamp = _digest(Path(inspect.getfile(function)).parent)
         except (RuntimeError, AttributeError):
             # No folder that may be written to (a read-only installation), or another Numba: rather none than an old kernel.
-            return numba.njit(function, error_model="numpy", **options)
+            return numba.njit(function, error_model="numpy", nogil=True, **options)
         return dispatcher
 
     return compiled
