@@ -26,6 +26,7 @@ ORDER = (
     ("tracking.initialization", "tracking.start_check", "tracking.step_check"),
     ("tracking.expectation",),
     ("tracking.step",),
+    ("tracking.deferred_search",),
     ("tracking.cuda_graphs", "tracking.compiling"),
     ("tracking.graphs",),
     ("tracking.tracker",),

@@ -1,6 +1,7 @@
 """Stages that are timed from outside: their own times, and all as it was afterwards."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -56,6 +57,15 @@ def test_a_stage_that_fails_is_counted_too():
     with pytest.raises(KeyError):
         times.timing("fails", fails)()
     assert dict(times.seconds) == {"fails": 1.0}
+
+
+def test_what_another_thread_does_meanwhile_is_no_part_of_a_stage():
+    times = StageTimes(ticks())
+    inner = times.timing("inner", lambda value: value + 1)
+    with ThreadPoolExecutor(1) as pool:
+        outer = times.timing("outer", lambda value: pool.submit(inner, value).result())
+        assert outer(1) == 2
+    assert dict(times.seconds) == {"outer": 1.0}
 
 
 def test_every_stage_of_a_step_is_timed_and_the_step_is_the_same():

@@ -19,10 +19,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchtrack.baselines.event_lines import EventLineTracker
-from torchtrack.core.events import EventBatch
 from torchtrack.core.linalg import solve_positive
-from torchtrack.tracking.estimation.terms import CostTerm, Linearisation
+from torchtrack.tracking.estimation.terms import Linearisation
 from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.step import StepInput
 
 # Deviation of the distance between an event and its line (px): much is common to the events of a line, so it is not small.
 _EVENT_PX = 4.0
@@ -44,14 +44,13 @@ class LineTracker(EventLineTracker):
         covariance = torch.diag(deviations.square()).repeat(len(state.T_cam_obj), 1, 1)
         return replace(state, motion=replace(state.motion, covariance=covariance))
 
-    def _tracked(
-        self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...]
-    ) -> tuple[TrackerState, StepResult]:
-        window = self._open(state, events, t_us, state.velocity)
+    def _tracked(self, state: TrackerState, given: StepInput) -> tuple[TrackerState, StepResult]:
+        events = given.events.events
+        window = self._open(state, events, given.t_us, state.velocity)
         predicted = predicted_covariance(state.motion.covariance, window.duration_s.double())
         eye = torch.eye(6, dtype=predicted.dtype, device=predicted.device).expand(len(predicted), 6, 6)
         information = solve_positive(predicted[:, :6, :6], eye)[0]
-        fit = self._solve_rounds(window, events, information.to(state.velocity.dtype), _EVENT_PX**-2, _APART_PX, extra_terms)
+        fit = self._solve_rounds(window, events, information.to(state.velocity.dtype), _EVENT_PX**-2, _APART_PX, given.extra_terms)
         judged = self._judge(window, fit)
         taken = judged.is_taken
         correction, covariance = corrected(predicted, information, fit.solution)

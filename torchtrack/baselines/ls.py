@@ -1,15 +1,12 @@
 """``ls``: least squares of the distances between events and projected model lines, the paper's second comparison method."""
 
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from torchtrack.baselines.event_lines import EventLineTracker
 from torchtrack.core import lie
-from torchtrack.core.events import EventBatch
 from torchtrack.core.linalg import inverse
-from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.state import StepResult, TrackerState
+from torchtrack.tracking.step import StepInput
 
 # Share of a new window in the velocity.
 _VELOCITY_GAIN = 0.6
@@ -23,12 +20,11 @@ class LeastSquaresTracker(EventLineTracker):
     window's end with the line's own velocity, and the gate around the lines narrows from round to round.
     """
 
-    def _tracked(
-        self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...]
-    ) -> tuple[TrackerState, StepResult]:
-        window = self._open(state, events, t_us, state.velocity)
+    def _tracked(self, state: TrackerState, given: StepInput) -> tuple[TrackerState, StepResult]:
+        events = given.events.events
+        window = self._open(state, events, given.t_us, state.velocity)
         nothing = torch.zeros(len(state.velocity), 6, 6, dtype=state.velocity.dtype, device=state.velocity.device)
-        fit = self._solve_rounds(window, events, nothing, weight=1.0, apart_px=0.0, extra_terms=extra_terms)
+        fit = self._solve_rounds(window, events, nothing, weight=1.0, apart_px=0.0, extra_terms=given.extra_terms)
         judged = self._judge(window, fit)
         moved = lie.small_difference_about(state.T_cam_obj, fit.solution.T_cam_obj.double(), self.centre_obj.double()).to(state.velocity.dtype)
         mixed = torch.lerp(state.velocity, moved / window.duration_s.clamp(min=1e-6)[:, None], _VELOCITY_GAIN)

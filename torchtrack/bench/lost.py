@@ -3,6 +3,9 @@
 Of an object that is to be lost, no event is left after the warm-up, and the tracker looks for it ever after, but the rarer the longer it is
 lost. Windows are measured once it is known to be lost: those of the first second, and those that come later. No shape is there twice in a
 stream, so that none is found where another one is.
+
+On a CPU, also with searches that go on beside the windows, on another core. Of these it is the time that passes that counts: windows may wait for
+an answer, and for Python, which both threads need.
 """
 
 from collections.abc import Iterator
@@ -11,9 +14,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from torchtrack.bench.clock import Clock
 from torchtrack.bench.results import Report, Result, time_result
 from torchtrack.bench.scene import Run, Scene, simulated, started
 from torchtrack.bench.setup import Setup
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.tracking.validation.status import Status
 
 SHAPES = ("lbracket", "cube", "satellite", "robot", "book", "wedge", "mug", "animal")
@@ -25,6 +30,8 @@ STREAMS = {"cpu": (1, 1), "cuda": (32, 5)}
 DURATION_S = 2.0
 # When its events end (µs), how many windows after the warm-up it is surely known to be lost, and how many of the next are the first second's.
 HIDDEN_FROM_US, KNOWN_AFTER, SOON = 50_000, 40, 160
+# When answers come of searches beside the windows (µs).
+ANSWER_AFTER_US = 100_000
 # How much longer a step may take than with none lost: the median, and the step that 95 % are faster than.
 MOST_OVER_NONE = (1.5, 2.0)
 
@@ -36,23 +43,28 @@ def measure(setup: Setup) -> Report:
         MissingExtraError: if the simulator's libraries are not installed.
     """
     scene = simulated(SHAPES, COLUMNS, duration_s=DURATION_S)
-    cases = [_case(setup, scene, shape) for shape in LOST]
+    waits = (0, ANSWER_AFTER_US) if setup.device.type == "cpu" else (0,)
+    cases = [_case(setup, scene, shape, answer_after_us) for answer_after_us in waits for shape in LOST]
     title = f"Steps with an object lost all the time, preset default, windows of 5 ms; {setup.clock.meaning}"
     return Report("lost", title, tuple(result for results, _ in cases for result in results), tuple(note for _, note in cases))
 
 
-def _case(setup: Setup, scene: Scene, shape: str) -> tuple[list[Result], str]:
+def _case(setup: Setup, scene: Scene, shape: str, answer_after_us: int) -> tuple[list[Result], str]:
     """Times with none lost and with one, turn by turn, so that a machine that gets slower does so for both."""
     streams, lost_in = STREAMS[setup.device.type]
     count = len(SHAPES) * streams
     name = f"{count} objects, {shape} lost" + (f" in {lost_in} of {streams} streams" if streams > 1 else "")
+    if answer_after_us:
+        name += f", searched for beside, answers after {answer_after_us // 1000} ms"
     setup.show(name)
-    number = SHAPES.index(shape)
+    number, search = SHAPES.index(shape), RelocalizationConfig(answer_after_us=answer_after_us)
+    clock = Clock(setup.device, threads=2) if answer_after_us else setup.clock
     with_lost = [_without(scene, number)] * lost_in + [scene] * (streams - lost_in)
-    runs = [started(scenes, setup.device).after(KNOWN_AFTER) for scenes in ([scene] * streams, with_lost)]
-    times = np.array([[run.latencies(setup.clock) for run in runs] for _ in range(setup.repeats)])
+    runs = [started(scenes, setup.device, search=search).after(KNOWN_AFTER) for scenes in ([scene] * streams, with_lost)]
+    times = np.array([[run.latencies(clock) for run in runs] for _ in range(setup.repeats)])
     parts = {"in the first second": times[..., :SOON], "later": times[..., SOON:]}
-    results = [result for when, part in parts.items() for result in _results(f"{count} objects, none lost (beside {shape})", name, when, part)]
+    none = name.replace(f"{shape} lost", f"none lost (beside {shape})")
+    results = [result for when, part in parts.items() for result in _results(none, name, when, part)]
     return results, f"{name}: in {_lost_ratio(runs[1], number):.0%} of its windows"
 
 

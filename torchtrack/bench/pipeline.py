@@ -8,6 +8,7 @@ import numpy as np
 from torchtrack.bench.results import Report, Result, time_result
 from torchtrack.bench.scene import HD, SHAPES, Scene, read, shapes_of, simulated, started, with_events_outside
 from torchtrack.bench.setup import Setup
+from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.core.dispatch import backend_is_installed
 from torchtrack.core.events import EventBatch
 from torchtrack.run.stepping import cut_windows, steps
@@ -95,7 +96,8 @@ def _latency(setup: Setup, case: _Case) -> _Part:
     """Median and 95 % of the time of a step, each once per repeat, and how well it tracked."""
     name = case.full_name
     setup.show(name)
-    run = started([case.scene] * case.streams, setup.device, compiled=case.compiled, kernels=case.kernels, searches=case.searches)
+    search = None if case.searches else RelocalizationConfig(hypotheses=0)
+    run = started([case.scene] * case.streams, setup.device, compiled=case.compiled, kernels=case.kernels, search=search)
     quality = run.quality(setup.clock)
     repeats = [run.latencies(setup.clock) for _ in range(setup.repeats)]
     median, p95 = ([float(value) for value in np.quantile(repeats, share, axis=1)] for share in (0.5, 0.95))

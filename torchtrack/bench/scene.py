@@ -249,7 +249,9 @@ class Run:
         return torch.stack([rotation_angle_deg(estimated[:, :3, :3], expected[:, :3, :3]), 1e3 * (estimated - expected)[:, :3, 3].norm(dim=-1)], -1)
 
 
-def started(scenes: Sequence[Scene], device: torch.device, *, compiled: bool = False, kernels: bool = True, searches: bool = True) -> Run:
+def started(
+    scenes: Sequence[Scene], device: torch.device, *, compiled: bool = False, kernels: bool = True, search: RelocalizationConfig | None = None
+) -> Run:
     """A tracker that follows scenes of the same time, after its first windows.
 
     Args:
@@ -257,14 +259,14 @@ def started(scenes: Sequence[Scene], device: torch.device, *, compiled: bool = F
         device: where the tracker runs.
         compiled: whether steady windows are taken by compiled graphs.
         kernels: whether kernels of a backend are used where they apply.
-        searches: whether lost objects are searched for.
+        search: how lost objects are searched for; as usual when not given.
 
     Raises:
         ConfigError: if the scenes end with their first windows.
     """
     first, models = scenes[0], [model for scene in scenes for model in scene.models]
     index = [stream for stream, scene in enumerate(scenes) for _ in scene.models]
-    config = TrackerConfig() if searches else TrackerConfig(relocalization=RelocalizationConfig(hypotheses=0))
+    config = TrackerConfig(relocalization=search or RelocalizationConfig())
     tracker = Tracker(models, [scene.camera for scene in scenes], config, index, compiled=compiled, kernels=kernels).to(device)
     state = tracker.init(torch.cat([scene.T_cam_obj for scene in scenes]), first.start_us)
     tracker.prepare(state)

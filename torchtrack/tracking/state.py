@@ -107,12 +107,12 @@ class Answer:
     Args:
         looked: objects that other poses were tried for.
         is_unconfirmed: those of which no more was asked than whether another pose explains far more.
-        found: state and result of each object that was found, by its number, as a tracker of it alone has them.
+        relocalized: state and result of each object that was found, by its number, as a tracker of it alone has them.
     """
 
     looked: Bool[Tensor, "b"]
     is_unconfirmed: Bool[Tensor, "b"]
-    found: Mapping[int, tuple[TrackerState, StepResult]]
+    relocalized: Mapping[int, tuple[TrackerState, StepResult]]
 
 
 @dataclass(frozen=True)

@@ -146,12 +146,12 @@ def _answer(tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, 
     located = relocalized(tracked, state, window)
     taken = update(tracked, state, window, located, given)
     looked = torch.zeros_like(located.scored.is_relocalized) if located.looked is None else located.looked
-    found = {}
+    alone = {}
     for number in (looked & located.scored.is_relocalized).nonzero()[:, 0].tolist():
         stream = int(tracked.stream_index[number])
         own = slice(number, number + 1), slice(stream, stream + 1)
-        found[number] = take_part(taken[0], *own), take_part(taken[1], *own)
-    return Answer(looked, has(window.evidence.triggers, Trigger.UNCONFIRMED), found)
+        alone[number] = take_part(taken[0], *own), take_part(taken[1], *own)
+    return Answer(looked, has(window.evidence.triggers, Trigger.UNCONFIRMED), alone)
 
 
 def steady_window(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> SteadyWindow:

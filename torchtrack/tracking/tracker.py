@@ -21,6 +21,7 @@ from torchtrack.core.later import Ahead
 from torchtrack.core.pose_types import as_pose_matrices
 from torchtrack.errors import TorchtrackWarning
 from torchtrack.object_model import ObjectModel
+from torchtrack.tracking.deferred_search import followed, may_search_later, with_search
 from torchtrack.tracking.estimation.terms import CostTerm
 from torchtrack.tracking.expectation import predicted_after
 from torchtrack.tracking.frontend.tiles import NearbyEvents
@@ -28,7 +29,6 @@ from torchtrack.tracking.graphs import CompiledStep
 from torchtrack.tracking.initialization import PARTS, check_poses, first_state, to_be_parted
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.sampling import rehearse
-from torchtrack.tracking.search_beside import followed, may_search_later, with_search
 from torchtrack.tracking.start_check import check_in_view
 from torchtrack.tracking.state import StepResult, TrackerState, choose_rows
 from torchtrack.tracking.step import StepInput, advance, opened
@@ -155,7 +155,7 @@ class Tracker(TrackedObjects):
         t_us = self._window_end(state, events, t_end_us)
         check_step(state.t_us, events, t_us)
         with torch.autocast(t_us.device.type, enabled=False), dispatch.backend(wanted=self.kernels, values=self.intrinsics):
-            return self._tracked(state, events, t_us, extra_terms)
+            return self._tracked(state, StepInput(NearbyEvents(events), t_us, extra_terms=extra_terms))
 
     def prepare(self, state: TrackerState) -> None:
         """Compile what is compiled, before the first window: graphs take a minute or more, kernels half of that, and a live camera does not wait.
@@ -167,25 +167,24 @@ class Tracker(TrackedObjects):
             self.graphs.prepare(state)
             if host_sync.read_at_once(self.intrinsics) and dispatch.may_accelerate(self.intrinsics):
                 # Kernels are compiled, or read from the disk, when they are first called: for a window without events.
-                self._advance(state, EventBatch.empty(), state.t_us + 1)
+                self._advance(state, StepInput(NearbyEvents(EventBatch.empty()), state.t_us + 1))
                 if self.config.searches:
                     rehearse(predicted_after(self, state, torch.full_like(self.diameter_m, 1e-6)), self.config)
 
-    def _tracked(
-        self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...]
-    ) -> tuple[TrackerState, StepResult]:
-        """The state and result after the window that ends at ``t_us``, whose events are checked."""
+    def _tracked(self, state: TrackerState, given: StepInput) -> tuple[TrackerState, StepResult]:
+        """The state and result after a window whose events are checked."""
         under_way = state.search
         if under_way is None and not may_search_later(state, self.config):
-            return self._taken(state, events, t_us, extra_terms)
+            return self._taken(state, given)
         asked = torch.zeros_like(self.stream_index) if under_way is None else under_way.triggers
         if under_way is not None:
-            under_way = followed(under_way, events, t_us, self._followed, self._ahead)
-        taken = self._taken(replace(state, search=None), events, t_us, extra_terms, asked)
+            # Before the window is taken: what was found is followed through it meanwhile.
+            under_way = followed(under_way, given, self._followed, self._ahead)
+        taken = self._taken(replace(state, search=None), replace(given, asked=asked))
         return with_search(taken, under_way, self.config, self._ahead)
 
     def _followed(self, number: int, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult]:
-        """A window of one of the objects alone, that is looked for by nobody."""
+        """A window of one of the objects alone, of which no other poses are tried."""
         if number not in self._alone:
             alone = self.alone(number)
             search = self.config.relocalization.model_copy(update={"hypotheses": 0, "answer_after_us": 0})
@@ -195,49 +194,40 @@ class Tracker(TrackedObjects):
         own = events if self.streams == 1 else events[events.stream_index == stream].of_stream(0)
         return self._alone[number].step(state, own, t_us[stream : stream + 1])
 
-    def _taken(
-        self, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"], extra_terms: tuple[CostTerm, ...], asked: Tensor | None = None
-    ) -> tuple[TrackerState, StepResult]:
-        """The same without a search that goes on; what objects ``asked`` for earlier, where theirs need not be waited for."""
-        steady = None if extra_terms else self._steady(state, events, t_us)
+    def _taken(self, state: TrackerState, given: StepInput) -> tuple[TrackerState, StepResult]:
+        """The state and result after a window, whatever search goes on beside it."""
+        steady = None if given.extra_terms else self._steady(state, given)
         if steady is not None:
             return _counted(steady)
-        in_parts = to_be_parted(state, events, t_us, self.objects, self.config)
+        in_parts = to_be_parted(state, given.events.events, given.t_us, self.objects, self.config)
         parted = host_sync.AsyncValue.to(in_parts)
         if host_sync.read_at_once(in_parts) and bool(in_parts.all()):
-            return _counted(self._advance_in_parts(state, events, t_us, in_parts, extra_terms))
+            return _counted(self._advance_in_parts(state, given, in_parts))
+        if given.asked is not None and parted.any():
+            # In each part, searches are waited for.
+            given = replace(given, asked=None)
+        done = self._advance(state, given)
         if not parted.any():
-            return _counted(self._advance(state, events, t_us, extra_terms=extra_terms, asked=asked))
-        done = self._advance(state, events, t_us, extra_terms=extra_terms)
-        return _counted(choose_rows(in_parts, self._advance_in_parts(state, events, t_us, in_parts, extra_terms), done))
+            return _counted(done)
+        return _counted(choose_rows(in_parts, self._advance_in_parts(state, given, in_parts), done))
 
-    def _steady(self, state: TrackerState, events: EventBatch, t_us: Tensor) -> tuple[TrackerState, StepResult] | None:
+    def _steady(self, state: TrackerState, given: StepInput) -> tuple[TrackerState, StepResult] | None:
         """A window by a graph, where there is one and it holds."""
-        return None if torch.is_grad_enabled() else self.graphs(state, events, t_us)
+        return None if torch.is_grad_enabled() else self.graphs(state, given.events.events, given.t_us)
 
-    def _advance_in_parts(
-        self, state: TrackerState, events: EventBatch, t_us: Tensor, starting: Tensor, extra_terms: tuple[CostTerm, ...]
-    ) -> tuple[TrackerState, StepResult]:
+    def _advance_in_parts(self, state: TrackerState, given: StepInput, starting: Tensor) -> tuple[TrackerState, StepResult]:
         """The window as several short ones, with a search for objects that are ``starting``; further terms hold at the end of the last."""
+        events, t_us = given.events.events, given.t_us
         for left in range(PARTS, 1, -1):
             until_us = state.t_us + (t_us - state.t_us) // left
             early = events.t_us <= until_us[events.stream_index]
-            state, _ = self._advance(state, events[early], until_us, starting)
+            state, _ = self._advance(state, StepInput(NearbyEvents(events[early]), until_us, starting))
             events = events[~early]
-        return self._advance(state, events, t_us, starting, extra_terms)
+        return self._advance(state, StepInput(NearbyEvents(events), t_us, starting, extra_terms=given.extra_terms))
 
-    def _advance(
-        self,
-        state: TrackerState,
-        events: EventBatch,
-        t_us: Tensor,
-        starting: Tensor | None = None,
-        extra_terms: tuple[CostTerm, ...] = (),
-        asked: Tensor | None = None,
-    ) -> tuple[TrackerState, StepResult]:
+    def _advance(self, state: TrackerState, given: StepInput) -> tuple[TrackerState, StepResult]:
         """One window, or one part of it."""
-        given = StepInput(NearbyEvents(events), t_us, starting, extra_terms=extra_terms, asked=asked)
-        return advance(self, opened(self, state, events), given)
+        return advance(self, opened(self, state, given.events.events), given)
 
     def _window_end(self, state: TrackerState, events: EventBatch, t_end_us: int | Tensor | None) -> Tensor:
         """End of the window of each stream (µs)."""

@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import partial
 
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
 from torchtrack.config.tracker import TrackerConfig
@@ -18,6 +17,7 @@ from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch
 from torchtrack.core.later import Ahead, Later
 from torchtrack.tracking.state import Answer, Search, StepResult, TrackerState, with_object
+from torchtrack.tracking.step import StepInput
 from torchtrack.tracking.validation.status import Status
 from torchtrack.tracking.validation.verdict import Limits, looked_elsewhere
 
@@ -31,19 +31,20 @@ def may_search_later(state: TrackerState, config: TrackerConfig) -> bool:
     return bool(config.relocalization.answer_after_us) and host_sync.read_at_once(state.t_us) and not torch.is_grad_enabled()
 
 
-def followed(search: Search, events: EventBatch, t_us: Int[Tensor, "s"], follow: Follow, ahead: Ahead) -> Search:
+def followed(search: Search, window: StepInput, follow: Follow, ahead: Ahead) -> Search:
     """The search with what it finds followed through one more window."""
     if search.answer is None:
         return search
-    answer = Later(partial(_followed, search.answer, events, t_us, follow))
+    answer = Later(partial(_followed, search.answer, window, follow))
     ahead.compute(answer)
     return replace(search, answer=answer)
 
 
 @torch.no_grad()
-def _followed(before: Later[Answer], events: EventBatch, t_us: Int[Tensor, "s"], follow: Follow) -> Answer:
+def _followed(before: Later[Answer], window: StepInput, follow: Follow) -> Answer:
     answer = before.value()
-    return replace(answer, found={number: follow(number, state, events, t_us) for number, (state, _) in answer.found.items()})
+    relocalized = {number: follow(number, state, window.events.events, window.t_us) for number, (state, _) in answer.relocalized.items()}
+    return replace(answer, relocalized=relocalized)
 
 
 def with_search(taken: Taken, under_way: Search | None, config: TrackerConfig, ahead: Ahead) -> Taken:
@@ -75,7 +76,7 @@ def answered(taken: Taken, answer: Answer, limits: Limits) -> Taken:
     found_nothing = answer.looked & answer.is_unconfirmed
     health = state.health.with_looks(answer.looked)
     state = replace(state, health=replace(health, confirmations=looked_elsewhere(health.confirmations, found_nothing, limits)))
-    for number, own in answer.found.items():
+    for number, own in answer.relocalized.items():
         if _is_better(number, own, (state, result)):
             state, result = with_object(number, (state, result), own)
     return state, result
