@@ -37,7 +37,10 @@ def tiny(monkeypatch):
     small = {
         pipeline: {
             "SHAPES": ("lbracket",),
-            "MANY": {"cpu": ((2, 2, 1, 15.0, True), (2, 2, 2, None, False))},
+            "MANY": {"cpu": ((2, 2, 1, 15.0, True), (3, 2, 1, None, True), (2, 2, 2, None, False))},
+            "MANY_OBJECTS": 3,
+            "CONFIRMED_AFTER": 2,
+            "MANY_DURATION_S": 0.065,
             "OUTSIDE_MEV_S": (1.0,),
             "HD": (320, 240),
             "HD_MEV_S": 4.0,
@@ -87,10 +90,11 @@ def test_pipeline(tiny, simulator, tmp_path, capsys):
     content = written(tmp_path, "pipeline")
     names = [entry["name"] for entry in content["results"]]
     assert names[:4] == ["1 object (lbracket), median", "1 object (lbracket), 95 %", "2 objects, median", "2 objects, 95 %"]
-    assert names[4:6] == [f"4 objects in 2 streams, nobody searched for, {what}" for what in ("median", "95 %")]
+    assert names[4:8] == [f"3 objects{when}, {what}" for when in (", while poses are confirmed", "") for what in ("median", "95 %")]
+    assert names[8:10] == [f"4 objects in 2 streams, nobody searched for, {what}" for what in ("median", "95 %")]
     alone = [f"{count}, without kernels, {what}" for count in ("1 object (lbracket)", "2 objects") for what in ("median", "95 %")]
-    assert names[6:10] == alone
-    assert names[10:] == ["1 object with 1 Mev/s outside it over none", "1 object in 320x240 at 4 Mev/s, stream over work"]
+    assert names[10:14] == alone
+    assert names[14:] == ["1 object with 1 Mev/s outside it over none", "1 object in 320x240 at 4 Mev/s, stream over work"]
     assert all(entry["figures"][0] > 0 and len(entry["figures"]) == 1 for entry in content["results"])
     assert "100.0% of poses are TRACKING" in content["notes"][0]
     assert content["machine"]["kernels"].startswith("numba")

@@ -1,5 +1,6 @@
 """What was lost for long is searched for everywhere, a part in each window: it is found at another pose, and nothing else changes."""
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from torchtrack.core.windows import EventWindow, windows_by_time
 from torchtrack.errors import PoseError
 from torchtrack.io import Trajectory
 from torchtrack.object_model import ObjectModel
-from torchtrack.run import lost_search
+from torchtrack.run import searches_everywhere
 from torchtrack.run.lost_search import LostSearch, with_object
 from torchtrack.run.stepping import steps
 from torchtrack.tracking.state import take_part
@@ -78,13 +79,56 @@ def test_an_object_that_comes_back_turned_is_found_again(scene):
     assert torch.allclose(last.state.T_cam_obj[0, :3, 3], truth.T_cam_obj[-1, :3, 3], atol=0.02)
     assert int(last.result.status[0]) == int(Status.TRACKING)
     # A search is many parts, of which a window takes one.
-    assert 20 < search.parts <= (END_US - BACK_US) // 5000
+    assert 20 < search.windows <= (END_US - BACK_US) // 5000
 
 
 def test_without_it_the_object_stays_lost(scene):
     *_, truth = scene
     taken, search = followed(scene, config(everywhere_after_us=0))
-    assert search.parts == 0 and error_deg(taken[-1].state.T_cam_obj[0], truth.T_cam_obj[-1]) > 20
+    assert search.windows == 0 and error_deg(taken[-1].state.T_cam_obj[0], truth.T_cam_obj[-1]) > 20
+
+
+# ---- in a thread of its own
+
+LATE_US = 10_000
+
+
+def test_in_a_thread_it_ends_when_it_was_said_to(scene):
+    """Later than in parts; every time with the same poses, whatever it took."""
+    *_, truth = scene
+    taken, search = followed(scene, config(answer_after_us=LATE_US))
+    again, _ = followed(scene, config(answer_after_us=LATE_US))
+    last = taken[-1]
+    assert error_deg(last.state.T_cam_obj[0], truth.T_cam_obj[-1]) < 5
+    assert int(last.result.status[0]) == int(Status.TRACKING)
+    # With the window that it begins after.
+    assert search.windows == 20 * LATE_US // 5000 + 1
+    assert all(torch.equal(first.state.T_cam_obj, other.state.T_cam_obj) for first, other in zip(taken, again, strict=True))
+
+
+def test_a_gap_ends_what_a_thread_does(lost, monkeypatch):
+    going_on, over = threading.Event(), threading.Event()
+
+    def endless(start, box):
+        try:
+            while True:
+                going_on.set()
+                yield
+        finally:
+            over.set()
+
+    monkeypatch.setattr(searches_everywhere, "poses_in_box", endless)
+    search = searched(lost, some(lost), 30, answer_after_us=1_000_000)
+    assert going_on.wait(10) and not over.is_set()
+    _, state, _ = lost
+    empty = EventWindow(some(lost)[:0], 200_000, 205_000, after_gap=True)
+    assert search.after(empty, state) is state
+    assert over.wait(10)
+
+
+def test_without_such_an_object_the_thread_ends_with_nothing(lost, monkeypatch):
+    monkeypatch.setattr(searches_everywhere, "poses_in_box", never_anything)
+    assert searched(lost, some(lost), answer_after_us=5_000).windows >= 20
 
 
 # ---- when a search begins
@@ -130,28 +174,28 @@ def some(lost, shift_px=0):
 
 
 def test_a_search_that_failed_is_not_repeated_at_once(lost, monkeypatch):
-    monkeypatch.setattr(lost_search, "poses_in_box", never_anything)
-    assert 2 <= searched(lost, some(lost)).parts <= 4
+    monkeypatch.setattr(searches_everywhere, "poses_in_box", never_anything)
+    assert 2 <= searched(lost, some(lost)).windows <= 4
 
 
 @pytest.mark.parametrize("changes", [{"everywhere_after_us": 0}, {"hypotheses": 0}, {"everywhere_after_us": 3_000_000}])
 def test_no_search_where_none_is_asked_for(lost, monkeypatch, changes):
-    monkeypatch.setattr(lost_search, "poses_in_box", never_anything)
-    assert searched(lost, some(lost), 30, **changes).parts == 0
+    monkeypatch.setattr(searches_everywhere, "poses_in_box", never_anything)
+    assert searched(lost, some(lost), 30, **changes).windows == 0
 
 
 def test_no_search_for_what_is_still_coming_into_the_image_nor_without_events(lost, monkeypatch):
-    monkeypatch.setattr(lost_search, "poses_in_box", never_anything)
-    assert searched(lost, some(lost), 30).parts > 0
-    assert searched(lost, some(lost, 60), 30).parts == 0
-    assert searched(lost, some(lost)[:20], 30).parts == 0
+    monkeypatch.setattr(searches_everywhere, "poses_in_box", never_anything)
+    assert searched(lost, some(lost), 30).windows > 0
+    assert searched(lost, some(lost, 60), 30).windows == 0
+    assert searched(lost, some(lost)[:20], 30).windows == 0
 
 
 def test_no_search_among_the_events_of_another_object(lost, monkeypatch):
-    monkeypatch.setattr(lost_search, "poses_in_box", never_anything)
+    monkeypatch.setattr(searches_everywhere, "poses_in_box", never_anything)
     two, state, events = lost
     on_the_events = replace(state.motion, T_cam_obj=state.T_cam_obj[[1, 1]])
-    assert searched((two, replace(state, motion=on_the_events), events), some(lost), 30).parts == 0
+    assert searched((two, replace(state, motion=on_the_events), events), some(lost), 30).windows == 0
 
 
 def test_the_others_stay_as_they_are(lost):

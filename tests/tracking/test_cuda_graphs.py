@@ -234,7 +234,7 @@ def test_a_lost_object_does_not_take_its_neighbours_out_of_the_graph(taken, monk
     """The graph holds, the lost one is found after it, and its neighbours are what they are when nobody is looked for."""
     batches, without = _three_streams(9), []
     monkeypatch.setattr(
-        Tracker, "_advance", lambda self, *args, whole=Tracker._advance, **more: without.append(args[2]) or whole(self, *args, **more)
+        Tracker, "_advance", lambda self, *args, whole=Tracker._advance, **more: without.append(args[1]) or whole(self, *args, **more)
     )
     by_graphs = _with_one_lost(_three_boxes(), batches)
     assert without == []

@@ -2,8 +2,10 @@
 
 Relocalization looks around where an object was last seen, and takes what lies within some 60° of that. What was out of the image, or behind
 something, for longer comes back at any pose. So the events that nothing else explains are searched as a recording is at its start
-(:mod:`torchtrack.run.first_pose.searching`), beside the tracker: a window takes one part of it, and the tracker knows nothing of it until a
+(:mod:`torchtrack.run.searches_everywhere`), beside the tracker: a window takes one part of it, and the tracker knows nothing of it until a
 pose has been followed from the search's beginning up to now, and explains as much all the way as the object did when it was seen well.
+
+With ``relocalization.answer_after_us``, no window takes a part: the search goes on in a thread of its own.
 """
 
 from collections import deque
@@ -16,14 +18,16 @@ from torch import Tensor
 
 from torchtrack.core.camera import Camera, undistortion_table
 from torchtrack.core.events import EventBatch, concatenate
+from torchtrack.core.later import Ahead
 from torchtrack.core.windows import EventWindow
 from torchtrack.errors import EventDataError, PoseError
 from torchtrack.io.keep_up import HastyWindow
 from torchtrack.object_model import ObjectModel
 from torchtrack.run.first_pose.parts import Parts
-from torchtrack.run.first_pose.searching import poses_in_box, projected_box
+from torchtrack.run.first_pose.searching import projected_box
 from torchtrack.run.first_pose.start import Box, Start, box_of_events
-from torchtrack.run.first_pose.tracked import FOLLOWED_US, alone, followed_on
+from torchtrack.run.first_pose.tracked import FOLLOWED_US
+from torchtrack.run.searches_everywhere import Candidate, SearchEverywhere, SearchInParts, SearchInThread, candidate_in_box
 from torchtrack.tracking.relocalization.schedule import is_time
 from torchtrack.tracking.state import TrackerState
 from torchtrack.tracking.tracker import Tracker
@@ -41,8 +45,8 @@ _FROM_BORDER_PX = 4.0
 _ITS_OWN = 0.1
 # What explains less is no object, however little of it was ever seen.
 _LEAST_EXPLAINED = 0.5
-# Windows that a pose is followed through at a time, so that it catches up with the tracker.
-_CAUGHT_UP = 8
+# In a thread, it has so many times as long as a search around the last place: it takes 20 to 110 parts, of 10 to 20 ms each as a rule.
+_TIMES_AS_LONG = 20
 
 
 class LostSearch:
@@ -53,7 +57,7 @@ class LostSearch:
         stream: which one of it.
 
     Attributes:
-        parts: how many parts of searches were done.
+        windows: after how many a search has gone on.
     """
 
     def __init__(self, tracker: Tracker, stream: int = 0) -> None:
@@ -66,13 +70,14 @@ class LostSearch:
         self._table: Float[Tensor, "h w 2"] | None = None
         self._windows: deque[EventWindow] = deque()
         self._searched: int | None = None
-        self._search: Parts[TrackerState | None] | None = None
+        self._search: SearchEverywhere | None = None
+        self._ahead, self._ends_after_us = Ahead(), _TIMES_AS_LONG * search.answer_after_us
         # Since when each object is lost, and since when it is seen well; those that are not have no entry (µs).
         self._lost_us: dict[int, int] = {}
         self._well_us: dict[int, int] = {}
         # Of each object, when it may be searched for again, and how long to wait after that (µs).
         self._waits: dict[int, tuple[int, int]] = {}
-        self.parts = 0
+        self.windows = 0
 
     def after(self, window: EventWindow, state: TrackerState) -> TrackerState:
         """The state after a window, with the object in it that a search has found by now; the same one where there is none.
@@ -90,18 +95,20 @@ class LostSearch:
             self._look(state, window.t_end_us)
             if self._search is None:
                 self._begin(state, window.t_end_us)
-        return state if self._search is None else self._advanced(self._search, state, window.t_end_us)
+        return state if self._search is None else self._advanced(self._search, state, window)
 
     def _hold(self, window: EventWindow) -> None:
-        """Keep the window, and those that a search needs that is under way or may begin.
+        """Keep the window, and those that a search needs that may begin.
 
         What was seen before a gap is over; and where a live stream is behind there is no time to search.
         """
         if window.after_gap or isinstance(window, HastyWindow):
             self._windows.clear()
+            if self._search is not None:
+                self._search.drop()
             self._search = None
         self._windows.append(window)
-        while self._search is None and len(self._windows) > 1 and self._windows[0].t_start_us < window.t_end_us - FOLLOWED_US:
+        while len(self._windows) > 1 and self._windows[0].t_start_us < window.t_end_us - FOLLOWED_US:
             self._windows.popleft()
 
     def _begin(self, state: TrackerState, now_us: int) -> None:
@@ -118,7 +125,12 @@ class LostSearch:
             return
         if box is not None and self._is_inside(box):
             wanted = max(self._accept_ratio * float(state.health.reference_explained_ratio[number]), _LEAST_EXPLAINED)
-            self._searched, self._search = number, self._found(start, box, wanted)
+            self._searched, self._search = number, self._under_way(candidate_in_box(start, box, wanted), now_us)
+
+    def _under_way(self, candidate: Parts[Candidate | None], now_us: int) -> SearchEverywhere:
+        if not self._ends_after_us:
+            return SearchInParts(candidate, self._windows)
+        return SearchInThread(candidate, self._windows, now_us + self._ends_after_us, self._ahead)
 
     def _longest_lost(self, now_us: int) -> int | None:
         due = [number for number, since_us in self._lost_us.items() if now_us >= max(since_us + self._after_us, self._waits.get(number, (0, 0))[0])]
@@ -162,44 +174,21 @@ class LostSearch:
         low, far = min(box.u0, box.v0), max(box.u1 - self._camera.width, box.v1 - self._camera.height)
         return low >= _FROM_BORDER_PX and far <= -_FROM_BORDER_PX
 
-    def _found(self, start: Start, box: Box, wanted: float) -> Parts[TrackerState | None]:
-        """The state of the object alone by now; None where no pose explains as much as is wanted."""
-        poses = yield from poses_in_box(start, box)
-        best = yield from followed_on(start, poses)
-        if best.quality < wanted:
-            return None
-        tracker, state, scores = alone(start), best.state, [best.state.health.score]
-        while pending := [window for window in self._windows if window.t_end_us > int(state.t_us[0])]:
-            for window in pending[:_CAUGHT_UP]:
-                with torch.inference_mode():
-                    events = window.events.to("cpu").slice_time(int(state.t_us[0]), window.t_end_us)
-                    state, _ = tracker.step(state, events, window.t_end_us)
-                scores.append(state.health.score)
-            if len(pending) > _CAUGHT_UP:
-                yield
-        return state if float(torch.cat(scores).mean()) >= wanted else None
-
-    def _advanced(self, search: Parts[TrackerState | None], state: TrackerState, now_us: int) -> TrackerState:
-        """The state after one more part of the search."""
-        self.parts += 1
-        own: TrackerState | None = None
-        try:
-            next(search)
+    def _advanced(self, search: SearchEverywhere, state: TrackerState, window: EventWindow) -> TrackerState:
+        """The state after a window that a search goes on after."""
+        self.windows += 1
+        ended = search.after(window)
+        if ended is None:
             return state
-        except StopIteration as done:
-            own = done.value
-        except (EventDataError, PoseError):
-            # No such object there; that is not known before it is tried.
-            own = None
         number, self._search = self._searched or 0, None
         if number not in self._lost_us:
             return state
-        if own is not None:
+        if ended.own is not None:
             self._waits.pop(number, None)
             self._lost_us.pop(number)
-            return with_object(state, number, own)
+            return with_object(state, number, ended.own)
         wait_us = self._waits.get(number, (0, _FIRST_WAIT_US))[1]
-        self._waits[number] = now_us + wait_us, min(2 * wait_us, _LONGEST_WAIT_US)
+        self._waits[number] = window.t_end_us + wait_us, min(2 * wait_us, _LONGEST_WAIT_US)
         return state
 
 

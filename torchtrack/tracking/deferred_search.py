@@ -16,7 +16,7 @@ from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch
 from torchtrack.core.later import Ahead, Later
-from torchtrack.tracking.state import Answer, Search, StepResult, TrackerState, with_object
+from torchtrack.tracking.state import Answer, Search, StepResult, TrackerState, put_object
 from torchtrack.tracking.step import StepInput
 from torchtrack.tracking.validation.status import Status
 from torchtrack.tracking.validation.verdict import Limits, looked_elsewhere
@@ -78,7 +78,7 @@ def answered(taken: Taken, answer: Answer, limits: Limits) -> Taken:
     state = replace(state, health=replace(health, confirmations=looked_elsewhere(health.confirmations, found_nothing, limits)))
     for number, own in answer.relocalized.items():
         if _is_better(number, own, (state, result)):
-            state, result = with_object(number, (state, result), own)
+            state, result = put_object(number, (state, result), own)
     return state, result
 
 

@@ -185,7 +185,7 @@ def each_tensor(change: Callable[[Tensor], Tensor], value: D) -> D:
     return changed
 
 
-def with_object(number: int, of_all: tuple[TrackerState, StepResult], alone: tuple[TrackerState, StepResult]) -> tuple[TrackerState, StepResult]:
+def put_object(number: int, of_all: tuple[TrackerState, StepResult], alone: tuple[TrackerState, StepResult]) -> tuple[TrackerState, StepResult]:
     """State and result of all objects, with one of them as a tracker of it alone has it."""
 
     def put(rows: Tensor, row: Tensor) -> Tensor:
