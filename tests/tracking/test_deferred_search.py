@@ -17,8 +17,9 @@ from torchtrack.core.later import Ahead, Later
 from torchtrack.core.lie import retract_about
 from torchtrack.run.stepping import passed_over
 from torchtrack.tracking import step
-from torchtrack.tracking.deferred_search import answered
-from torchtrack.tracking.state import Answer, joined, take_part
+from torchtrack.tracking.deferred_search import answered, with_search
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, Trigger, next_kind
+from torchtrack.tracking.state import Answer, Search, joined, take_part
 from torchtrack.tracking.validation.status import Status
 from torchtrack.tracking.validation.verdict import Limits
 
@@ -102,7 +103,7 @@ def test_what_is_asked_for_meanwhile_is_searched_for_next():
     """With one look for a stream in a window, two that are lost take two searches, one after the other."""
     config = TrackerConfig(relocalization=RelocalizationConfig(answer_after_us=LATE_WINDOWS * WINDOW_US, objects=1))
     states, results = run(*one_lost(config, lost=(0, 1)))
-    since = {int(state.search.since_us) for state in states if state.search is not None and state.search.answer is not None}
+    since = {int(state.search.since_us[0]) for state in states if state.search is not None and state.search.answer is not None}
     assert len(since) >= 2 and min(b - a for a, b in zip(sorted(since), sorted(since)[1:], strict=False)) > LATE_WINDOWS * WINDOW_US
     assert max(degrees_off(results[-1], number) for number in range(2)) < 1.2
 
@@ -245,6 +246,21 @@ def test_what_was_found_has_to_be_better_by_then(score, status, own_status, is_t
     assert taken[0].maps is not better.maps or not is_taken
 
 
+def test_kinds_of_search_have_their_turns():
+    ahead, kinds = _Never(), []
+    (state, result), _, _ = window_and_answer()
+    triggers = torch.tensor([int(Trigger.UNCERTAIN | Trigger.FAR_BELOW_REFERENCE)])
+    search = Search(state.t_us, triggers)
+    for _ in range(3):
+        kind = next_kind(search.triggers | triggers, search.kind)
+        asked = Search(state.t_us, search.triggers | triggers, Later(lambda: None), kind)
+        search = with_search((replace(state, search=asked), result), search, LATER, ahead)[0].search
+        kinds.append(search.kind)
+        assert int(search.triggers) == int(triggers) & ~kind
+        search = replace(search, answer=None)
+    assert kinds == [int(AROUND_PREDICTION), int(AROUND_LAST_SEEN), int(AROUND_PREDICTION)]
+
+
 def test_a_state_can_be_shown_while_a_search_goes_on():
     taken, answer, _ = window_and_answer()
-    assert "TrackerState(" in repr(replace(taken[0], search=step.Search(taken[0].t_us, torch.zeros(1, dtype=torch.int64), Later(lambda: answer))))
+    assert "TrackerState(" in repr(replace(taken[0], search=Search(taken[0].t_us, torch.zeros(1, dtype=torch.int64), Later(lambda: answer))))

@@ -5,6 +5,7 @@ that was fixed when it began, so that poses do not hang on how long it took, and
 """
 
 import threading
+import weakref
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -140,6 +141,8 @@ class SearchInThread:
         self._until_us, self._ahead, self._is_over = until_us, ahead, threading.Event()
         self._candidate = Later(partial(_searched, candidate, tuple(windows), self._is_over))
         ahead.compute(self._candidate)
+        # Whoever forgets it does not wait for it any more.
+        weakref.finalize(self, self._is_over.set)
 
     def after(self, window: EventWindow) -> Ended | None:
         """Have what the search finds followed through one more window."""

@@ -2,7 +2,8 @@
 
 A search starts from what a window has computed, and its answer comes ``relocalization.answer_after_us`` later. What was found is followed through
 the windows since, alone, as they come, so that its pose is one of now. When the answer comes does not hang on how long it took: poses are the same
-on any machine, and a search that takes longer is waited for. There is one search at a time; what objects ask for meanwhile is for the next one.
+on any machine, and a search that takes longer is waited for. There is one search at a time, of one kind; other kinds, and what objects ask for
+meanwhile, have their turn next.
 """
 
 from collections.abc import Callable
@@ -62,7 +63,7 @@ def with_search(taken: Taken, under_way: Search | None, config: TrackerConfig, a
         if asked is None or asked.answer is None:
             return taken
         ahead.compute(asked.answer)
-        return replace(state, search=replace(asked, triggers=torch.zeros_like(asked.triggers))), result
+        return replace(state, search=replace(asked, triggers=asked.triggers & ~asked.kind)), result
     left = replace(under_way, triggers=torch.zeros_like(under_way.triggers) if asked is None else asked.triggers)
     if int((state.t_us - under_way.since_us).max()) < config.relocalization.answer_after_us:
         return replace(state, search=left), result

@@ -123,11 +123,13 @@ class Search:
         since_us: end of the window that it is of, of each stream (µs).
         triggers: what objects asked for that the search is not of.
         answer: what came of it, followed through the windows since; none where no search goes on.
+        kind: the triggers that the last search was of.
     """
 
     since_us: Int[Tensor, "s"]
     triggers: Int[Tensor, "b"]
-    answer: Later[Answer] | None
+    answer: Later[Answer] | None = None
+    kind: int = 0
 
 
 def _times(t_us: Int[Tensor, "s"]) -> str:

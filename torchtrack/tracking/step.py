@@ -33,7 +33,7 @@ from torchtrack.tracking.relocalization.evidence import TriggerEvidence, gather_
 from torchtrack.tracking.relocalization.last_seen import LastSeen
 from torchtrack.tracking.relocalization.lost_objects import Relocalized
 from torchtrack.tracking.relocalization.relocalize import relocalize
-from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, has, triggered
+from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, has, next_kind, triggered
 from torchtrack.tracking.state import Answer, Search, StepResult, TrackerState, each_tensor, take_part
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.measures import required_spread
@@ -52,7 +52,7 @@ class StepInput:
         reads: asks for what has to be decided.
         learns: whether anything may be learned from the window.
         extra_terms: of the cost, beside contours and prediction.
-        asked: what objects asked for in earlier windows, where searches go on beside the windows; none where they are waited for.
+        search: the last one, where searches go on beside the windows; none where they are waited for.
     """
 
     events: NearbyEvents
@@ -61,7 +61,7 @@ class StepInput:
     reads: host_sync.HostReads = field(default_factory=host_sync.HostReads)
     learns: bool = True
     extra_terms: tuple[CostTerm, ...] = ()
-    asked: Int[Tensor, "b"] | None = None
+    search: Search | None = None
 
 
 @dataclass(frozen=True)
@@ -118,26 +118,27 @@ def advance(tracked: TrackedObjects, state: TrackerState, given: StepInput) -> t
         given: the window.
     """
     window = steady_window(tracked, state, given)
-    if given.asked is not None:
-        return _searched_later(tracked, state, window, given, given.asked)
+    if given.search is not None:
+        return _searched_later(tracked, state, window, given, given.search)
     # A GPU is waited for: a pose that begins to slip is farther off a window later.
     searches = given.reads.ask(has(window.evidence.triggers, SEARCHED), False).any()
     return update(tracked, state, window, relocalized(tracked, state, window) if searches else window.located, given)
 
 
 def _searched_later(
-    tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, given: StepInput, asked: Int[Tensor, "b"]
+    tracked: TrackedObjects, state: TrackerState, window: SteadyWindow, given: StepInput, last: Search
 ) -> tuple[TrackerState, StepResult]:
-    """State and result of a window with nobody looked for, and with the search that objects ask for, by now or since they asked and are not well."""
+    """State and result of a window with nobody looked for, and with a search that objects ask for, by now or since they asked and are not well."""
     evidence, limits = window.evidence, Limits.from_config(tracked.config)
     is_well = (evidence.time_since_validated_s == 0) & (evidence.confirmations >= limits.confirmed_by)
-    triggers = evidence.triggers | torch.where(is_well, 0, asked)
+    triggers = evidence.triggers | torch.where(is_well, 0, last.triggers)
     next_state, result = update(tracked, state, window, window.located, given)
     if host_sync.none_of(has(triggers, SEARCHED)):
         return next_state, result
-    window = replace(window, evidence=replace(evidence, triggers=triggers))
-    answer = Later(partial(_answer, tracked, state, window, given))
-    return replace(next_state, search=Search(given.t_us, triggers, answer)), result
+    kind = next_kind(triggers, last.kind)
+    window = replace(window, evidence=replace(evidence, triggers=triggers & (kind | ~int(SEARCHED))))
+    answer = Later(partial(_answer, tracked, state, window, replace(given, search=None)))
+    return replace(next_state, search=Search(given.t_us, triggers, answer, kind)), result
 
 
 @torch.no_grad()

@@ -30,7 +30,7 @@ from torchtrack.tracking.initialization import PARTS, check_poses, first_state, 
 from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.sampling import rehearse
 from torchtrack.tracking.start_check import check_in_view
-from torchtrack.tracking.state import StepResult, TrackerState, choose_rows
+from torchtrack.tracking.state import Search, StepResult, TrackerState, choose_rows
 from torchtrack.tracking.step import StepInput, advance, opened
 from torchtrack.tracking.step_check import check_step
 
@@ -176,11 +176,11 @@ class Tracker(TrackedObjects):
         under_way = state.search
         if under_way is None and not may_search_later(state, self.config):
             return self._taken(state, given)
-        asked = torch.zeros_like(self.stream_index) if under_way is None else under_way.triggers
+        last = under_way or Search(state.t_us, torch.zeros_like(self.stream_index))
         if under_way is not None:
             # Before the window is taken: what was found is followed through it meanwhile.
             under_way = followed(under_way, given, self._followed, self._ahead)
-        taken = self._taken(replace(state, search=None), replace(given, asked=asked))
+        taken = self._taken(replace(state, search=None), replace(given, search=last))
         return with_search(taken, under_way, self.config, self._ahead)
 
     def _followed(self, number: int, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult]:
@@ -203,9 +203,9 @@ class Tracker(TrackedObjects):
         parted = host_sync.AsyncValue.to(in_parts)
         if host_sync.read_at_once(in_parts) and bool(in_parts.all()):
             return _counted(self._advance_in_parts(state, given, in_parts))
-        if given.asked is not None and parted.any():
+        if given.search is not None and parted.any():
             # In each part, searches are waited for.
-            given = replace(given, asked=None)
+            given = replace(given, search=None)
         done = self._advance(state, given)
         if not parted.any():
             return _counted(done)

@@ -15,7 +15,7 @@ from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import CornerConfig, TrackerConfig
 from torchtrack.core.events import concatenate
 from torchtrack.core.lie import retract_about
-from torchtrack.tracking.relocalization.triggers import SEARCHED, Trigger, triggered
+from torchtrack.tracking.relocalization.triggers import AROUND_PREDICTION, SEARCHED, Trigger, next_kind, triggered
 from torchtrack.tracking.validation import verdict
 from torchtrack.tracking.validation.scored_fit import reference_where_known
 from torchtrack.tracking.validation.status import Status
@@ -251,3 +251,17 @@ def test_a_score_is_less_where_events_are_smeared():
     for times, expected in ((2 / 0.9, 0.5), (1 / 0.9, 1.0), (0.5, 1.0), (0.0, 1.0)):
         score = replace(actual, reference_inlier_ratio=times * actual.inlier_ratio).score
         assert float(score) == pytest.approx(expected * float(actual.explained_ratio), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("triggers", "last", "expected"),
+    [
+        ([0, int(Trigger.LOST)], 0, 0),
+        ([0, int(Trigger.UNCERTAIN)], 0, int(AROUND_PREDICTION)),
+        ([int(Trigger.UNCERTAIN), int(Trigger.UNCONFIRMED)], int(AROUND_PREDICTION), int(Trigger.UNCONFIRMED)),
+        ([int(Trigger.UNCERTAIN)], int(AROUND_PREDICTION), int(AROUND_PREDICTION)),
+        ([int(Trigger.UNCERTAIN | Trigger.DEPTH_CHANGED)], int(Trigger.UNCONFIRMED), int(AROUND_PREDICTION)),
+    ],
+)
+def test_the_next_kind_of_search_is_the_next_that_is_asked_for(triggers, last, expected):
+    assert next_kind(torch.tensor(triggers), last) == expected

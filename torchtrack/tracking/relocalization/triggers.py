@@ -54,6 +54,15 @@ AROUND_PREDICTION = Trigger.UNCERTAIN | Trigger.NEW | Trigger.LOW_SCORE | DRIFTS
 # What calls for a search. An object that is lost is expected where it was last validated, and uncertain there.
 SEARCHED = AROUND_PREDICTION | AROUND_LAST_SEEN | Trigger.UNCONFIRMED
 
+# What a search may be of by itself: each takes as long as the others, or longer.
+KINDS = (AROUND_PREDICTION, AROUND_LAST_SEEN, Trigger.UNCONFIRMED)
+
+
+def next_kind(triggers: Int[Tensor, "b"], last: int) -> int:
+    """The kind of search that is next in turn, of those that objects ask for, after one of the kind ``last``; 0 for none."""
+    turn = KINDS.index(Trigger(last)) + 1 if last else 0
+    return next((int(kind) for kind in (*KINDS[turn:], *KINDS[:turn]) if bool(has(triggers, kind).any())), 0)
+
 
 def triggered(evidence: TriggerEvidence, config: TrackerConfig) -> TriggerEvidence:
     """The evidence with the :class:`Trigger` bits of each object; with none where other poses are never tried."""
