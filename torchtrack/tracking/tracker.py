@@ -173,14 +173,14 @@ class Tracker(TrackedObjects):
 
     def _tracked(self, state: TrackerState, given: StepInput) -> tuple[TrackerState, StepResult]:
         """The state and result after a window whose events are checked."""
-        under_way = state.search
-        if under_way is None and not may_search_later(state, self.config):
+        under_way, is_later = state.search, may_search_later(state, self.config)
+        if under_way is None and not is_later:
             return self._taken(state, given)
         last = under_way or Search(state.t_us, torch.zeros_like(self.stream_index))
         if under_way is not None:
             # Before the window is taken: what was found is followed through it meanwhile.
             under_way = followed(under_way, given, self._followed, self._ahead)
-        taken = self._taken(replace(state, search=None), replace(given, search=last))
+        taken = self._taken(replace(state, search=None), replace(given, search=last if is_later else None))
         return with_search(taken, under_way, self.config, self._ahead)
 
     def _followed(self, number: int, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult]:
