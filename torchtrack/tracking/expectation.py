@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -19,8 +20,11 @@ from torchtrack.tracking.objects import TrackedObjects
 from torchtrack.tracking.relocalization.evidence import Schedule
 from torchtrack.tracking.relocalization.last_seen import LastSeen, anywhere
 from torchtrack.tracking.relocalization.schedule import may_look_far, schedule
-from torchtrack.tracking.relocalization.triggers import Trigger, has
-from torchtrack.tracking.state import TrackerState
+from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, DRIFTS, Trigger, has
+from torchtrack.tracking.state import Search, TrackerState
+
+# What objects are looked for by farther away than they are expected.
+_FAR = AROUND_LAST_SEEN | DRIFTS | Trigger.UNCONFIRMED
 
 
 @dataclass(frozen=True)
@@ -67,14 +71,19 @@ def predicted_after(tracked: TrackedObjects, state: TrackerState, dt_s: Float[Te
     return forecast(state.motion, dt_s, objects, tracked.far_pose, config)
 
 
-def near_objects(tracked: TrackedObjects, state: TrackerState, expected: Expected, events: NearbyEvents) -> NearbyEvents:
+def near_objects(tracked: TrackedObjects, state: TrackerState, expected: Expected, events: NearbyEvents, last: Search | None = None) -> NearbyEvents:
     """Those of the events that can have to do with the objects: any, for objects that may be looked for anywhere.
 
     A weighting network of one's own is shown all.
+
+    Args:
+        last: the last search, where searches go on beside the windows: while it does, nobody else is looked for.
     """
     if tracked.shows_all:
         return events
     prediction, far = expected.prediction.detached(), may_look_far(state, expected.scheduled, tracked.config)
+    if last is not None:
+        far = torch.zeros_like(far) if last.answer is not None else far | has(last.triggers, _FAR)
     if not host_sync.none_of(far):
         prediction = replace(prediction, covariance=anywhere(prediction.covariance, far))
     return tracked.sensors.near_objects(events, prediction, expected.dt_s, tracked.config)

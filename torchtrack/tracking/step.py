@@ -172,7 +172,7 @@ def steady_window(tracked: TrackedObjects, state: TrackerState, given: StepInput
 def observe(tracked: TrackedObjects, state: TrackerState, expected: Expected, given: StepInput) -> Observed:
     """Stage 2: events, corners and flow near the objects, and the contours that they are matched with."""
     config, sensors, maps, t_us = tracked.config, tracked.sensors, state.maps, given.t_us
-    prediction, nearby = expected.prediction.detached(), near_objects(tracked, state, expected, given.events)
+    prediction, nearby = expected.prediction.detached(), near_objects(tracked, state, expected, given.events, given.search)
     events, burst_age_us = sensors.window_events(nearby, maps.burst_age_us, t_us, t_us - state.t_us)
     contours = prediction.objects.contours(prediction.T_cam_obj, config.contours)
     sigma_px = prediction.sigma_px(contours).detach() if config.solver.prior else torch.zeros_like(tracked.diameter_m)
