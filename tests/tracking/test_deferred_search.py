@@ -4,6 +4,7 @@ import copy
 import pickle
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from helpers import SMALL_CAMERA, box_model, pose, pose_errors
@@ -13,11 +14,15 @@ from tracked_boxes import WIDE_CAMERA, WINDOW_US, assert_same, follow, moving_bo
 from torchtrack import Tracker
 from torchtrack.config.relocalization import RelocalizationConfig
 from torchtrack.config.tracker import TrackerConfig
+from torchtrack.core.events import EventBatch
+from torchtrack.core.host_sync import HostReads
 from torchtrack.core.later import Ahead, Later
 from torchtrack.core.lie import retract_about
 from torchtrack.run.stepping import passed_over
 from torchtrack.tracking import step
 from torchtrack.tracking.deferred_search import answered, with_search
+from torchtrack.tracking.expectation import expect, near_objects
+from torchtrack.tracking.frontend.tiles import NearbyEvents
 from torchtrack.tracking.relocalization.triggers import AROUND_LAST_SEEN, AROUND_PREDICTION, Trigger, next_kind
 from torchtrack.tracking.state import Answer, Search, joined, take_part
 from torchtrack.tracking.validation.status import Status
@@ -106,6 +111,21 @@ def test_what_is_asked_for_meanwhile_is_searched_for_next():
     since = {int(state.search.since_us[0]) for state in states if state.search is not None and state.search.answer is not None}
     assert len(since) >= 2 and min(b - a for a, b in zip(sorted(since), sorted(since)[1:], strict=False)) > LATE_WINDOWS * WINDOW_US
     assert max(degrees_off(results[-1], number) for number in range(2)) < 1.2
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("is_under_way", "trigger", "is_everywhere"),
+    [(False, Trigger.DEPTH_CHANGED, True), (False, Trigger.UNCERTAIN, False), (True, Trigger.DEPTH_CHANGED, False)],
+)
+def test_events_from_all_over_are_gathered_where_a_search_can_start_that_needs_them(is_under_way, trigger, is_everywhere):
+    (state, _), answer, _ = window_and_answer()
+    tracker, t_us = Tracker([box_model()], SMALL_CAMERA), state.t_us + WINDOW_US
+    events = EventBatch.from_numpy(np.array([1]), np.array([1]), t_us.numpy(), np.ones(1, dtype=bool))
+    expected = expect(tracker, state, events, t_us, HostReads())
+    last = Search(state.t_us, torch.tensor([int(trigger)]), Later(lambda: answer) if is_under_way else None)
+    near = near_objects(tracker, state, expected, NearbyEvents(events), last)
+    assert bool(near.near_tiles.all()) == is_everywhere
 
 
 # ---- what poses hang on
