@@ -37,6 +37,21 @@ def test_many_threads_that_ask_at_once_get_the_same():
     assert len(calls) == 1
 
 
+def test_many_that_are_made_of_one_another_are_computed_one_after_the_other():
+    later = Later(lambda: 0)
+    for _ in range(5000):
+        later = Later(lambda before=later: before.value() + 1, later)
+    assert later.value() == 5000
+
+
+def test_those_made_of_one_that_fails_fail():
+    broken = Later(lambda: 1 // 0)
+    later = Later(lambda: broken.value(), broken)
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            later.value()
+
+
 def test_it_is_computed_in_the_context_that_it_was_made_in():
     token = NAME.set("there")
     later = Later(NAME.get)

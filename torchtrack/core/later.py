@@ -16,28 +16,37 @@ class Later(Generic[T]):
 
     Args:
         compute: gives it, or raises what everybody who asks is to get; in the context that this is made in.
+        before: a value that it is made of, if any. Many may be made of one another: they are computed one after the other.
     """
 
-    def __init__(self, compute: Callable[[], T]) -> None:
+    def __init__(self, compute: Callable[[], T], before: "Later[Any] | None" = None) -> None:
         self._lock = threading.Lock()
         self._compute: Callable[[], T] | None = partial(copy_context().run, compute)
+        self._before: Later[Any] | None = before
         self._value: Any = None
 
     def value(self) -> T:
         """The value, for which is waited where another thread computes it."""
+        missing: list[Later[Any]] = [self]
+        while (before := missing[-1]._before) is not None:
+            missing.append(before)
+        for later in reversed(missing):
+            later._settle()
+        value: T = self._value
+        return value
+
+    def _settle(self) -> None:
         with self._lock:
             if self._compute is not None:
                 self._value = self._compute()
                 # What it was made of is not needed any more.
-                self._compute = None
-            value: T = self._value
-            return value
+                self._compute = self._before = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {"value": self.value()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._lock, self._compute, self._value = threading.Lock(), None, state["value"]
+        self._lock, self._compute, self._before, self._value = threading.Lock(), None, None, state["value"]
 
 
 class Ahead:

@@ -146,7 +146,7 @@ class SearchInThread:
 
     def after(self, window: EventWindow) -> Ended | None:
         """Have what the search finds followed through one more window."""
-        self._candidate = Later(partial(_followed, self._candidate, window, self._is_over))
+        self._candidate = Later(partial(_followed, self._candidate, window, self._is_over), self._candidate)
         self._ahead.compute(self._candidate)
         if window.t_end_us < self._until_us:
             return None

@@ -36,7 +36,7 @@ def followed(search: Search, window: StepInput, follow: Follow, ahead: Ahead) ->
     """The search with what it finds followed through one more window."""
     if search.answer is None:
         return search
-    answer = Later(partial(_followed, search.answer, window, follow))
+    answer = Later(partial(_followed, search.answer, window, follow), search.answer)
     ahead.compute(answer)
     return replace(search, answer=answer)
 
