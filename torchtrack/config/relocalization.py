@@ -26,7 +26,7 @@ class RelocalizationConfig(Settings):
         0,
         ge=0,
         le=1_000_000,
-        description="A search goes on beside the windows, on another core, and its answer comes after so long (µs); 0: windows wait for it.",
+        description="Searches go on beside the windows, on another core, and are answered after so long (µs); 0: windows wait.",
     )
     not_validated_below: float = Field(
         0.75,

@@ -112,6 +112,6 @@ def test_a_step_is_the_same_without_the_events_that_are_left_out(monkeypatch):
     results = [tracker.step(state, noisy)[1]]
     near = near_tiles(tracker, state, torch.tensor([6 * WINDOW_US]))
     assert len(tracker.tiles.keep(noisy, near).events) < len(noisy) // 2
-    monkeypatch.setattr(step, "near_objects", lambda tracked, state, expected, events: events)
+    monkeypatch.setattr(step, "near_objects", lambda tracked, state, expected, events, last: events)
     results.append(tracker.step(state, noisy)[1])
     assert torch.equal(results[0].T_cam_obj, results[1].T_cam_obj)
