@@ -40,13 +40,12 @@ def test_many_threads_that_ask_at_once_get_the_same():
 def test_many_that_are_made_of_one_another_are_computed_one_after_the_other():
     later = Later(lambda: 0)
     for _ in range(5000):
-        later = Later(lambda before=later: before.value() + 1, later)
+        later = later.then(lambda value: value + 1)
     assert later.value() == 5000
 
 
 def test_those_made_of_one_that_fails_fail():
-    broken = Later(lambda: 1 // 0)
-    later = Later(lambda: broken.value(), broken)
+    later = Later(lambda: 1 // 0).then(lambda value: value + 1)
     for _ in range(2):
         with pytest.raises(ZeroDivisionError):
             later.value()
@@ -68,16 +67,14 @@ def test_an_error_is_raised_wherever_the_value_is_asked_for():
 
 
 def test_ahead_computes_in_a_thread_of_its_own_and_in_order():
-    ahead, done, order = Ahead(), threading.Event(), []
-    first, second = Later(lambda: done.wait() and order.append(threading.get_ident())), Later(lambda: order.append(2))
-    ahead.compute(first)
-    ahead.compute(second)
+    ahead, begin, ended, order = Ahead(), threading.Event(), threading.Event(), []
+    ahead.compute(Later(lambda: begin.wait(10) and order.append((1, threading.get_ident()))))
+    ahead.compute(Later(lambda: order.append((2, threading.get_ident())) or ended.set()))
     assert not order
-    done.set()
-    second.value()
-    first.value()
-    assert 2 in order and threading.get_ident() not in [*order[:1], 2]
-    assert len(order) == 2
+    begin.set()
+    assert ended.wait(10)
+    (first, its_thread), (second, other_thread) = order
+    assert (first, second) == (1, 2) and its_thread == other_thread != threading.get_ident()
 
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))], ids=["copy", "deepcopy", "pickle"])

@@ -87,10 +87,9 @@ def test_its_neighbour_has_the_same_digits_whether_it_is_lost_or_not():
     _, held = run(*one_lost(lost=()))
     _, waited = run(*one_lost(TrackerConfig(), lost=()))
     assert degrees_off(lost[LATE_WINDOWS]) > 3
-    for number in (1,):
-        assert torch.equal(poses_of(lost, number), poses_of(held, number))
-        assert torch.equal(poses_of(held, number), poses_of(waited, number))
-        assert [int(result.status[number]) for result in lost] == [int(result.status[number]) for result in held]
+    assert torch.equal(poses_of(lost, 1), poses_of(held, 1))
+    assert torch.equal(poses_of(held, 1), poses_of(waited, 1))
+    assert [int(result.status[1]) for result in lost] == [int(result.status[1]) for result in held]
 
 
 def test_in_any_stream():
@@ -176,16 +175,12 @@ def test_a_copy_goes_on_with_the_search(copied):
 
 def test_where_gradients_are_recorded_searches_are_waited_for():
     tracker, state, cut = one_lost()
-    at_once = Tracker([box_model()] * 2, [WIDE_CAMERA], index_of(tracker))
+    at_once = Tracker([box_model()] * 2, WIDE_CAMERA)
     with torch.enable_grad():
         after, result = tracker.step(state, *cut[0])
         assert after.search is None
         expected = at_once.step(state, *cut[0])[1]
     assert torch.equal(result.T_cam_obj, expected.T_cam_obj)
-
-
-def index_of(tracker):
-    return tracker.config.model_copy(update={"relocalization": RelocalizationConfig()})
 
 
 def test_no_part_of_a_state_has_the_search_nor_what_is_made_of_parts():

@@ -17,12 +17,8 @@ def in_haste(config: TrackerConfig, *, searches: bool) -> TrackerConfig:
         config: of the tracker when it keeps up.
         searches: whether objects that are lost are searched for, by fewer poses than otherwise.
     """
-    search = _brief(config.relocalization) if searches else _without(config.relocalization)
-    return config.model_copy(update={"relocalization": search, "disabled": config.disabled | _LEFT_OUT})
-
-
-def _without(search: RelocalizationConfig) -> RelocalizationConfig:
-    return search.model_copy(update={"hypotheses": 0})
+    hasty = config.model_copy(update={"relocalization": _brief(config.relocalization)}) if searches else config.without_searches()
+    return hasty.model_copy(update={"disabled": config.disabled | _LEFT_OUT})
 
 
 def _brief(search: RelocalizationConfig) -> RelocalizationConfig:

@@ -144,6 +144,10 @@ class TrackerConfig(Settings):
         """Whether other poses than the predicted ones are ever tried."""
         return self.relocalization.hypotheses > 0 and self.solver.prior
 
+    def without_searches(self) -> "TrackerConfig":
+        """The same settings, but no other poses are tried."""
+        return self.model_copy(update={"relocalization": self.relocalization.model_copy(update={"hypotheses": 0})})
+
     @field_serializer("disabled", when_used="json")
     def _in_order(self, disabled: frozenset[Component]) -> list[str]:
         return sorted(disabled)

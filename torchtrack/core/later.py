@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
+R = TypeVar("R")
 
 
 class Later(Generic[T]):
@@ -16,14 +17,19 @@ class Later(Generic[T]):
 
     Args:
         compute: gives it, or raises what everybody who asks is to get; in the context that this is made in.
-        before: a value that it is made of, if any. Many may be made of one another: they are computed one after the other.
     """
 
-    def __init__(self, compute: Callable[[], T], before: "Later[Any] | None" = None) -> None:
+    def __init__(self, compute: Callable[[], T]) -> None:
         self._lock = threading.Lock()
         self._compute: Callable[[], T] | None = partial(copy_context().run, compute)
-        self._before: Later[Any] | None = before
+        self._before: Later[Any] | None = None
         self._value: Any = None
+
+    def then(self, change: Callable[[T], R]) -> "Later[R]":
+        """What a function makes of the value, later. Many may be made of one another: they are computed one after the other."""
+        later = Later(lambda: change(self.value()))
+        later._before = self
+        return later
 
     def value(self) -> T:
         """The value, for which is waited where another thread computes it."""

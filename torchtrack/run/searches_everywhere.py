@@ -146,7 +146,7 @@ class SearchInThread:
 
     def after(self, window: EventWindow) -> Ended | None:
         """Have what the search finds followed through one more window."""
-        self._candidate = Later(partial(_followed, self._candidate, window, self._is_over), self._candidate)
+        self._candidate = self._candidate.then(partial(_followed, window=window, is_over=self._is_over))
         self._ahead.compute(self._candidate)
         if window.t_end_us < self._until_us:
             return None
@@ -170,6 +170,5 @@ def _searched(parts: Parts[Candidate | None], windows: Sequence[EventWindow], is
     return None
 
 
-def _followed(before: Later[Candidate | None], window: EventWindow, is_over: threading.Event) -> Candidate | None:
-    candidate = before.value()
+def _followed(candidate: Candidate | None, window: EventWindow, is_over: threading.Event) -> Candidate | None:
     return None if candidate is None or is_over.is_set() else candidate.followed([window])

@@ -16,11 +16,11 @@ from torch import Tensor
 from torchtrack.config.tracker import TrackerConfig
 from torchtrack.core import host_sync
 from torchtrack.core.events import EventBatch
-from torchtrack.core.later import Ahead, Later
+from torchtrack.core.later import Ahead
 from torchtrack.tracking.state import Answer, Search, StepResult, TrackerState, put_object
 from torchtrack.tracking.step import StepInput
 from torchtrack.tracking.validation.status import Status
-from torchtrack.tracking.validation.verdict import Limits, looked_elsewhere
+from torchtrack.tracking.validation.verdict import Limits
 
 Taken = tuple[TrackerState, StepResult]
 Follow = Callable[[int, TrackerState, EventBatch, Tensor], Taken]
@@ -36,14 +36,13 @@ def followed(search: Search, window: StepInput, follow: Follow, ahead: Ahead) ->
     """The search with what it finds followed through one more window."""
     if search.answer is None:
         return search
-    answer = Later(partial(_followed, search.answer, window, follow), search.answer)
+    answer = search.answer.then(partial(_followed, window=window, follow=follow))
     ahead.compute(answer)
     return replace(search, answer=answer)
 
 
 @torch.no_grad()
-def _followed(before: Later[Answer], window: StepInput, follow: Follow) -> Answer:
-    answer = before.value()
+def _followed(answer: Answer, window: StepInput, follow: Follow) -> Answer:
     relocalized = {number: follow(number, state, window.events.events, window.t_us) for number, (state, _) in answer.relocalized.items()}
     return replace(answer, relocalized=relocalized)
 
@@ -74,9 +73,7 @@ def with_search(taken: Taken, under_way: Search | None, config: TrackerConfig, a
 def answered(taken: Taken, answer: Answer, limits: Limits) -> Taken:
     """State and result of a window with what a search has found, where that explains more by now than what the object has become meanwhile."""
     state, result = taken
-    found_nothing = answer.looked & answer.is_unconfirmed
-    health = state.health.with_looks(answer.looked)
-    state = replace(state, health=replace(health, confirmations=looked_elsewhere(health.confirmations, found_nothing, limits)))
+    state = replace(state, health=state.health.after_looks(answer.looked, answer.is_unconfirmed, limits))
     for number, own in answer.relocalized.items():
         if _is_better(number, own, (state, result)):
             state, result = put_object(number, (state, result), own)

@@ -38,7 +38,7 @@ from torchtrack.tracking.state import Answer, Search, StepResult, TrackerState, 
 from torchtrack.tracking.update import conclude
 from torchtrack.tracking.validation.measures import required_spread
 from torchtrack.tracking.validation.scored_fit import ScoredFit, explained_at_rest, reference_where_known, score_fit
-from torchtrack.tracking.validation.verdict import Limits, confirmed_status, looked_elsewhere
+from torchtrack.tracking.validation.verdict import Limits, confirmed_status
 
 
 @dataclass(frozen=True)
@@ -238,11 +238,8 @@ def update(
     next_state, result = conclude(state, located, seen.corners, expected.dt_s, config)
     lesson = Lesson(seen.events, expected.dt_s, seen.sigma_px, tracked.on_surfaces, learns=given.learns)
     next_state = learned_after(next_state, result, prediction, scored, lesson, config)
-    limits = Limits.from_config(config)
-    health = next_state.health.with_looks(located.looked)
-    if located.looked is not None:
-        found_nothing = located.looked & has(window.evidence.triggers, Trigger.UNCONFIRMED)
-        health = replace(health, confirmations=looked_elsewhere(health.confirmations, found_nothing, limits))
+    limits, health, looked = Limits.from_config(config), next_state.health, located.looked
+    health = health.with_looks(None) if looked is None else health.after_looks(looked, has(window.evidence.triggers, Trigger.UNCONFIRMED), limits)
     status = confirmed_status(result.status, health.confirmations, limits)
     maps = replace(next_state.maps, burst_age_us=seen.burst_age_us)
     return replace(next_state, t_us=given.t_us, maps=maps, health=health), replace(result, t_us=given.t_us, status=status)

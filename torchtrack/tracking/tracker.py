@@ -90,11 +90,16 @@ class Tracker(TrackedObjects):
         streams = f"{self.streams} stream{'s' * (self.streams > 1)} of {sizes} pixels"
         return f"{type(self).__name__}({objects}, {streams}, {self.intrinsics.device}, {str(self.intrinsics.dtype).removeprefix('torch.')})"
 
-    def alone(self, number: int) -> "Tracker":
-        """A tracker of one of the objects alone, in its stream, with the same settings."""
+    def alone(self, number: int, config: TrackerConfig | None = None) -> "Tracker":
+        """A tracker of one of the objects alone, in its stream; with the same settings where no others are given."""
         weighting_network, camera = self.weighting_network if self.has_own_network else None, self.cameras[int(self.stream_index[number])]
         alone = Tracker(
-            [self.object_models[number]], camera, self.config, dtype=self.intrinsics.dtype, weighting_network=weighting_network, kernels=self.kernels
+            [self.object_models[number]],
+            camera,
+            config or self.config,
+            dtype=self.intrinsics.dtype,
+            weighting_network=weighting_network,
+            kernels=self.kernels,
         )
         return alone.to(self.intrinsics.device)
 
@@ -179,17 +184,14 @@ class Tracker(TrackedObjects):
         last = under_way or Search(state.t_us, torch.zeros_like(self.stream_index))
         if under_way is not None:
             # Before the window is taken: what was found is followed through it meanwhile.
-            under_way = followed(under_way, given, self._followed, self._ahead)
+            under_way = followed(under_way, given, self._followed_alone, self._ahead)
         taken = self._taken(replace(state, search=None), replace(given, search=last if is_later else None))
         return with_search(taken, under_way, self.config, self._ahead)
 
-    def _followed(self, number: int, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult]:
+    def _followed_alone(self, number: int, state: TrackerState, events: EventBatch, t_us: Int[Tensor, "s"]) -> tuple[TrackerState, StepResult]:
         """A window of one of the objects alone, of which no other poses are tried."""
         if number not in self._alone:
-            alone = self.alone(number)
-            search = self.config.relocalization.model_copy(update={"hypotheses": 0, "answer_after_us": 0})
-            alone.config = self.config.model_copy(update={"relocalization": search})
-            self._alone[number] = alone
+            self._alone[number] = self.alone(number, self.config.without_searches())
         stream = int(self.stream_index[number])
         own = events if self.streams == 1 else events[events.stream_index == stream].of_stream(0)
         return self._alone[number].step(state, own, t_us[stream : stream + 1])

@@ -96,8 +96,7 @@ def alone(start: Start) -> Tracker:
 
 def alone_config() -> TrackerConfig:
     """The usual settings, without a search for other poses: these are all tried as it is."""
-    config = preset("causal")
-    return config.model_copy(update={"relocalization": config.relocalization.model_copy(update={"hypotheses": 0})})
+    return preset("causal").without_searches()
 
 
 def _for_all(events: EventBatch, count: int) -> EventBatch:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchtrack.tracking.validation.verdict import References
+from torchtrack.tracking.validation.verdict import Limits, References, looked_elsewhere
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,11 @@ class TrackHealth:
         """The same after a window in which objects were looked for; nobody where not given."""
         looks = self.looks if looked is None else self.looks + looked
         return replace(self, looks=torch.where(self.time_since_validated_s == 0, 0, looks))
+
+    def after_looks(self, looked: Bool[Tensor, "b"], is_unconfirmed: Bool[Tensor, "b"], limits: Limits) -> "TrackHealth":
+        """The same after a search, which confirms the poses of which no more was asked than whether another one explains far more."""
+        confirmations = looked_elsewhere(self.confirmations, looked & is_unconfirmed, limits)
+        return replace(self.with_looks(looked), confirmations=confirmations)
 
     @property
     def references(self) -> References:
